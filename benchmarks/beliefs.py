@@ -42,7 +42,12 @@ def with_sensing(settings: PlanningSettings, **sensing: Any) -> PlanningSettings
 
 
 def recorded_trial(
-    problem: Problem, settings: PlanningSettings, trial: int = 0
+    problem: Problem,
+    settings: PlanningSettings,
+    trial: int = 0,
+    *,
+    seed: int = SEED,
+    max_steps: int = MAX_STEPS,
 ) -> tuple[list[PlanningState], list[float]]:
     """Run a trial; return its state before each sensing decision and what the decision took.
 
@@ -53,10 +58,10 @@ def recorded_trial(
         Each decision made once, where it belongs, in between everything else that a trial does.
     """
     planner = Planner(problem, settings)
-    state = planner.init(SEED, trial)
-    environment = SimulatedEnvironment(problem, SEED, trial)
+    state = planner.init(seed, trial)
+    environment = SimulatedEnvironment(problem, seed, trial)
     states, seconds = [], []
-    while not environment.is_done() and state.step < MAX_STEPS:
+    while not environment.is_done() and state.step < max_steps:
         if planner.needs_sensing(state):
             states.append(state)
             start = time.perf_counter()

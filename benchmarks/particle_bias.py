@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.beliefs import settings_for
+from benchmarks.beliefs import recorded_trial, settings_for
 from holdfast.arrays import FloatArray
 from holdfast.belief import Belief
 from holdfast.config.settings import PlanningSettings, SelectorSettings
@@ -28,7 +28,6 @@ from holdfast.lab.studies.cases import CASES
 from holdfast.lab.studies.trial_batches import problem_of
 from holdfast.planning import Planner, PlanningState
 from holdfast.problems.problem import Problem
-from holdfast.robot.environment import SimulatedEnvironment
 
 MANY = 4000
 WANTED = ("three plates", "tight hole", "passer-by", "busy room")
@@ -81,20 +80,8 @@ def beliefs_of(
     """Return states before sensing decisions, a few of each trial."""
     settings = settings_of(Rival("nearest_neighbor", MANY, 10), interval)
     found: list[PlanningState] = []
-    planner = Planner(problem, settings)
     for trial in range(TRIALS):
-        state = planner.init(seed, trial)
-        world = SimulatedEnvironment(problem, seed, trial)
-        states = []
-        while not world.is_done() and state.step < max_steps:
-            if planner.needs_sensing(state):
-                states.append(state)
-                sensing_action, _ = planner.choose_sensing_action(state)
-                observation = world.perform_sensing(sensing_action)
-                state, _ = planner.observe(state, sensing_action, observation)
-            action, _ = planner.choose_task_action(state)
-            world.perform(action)
-            state = planner.advance(state, action)
+        states, _ = recorded_trial(problem, settings, trial, seed=seed, max_steps=max_steps)
         kept = rng.choice(len(states), min(IN_EACH_TRIAL, len(states)), replace=False)
         found += [states[index] for index in sorted(kept)]
     return found

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 from rich.console import Console
@@ -19,7 +16,6 @@ __all__ = [
     "milliseconds",
     "paragraph",
     "show",
-    "write_atomically",
 ]
 
 
@@ -123,19 +119,3 @@ def show(console: Console, content: Sequence[str | Table]) -> None:
         for row in part.rows:
             table.add_row(*[cell.replace("**", "") for cell in row])
         console.print(table)
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Write a file so that it is there as a whole or not at all."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    temporary = Path(name)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.chmod(0o644)
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise

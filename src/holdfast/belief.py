@@ -12,7 +12,7 @@ still ranks them instead of turning every weight into zero.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,7 @@ from holdfast.randomness import Stream
 
 __all__ = [
     "Belief",
-    "UpdateInfo",
+    "ObservationInfo",
     "effective_sample_size",
     "estimate",
     "resample",
@@ -38,14 +38,6 @@ VALIDATION_GATE_SQUARED = 64.0
 """Square of eight standard deviations. An observation further than this from every particle lies
 outside the validation gate; under a correct model in one dimension its probability is below
 2e-15."""
-
-
-class ObservationModel(Protocol):
-    """The part of a problem that an update needs."""
-
-    def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray: ...
-
-    def observation_variance(self, states: FloatArray, sensing_action: int) -> FloatArray: ...
 
 
 class Belief(NamedTuple):
@@ -64,16 +56,9 @@ class Belief(NamedTuple):
 
     @classmethod
     def uniform(cls, states: npt.ArrayLike) -> Belief:
-        """Return a belief of equally weighted particles.
+        """Return a belief of equally weighted particles, (num_particles, state_size).
 
-        Parameters
-        ----------
-        states : array of shape (num_particles, state_size)
-
-        Raises
-        ------
-        InvalidValueError
-            If there is no particle or a coordinate is not finite.
+        Raises InvalidValueError if there is no particle or a coordinate is not finite.
         """
         array = np.array(states, dtype=np.float64, order="C")
         if array.ndim != 2 or array.shape[0] == 0 or array.shape[1] == 0:
@@ -90,16 +75,8 @@ class Belief(NamedTuple):
     def weighted(cls, states: npt.ArrayLike, weights: npt.ArrayLike) -> Belief:
         """Return a belief of weighted particles; the weights are normalised.
 
-        Parameters
-        ----------
-        states : array of shape (num_particles, state_size)
-        weights : array of shape (num_particles,)
-            Non-negative and finite, not all zero.
-
-        Raises
-        ------
-        InvalidValueError
-            If a state or a weight is out of bounds or the shapes do not fit.
+        The weights, of shape (num_particles,), are non-negative and finite, not all zero; what is
+        out of bounds raises InvalidValueError.
         """
         belief = cls.uniform(states)
         array = np.ascontiguousarray(weights, dtype=np.float64)
@@ -127,16 +104,19 @@ def uniform_weights(count: int) -> FloatArray:
     return weights
 
 
-class UpdateInfo(NamedTuple):
-    """Diagnostics of an update.
+class ObservationInfo(NamedTuple):
+    """The result of updating the belief by an observation.
 
     Attributes
     ----------
     effective_sample_size : float
-        ``1 / sum(weights**2)`` after the update, from 1 to the number of particles.
+        ``1 / sum(weights**2)`` after the update and before resampling, from 1 to the number of
+        particles.
     explained : bool
         False if the observation lies outside the validation gate of every particle (for a general
-        likelihood: is impossible under all of them).
+        likelihood: is impossible under all of them): the belief is valid but not to be trusted.
+    resampled : bool
+        Whether the particles were drawn anew after the update.
     mahalanobis_distance : float or None
         Distance of the observation from the nearest particle's prediction, in standard deviations;
         None for a general likelihood, which has no such distance.
@@ -144,16 +124,14 @@ class UpdateInfo(NamedTuple):
 
     effective_sample_size: float
     explained: bool
+    resampled: bool
     mahalanobis_distance: float | None = None
 
 
 def estimate(belief: Belief, kind: Literal["mean", "most_likely"] = "mean") -> FloatArray:
     """Return a point estimate of the state, shape ``(state_size,)``.
 
-    Parameters
-    ----------
-    kind : {"mean", "most_likely"}
-        The mean, or the particle of the greatest weight (the first of equals).
+    It is the mean, or the particle of the greatest weight (the first of equals).
     """
     if kind == "most_likely":
         # A copy: the belief may be large, and what is returned may outlive it.
@@ -174,23 +152,18 @@ def effective_sample_size(belief: Belief) -> float:
 
 
 def update(
-    problem: ObservationModel, belief: Belief, sensing_action: int, observation: npt.ArrayLike
-) -> tuple[Belief, UpdateInfo]:
-    """Multiply the weights by the likelihood of an observation (Bayes' rule).
+    problem: Any, belief: Belief, sensing_action: int, observation: npt.ArrayLike
+) -> tuple[Belief, ObservationInfo]:
+    """Multiply the weights by the likelihood of an observation (Bayes' rule); do not resample.
+
+    If the log-likelihood is minus infinity for every particle, the belief stays as it is.
 
     Parameters
     ----------
-    problem : ObservationModel
+    problem : Problem
         Has the mean and variance of the observation in each state, or a method
         ``log_likelihood(states, sensing_action, observation)``.
     observation : array of shape (observation_size,)
-
-    Returns
-    -------
-    belief : Belief
-        The same states with new weights. If the log-likelihood is minus infinity for every
-        particle, the unchanged belief.
-    info : UpdateInfo
 
     Raises
     ------
@@ -205,17 +178,13 @@ def update(
             f"observation {in_brief(observed)}: every coordinate must be finite"
         )
     if not has_general_observations(problem):
-        mean = checked.observation_mean(problem, belief.states, sensing_action)
-        variance = checked.observation_variance(problem, belief.states, sensing_action, mean)
+        mean, variance = checked.prediction(problem, belief.states, sensing_action)
         if mean.shape[-1] != observed.shape[0]:
             raise InvalidValueError(
                 f"observation of {observed.shape[0]} coordinates: sensing action {sensing_action} "
                 f"gives {mean.shape[-1]}"
             )
-        # A comparison with NaN is false.
-        usable = (variance > 0.0).all() and numerics.all_finite(variance)
-        if not usable or not numerics.all_finite(mean):
-            raise checked.unusable_prediction(problem, sensing_action, mean, variance)
+        checked.require_usable(problem, sensing_action, mean, variance)
         log_likelihood, squared_distance = _gaussian_log_likelihood(
             observed, mean, variance, belief.weights
         )
@@ -227,10 +196,10 @@ def update(
         explained = bool(((log_likelihood > -np.inf) & (belief.weights > 0.0)).any())
     weights, survivors = _kernel.normalize(numerics.log(belief.weights) + log_likelihood, False)
     if survivors == 0:
-        return belief, UpdateInfo(effective_sample_size(belief), False, distance)
+        return belief, ObservationInfo(effective_sample_size(belief), False, False, distance)
     weights.setflags(write=False)
     after = Belief(belief.states, weights)
-    return after, UpdateInfo(effective_sample_size(after), explained, distance)
+    return after, ObservationInfo(effective_sample_size(after), explained, False, distance)
 
 
 def _gaussian_log_likelihood(
@@ -258,24 +227,13 @@ def _gaussian_log_likelihood(
 
 
 def resample(belief: Belief, stream: Stream) -> Belief:
-    """Draw the same number of particles from the belief, by systematic resampling.
+    """Draw the same number of equally weighted particles, by systematic resampling.
 
-    Parameters
-    ----------
-    stream : Stream
-        Source of the one uniform offset.
-
-    Returns
-    -------
-    Belief
-        Equally weighted particles; particle n occurs ``floor(N w_n)`` or ``ceil(N w_n)`` times.
-
-    Notes
-    -----
-    Carpenter, Clifford and Fearnhead (1999), "Improved particle filter for nonlinear problems".
+    The stream gives the one uniform offset. Particle n occurs ``floor(N w_n)`` or ``ceil(N w_n)``
+    times: Carpenter, Clifford and Fearnhead (1999), "Improved particle filter for nonlinear
+    problems".
     """
-    offset = float(stream.uniform())
-    indices = _kernel.systematic_resample(belief.weights, offset)
+    indices = _kernel.systematic_resample(belief.weights, float(stream.uniform()))
     states = belief.states[indices]
     states.setflags(write=False)
     return Belief(states, uniform_weights(belief.weights.shape[0]))

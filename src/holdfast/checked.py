@@ -28,71 +28,60 @@ __all__ = [
     "move_each",
     "next_stage",
     "next_stages",
-    "observation_mean",
-    "observation_variance",
     "policy",
+    "prediction",
+    "require_usable",
     "rewards",
     "sample_observation",
     "scalar",
     "states_of",
     "truth",
-    "unusable_prediction",
 ]
 
 MAX_OBSERVATION_SIZE = 1024
 
 
-def observation_mean(problem: Any, states: FloatArray, sensing_action: int) -> FloatArray:
-    """Return the expected observation, shape ``(..., observation_size)``."""
-    mean = problem.observation_mean(states, sensing_action)
+def prediction(
+    problem: Any, states: FloatArray, sensing_action: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the mean and the variance of the observation in each state.
+
+    The mean has the shape ``(..., observation_size)``, and the variance that or
+    ``(observation_size,)``. Whether they are finite is left to :func:`require_usable`.
+    """
+    mean: FloatArray = problem.observation_mean(states, sensing_action)
     leading = states.shape[:-1]
     if not _is_float_array(mean) or mean.ndim != states.ndim or mean.shape[:-1] != leading:
-        raise _misfit(
-            problem,
-            f"observation_mean of sensing action {sensing_action}",
-            mean,
-            (*leading, "observation_size"),
-        )
+        what = f"observation_mean of sensing action {sensing_action}"
+        raise _misfit(problem, what, mean, (*leading, "observation_size"))
     if not 1 <= mean.shape[-1] <= MAX_OBSERVATION_SIZE:
         raise ProblemError(
             f"observation_mean of {name_of(problem)} has {mean.shape[-1]} coordinates: allowed are "
             f"1 to {MAX_OBSERVATION_SIZE}"
         )
-    checked: FloatArray = mean
-    return checked
+    variance: FloatArray = problem.observation_variance(states, sensing_action)
+    one = mean.shape[-1:]
+    if not isinstance(variance, np.ndarray) or variance.shape not in (one, mean.shape):
+        need = one if mean.ndim == 1 else f"{one} or {mean.shape}"
+        what = f"observation_variance of sensing action {sensing_action}"
+        raise _misfit(problem, what, variance, need)
+    return mean, variance
 
 
-def observation_variance(
-    problem: Any, states: FloatArray, sensing_action: int, mean: FloatArray
-) -> FloatArray:
-    """Return the variance, shape ``(observation_size,)`` or that of ``mean``."""
-    variance = problem.observation_variance(states, sensing_action)
-    if not isinstance(variance, np.ndarray) or variance.shape not in (mean.shape[-1:], mean.shape):
-        raise _misfit(
-            problem,
-            f"observation_variance of sensing action {sensing_action}",
-            variance,
-            mean.shape[-1:] if mean.ndim == 1 else f"{mean.shape[-1:]} or {mean.shape}",
-        )
-    checked: FloatArray = variance
-    return checked
-
-
-def unusable_prediction(
+def require_usable(
     problem: Any, sensing_action: int, mean: FloatArray, variance: FloatArray
-) -> ProblemError:
-    """Return the error about the first entry of a mean or variance that no observation can have.
-
-    The caller knows that there is one: that is found sooner than where it is.
-    """
+) -> None:
+    """Raise the error about the first entry of a prediction that no observation can have."""
+    # Comparisons with NaN are false.
+    if (variance > 0.0).all() and _kernel.all_finite(variance) and _kernel.all_finite(mean):
+        return
     function, values, need = "observation_mean", mean, "finite"
     unusable = ~np.isfinite(mean)
     if not unusable.any():
         function, values, need = "observation_variance", variance, "positive and finite"
-        # A comparison with NaN is false.
         unusable = ~((variance > 0.0) & (variance < np.inf))
     index = tuple(map(int, np.argwhere(unusable)[0]))
-    return ProblemError(
+    raise ProblemError(
         f"{function} of {name_of(problem)}, sensing action {sensing_action}, is {values[index]} at "
         f"{_written(index)} of shape {_written(values.shape)}: every entry must be {need}"
     )
@@ -102,7 +91,7 @@ def sample_observation(
     problem: Any, state: FloatArray, sensing_action: int, stream: object
 ) -> FloatArray:
     """Return an observation that was drawn in one state, shape ``(observation_size,)``."""
-    drawn = problem.sample_observation(state, sensing_action, stream)
+    drawn: FloatArray = problem.sample_observation(state, sensing_action, stream)
     if not isinstance(drawn, np.ndarray) or drawn.dtype.kind not in "fiu" or drawn.ndim != 1:
         raise _misfit(
             problem,
@@ -115,8 +104,7 @@ def sample_observation(
             f"sample_observation of {name_of(problem)} returned {in_brief(drawn)} of "
             f"{drawn.size} coordinates: need 1 to {MAX_OBSERVATION_SIZE}, all of them finite"
         )
-    checked: FloatArray = drawn
-    return checked
+    return drawn
 
 
 def log_likelihood(
@@ -245,16 +233,10 @@ def move_each(
     streams: Sequence[object],
     threads: int,
 ) -> FloatArray:
-    """Return several beliefs moved, each by its own action, read-only from now on.
+    """Return b beliefs moved, each by its own action and with its own stream, read-only.
 
-    Parameters
-    ----------
-    states : array of shape (b, n, state_size)
-    actions : array of shape (b, action_size)
-    streams : sequence of Stream
-        One for each belief.
-    threads : int
-        At most so many, if the problem has a ``move_each``; 0 is all.
+    ``states`` has the shape ``(b, n, state_size)``, ``actions`` ``(b, action_size)``; ``threads``
+    counts if the problem has a ``move_each``.
     """
     if has_own(problem, "move_each", ("move",)):
         moved = problem.move_each(states, actions, streams, threads)
@@ -279,11 +261,10 @@ def truth(problem: Any, function: str, value: object) -> bool:
     return bool(single)
 
 
-def _array(problem: Any, function: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
+def _array(problem: Any, function: str, value: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     if not _is_float_array(value) or value.shape != shape:
         raise _misfit(problem, function, value, shape)
-    checked: FloatArray = value
-    return checked
+    return value
 
 
 def _finite(problem: Any, function: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
@@ -312,10 +293,8 @@ def _stages(problem: Any, function: str, stages: Any, states: FloatArray) -> Int
 def _single(problem: Any, function: str, value: object) -> Any:
     if type(value) in (int, float, bool):
         return value
-    if isinstance(value, (list, tuple)):
-        raise _misfit(problem, function, value, ())
-    number = np.asarray(value)
-    if number.ndim != 0 or number.dtype.kind not in "fiub":
+    number = None if isinstance(value, (list, tuple)) else np.asarray(value)
+    if number is None or number.ndim != 0 or number.dtype.kind not in "fiub":
         raise _misfit(problem, function, value, ())
     return value
 

@@ -7,49 +7,6 @@ has the file open, not this code.
 
 from __future__ import annotations
 
-__all__ = [
-    "CallError",
-    "CheckpointError",
-    "ConfigurationError",
-    "CredentialsError",
-    "DecidedOtherwiseError",
-    "DescriptorError",
-    "EndOfRecordsError",
-    "EnvironmentFailedError",
-    "FrameError",
-    "GoneError",
-    "GuardError",
-    "HealthError",
-    "HeldError",
-    "HoldfastError",
-    "IllegalTransitionError",
-    "InvalidValueError",
-    "KeysExhaustedError",
-    "LostJournalError",
-    "MessageError",
-    "MetricsError",
-    "MissingRosbagsError",
-    "OptionError",
-    "OtherCodeError",
-    "OutputError",
-    "OwnDecisionError",
-    "ProblemError",
-    "RecordError",
-    "RunError",
-    "ServiceBrokenError",
-    "ServiceProcessError",
-    "ServiceRefusedError",
-    "SilentError",
-    "StaleEpochError",
-    "TransportError",
-    "TrialCrashError",
-    "TrialError",
-    "UnknownPerformanceError",
-    "UnknownProblemError",
-    "UnwritableOutputError",
-    "WorkerDiedError",
-]
-
 
 class HoldfastError(Exception):
     """Base of every error that holdfast raises on purpose."""

@@ -20,15 +20,13 @@ import numpy.typing as npt
 
 from holdfast import _kernel, numerics
 from holdfast.arrays import FloatArray, in_brief
+from holdfast.config.settings import MAX_PRIOR_NEIGHBORS_POINTS
 from holdfast.errors import InvalidValueError
 
 __all__ = ["GaussianMixture", "NearestNeighbor", "PriorNeighbors", "entropy"]
 
 
 MAX_DIMENSION = 64
-MAX_PRIOR_NEIGHBORS_POINTS = 4096
-"""Bound on the points of :class:`PriorNeighbors`: where all lie within the resolution of each
-other, their neighbourhoods then take 64 MB."""
 
 LARGEST = 1e150
 """Bound on coordinates, and on the resolution and its inverse: their squares must be numbers."""
@@ -180,10 +178,7 @@ TOTAL_VARIANCE = KernelEstimator(EstimatorKind.TOTAL_VARIANCE, 1, 1.0, 0.0, 0.0,
 def scaled(points: FloatArray, estimator: KernelEstimator) -> FloatArray:
     """Return the points as the kernel takes them.
 
-    Raises
-    ------
-    InvalidValueError
-        If one is too far from zero in the units of the estimator.
+    InvalidValueError says if one is too far from zero in the units of the estimator.
     """
     if estimator.scale is None:
         return points
@@ -205,13 +200,7 @@ def first_unbounded(points: FloatArray) -> int | None:
 
 
 def scale_of(resolution: FloatArray, dimension: int) -> tuple[FloatArray, float]:
-    """Return what makes a resolution 1 in every coordinate, and the log of its cell's volume.
-
-    Raises
-    ------
-    InvalidValueError
-        If there are not as many numbers as coordinates, or one is out of bounds.
-    """
+    """Return what makes a resolution 1 in every coordinate, and the log of its cell's volume."""
     sizes = np.ascontiguousarray(resolution, dtype=np.float64)
     if sizes.shape != (dimension,):
         raise InvalidValueError(
@@ -232,20 +221,10 @@ def kernel_estimator(
     *,
     split_volume: bool = False,
 ) -> KernelEstimator:
-    """Check an estimator and translate it.
+    """Check an estimator of points with ``dimension`` coordinates, and translate it.
 
-    Parameters
-    ----------
-    dimension : int
-        Number of coordinates of a point.
-    split_volume : bool
-        Keep the part of a mixture's entropy that depends on units apart, in ``log_volume``. That of
-        a nearest-neighbour estimate with an array is always there.
-
-    Raises
-    ------
-    InvalidValueError
-        If a parameter is out of bounds.
+    ``split_volume`` keeps the part of a mixture's entropy that depends on units apart, in
+    ``log_volume``. That of a nearest-neighbour estimate with an array is always there.
     """
     if not 1 <= dimension <= MAX_DIMENSION:
         raise InvalidValueError(

@@ -96,11 +96,8 @@ def expected_returns(
 ) -> Returns:
     """Return the expected return after each sensing action.
 
-    Raises
-    ------
-    ProblemError
-        If a function of the problem returns something out of its contract, or a hypothetical
-        observation has no likelihood under any particle.
+    ProblemError says if a function of the problem breaks its contract, or a hypothetical
+    observation has no likelihood under any particle.
     """
     costs = sensing_costs(problem)
     count = costs.shape[0]
@@ -184,33 +181,20 @@ def rollout_returns(
     stage: int,
     motion: Stream,
 ) -> FloatArray:
-    """Return the discounted returns of robots that act on a belief, up to the goal.
+    """Return the discounted returns, shape (J, M), of robots that act on a belief, up to the goal.
 
     They lack what is the same for all J: a rollout ends where only that is left.
 
     Parameters
     ----------
-    settings : PlanningSettings
-        Of it count the discount, the sensing interval and the length of a rollout.
     true_states : array of shape (M, state_size)
         Of the robots.
     estimates : array of shape (J, M, state_size)
         The states that they assume after each of J observations.
     clouds : array of shape (J, M, L, state_size)
         Some particles of these beliefs. By their mean displacement the estimates move.
-    stage : int
-        Stage of the task.
     motion : Stream
         The noise of the motion, the same for all J.
-
-    Returns
-    -------
-    array of shape (J, M)
-
-    Raises
-    ------
-    ProblemError
-        If a function of the problem returns something out of its contract.
     """
     rollouts = _Rollouts(problem, settings, true_states, estimates, clouds, stage)
     interval = settings.sensing_interval + 1

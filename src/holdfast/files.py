@@ -3,6 +3,9 @@
 A file is written under a temporary name in the same directory and then renamed. A rename is atomic:
 after a crash, and for every reader, the path holds the old file or the new one, never a part.
 Directories whose files belong together, such as a key and its certificate, appear the same way.
+
+All functions but :func:`read_bounded` raise :class:`~holdfast.errors.OutputError` if the system
+refuses something, or what they would write is there already.
 """
 
 from __future__ import annotations
@@ -44,27 +47,16 @@ _PIPE_PAUSE_S = 0.02
 
 
 class NewFile(NamedTuple):
-    """A file of a new directory.
-
-    Attributes
-    ----------
-    mode : int
-        Its permissions, before the process's umask.
-    """
+    """A file of a new directory; ``mode`` is its permissions, before the process's umask."""
 
     content: bytes
     mode: int
 
 
 def read_bounded(path: Path, most: int) -> bytes:
-    """Read a file or pipe that the user names, with bounds on size and time.
+    """Read at most so many bytes of a file or pipe that the user names.
 
     A pipe may be a shell's ``<(command)``. Reading fails after 10 s without a writer or data.
-
-    Parameters
-    ----------
-    most : int
-        Maximum number of bytes to read.
 
     Raises
     ------
@@ -114,18 +106,22 @@ def _read_pipe(descriptor: int, most: int, *, named: bool) -> bytes:
     return bytes(content)
 
 
+@contextlib.contextmanager
+def _refusals(path: Path, what: str) -> Iterator[None]:
+    """Turn the system's refusals into errors about the path."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be {what}: {error.strerror or error}") from error
+
+
 def write_atomically(path: Path, content: bytes | Iterable[str]) -> None:
-    """Write a file atomically; a file that exists is replaced.
+    """Write a file atomically; a file that exists is replaced, or unchanged if that fails.
 
     Parameters
     ----------
     content : bytes, str or iterable of str
         Text is encoded as UTF-8, piece by piece.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written; then the path is unchanged.
     """
     pieces: Iterable[bytes]
     if isinstance(content, bytes):
@@ -134,29 +130,23 @@ def write_atomically(path: Path, content: bytes | Iterable[str]) -> None:
         pieces = (piece.encode() for piece in ((content,) if isinstance(content, str) else content))
     # In the same folder, because a rename is atomic only within one file system.
     temporary = _unfinished(path)
-    try:
-        with temporary.open("wb") as file:
-            file.writelines(pieces)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        if isinstance(error, OSError):
-            raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
-        raise
+    with _refusals(path, "written"):
+        try:
+            with temporary.open("wb") as file:
+                file.writelines(pieces)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+            raise
 
 
 def remove_unfinished(directory: Path, *, below: bool = False) -> None:
     """Remove temporary files of killed writers; a young one may belong to a running writer.
 
-    Parameters
-    ----------
-    directory : Path
-        It may be missing.
-    below : bool
-        Whether to search its subdirectories, too.
+    The directory may be missing; with ``below`` its subdirectories are searched, too.
     """
     latest = time.time() - _LONGEST_WRITE_S
     for path in directory.rglob(".*.tmp") if below else directory.glob(".*.tmp"):
@@ -172,39 +162,36 @@ def _unfinished(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
 
-def create_directory_atomically(path: Path, files: Mapping[str, NewFile]) -> None:
-    """Create a directory that only its owner can enter, with all its files, atomically.
-
-    Parameters
-    ----------
-    path : Path
-        Its parent must exist. An empty directory at this path is replaced.
-    files : mapping of str to NewFile
-        The files by name.
-
-    Raises
-    ------
-    OutputError
-        If the path exists or cannot be written; then nothing is changed.
-    """
+@contextlib.contextmanager
+def _unfinished_directory(path: Path, mode: int = 0o777) -> Iterator[Path]:
+    """Create the temporary directory of a path, and remove it after the block if it is there."""
     temporary = _unfinished(path)
     try:
-        temporary.mkdir(mode=0o700)
-        for name, new in files.items():
-            # The mode is set at creation, so that a key is never readable by others.
-            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
-            with os.fdopen(os.open(temporary / name, flags, new.mode), "wb") as file:
-                file.write(new.content)
-                file.flush()
-                os.fsync(file.fileno())
-        temporary.rename(path)
-    except BaseException as error:
+        temporary.mkdir(mode)
+        yield temporary
+    finally:
         _remove_tree(temporary)
-        if isinstance(error, OSError):
-            # A rename onto a directory with files fails with one of several errors.
-            reason = "it exists already" if path.exists() else error.strerror
-            raise OutputError(f"{path}: cannot be created: {reason}") from error
-        raise
+
+
+def create_directory_atomically(path: Path, files: Mapping[str, NewFile]) -> None:
+    """Create a directory that only its owner can enter, with all its files by name, atomically.
+
+    Its parent must exist. An empty directory at this path is replaced.
+    """
+    try:
+        with _unfinished_directory(path, 0o700) as temporary:
+            for name, new in files.items():
+                # The mode is set at creation, so that a key is never readable by others.
+                flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
+                with os.fdopen(os.open(temporary / name, flags, new.mode), "wb") as file:
+                    file.write(new.content)
+                    file.flush()
+                    os.fsync(file.fileno())
+            temporary.rename(path)
+    except OSError as error:
+        # A rename onto a directory with files fails with one of several errors.
+        reason = "it exists already" if path.exists() else error.strerror
+        raise OutputError(f"{path}: cannot be created: {reason}") from error
 
 
 def replace_directory(path: Path, files: Mapping[str, NewFile]) -> None:
@@ -212,20 +199,13 @@ def replace_directory(path: Path, files: Mapping[str, NewFile]) -> None:
 
     No reader sees files of both. If the process is killed meanwhile, the path may be missing until
     :func:`restore_directory` is called.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
     """
     restore_directory(path)
     new, old = _beside(path)
     create_directory_atomically(new, files)
-    try:
+    with _refusals(path, "replaced"):
         path.rename(old)
         new.rename(path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be replaced: {error.strerror}") from error
     _remove_tree(old)
 
 
@@ -233,18 +213,11 @@ def restore_directory(path: Path) -> None:
     """Complete a replacement whose process was killed, and remove its temporary directories.
 
     No other process may use the directory meanwhile.
-
-    Raises
-    ------
-    OutputError
-        If the directory cannot be renamed.
     """
     new, old = _beside(path)
     if old.exists() and not path.exists():
-        try:
+        with _refusals(path, "restored"):
             (new if new.exists() else old).rename(path)
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be restored: {error.strerror}") from error
     for name in (path.name, new.name):
         for unfinished in path.parent.glob(f".{name}.*.tmp"):
             _remove_tree(unfinished)
@@ -260,26 +233,13 @@ def _beside(path: Path) -> tuple[Path, Path]:
 def claim_directory(out: Path | None, parent: Path, name: str) -> Path:
     """Create an empty output directory for a command.
 
-    Parameters
-    ----------
-    out : Path or None
-        The directory; it may exist if it is empty. None: ``name`` in ``parent``, with a number if
-        it exists.
-    parent : Path
-        Created if missing.
-
-    Raises
-    ------
-    OutputError
-        If the directory is not empty or cannot be created.
+    It is ``out``, which may exist if it is empty; or ``name`` in ``parent``, which is created if
+    missing, with a number if it exists.
     """
-    try:
+    with _refusals(out or parent, "made"):
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
-            if any(out.iterdir()):
-                raise OutputError(
-                    f"{out}: holds files already; remove it, or choose another directory (--out)"
-                )
+            _require_empty(out, "--out")
             return out
         parent.mkdir(parents=True, exist_ok=True)
         for number in range(1, _MAX_DEFAULT_DIRECTORIES):
@@ -287,74 +247,44 @@ def claim_directory(out: Path | None, parent: Path, name: str) -> Path:
             with contextlib.suppress(FileExistsError):
                 path.mkdir()
                 return path
-    except OSError as error:
-        raise OutputError(f"{out or parent}: cannot be made: {error.strerror}") from error
     raise OutputError(f"{parent}: more than {_MAX_DEFAULT_DIRECTORIES} of {name}; give --out")
 
 
 def require_free(path: Path, option: str, *, directory: bool) -> None:
-    """Check that a file or directory can be created: the path is free, and its parent exists.
+    """Check that the file or directory of an option can be created.
 
-    Parameters
-    ----------
-    option : str
-        The option that named the path, for messages.
-    directory : bool
-        Whether to create a directory: then an empty one may exist.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be created.
+    The path is free, or an empty directory where one is wanted, and its parent exists.
     """
-    try:
+    with _refusals(path, "made"):
         if directory and path.is_dir():
-            if any(path.iterdir()):
-                raise OutputError(
-                    f"{path}: holds files already; remove it, or choose another directory "
-                    f"({option})"
-                )
+            _require_empty(path, option)
         elif path.is_symlink() or path.exists():
             raise OutputError(f"{path}: exists already; remove it, or choose another ({option})")
         elif not path.parent.is_dir():
             raise OutputError(f"{path}: cannot be made: there is no directory {path.parent}")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be made: {error.strerror}") from error
+
+
+def _require_empty(path: Path, option: str) -> None:
+    if any(path.iterdir()):
+        raise OutputError(
+            f"{path}: holds files already; remove it, or choose another directory ({option})"
+        )
 
 
 @contextlib.contextmanager
 def directory_beside(path: Path) -> Iterator[Path]:
-    """Create a temporary directory, and remove it after the block.
+    """Create a temporary directory beside a final path, and remove it after the block.
 
-    Parameters
-    ----------
-    path : Path
-        The final path (:func:`move_into_place`); the directory is created beside it.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be created, or the block raises OSError, as on a full disk.
+    An OSError of the block, as of a full disk, is an OutputError, too. What was made in it goes to
+    its path by :func:`move_into_place`.
     """
-    temporary = _unfinished(path)
-    try:
-        temporary.mkdir()
+    with _refusals(path, "written"), _unfinished_directory(path) as temporary:
         yield temporary
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        _remove_tree(temporary)
 
 
 def move_into_place(made: Path, path: Path) -> None:
-    """Write a file, or a directory of files, through to the disk, and rename it to its path.
-
-    Raises
-    ------
-    OutputError
-        If a system call fails.
-    """
-    try:
+    """Write a file, or a directory of files, through to the disk, and rename it to its path."""
+    with _refusals(path, "written"):
         for file in sorted(made.iterdir()) if made.is_dir() else [made]:
             descriptor = os.open(file, os.O_RDONLY | os.O_CLOEXEC)
             try:
@@ -362,8 +292,6 @@ def move_into_place(made: Path, path: Path) -> None:
             finally:
                 os.close(descriptor)
         made.rename(path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def _remove_tree(directory: Path) -> None:

@@ -35,23 +35,29 @@ MAX_NOISE_ATTEMPTS = 1000
 
 
 class _World:
-    """Base of the worlds: the checks and the calls into the kernel."""
+    """Base of the worlds: the checks and the calls into the kernel.
 
-    _DIMENSION: int
-    _SPACE_DIMENSION: int
+    ``dimension`` is the number of a state's coordinates, ``space_dimension`` that of a point's.
+    States and actions have their coordinates last.
+
+    All methods raise InvalidValueError if shapes do not fit, or a value is not finite or out of
+    bounds. Results do not depend on ``threads``, of which 0 means all cores.
+    """
+
+    dimension: int
+    space_dimension: int
     _kernel: Any  # one of the kernel's three worlds, which have the same methods
     obstacles: FloatArray
 
     def _check_obstacles(self, obstacles: npt.ArrayLike) -> FloatArray:
-        size = 2 * self._SPACE_DIMENSION
+        half = self.space_dimension
         limits = np.array(obstacles, dtype=np.float64, order="C")
         if limits.size == 0:
-            limits = limits.reshape(0, size)
-        if limits.ndim != 2 or limits.shape[1] != size:
-            raise InvalidValueError(f"obstacles: shape {limits.shape}, must be (m, {size})")
+            limits = limits.reshape(0, 2 * half)
+        if limits.ndim != 2 or limits.shape[1] != 2 * half:
+            raise InvalidValueError(f"obstacles: shape {limits.shape}, must be (m, {2 * half})")
         if not np.isfinite(limits).all():
             raise InvalidValueError(f"obstacles: a limit is not finite; use {FAR:g} for far away")
-        half = self._SPACE_DIMENSION
         empty = (limits[:, :half] >= limits[:, half:]).any(axis=1)
         if empty.any():
             index = int(np.argmax(empty))
@@ -62,27 +68,10 @@ class _World:
         return limits
 
     def collides(self, states: FloatArray) -> BoolArray:
-        """Tell which states overlap an obstacle.
-
-        Parameters
-        ----------
-        states : array of shape (..., d)
-
-        Returns
-        -------
-        array of bool of the leading shape
-
-        Raises
-        ------
-        InvalidValueError
-            If the last axis is not d long, or a state is not finite.
-        """
-        dimension = self._DIMENSION
-        states = np.ascontiguousarray(states, dtype=np.float64)
-        if states.shape[-1] != dimension:
-            raise InvalidValueError(f"states: shape {states.shape}, must be (..., {dimension})")
+        """Tell which states overlap an obstacle; the result has their leading shape."""
+        states = self._rows("states", states)
         result = np.empty(states.shape[:-1], dtype=np.bool_)
-        if not self._kernel.collides(states.reshape(-1, dimension), result.reshape(-1)):
+        if not self._kernel.collides(states.reshape(-1, self.dimension), result.reshape(-1)):
             _raise_not_finite("states", states)
         return result
 
@@ -114,24 +103,9 @@ class _World:
             Fraction of the action, above 0 and below 1.
         stream : Stream
             Source of the noise; a :class:`~holdfast.randomness.NoiseFreeStream` adds none.
-
-        Returns
-        -------
-        array of the broadcast shape
-
-        Raises
-        ------
-        InvalidValueError
-            If shapes do not fit, or a value is not finite or out of bounds.
         """
-        dimension = self._DIMENSION
-        states = np.ascontiguousarray(states, dtype=np.float64)
-        actions = np.ascontiguousarray(actions, dtype=np.float64)
-        if states.shape[-1] != dimension or actions.shape[-1] != dimension:
-            raise InvalidValueError(
-                f"states: shape {states.shape}, actions: shape {actions.shape}; "
-                f"both must be (..., {dimension})"
-            )
+        dimension = self.dimension
+        states, actions = self._rows("states", states), self._rows("actions", actions)
         if actions.size != dimension and actions.shape != states.shape:
             states, actions = _broadcast(states, actions)
         one_action = actions.shape == (dimension,)
@@ -148,7 +122,7 @@ class _World:
             next_states.reshape(-1, dimension),
         )
         if not moved:
-            _explain_move(states, actions, standard_deviation, tolerance)
+            self._explain_move(states, actions, standard_deviation, tolerance)
         return next_states
 
     def follow(
@@ -160,41 +134,18 @@ class _World:
         tolerance: float,
         threads: int,
     ) -> tuple[FloatArray, IntArray]:
-        """Follow a policy of the kernel without noise, from each state independently.
+        """Follow a policy of the kernel without noise, from each of n states independently.
 
-        The result equals, bit for bit, repeated calls of the problem's policy, limits, motion
-        without noise and next stage; this is much faster.
-
-        Parameters
-        ----------
-        policy : PegPolicy2D, PegPolicy3D or ViaPointPolicy
-            A policy of the kernel for this kind of world.
-        states : array of shape (n, d)
-        stage : int
-            Initial stage of all states.
-        offsets : sequence of int
-            Numbers of steps, in ascending order.
-        tolerance : float
-            Fraction of an action to which contact is located; 0 for motion without obstacles.
-        threads : int
-            Maximum number; 0 means all cores. The result does not depend on it.
-
-        Returns
-        -------
-        states_at : array of shape (len(offsets), n, d)
-        stages_at : array of int of shape (len(offsets), n)
-
-        Raises
-        ------
-        InvalidValueError
-            If the last axis is not d long, or a state is not finite.
+        All begin in one stage. The result, the states (K, n, d) and stages (K, n) after K numbers
+        of steps (``offsets``, ascending), equals, bit for bit, repeated calls of the problem's
+        policy, limits, motion without noise and next stage; this is much faster. A tolerance of 0
+        is motion without obstacles.
         """
-        dimension = self._DIMENSION
-        states = np.ascontiguousarray(states, dtype=np.float64)
-        if states.ndim != 2 or states.shape[1] != dimension:
-            raise InvalidValueError(f"states: shape {states.shape}, must be (n, {dimension})")
+        states = self._rows("states", states)
+        if states.ndim != 2:
+            raise InvalidValueError(f"states: shape {states.shape}, must be (n, {self.dimension})")
         shape = (len(offsets), states.shape[0])
-        states_at = np.empty((*shape, dimension))
+        states_at = np.empty((*shape, self.dimension))
         stages_at = np.empty(shape, dtype=np.int64)
         followed = self._kernel.follow(
             policy,
@@ -203,7 +154,7 @@ class _World:
             offsets,
             tolerance,
             threads,
-            states_at.reshape(-1, dimension),
+            states_at.reshape(-1, self.dimension),
             stages_at.reshape(-1),
         )
         if not followed:
@@ -219,38 +170,18 @@ class _World:
         streams: Sequence[Stream],
         threads: int,
     ) -> FloatArray:
-        """Move several beliefs, each by its own action and with its own stream.
+        """Move b beliefs of shape (n, d), each by its own action and with its own stream.
 
-        The result equals, bit for bit, that of :meth:`move` for each belief in turn.
-
-        Parameters
-        ----------
-        states : array of shape (b, n, d)
-        actions : array of shape (b, d)
-        standard_deviation : array of shape (d,)
-        streams : sequence of Stream
-            One for each belief.
-        threads : int
-            Maximum number; 0 means all cores.
-
-        Returns
-        -------
-        array of shape (b, n, d)
-
-        Raises
-        ------
-        InvalidValueError
-            If shapes do not fit, or a value is not finite or out of bounds.
+        ``states`` has the shape (b, n, d), ``actions`` (b, d). The result equals, bit for bit, that
+        of :meth:`move` for each belief in turn.
         """
-        dimension = self._DIMENSION
-        states = np.ascontiguousarray(states, dtype=np.float64)
-        actions = np.ascontiguousarray(actions, dtype=np.float64)
-        beliefs = len(streams)
-        fits = states.ndim == 3 and states.shape[0] == beliefs and states.shape[2] == dimension
-        if not fits or actions.shape != (beliefs, dimension):
+        states, actions = self._rows("states", states), self._rows("actions", actions)
+        count = len(streams)
+        if states.ndim != 3 or states.shape[0] != count or actions.shape[:-1] != (count,):
             raise InvalidValueError(
-                f"states: shape {states.shape}, actions: shape {actions.shape}; for {beliefs} "
-                f"streams they must be ({beliefs}, n, {dimension}) and ({beliefs}, {dimension})"
+                f"states: shape {states.shape}, actions: shape {actions.shape}; for {count} "
+                f"streams they must be ({count}, n, {self.dimension}) and "
+                f"({count}, {self.dimension})"
             )
         next_states = np.empty(states.shape)
         moved = self._kernel.move_each(
@@ -263,21 +194,15 @@ class _World:
             next_states,
         )
         if not moved:
-            _explain_move(states, actions, standard_deviation, tolerance)
+            self._explain_move(states, actions, standard_deviation, tolerance)
         return next_states
 
     def draw_free(
         self, mean: FloatArray, standard_deviation: FloatArray, count: int, stream: Stream
     ) -> tuple[FloatArray, int]:
-        """Draw states of a Gaussian until each is free of collision.
+        """Draw ``count`` states of a Gaussian, each until it is free of collision.
 
-        Parameters
-        ----------
-        mean, standard_deviation : array of shape (d,)
-        count : int
-            Number of states.
-        stream : Stream
-            Source of the draws; state n uses the same ones whatever ``count`` is.
+        State n uses the same random numbers whatever ``count`` is.
 
         Returns
         -------
@@ -285,25 +210,12 @@ class _World:
         num_unplaced : int
             Number of states that collided in all :data:`MAX_NOISE_ATTEMPTS` draws. These are set to
             the mean, which may collide.
-
-        Raises
-        ------
-        InvalidValueError
-            If shapes do not fit, or a value is not finite or out of bounds.
         """
-        dimension = self._DIMENSION
         if count < 0:
             raise InvalidValueError(f"count: {count}, must be at least 0")
-        for name, values in (("mean", mean), ("standard_deviation", standard_deviation)):
-            if values.shape != (dimension,):
-                raise InvalidValueError(f"{name}: shape {values.shape}, must be ({dimension},)")
-            if not np.isfinite(values).all():
-                _raise_not_finite(name, values)
-        if (standard_deviation < 0.0).any():
-            raise InvalidValueError(
-                f"standard_deviation: {standard_deviation.tolist()}, must not be negative"
-            )
-        states = np.empty((count, dimension))
+        self._check_vector("mean", mean)
+        self._check_deviation(standard_deviation)
+        states = np.empty((count, self.dimension))
         num_unplaced = self._kernel.draw_free(
             np.ascontiguousarray(mean, dtype=np.float64),
             np.ascontiguousarray(standard_deviation, dtype=np.float64),
@@ -311,6 +223,40 @@ class _World:
             states,
         )
         return states, int(num_unplaced)
+
+    def _rows(self, name: str, values: FloatArray) -> FloatArray:
+        """Return states or actions as the kernel takes them."""
+        array = np.ascontiguousarray(values, dtype=np.float64)
+        if array.shape[-1] != self.dimension:
+            raise InvalidValueError(f"{name}: shape {array.shape}, must be (..., {self.dimension})")
+        return array
+
+    def _check_vector(self, name: str, values: FloatArray) -> None:
+        if values.shape != (self.dimension,):
+            raise InvalidValueError(f"{name}: shape {values.shape}, must be ({self.dimension},)")
+        if not np.isfinite(values).all():
+            _raise_not_finite(name, values)
+
+    def _check_deviation(self, deviation: FloatArray) -> None:
+        self._check_vector("standard_deviation", deviation)
+        if (deviation < 0.0).any():
+            raise InvalidValueError(
+                f"standard_deviation: {deviation.tolist()}, must not be negative"
+            )
+
+    def _explain_move(
+        self,
+        states: FloatArray,
+        actions: FloatArray,
+        standard_deviation: FloatArray,
+        tolerance: float,
+    ) -> NoReturn:
+        """Raise the error for arguments that the kernel refused."""
+        for name, values in (("states", states), ("actions", actions)):
+            if not np.isfinite(values).all():
+                _raise_not_finite(name, values)
+        self._check_deviation(standard_deviation)
+        raise InvalidValueError(f"tolerance: {tolerance}, must be above 0 and below 1")
 
 
 class DiscWorld(_World):
@@ -322,15 +268,10 @@ class DiscWorld(_World):
         Of the disc, above 0.
     obstacles : array of shape (m, 4)
         Rectangles as ``x_min, y_min, x_max, y_max``.
-
-    Raises
-    ------
-    InvalidValueError
-        If a value is not finite or out of bounds.
     """
 
-    _DIMENSION = 2
-    _SPACE_DIMENSION = 2
+    dimension = 2
+    space_dimension = 2
 
     def __init__(self, radius: float, obstacles: npt.ArrayLike) -> None:
         self.radius = _check_length("radius", radius)
@@ -347,15 +288,10 @@ class RectangleWorld(_World):
         Of the rectangle along x and y at angle zero, above 0. The angle is counter-clockwise.
     obstacles : array of shape (m, 4)
         Rectangles as ``x_min, y_min, x_max, y_max``.
-
-    Raises
-    ------
-    InvalidValueError
-        If a value is not finite or out of bounds.
     """
 
-    _DIMENSION = 3
-    _SPACE_DIMENSION = 2
+    dimension = 3
+    space_dimension = 2
 
     def __init__(self, width: float, height: float, obstacles: npt.ArrayLike) -> None:
         self.width = _check_length("width", width)
@@ -375,15 +311,10 @@ class BoxWorld(_World):
         Of the box along x, y and z at angles zero, above 0.
     obstacles : array of shape (m, 6)
         Boxes as ``x_min, y_min, z_min, x_max, y_max, z_max``.
-
-    Raises
-    ------
-    InvalidValueError
-        If a value is not finite or out of bounds.
     """
 
-    _DIMENSION = 6
-    _SPACE_DIMENSION = 3
+    dimension = 6
+    space_dimension = 3
 
     def __init__(self, size: tuple[float, float, float], obstacles: npt.ArrayLike) -> None:
         x, y, z = (_check_length(f"size[{i}]", length) for i, length in enumerate(size))
@@ -415,25 +346,3 @@ def _raise_not_finite(name: str, values: FloatArray) -> NoReturn:
     index = np.unravel_index(int(np.argmin(np.isfinite(values))), values.shape)
     position = ", ".join(str(int(i)) for i in index)
     raise InvalidValueError(f"{name}[{position}]: {values[index]}, must be finite")
-
-
-def _explain_move(
-    states: FloatArray, actions: FloatArray, standard_deviation: FloatArray, tolerance: float
-) -> NoReturn:
-    """Raise the error for arguments that the kernel refused."""
-    for name, values in (
-        ("states", states),
-        ("actions", actions),
-        ("standard_deviation", standard_deviation),
-    ):
-        if not np.isfinite(values).all():
-            _raise_not_finite(name, values)
-    if standard_deviation.shape != states.shape[-1:]:
-        raise InvalidValueError(
-            f"standard_deviation: shape {standard_deviation.shape}, must be {states.shape[-1:]}"
-        )
-    if (standard_deviation < 0.0).any():
-        raise InvalidValueError(
-            f"standard_deviation: {standard_deviation.tolist()}, must not be negative"
-        )
-    raise InvalidValueError(f"tolerance: {tolerance}, must be above 0 and below 1")

@@ -66,22 +66,7 @@ def all_finite(values: FloatArray) -> bool:
 
 
 def weighted_mean(rows: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the mean of rows under weights that sum to 1.
-
-    Parameters
-    ----------
-    rows : array of shape (n, d)
-    weights : array of shape (n,)
-
-    Returns
-    -------
-    array of shape (d,)
-
-    Raises
-    ------
-    InvalidValueError
-        If the shapes do not fit.
-    """
+    """Return the mean, shape (d,), of rows (n, d) under weights (n,) that sum to 1."""
     values = np.ascontiguousarray(rows, dtype=np.float64)
     shares = np.ascontiguousarray(weights, dtype=np.float64)
     if values.ndim != 2 or shares.shape != values.shape[:1]:

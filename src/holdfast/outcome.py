@@ -17,7 +17,7 @@ import numpy as np
 
 from holdfast.arrays import FloatArray
 from holdfast.errors import InvalidValueError
-from holdfast.problem_attributes import first_reward, sensing_costs
+from holdfast.problem_attributes import sensing_costs
 
 __all__ = [
     "TRIAL_COLUMNS",
@@ -136,15 +136,13 @@ class DecisionLog:
 class RewardAccount:
     """A trial's rewards less the costs of its sensing actions.
 
-    Attributes
-    ----------
-    total : float or None
-        None as long as there is neither a reward nor a problem with sensing costs.
+    ``total`` is None as long as there is neither a reward nor a problem with sensing costs.
     """
 
     def __init__(self, problem: Any) -> None:
         self._costs = sensing_costs(problem)
-        self.total = first_reward(problem)
+        has_costs = getattr(problem, "sensing_costs", None) is not None
+        self.total: float | None = 0.0 if has_costs else None
 
     def sensed(self, sensing_action: int) -> None:
         """Subtract the cost of a sensing action."""
@@ -167,21 +165,16 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    trial : int
-        Number of the trial, from 0.
-    seed : int
-        Seed of the run; the trial's random streams follow from it and from ``trial``.
-    success : bool
-        Whether the goal was reached.
-    failed : bool
-        Whether the task ended in failure. If neither, the trial ran out of steps.
-    steps : int
-        Task actions performed.
+    trial, seed : int
+        Number of the trial, from 0, and seed of the run: the random streams follow from both.
+    success, failed : bool
+        Whether the goal was reached, and whether the task ended in failure. If neither, the trial
+        ran out of steps.
+    steps, sensing_decisions : int
+        Task actions performed, and sensing actions chosen.
     reward : float or None
         Sum of the rewards of the steps. A step without one adds nothing; None if there were steps
         and none of them had one, unless sensing has prices, which are rewards.
-    sensing_decisions : int
-        Sensing actions chosen.
     mean_sensing_ms : float
         Mean wall time of choosing a sensing action, 0 if none was chosen.
     recoveries : int

@@ -29,7 +29,14 @@ import numpy.typing as npt
 
 from holdfast import checked, numerics, sensing
 from holdfast.arrays import FloatArray, in_brief
-from holdfast.belief import Belief, estimate, resample, uniform_weights, update
+from holdfast.belief import (
+    Belief,
+    ObservationInfo,
+    estimate,
+    resample,
+    uniform_weights,
+    update,
+)
 from holdfast.config.settings import MAX_PARTICLES, Method, PlanningSettings, check_settings
 from holdfast.errors import CheckpointError, InvalidValueError, ProblemError
 from holdfast.problem_attributes import check_problem
@@ -57,14 +64,9 @@ CHECKPOINT_VERSION = 1
 class PlanningState(NamedTuple):
     """Everything that the next decision depends on, besides the problem and the settings.
 
-    Attributes
-    ----------
-    seed, trial, step : int
-        Name the random streams; ``step`` counts task actions.
-    stage : int
-        Stage of the task (which hole or via point is next).
-    sensed : bool
-        Whether this step's observation is already part of the belief.
+    ``seed``, ``trial`` and ``step``, which counts task actions, name the random streams; ``stage``
+    is that of the task (which hole or via point is next); ``sensed`` says whether this step's
+    observation is already part of the belief.
     """
 
     seed: int
@@ -73,26 +75,6 @@ class PlanningState(NamedTuple):
     stage: int
     sensed: bool
     belief: Belief
-
-
-class ObservationInfo(NamedTuple):
-    """The result of updating the belief by an observation.
-
-    Attributes
-    ----------
-    effective_sample_size : float
-        After the update and before resampling; from 1 to the number of particles.
-    explained : bool
-        False if no particle explains the observation: the belief is valid but not to be trusted.
-    mahalanobis_distance : float or None
-        How far, in standard deviations, the observation is from what the nearest particle expects;
-        None for a general likelihood.
-    """
-
-    effective_sample_size: float
-    explained: bool
-    resampled: bool
-    mahalanobis_distance: float | None = None
 
 
 class TaskInfo(NamedTuple):
@@ -116,14 +98,8 @@ class TaskInfo(NamedTuple):
 class Decision(NamedTuple):
     """All decisions of a state that no further observation can change.
 
-    Attributes
-    ----------
-    actions : tuple of arrays of shape (action_size,)
-        Task actions up to the next sensing step; none if the state has to sense first.
-    sensing_action : int or None
-        Of that sensing step; None if it is too far away.
-    ahead : PlanningState
-        The state in which it was chosen.
+    The task actions up to the next sensing step, none if the state has to sense first; the sensing
+    action of that step, None if it is too far away; and the state ``ahead`` in which it was chosen.
     """
 
     actions: tuple[FloatArray, ...]
@@ -139,19 +115,8 @@ def needs_sensing(settings: PlanningSettings, state: PlanningState) -> bool:
 class Planner:
     """Makes all decisions for one problem, as pure functions of a state.
 
-    Parameters
-    ----------
-    settings : PlanningSettings, optional
-        Default: ``PlanningSettings()``.
-    particles : int, optional
-        Number of particles, in place of the settings'.
-    method : str, optional
-        How sensing actions are chosen (``"random"``, say), in place of the settings'.
-
-    Raises
-    ------
-    InvalidValueError
-        If the problem is a name, or what is given in place of a setting is out of bounds.
+    A number of particles and a method of choosing sensing actions (``"random"``, say) take the
+    place of the settings'; one that is out of bounds raises InvalidValueError.
     """
 
     def __init__(
@@ -180,12 +145,7 @@ class Planner:
     def init(self, seed: int, trial: int = 0) -> PlanningState:
         """Return the state before the first step of a trial.
 
-        Parameters
-        ----------
-        seed : int
-            From 0 to 2**63 - 1.
-        trial : int
-            From 0 to 2**32 - 1.
+        The seed is from 0 to 2**63 - 1, the trial from 0 to 2**32 - 1.
 
         Raises
         ------
@@ -200,13 +160,9 @@ class Planner:
                     f"{what} {number!r:.80}: allowed are whole numbers from 0 to {2**bits - 1}"
                 )
         problem = self.problem
-        count = self.settings.particle_filter.num_particles
-        if not 1 <= count <= MAX_PARTICLES:
-            raise InvalidValueError(
-                f"particle_filter.num_particles {count}: allowed are 1 to {MAX_PARTICLES}"
-            )
         check_problem(problem)
         check_settings(self.settings)
+        count = self.settings.particle_filter.num_particles
         drawn = problem.initial_states(stream(seed, trial, 0, Purpose.INITIAL_BELIEF), count)
         states = checked.states_of(problem, "initial_states", drawn, (count, problem.state_size))
         return PlanningState(seed, trial, 0, 0, False, Belief(states, uniform_weights(count)))
@@ -214,10 +170,7 @@ class Planner:
     def check(self, state: PlanningState) -> None:
         """Check that a state from elsewhere belongs to this problem and these settings.
 
-        Raises
-        ------
-        InvalidValueError
-            If its number of particles, their size or its stage does not fit.
+        InvalidValueError says if its number of particles, their size or its stage does not fit.
         """
         problem = self.problem
         check_problem(problem)
@@ -266,12 +219,7 @@ class Planner:
     def observe(
         self, state: PlanningState, sensing_action: int, observation: npt.ArrayLike
     ) -> tuple[PlanningState, ObservationInfo]:
-        """Update the belief by an observation, and set ``sensed``.
-
-        Parameters
-        ----------
-        observation : array of shape (observation_size,)
-            What the sensing action showed.
+        """Update the belief by an observation, shape ``(observation_size,)``, and set ``sensed``.
 
         Raises
         ------
@@ -304,11 +252,7 @@ class Planner:
     def choose_task_action(self, state: PlanningState) -> tuple[FloatArray, TaskInfo]:
         """Choose the next task action: the policy's for the estimate, within the limits of a step.
 
-        Returns
-        -------
-        action : array of shape (action_size,)
-            The executed action.
-        info : TaskInfo
+        The executed action has the shape ``(action_size,)``.
 
         Raises
         ------
@@ -329,11 +273,6 @@ class Planner:
 
     def advance(self, state: PlanningState, task_action: FloatArray) -> PlanningState:
         """Predict the belief by a performed task action and go to the next step.
-
-        Parameters
-        ----------
-        task_action : array of shape (action_size,)
-            The executed action.
 
         Raises
         ------
@@ -362,12 +301,8 @@ class Planner:
     ) -> tuple[list[FloatArray], PlanningState]:
         """Choose the task actions up to the next sensing step: no observation comes between them.
 
-        Returns
-        -------
-        actions : list of arrays of shape (action_size,)
-            At most ``max_actions`` executed actions; empty if the state has to sense first.
-        ahead : PlanningState
-            The state that they lead to.
+        Return at most ``max_actions`` executed actions, none if the state has to sense first, and
+        the state that they lead to.
         """
         actions: list[FloatArray] = []
         while len(actions) < max_actions and not self.needs_sensing(state):

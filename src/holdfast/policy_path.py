@@ -33,14 +33,9 @@ _MOST_DRAWS = 1000
 
 
 class PathPoints(NamedTuple):
-    """The actions along the particles' paths.
+    """The actions of all particles at each of K offsets, shape (K, N, action_size).
 
-    Attributes
-    ----------
-    points : array of shape (K, N, action_size)
-        The actions of all particles at each of the K offsets.
-    factors : tuple of float
-        Weight of the entropy at each of the K offsets.
+    ``factors`` are the weights of the entropies at the offsets.
     """
 
     points: FloatArray
@@ -53,15 +48,8 @@ def path_points(
     """Follow every particle along its own noise-free path under the policy.
 
     A step is the policy's action for the particle's state and stage, limited by ``execute``, the
-    motion without noise, and the next stage.
-
-    Parameters
-    ----------
-    settings : PlanningSettings
-        ``selector.path_offsets``, ``path_unit``, ``path_discount`` and ``actions`` count.
-    states : array of shape (N, state_size)
-    stage : int
-        Of all particles, to begin with.
+    motion without noise, and the next stage. All particles begin in one stage. Of the settings,
+    ``selector.path_offsets``, ``path_unit``, ``path_discount`` and ``actions`` count.
 
     Raises
     ------

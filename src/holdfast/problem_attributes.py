@@ -22,7 +22,6 @@ from holdfast.errors import InvalidValueError, ProblemError
 __all__ = [
     "check_problem",
     "check_sizes",
-    "first_reward",
     "has_general_observations",
     "has_own",
     "name_of",
@@ -110,13 +109,7 @@ def check_problem(problem: Any) -> None:
 
 
 def check_sizes(problem: Any) -> None:
-    """Check the name and the sizes, which every use of a problem needs.
-
-    Raises
-    ------
-    ProblemError
-        If one of them is missing or out of bounds.
-    """
+    """Check the name and the sizes, which every use of a problem needs; raise ProblemError."""
     kind = type(problem).__name__
     name = getattr(problem, "name", "")
     if not isinstance(name, str) or not name:
@@ -155,24 +148,10 @@ def _numbers(value: object) -> npt.NDArray[Any] | None:
 def resolution_of(
     problem: Any, given: float | Sequence[float] | None, *, of_states: bool
 ) -> float | FloatArray:
-    """Return the resolution of the points whose entropy counts.
+    """Return the resolution of the points whose entropy counts: actions, or states.
 
-    Parameters
-    ----------
-    given : float or sequence of float, optional
-        ``selector.resolution``; None for the problem's own.
-    of_states : bool
-        Whether the points are states instead of actions.
-
-    Returns
-    -------
-    float or array
-        One number for all coordinates, or one for each.
-
-    Raises
-    ------
-    InvalidValueError
-        If the numbers are not as many as the coordinates.
+    It is one number for all coordinates, or one for each: ``given`` (``selector.resolution``), or
+    the problem's own. Raises InvalidValueError if they are not as many as the coordinates.
     """
     of_what, size = ("a state", "state_size") if of_states else ("an action", "action_size")
     if given is not None:
@@ -250,11 +229,6 @@ def sensing_costs(problem: Any) -> FloatArray:
             f"numbers from 0 to {MAX_SENSING_COST:g}, one for each sensing action"
         )
     return costs.astype(np.float64)
-
-
-def first_reward(problem: Any) -> float | None:
-    """Return a trial's reward before its first step: 0.0 if sensing has prices, else None."""
-    return None if getattr(problem, "sensing_costs", None) is None else 0.0
 
 
 def has_general_observations(problem: object) -> bool:

@@ -69,18 +69,7 @@ class Stream:
         return _kernel.uniforms(self.words, _size(shape)).reshape(shape)
 
     def substream(self, index: int) -> Stream:
-        """Return an independent stream.
-
-        Parameters
-        ----------
-        index : int
-            Which one, from 0 to 2**32 - 1.
-
-        Raises
-        ------
-        InvalidValueError
-            If the index is out of range.
-        """
+        """Return an independent stream; the index is from 0 to 2**32 - 1."""
         if not 0 <= index < _WORD:
             raise InvalidValueError(f"substream index {index}: allowed are 0 to {_WORD - 1}")
         return Stream(_kernel.substream(self.words, index))
@@ -150,19 +139,8 @@ NOISE_FREE = NoiseFreeStream()
 def stream(seed: int, trial: int, step: int, purpose: Purpose) -> Stream:
     """Return the stream of one purpose at one step of one trial.
 
-    Parameters
-    ----------
-    seed : int
-        From 0 to 2**63 - 1.
-    trial, step : int
-        From 0 to 2**32 - 1.
-    purpose : Purpose
-        What the numbers are for.
-
-    Raises
-    ------
-    InvalidValueError
-        If a number is out of range.
+    The seed is from 0 to 2**63 - 1, trial and step are from 0 to 2**32 - 1; others raise
+    InvalidValueError.
     """
     if not 0 <= seed < 2**63:
         raise InvalidValueError(f"seed {seed}: allowed are 0 to {2**63 - 1}")

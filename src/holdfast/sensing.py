@@ -26,7 +26,6 @@ from holdfast.config.settings import NEIGHBOR_ESTIMATORS, PlanningSettings, esti
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.estimators import (
     LARGEST,
-    MAX_PRIOR_NEIGHBORS_POINTS,
     TOTAL_VARIANCE,
     GaussianMixture,
     KernelEstimator,
@@ -41,7 +40,7 @@ from holdfast.expected_return import expected_returns
 from holdfast.policy_path import path_points
 from holdfast.problem_attributes import has_general_observations, resolution_of
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Stream
+from holdfast.randomness import Stream, Words
 
 __all__ = ["SensingInfo", "choose_sensing_action"]
 
@@ -85,22 +84,10 @@ def choose_sensing_action(
     hypotheses: Stream,
     selection: Stream,
 ) -> tuple[int, SensingInfo]:
-    """Choose a sensing action for a belief.
+    """Choose a sensing action for a belief: an index, the lowest of equally good ones.
 
-    Parameters
-    ----------
-    stage : int
-        Stage of the task.
-    hypotheses : Stream
-        Random numbers of the hypothetical observations.
-    selection : Stream
-        Random number of the method ``random``.
-
-    Returns
-    -------
-    index : int
-        Index into ``problem.sensing_actions``. The lowest one of equally good ones.
-    info : SensingInfo
+    The stream ``hypotheses`` has the random numbers of the hypothetical observations, ``selection``
+    the one of the method ``random``.
 
     Raises
     ------
@@ -132,54 +119,15 @@ def choose_sensing_action(
     estimator = _estimator(problem, settings, belief, sets[0])
     points = sets.reshape(-1, sets.shape[-1])
     threads = settings.active_sensing.num_cores
-    several_steps = settings.active_sensing.horizon > 1
-    if has_general_observations(problem):
-        particles = _stratified(
-            belief.weights, settings.active_sensing.num_observation_samples, hypotheses
-        )
-        log_weights = _general_log_weights(problem, belief, range(count), particles, hypotheses)
-        samples, likelihoods, visits = _entropies(
-            points, log_weights, True, estimator, threads, factors
-        )
-        samples = samples.reshape(count, -1)
-        entropies = _row_means(samples)
-        weights = _normalized(log_weights, estimator) if several_steps else None
-    else:
-        sizes, predicted, variance = _predictions(problem, belief, range(count))
-        entropies, samples, likelihoods, visits = _kernel.hypothetical_entropies(
-            belief.weights,
-            sizes,
-            predicted,
-            variance,
-            settings.active_sensing.num_observation_samples,
-            hypotheses.words,
-            scaled(points, estimator),
-            *estimator.parameters,
-            threads,
-            factors,
-            estimator.prior,
-        )
-        weights = None
-        if several_steps:
-            weights = _kernel.hypothetical_weights(
-                belief.weights,
-                sizes,
-                predicted,
-                variance,
-                samples.shape[1],
-                hypotheses.words,
-                estimator.drops_negligible,
-            )
-    if weights is not None and not np.isnan(entropies).any():
+    size = settings.active_sensing.num_observation_samples
+    hypothetical = _hypotheses(problem, belief, range(count), size, hypotheses)
+    entropies, samples, likelihoods, visits = hypothetical.entropies(
+        scaled(points, estimator), estimator, threads, factors
+    )
+    if settings.active_sensing.horizon > 1 and not np.isnan(entropies).any():
+        weights = hypothetical.weights(estimator.drops_negligible)
         later = _later_entropies(
-            problem,
-            settings,
-            belief.states,
-            weights.reshape(*samples.shape, -1),
-            stage,
-            hypotheses,
-            estimator,
-            points_of,
+            problem, settings, belief.states, weights, stage, hypotheses, estimator, points_of
         )
         samples = samples + later
         entropies = _row_means(samples)
@@ -216,16 +164,8 @@ def _greatest_return(
     ) -> tuple[list[int], FloatArray]:
         nonlocal likelihoods
         likelihoods += len(actions) * samples * belief.weights.shape[0]
-        truths = _stratified(belief.weights, samples, stream)
-        if has_general_observations(problem):
-            log_weights = _general_log_weights(problem, belief, actions, truths, stream)
-            rows = [_kernel.normalize(row, False)[0] for row in log_weights]
-            return truths, np.array(rows).reshape(len(actions), samples, -1)
-        sizes, predicted, variance = _predictions(problem, belief, actions)
-        weights = _kernel.hypothetical_weights(
-            belief.weights, sizes, predicted, variance, samples, stream.words, False
-        )
-        return truths, weights
+        hypothetical = _hypotheses(problem, belief, actions, samples, stream)
+        return _stratified(belief.weights, samples, stream), hypothetical.weights(False)
 
     returns = expected_returns(problem, settings, belief, stage, hypotheses, posteriors)
     # What is least: as for the other methods.
@@ -262,18 +202,8 @@ def _estimator(
     kind = estimator_of(selector, points.shape[0])
     if kind in NEIGHBOR_ESTIMATORS:
         neighbors = settings.active_sensing.num_nearest_neighbors
-        if neighbors >= points.shape[0]:
-            raise InvalidValueError(
-                f"active_sensing.num_nearest_neighbors {neighbors}: must be below the number of "
-                f"particles, {points.shape[0]}"
-            )
         if kind == "nearest_neighbor":
             return kernel_estimator(NearestNeighbor(neighbors, resolution), dimension)
-        if points.shape[0] > MAX_PRIOR_NEIGHBORS_POINTS:
-            raise InvalidValueError(
-                f"particle_filter.num_particles {points.shape[0]}: selector.estimator "
-                f"prior_neighbors allows {MAX_PRIOR_NEIGHBORS_POINTS}"
-            )
         return kernel_estimator(PriorNeighbors(belief.weights, neighbors, resolution), dimension)
     upper = kind == "gaussian_mixture_upper"
     own = np.full(dimension, resolution * resolution)
@@ -304,72 +234,113 @@ def _require_bounded(problem: Problem, points: FloatArray, states: FloatArray, w
         )
 
 
-def _predictions(
-    problem: Problem, belief: Belief, actions: Sequence[int]
-) -> tuple[list[int], FloatArray, FloatArray]:
-    """Return the sizes of the observations, their means and their variances, row by coordinate.
+class _GaussianHypotheses(NamedTuple):
+    """Hypothetical observations of J sensing actions, M each, which the kernel draws.
 
-    The variances have one column where no sensing action's variance depends on the state.
+    ``arguments`` are what its functions take: the particles' weights, N; the sizes of the
+    observations, D in all; their means in each particle's state, (D, N); their variances, (D, N),
+    or (D, 1) where none depends on the state; M; and the words of the stream.
     """
-    states = belief.states
-    count = states.shape[0]
-    means = []
-    variances = []
-    for action in actions:
-        means.append(checked.observation_mean(problem, states, action))
-        variances.append(checked.observation_variance(problem, states, action, means[-1]))
-    sizes = [mean.shape[-1] for mean in means]
-    predicted = np.empty((sum(sizes), count))
-    varying = any(variance.ndim > 1 for variance in variances)
-    variance = np.empty((predicted.shape[0], count if varying else 1))
-    row = 0
-    for size, mean, own_variance in zip(sizes, means, variances, strict=True):
-        predicted[row : row + size] = mean.T
-        variance[row : row + size] = (
-            own_variance.T if own_variance.ndim > 1 else own_variance.reshape(-1, 1)
+
+    arguments: tuple[FloatArray, list[int], FloatArray, FloatArray, int, Words]
+
+    def entropies(
+        self,
+        points: FloatArray,
+        estimator: KernelEstimator,
+        threads: int,
+        factors: tuple[float, ...],
+    ) -> tuple[FloatArray, FloatArray, int, int]:
+        """Return the mean entropies (J,), the single ones (J, M), likelihoods and visits."""
+        return _kernel.hypothetical_entropies(
+            *self.arguments,
+            points,
+            *estimator.parameters,
+            threads,
+            factors,
+            estimator.prior,
         )
+
+    def weights(self, drop_negligible: bool) -> FloatArray:
+        """Return the posteriors' weights, shape (J, M, N)."""
+        weights = _kernel.hypothetical_weights(*self.arguments, drop_negligible)
+        _, sizes, _, _, samples, _ = self.arguments
+        return weights.reshape(len(sizes), samples, -1)
+
+
+class _GeneralHypotheses(NamedTuple):
+    """The same for a problem that gives ``log_likelihood`` and ``sample_observation``.
+
+    ``log_weights`` are those of the posteriors, shape (J * M, N).
+    """
+
+    log_weights: FloatArray
+    samples: int
+
+    def entropies(
+        self,
+        points: FloatArray,
+        estimator: KernelEstimator,
+        threads: int,
+        factors: tuple[float, ...],
+    ) -> tuple[FloatArray, FloatArray, int, int]:
+        found, likelihoods, visits, _ = _kernel.entropies(
+            np.ascontiguousarray(points),
+            self.log_weights,
+            True,
+            *estimator.parameters,
+            threads,
+            factors,
+            estimator.prior,
+        )
+        samples = found.reshape(-1, self.samples)
+        return _row_means(samples), samples, likelihoods, visits
+
+    def weights(self, drop_negligible: bool) -> FloatArray:
+        rows = [_kernel.normalize(row, drop_negligible)[0] for row in self.log_weights]
+        return np.array(rows).reshape(-1, self.samples, self.log_weights.shape[1])
+
+
+def _hypotheses(
+    problem: Problem, belief: Belief, actions: Sequence[int], samples: int, stream: Stream
+) -> _GaussianHypotheses | _GeneralHypotheses:
+    """Return the hypothetical observations of some sensing actions, ``samples`` each."""
+    if has_general_observations(problem):
+        return _general_hypotheses(problem, belief, actions, samples, stream)
+    found = [checked.prediction(problem, belief.states, action) for action in actions]
+    sizes = [mean.shape[-1] for mean, _ in found]
+    predicted = np.empty((sum(sizes), belief.states.shape[0]))
+    varying = any(variance.ndim > 1 for _, variance in found)
+    variances = np.empty((predicted.shape[0], predicted.shape[1] if varying else 1))
+    row = 0
+    for size, (mean, variance) in zip(sizes, found, strict=True):
+        predicted[row : row + size] = mean.T
+        variances[row : row + size] = variance.T if variance.ndim > 1 else variance.reshape(-1, 1)
         row += size
     # A comparison with NaN is false.
-    usable = ((variance > 0.0) & (variance < np.inf)).all()
+    usable = ((variances > 0.0) & (variances < np.inf)).all()
     if not usable or not numerics.all_finite(predicted):
-        for action, mean, own_variance in zip(actions, means, variances, strict=True):
-            right = (own_variance > 0.0).all() and numerics.all_finite(own_variance)
-            if not right or not numerics.all_finite(mean):
-                raise checked.unusable_prediction(problem, action, mean, own_variance)
-    return sizes, predicted, variance
+        for action, (mean, variance) in zip(actions, found, strict=True):
+            checked.require_usable(problem, action, mean, variance)
+    return _GaussianHypotheses((belief.weights, sizes, predicted, variances, samples, stream.words))
 
 
-def _general_log_weights(
-    problem: Problem,
-    belief: Belief,
-    actions: Sequence[int],
-    particles: Sequence[int],
-    hypotheses: Stream,
-) -> FloatArray:
-    """Return the log weights of the hypothetical posteriors, a row for each action and particle.
-
-    For problems that give ``log_likelihood`` and ``sample_observation`` instead of a Gaussian.
-    """
+def _general_hypotheses(
+    problem: Problem, belief: Belief, actions: Sequence[int], samples: int, stream: Stream
+) -> _GeneralHypotheses:
     log_prior = numerics.log(belief.weights)
+    particles = _stratified(belief.weights, samples, stream)
+    streams = stream.substream(_GENERAL_OBSERVATIONS)
     rows = []
     for action in actions:
         for i, particle in enumerate(particles):
             observation = checked.sample_observation(
-                problem,
-                belief.states[particle],
-                action,
-                hypotheses.substream(_GENERAL_OBSERVATIONS).substream(i),
+                problem, belief.states[particle], action, streams.substream(i)
             )
             rows.append(
                 log_prior + checked.log_likelihood(problem, belief.states, action, observation)
             )
-    return np.ascontiguousarray(rows, dtype=np.float64)
-
-
-def _normalized(log_weights: FloatArray, estimator: KernelEstimator) -> FloatArray:
-    """Return the weights, row by row, as the estimator takes them."""
-    drop = estimator.drops_negligible
-    return np.array([_kernel.normalize(row, drop)[0] for row in log_weights])
+    return _GeneralHypotheses(np.ascontiguousarray(rows, dtype=np.float64), samples)
 
 
 def _stratified(weights: FloatArray, samples: int, stream: Stream) -> list[int]:
@@ -379,26 +350,6 @@ def _stratified(weights: FloatArray, samples: int, stream: Stream) -> list[int]:
     found = np.searchsorted(np.cumsum(weights), positions, side="right")
     last = int(np.flatnonzero(weights)[-1])
     return [min(int(index), last) for index in found]
-
-
-def _entropies(
-    points: FloatArray,
-    weights: FloatArray,
-    logarithms: bool,
-    estimator: KernelEstimator,
-    threads: int,
-    factors: tuple[float, ...] = (1.0,),
-) -> tuple[FloatArray, int, int]:
-    result, likelihoods, visits, _ = _kernel.entropies(
-        np.ascontiguousarray(scaled(points, estimator)),
-        weights,
-        logarithms,
-        *estimator.parameters,
-        threads,
-        factors,
-        estimator.prior,
-    )
-    return result, likelihoods, visits
 
 
 def _later_entropies(
@@ -417,63 +368,41 @@ def _later_entropies(
     Each hypothetical belief takes the action of its own estimate and is moved by it. The motion
     noise is the same for every sensing action, as the observation noise is.
     """
-    actions, samples, count = weights.shape
-    rows = weights.reshape(-1, count)
-    motion = hypotheses.substream(_HORIZON_MOTION)
-    motions = [motion.substream(i) for i in range(samples)] * actions
-    size = max(1, _LARGEST_BLOCK // states_now.size)
-    blocks = [slice(first, first + size) for first in range(0, len(motions), size)]
-    later = [
-        _later_of_some(
-            problem, settings, states_now, rows[block], stage, motions[block], estimator, points_of
-        )
-        for block in blocks
-    ]
-    return np.concatenate(later).reshape(actions, samples)
-
-
-def _later_of_some(
-    problem: Problem,
-    settings: PlanningSettings,
-    states_now: FloatArray,
-    weights: FloatArray,
-    stage: int,
-    motions: Sequence[Stream],
-    estimator: KernelEstimator,
-    points_of: Callable[[FloatArray, int], FloatArray],
-) -> FloatArray:
-    """Return the later entropies of some beliefs, which are followed at the same time."""
     sensing = settings.active_sensing
-    count, threads = len(motions), sensing.num_cores
-    weights = np.ascontiguousarray(weights)
-    states = np.broadcast_to(states_now, (count, *states_now.shape))
-    stages = [stage] * count
-    later = np.zeros(count)
-    factor = 1.0
-    for step in range(1, sensing.horizon):
-        actions = np.empty((count, problem.action_size))
-        for row in range(count):
-            # One by one, as in planning: the policy of a user who does not keep to exact
-            # operations may have other bits for many estimates at once.
-            belief = Belief(states[row], weights[row])
-            estimated = estimate(belief, settings.particle_filter.estimate)
-            stages[row] = checked.next_stage(problem, estimated, stages[row])
-            commanded = checked.policy(problem, estimated, stages[row])
-            actions[row] = checked.executed_action(problem, commanded)
-        streams = [motion.substream(step) for motion in motions]
-        states = checked.move_each(problem, states, actions, streams, threads)
-        factor *= sensing.discount
-        points = _points_by_stage(points_of, states, stages)
-        flat_states = states.reshape(-1, states.shape[-1])
-        _require_bounded(problem, points, flat_states, "the predicted state")
-        later += factor * _kernel.entropies_of_each(
-            scaled(points, estimator).reshape(count, -1, points.shape[1]),
-            weights,
-            *estimator.parameters,
-            threads,
-            estimator.prior,
-        )
-    return later
+    motion = hypotheses.substream(_HORIZON_MOTION)
+    motions = [motion.substream(i) for i in range(weights.shape[1])] * weights.shape[0]
+    rows = weights.reshape(len(motions), -1)
+    later = np.zeros(len(motions))
+    size = max(1, _LARGEST_BLOCK // states_now.size)
+    for first in range(0, len(motions), size):
+        block = slice(first, first + size)
+        own = np.ascontiguousarray(rows[block])
+        states = np.broadcast_to(states_now, (len(own), *states_now.shape))
+        stages = [stage] * len(own)
+        factor = 1.0
+        for step in range(1, sensing.horizon):
+            actions = np.empty((len(own), problem.action_size))
+            for row, each in enumerate(own):
+                # One by one, as in planning: the policy of a user who does not keep to exact
+                # operations may have other bits for many estimates at once.
+                estimated = estimate(Belief(states[row], each), settings.particle_filter.estimate)
+                stages[row] = checked.next_stage(problem, estimated, stages[row])
+                commanded = checked.policy(problem, estimated, stages[row])
+                actions[row] = checked.executed_action(problem, commanded)
+            streams = [own_motion.substream(step) for own_motion in motions[block]]
+            states = checked.move_each(problem, states, actions, streams, sensing.num_cores)
+            factor *= sensing.discount
+            points = _points_by_stage(points_of, states, stages)
+            flat_states = states.reshape(-1, states.shape[-1])
+            _require_bounded(problem, points, flat_states, "the predicted state")
+            later[block] += factor * _kernel.entropies_of_each(
+                scaled(points, estimator).reshape(len(own), -1, points.shape[1]),
+                own,
+                *estimator.parameters,
+                sensing.num_cores,
+                estimator.prior,
+            )
+    return later.reshape(weights.shape[:2])
 
 
 def _points_by_stage(

@@ -57,13 +57,7 @@ def _core_files() -> frozenset[Path]:
 
 
 def problem_digest(problem_class: type, named_in: str | None = None) -> str:
-    """Return the digest of a problem's code beyond holdfast's core, in hexadecimal.
-
-    Parameters
-    ----------
-    named_in : str or None
-        As for :func:`problem_sources`.
-    """
+    """Return the digest of :func:`problem_sources`, in hexadecimal."""
     digest = hashlib.blake2b(digest_size=_DIGEST_SIZE)
     for module, source in sorted(problem_sources(problem_class, named_in).items()):
         digest.update(f"{module} {source}\n".encode())
@@ -148,14 +142,12 @@ def follow_imports(
     loaded: Callable[[str], Path | None] | None = None,
     places: bool = False,
 ) -> dict[str, Path]:
-    """Return the sources of modules and of all that they import, directly or not.
+    """Return the sources of modules and of all that they import, directly or not, by name.
 
     The sources are read, not run, so what is imported under a name made at run time is not found.
 
     Parameters
     ----------
-    modules : iterable of str
-        Their names.
     locate : callable
         Returns the source of a module, None for one that is not to be followed, and for a name that
         is no module.
@@ -164,16 +156,6 @@ def follow_imports(
         itself imported: in each process that has loaded the one, the other is loaded, too.
     places : bool
         Whether what a string names as ``module:attribute``, as registries do, counts as imported.
-
-    Returns
-    -------
-    dict of Path
-        By the names of the modules.
-
-    Raises
-    ------
-    OSError
-        If a source cannot be read.
     """
     found: dict[str, Path] = {}
     waiting = [(name, False) for name in modules]

@@ -14,6 +14,7 @@ from holdfast import planning
 from holdfast.arrays import FloatArray, IntArray
 from holdfast.belief import Belief, estimate, resample, update
 from holdfast.config.settings import (
+    ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
@@ -358,9 +359,24 @@ class TestBadInput:
     def test_number_of_particles(self, peg: Problem, count: int) -> None:
         """Settings made by hand are not validated: the first function that uses them is."""
         with pytest.raises(
-            InvalidValueError, match=rf"particle_filter\.num_particles {count}: allowed are 1 to 1"
+            InvalidValueError, match=rf"particle_filter\.num_particles is {count}; .* <= 10000000"
         ):
             Planner(peg, planning_settings(count)).init(SEED, TRIAL)
+
+    def test_too_many_particles_for_neighbours_of_the_prior(self, peg: Problem) -> None:
+        selector = SelectorSettings(method="action_entropy", estimator="prior_neighbors")
+        settings = msgspec.structs.replace(planning_settings(4097), selector=selector)
+        expected = r"particle_filter\.num_particles is 4097; .*prior_neighbors .*allows 4096"
+        with pytest.raises(InvalidValueError, match=expected):
+            Planner(peg, settings).init(SEED, TRIAL)
+
+    @pytest.mark.parametrize("neighbors", [60, 61, 1000])
+    def test_as_many_neighbours_as_particles(self, peg: Problem, neighbors: int) -> None:
+        sensing = ActiveSensingSettings(num_nearest_neighbors=neighbors)
+        settings = msgspec.structs.replace(planning_settings(60), active_sensing=sensing)
+        expected = rf"num_nearest_neighbors is {neighbors}; .* below .*num_particles, which is 60"
+        with pytest.raises(InvalidValueError, match=expected):
+            Planner(peg, settings).init(SEED, TRIAL)
 
     @pytest.mark.parametrize(
         ("seed", "trial", "text"),

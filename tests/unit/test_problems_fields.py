@@ -1,4 +1,4 @@
-"""The bounds of the problems' settings."""
+"""The bounds of the problems' settings, declared in holdfast.problems.rigid_body."""
 
 from __future__ import annotations
 

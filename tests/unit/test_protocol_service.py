@@ -896,7 +896,7 @@ class TestRefusals:
         )
         reply = refused(bench.ask(robot.request()))
         assert reply.code == "invalid"
-        assert "num_nearest_neighbors 20" in reply.text
+        assert "num_nearest_neighbors is 20" in reply.text
 
     def test_observation_of_the_wrong_size(self) -> None:
         bench, robot = Bench(), Robot()

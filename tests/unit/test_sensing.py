@@ -232,23 +232,6 @@ class Broken(Coordinates):
 
 
 class TestBadInput:
-    def test_too_many_particles_for_neighbours_of_the_prior(self) -> None:
-        settings = settings_of(
-            SelectorSettings(method="action_entropy", estimator="prior_neighbors")
-        )
-        belief = Belief.uniform(np.zeros((4097, 2)))
-        expected = r"particle_filter\.num_particles 4097: .*prior_neighbors allows 4096"
-        with pytest.raises(InvalidValueError, match=expected):
-            choose(Coordinates(), settings, belief)
-
-    @pytest.mark.parametrize("neighbors", [60, 61, 1000])
-    def test_as_many_neighbours_as_particles(self, neighbors: int) -> None:
-        selector = SelectorSettings(method="action_entropy", estimator="nearest_neighbor")
-        settings = settings_of(selector, num_nearest_neighbors=neighbors)
-        expected = rf"active_sensing\.num_nearest_neighbors {neighbors}: must be below .*, 60"
-        with pytest.raises(InvalidValueError, match=expected):
-            choose(Coordinates(), settings, belief_of(1.0, 1.0))
-
     @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
     def test_policy_not_finite(self, bad: float) -> None:
         belief = belief_of(1.0, 1.0)

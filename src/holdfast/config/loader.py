@@ -8,7 +8,8 @@ or environment is looked for beside the file and in the current directory, or in
 and :meth:`Configuration.to_yaml` writes every value in use.
 
 The bounds stand with the settings (:mod:`holdfast.config.settings`) and with each problem (its
-``Model`` and ``StateSpacePlanner``). Checks that involve two keys are here.
+``Model`` and ``StateSpacePlanner``). Checks that involve two keys are here, those of planning with
+its settings.
 """
 
 from __future__ import annotations
@@ -26,8 +27,6 @@ import msgspec.inspect
 
 from holdfast.config.problem_builder import build_from, find_problem, schemas_of
 from holdfast.config.settings import (
-    ENTROPY_METHODS,
-    NEIGHBOR_ESTIMATORS,
     UNINFORMED_METHODS,
     ActiveSensingSettings,
     EnvironmentSettings,
@@ -37,14 +36,12 @@ from holdfast.config.settings import (
     RecoverySettings,
     SelectorSettings,
     SimulatorSettings,
-    estimator_of,
     unfit_for_the_method,
 )
 from holdfast.config.source import SECTIONS, SETTINGS, Source, module_directory
 from holdfast.config.validation import described, shown
 from holdfast.config.yaml_document import MAX_BYTES, Document, read, write
 from holdfast.errors import ConfigurationError, InvalidValueError
-from holdfast.estimators import MAX_PRIOR_NEIGHBORS_POINTS
 from holdfast.files import read_bounded
 from holdfast.problem_attributes import resolution_of
 from holdfast.problems.problem import Problem
@@ -255,19 +252,6 @@ def _build(
     environment = _located_environment(source, source.section("environment", EnvironmentSettings))
     built = build_from(source, name, problem_class)
 
-    num_particles = particle_filter.num_particles
-    num_neighbors = active_sensing.num_nearest_neighbors
-    estimator = estimator_of(selector, num_particles)
-    if (
-        selector.method in ENTROPY_METHODS
-        and estimator in NEIGHBOR_ESTIMATORS
-        and num_neighbors >= num_particles
-    ):
-        raise source.error(
-            ("active_sensing", "num_nearest_neighbors"),
-            f"is {num_neighbors}; the {estimator} estimator needs it below"
-            f" particle_filter.num_particles, which is {num_particles}",
-        )
     of_states = selector.method == "state_entropy"
     has_a_list = isinstance(selector.resolution, tuple)
     if of_states or (has_a_list and selector.method not in UNINFORMED_METHODS):
@@ -278,16 +262,6 @@ def _build(
             raise source.error(
                 ("selector", key), str(error).removeprefix(f"selector.{key} ")
             ) from None
-    if (
-        selector.method in ENTROPY_METHODS
-        and estimator == "prior_neighbors"
-        and num_particles > MAX_PRIOR_NEIGHBORS_POINTS
-    ):
-        raise source.error(
-            ("particle_filter", "num_particles"),
-            f"is {num_particles}; the prior_neighbors estimator allows"
-            f" {MAX_PRIOR_NEIGHBORS_POINTS}",
-        )
     planning = PlanningSettings(
         particle_filter=particle_filter,
         active_sensing=active_sensing,

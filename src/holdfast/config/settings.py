@@ -42,6 +42,10 @@ FEW_PARTICLES = 500
 """Up to so many ``prior_neighbors`` has the less bias and takes little longer; its time grows with
 their square."""
 
+MAX_PRIOR_NEIGHBORS_POINTS = 4096
+"""Bound on the particles of ``prior_neighbors``: where all lie within the resolution of each other,
+their neighbourhoods then take 64 MB."""
+
 MAX_PATH_STEPS = 10_000
 """Bound on the entries of ``selector.path_offsets``, and on the steps that they come to."""
 
@@ -395,7 +399,20 @@ def unfit_for_path_entropy(settings: PlanningSettings) -> tuple[tuple[str, str],
 
 def unfit_for_the_method(settings: PlanningSettings) -> tuple[tuple[str, str], str] | None:
     """Return which key ``selector.method`` cannot use as it is, and why; None if all fit."""
-    if settings.selector.method != "expected_return":
+    method, particles = settings.selector.method, settings.particle_filter.num_particles
+    estimator = estimator_of(settings.selector, particles)
+    if method in ENTROPY_METHODS and estimator in NEIGHBOR_ESTIMATORS:
+        neighbors = settings.active_sensing.num_nearest_neighbors
+        if neighbors >= particles:
+            return ("active_sensing", "num_nearest_neighbors"), (
+                f"is {neighbors}; the {estimator} estimator needs it below "
+                f"particle_filter.num_particles, which is {particles}"
+            )
+        if estimator == "prior_neighbors" and particles > MAX_PRIOR_NEIGHBORS_POINTS:
+            return ("particle_filter", "num_particles"), (
+                f"is {particles}; the prior_neighbors estimator allows {MAX_PRIOR_NEIGHBORS_POINTS}"
+            )
+    if method != "expected_return":
         return unfit_for_path_entropy(settings)
     first = settings.active_sensing.num_observation_samples
     most = settings.selector.max_observation_samples

@@ -16,19 +16,19 @@ from holdfast import _kernel
 from holdfast.arrays import BoolArray, FloatArray, IntArray
 from holdfast.errors import InvalidValueError
 from holdfast.geometry import DiscWorld
-from holdfast.problems._fields import (
+from holdfast.problems.problem import Scene
+from holdfast.problems.rigid_body import (
+    Coordinate,
     CoordinatePair,
-    Gain,
     Length,
     PositiveVariance,
+    RigidBodyProblem,
     Seed,
-    Step,
     Tolerance,
     Variance,
+    constant,
     validated,
 )
-from holdfast.problems.problem import Scene
-from holdfast.problems.rigid_body import RigidBodyProblem, constant
 
 __all__ = ["CapsuleRobot", "CapsuleRobotModel", "CapsuleRobotPlanner", "Target", "Wall"]
 
@@ -37,15 +37,7 @@ MAX_PARTS = 10_000
 
 
 class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A straight wall along x or y.
-
-    Attributes
-    ----------
-    end_0, end_1 : tuple of float
-        Ends (x, y) of its middle line; the wall stops there.
-    thickness : float
-        Half of it lies on either side of the middle line.
-    """
+    """A straight wall along x or y, given by the ends of its middle line, where it stops."""
 
     end_0: CoordinatePair
     end_1: CoordinatePair
@@ -53,17 +45,9 @@ class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 
 
 class Target(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A via point, or the goal.
+    """A via point, or the goal: reached when the distance to its centre is below its radius.
 
-    Attributes
-    ----------
-    center : tuple of float
-        Where it is.
-    radius : float
-        It is reached when the distance is below this.
-    axis : int
-        Direction of the way to it. 0: ``gain_0`` acts on x and ``gain_1`` on y; 1: the other way
-        round.
+    Axis 0: ``gain_0`` acts on x and ``gain_1`` on y; 1: the other way round.
     """
 
     center: CoordinatePair
@@ -72,33 +56,7 @@ class Target(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class CapsuleRobotModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The section ``model``.
-
-    Attributes
-    ----------
-    robot_radius : float
-        Of the disc, in metres.
-    init_mean, init_cov : tuple of float
-        Mean and variances of the initial belief over (x, y).
-    motion_cov : tuple of float
-        Variances of the motion noise.
-    sensing_covs : tuple of tuple of float
-        For each sensing action, the variances of the observed x and y.
-    collision_tol : float
-        Fraction of an action to which contact is located.
-    seed : int
-        Accepted because the earlier work's files have it, without effect: ``simulator.seed`` is
-        the seed of everything.
-    num_walls : int or None
-        Number of walls; if given, it must be the length of ``walls``.
-    walls : tuple of Wall
-        The maze.
-    dt : float
-        Accepted because the earlier work's files have it, without effect: time is counted in
-        steps.
-    goal : Target
-        Where to go after the via points.
-    """
+    """The section ``model``; docs/problems.md has the meaning and the unit of each key."""
 
     robot_radius: Length = 0.1
     init_mean: CoordinatePair = (0.5, 2.5)
@@ -124,24 +82,12 @@ class CapsuleRobotModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
 
 
 class CapsuleRobotPlanner(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The section ``state_space_planner``.
+    """The section ``state_space_planner``; docs/problems.md has each key."""
 
-    Attributes
-    ----------
-    gain_0, gain_1 : float
-        Gains along a target's axis and across it.
-    num_via_points : int or None
-        Number of via points; if given, it must be the length of ``via_points``.
-    step_size : float
-        Largest norm of an executed action.
-    via_points : tuple of Target
-        In the order in which to reach them.
-    """
-
-    gain_0: Gain = 1.0
-    gain_1: Gain = 1.0
+    gain_0: Coordinate = 1.0
+    gain_1: Coordinate = 1.0
     num_via_points: int | None = None
-    step_size: Step = 0.1
+    step_size: Length = 0.1
     via_points: Annotated[tuple[Target, ...], msgspec.Meta(max_length=MAX_PARTS)] = (
         Target(center=(4.5, 2.5), axis=0),
         Target(center=(4.5, 1.5), axis=1),
@@ -165,6 +111,7 @@ class CapsuleRobot(RigidBodyProblem):
 
     Model: ClassVar[type[CapsuleRobotModel]] = CapsuleRobotModel
     StateSpacePlanner: ClassVar[type[CapsuleRobotPlanner]] = CapsuleRobotPlanner
+    model: CapsuleRobotModel
 
     name = "capsule_robot"
     state_size = 2
@@ -186,18 +133,8 @@ class CapsuleRobot(RigidBodyProblem):
             "via_points",
             len(planner.via_points),
         )
-        super().__init__(
-            DiscWorld(
-                model.robot_radius,
-                [_rectangle(index, wall) for index, wall in enumerate(model.walls)],
-            ),
-            init_mean=model.init_mean,
-            init_cov=model.init_cov,
-            motion_cov=model.motion_cov,
-            collision_tol=model.collision_tol,
-        )
-        self.model = model
-        self.state_space_planner = planner
+        walls = [_rectangle(index, wall) for index, wall in enumerate(model.walls)]
+        super().__init__(model, planner, DiscWorld(model.robot_radius, walls))
         self.sensing_actions: Sequence[str] = tuple(
             f"x, y with variances {x:g}, {y:g}" for x, y in model.sensing_covs
         )
@@ -246,13 +183,7 @@ class CapsuleRobot(RigidBodyProblem):
         """Return -1 where the action, done again from where it led, would end in a wall, else 0."""
         return np.where(self.world.collides(states + actions), -1.0, 0.0)
 
-    def expected_path(
-        self, states: FloatArray, stage: int, offsets: Sequence[int], threads: int
-    ) -> tuple[FloatArray, IntArray]:
-        """Follow the policy without noise; the kernel has it as well."""
-        return self.world.follow(
-            self._path_policy, states, stage, offsets, self._collision_tolerance, threads
-        )
+    expected_path = RigidBodyProblem.follow_policy
 
     def is_goal(self, states: FloatArray) -> BoolArray:
         """Tell where the centre is within the goal's radius."""
@@ -273,13 +204,6 @@ class CapsuleRobot(RigidBodyProblem):
             goal=self.model.goal.center,
             points=self._centers[:-1],
         )
-
-    def _check_sensing_action(self, sensing_action: int) -> None:
-        count = len(self._observation_variances)
-        if not 0 <= sensing_action < count:
-            raise InvalidValueError(
-                f"sensing action: {sensing_action}, must be at least 0 and below {count}"
-            )
 
 
 def _squared_distance(states: FloatArray, centers: FloatArray) -> FloatArray:

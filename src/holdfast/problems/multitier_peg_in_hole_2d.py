@@ -16,40 +16,28 @@ from holdfast import _kernel
 from holdfast.arrays import BoolArray, FloatArray, IntArray
 from holdfast.errors import InvalidValueError
 from holdfast.geometry import FAR, RectangleWorld
-from holdfast.problems._fields import (
+from holdfast.problems.problem import Scene
+from holdfast.problems.rigid_body import (
     Coordinate,
     CoordinatePair,
     Length,
+    PegPlanner,
+    PegProblem,
     PositiveVariance,
     Seed,
-    Step,
     Tolerance,
     Variance,
+    constant,
+    rectangle,
+    upright_limit,
     validated,
 )
-from holdfast.problems.problem import Scene
-from holdfast.problems.rigid_body import PegProblem, constant, upright_limit
 
-__all__ = [
-    "Hole",
-    "MultitierPegInHole2D",
-    "MultitierPegInHole2DModel",
-    "MultitierPegInHole2DPlanner",
-]
+__all__ = ["Hole", "MultitierPegInHole2D", "MultitierPegInHole2DModel"]
 
 
 class Hole(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A hole and the plate that it is in.
-
-    Attributes
-    ----------
-    center : tuple of float
-        Centre (x, y) of the hole; the plate lies half above and half below it.
-    tol : float
-        Gap between peg and hole on either side.
-    depth : float
-        Thickness of the plate.
-    """
+    """A hole and the plate that it is in, of which half lies above the hole's centre."""
 
     center: CoordinatePair
     tol: Length = 0.1
@@ -59,28 +47,7 @@ class Hole(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 class MultitierPegInHole2DModel(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 ):
-    """The section ``model``.
-
-    Attributes
-    ----------
-    peg_dim : tuple of float
-        Width and height of the peg, in metres.
-    map_dim : tuple of float
-        The map's walls: ``x_min, y_min, x_max, y_max``.
-    init_mean, init_cov : tuple of float
-        Mean and variances of the initial belief over (x, y, θ).
-    motion_cov : tuple of float
-        Variances of the motion noise.
-    sensing_cov : float
-        Variance of an observation.
-    init_seed, motion_seed, sensing_seed : int
-        Accepted because the earlier work's files have them, without effect: ``simulator.seed``
-        is the seed of everything.
-    collision_tol : float
-        Fraction of an action to which contact is located.
-    holes : tuple of Hole
-        In the order in which to pass them.
-    """
+    """The section ``model``; docs/problems.md has the meaning and the unit of each key."""
 
     peg_dim: tuple[Length, Length] = (1.0, 2.0)
     map_dim: tuple[Coordinate, Coordinate, Coordinate, Coordinate] = (-12.0, -12.0, 12.0, 12.0)
@@ -99,23 +66,6 @@ class MultitierPegInHole2DModel(
     )
 
 
-class MultitierPegInHole2DPlanner(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
-):
-    """The section ``state_space_planner``.
-
-    Attributes
-    ----------
-    translation_step_size : float
-        Largest size of an action's x and of its y component, each on its own.
-    rotation_step_size : float
-        Largest size of its angular component.
-    """
-
-    translation_step_size: Step = 0.1
-    rotation_step_size: Step = 0.1
-
-
 class MultitierPegInHole2D(PegProblem):
     """Bring a peg down through the holes of several plates, in the plane.
 
@@ -132,7 +82,7 @@ class MultitierPegInHole2D(PegProblem):
     """
 
     Model: ClassVar[type[MultitierPegInHole2DModel]] = MultitierPegInHole2DModel
-    StateSpacePlanner: ClassVar[type[MultitierPegInHole2DPlanner]] = MultitierPegInHole2DPlanner
+    model: MultitierPegInHole2DModel
 
     name = "multitier_peg_in_hole_2d"
     state_size = 3
@@ -145,28 +95,13 @@ class MultitierPegInHole2D(PegProblem):
     def __init__(
         self,
         model: MultitierPegInHole2DModel | None = None,
-        state_space_planner: MultitierPegInHole2DPlanner | None = None,
+        state_space_planner: PegPlanner | None = None,
     ) -> None:
         model = validated("model", model or MultitierPegInHole2DModel())
-        planner = validated(
-            "state_space_planner", state_space_planner or MultitierPegInHole2DPlanner()
-        )
+        planner = validated("state_space_planner", state_space_planner or PegPlanner())
         width, height = model.peg_dim
-        super().__init__(
-            RectangleWorld(width, height, _walls(model) + _plates(model)),
-            init_mean=model.init_mean,
-            init_cov=model.init_cov,
-            motion_cov=model.motion_cov,
-            collision_tol=model.collision_tol,
-            sensing_cov=model.sensing_cov,
-            step_limits=(
-                planner.translation_step_size,
-                planner.translation_step_size,
-                planner.rotation_step_size,
-            ),
-        )
-        self.model = model
-        self.state_space_planner = planner
+        world = RectangleWorld(width, height, _walls(model) + _plates(model))
+        super().__init__(model, planner, world)
         self.num_stages = len(model.holes)
         self._half_width = 0.5 * width
         self._peg_height = height
@@ -201,13 +136,7 @@ class MultitierPegInHole2D(PegProblem):
         following = np.minimum(stage + passed, self.num_stages - 1)
         return int(following) if np.ndim(following) == 0 else following
 
-    def expected_path(
-        self, states: FloatArray, stage: int, offsets: Sequence[int], threads: int
-    ) -> tuple[FloatArray, IntArray]:
-        """Follow the policy without noise; the kernel has it as well."""
-        return self.world.follow(
-            self._path_policy, states, stage, offsets, self._collision_tolerance, threads
-        )
+    expected_path = PegProblem.follow_policy
 
     def is_goal(self, states: FloatArray) -> BoolArray:
         """Tell where the peg's centre is below that of the last hole, near its axis."""
@@ -218,17 +147,11 @@ class MultitierPegInHole2D(PegProblem):
 
     def scene(self) -> Scene:
         """Return the map with its plates, and the peg."""
-        half_width, half_height = (0.5 * length for length in self.model.peg_dim)
         return Scene(
             axes=(0, 1),
             limits=self.model.map_dim,
             obstacles=self.world.obstacles,
-            body=[
-                (-half_width, -half_height),
-                (half_width, -half_height),
-                (half_width, half_height),
-                (-half_width, half_height),
-            ],
+            body=rectangle(*self.model.peg_dim),
             angle=2,
             goal=self.model.holes[-1].center,
             points=[hole.center for hole in self.model.holes],

@@ -16,41 +16,25 @@ import numpy as np
 from holdfast import _kernel
 from holdfast.arrays import BoolArray, FloatArray, IntArray
 from holdfast.geometry import FAR, RectangleWorld
-from holdfast.problems._fields import (
+from holdfast.problems.problem import Scene
+from holdfast.problems.rigid_body import (
     Coordinate,
     Length,
+    PegPlanner,
+    PegProblem,
     PositiveVariance,
-    Step,
     Tolerance,
     Variance,
+    rectangle,
+    upright_limit,
     validated,
 )
-from holdfast.problems.problem import Scene
-from holdfast.problems.rigid_body import PegProblem, upright_limit
 
-__all__ = ["PegInHole2D", "PegInHole2DModel", "PegInHole2DPlanner"]
+__all__ = ["PegInHole2D", "PegInHole2DModel"]
 
 
 class PegInHole2DModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The section ``model``.
-
-    Attributes
-    ----------
-    state_size : int
-        3; accepted because the thesis's files have it, without effect.
-    peg_width, peg_height : float
-        Of the peg, in metres.
-    hole_tolerance : float
-        Gap between peg and hole on either side and below, and half the goal's size.
-    init_mean, init_cov : tuple of float
-        Mean and variances of the initial belief over (x, y, θ).
-    motion_cov : tuple of float
-        Variances of the motion noise.
-    sensing_cov : float
-        Variance of an observation.
-    collision_tol : float
-        Fraction of an action to which contact is located.
-    """
+    """The section ``model``; docs/problems.md has the meaning and the unit of each key."""
 
     state_size: Literal[3] = 3
     peg_width: Length = 1.0
@@ -61,21 +45,6 @@ class PegInHole2DModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     motion_cov: tuple[Variance, Variance, Variance] = (0.01, 0.01, 0.01)
     sensing_cov: PositiveVariance = 0.001
     collision_tol: Tolerance = 0.001
-
-
-class PegInHole2DPlanner(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The section ``state_space_planner``.
-
-    Attributes
-    ----------
-    translation_step_size : float
-        Largest size of an action's x and of its y component, each on its own.
-    rotation_step_size : float
-        Largest size of its angular component.
-    """
-
-    translation_step_size: Step = 0.1
-    rotation_step_size: Step = 0.1
 
 
 class PegInHole2D(PegProblem):
@@ -93,7 +62,7 @@ class PegInHole2D(PegProblem):
     """
 
     Model: ClassVar[type[PegInHole2DModel]] = PegInHole2DModel
-    StateSpacePlanner: ClassVar[type[PegInHole2DPlanner]] = PegInHole2DPlanner
+    model: PegInHole2DModel
 
     name = "peg_in_hole_2d"
     state_size = 3
@@ -106,37 +75,20 @@ class PegInHole2D(PegProblem):
     def __init__(
         self,
         model: PegInHole2DModel | None = None,
-        state_space_planner: PegInHole2DPlanner | None = None,
+        state_space_planner: PegPlanner | None = None,
     ) -> None:
         model = validated("model", model or PegInHole2DModel())
-        planner = validated("state_space_planner", state_space_planner or PegInHole2DPlanner())
+        planner = validated("state_space_planner", state_space_planner or PegPlanner())
         half_hole = 0.5 * model.peg_width + model.hole_tolerance
         floor = -0.5 * model.peg_height - model.hole_tolerance
-        super().__init__(
-            RectangleWorld(
-                model.peg_width,
-                model.peg_height,
-                [
-                    (-FAR, -FAR, -half_hole, 0.0),
-                    (half_hole, -FAR, FAR, 0.0),
-                    (-half_hole, -FAR, half_hole, floor),
-                ],
-            ),
-            init_mean=model.init_mean,
-            init_cov=model.init_cov,
-            motion_cov=model.motion_cov,
-            collision_tol=model.collision_tol,
-            sensing_cov=model.sensing_cov,
-            step_limits=(
-                planner.translation_step_size,
-                planner.translation_step_size,
-                planner.rotation_step_size,
-            ),
-        )
-        self.model = model
-        self.state_space_planner = planner
+        obstacles = [
+            (-FAR, -FAR, -half_hole, 0.0),
+            (half_hole, -FAR, FAR, 0.0),
+            (-half_hole, -FAR, half_hole, floor),
+        ]
+        world = RectangleWorld(model.peg_width, model.peg_height, obstacles)
+        super().__init__(model, planner, world)
         self._half_width = 0.5 * model.peg_width
-        self._tolerance = model.hole_tolerance
         self._upright_limit = upright_limit(model.hole_tolerance, 0.5 * model.peg_height)
         self._path_policy = _kernel.PegPolicy2D(
             [(0.0, self._upright_limit, 0.0)], self._half_width, 0.0, self._upper_limits.tolist()
@@ -154,36 +106,22 @@ class PegInHole2D(PegProblem):
         actions[..., 2] = np.where(near, -angle, 0.0)
         return actions
 
-    def expected_path(
-        self, states: FloatArray, stage: int, offsets: Sequence[int], threads: int
-    ) -> tuple[FloatArray, IntArray]:
-        """Follow the policy without noise; the kernel has it as well."""
-        return self.world.follow(
-            self._path_policy, states, stage, offsets, self._collision_tolerance, threads
-        )
+    expected_path = PegProblem.follow_policy
 
     def is_goal(self, states: FloatArray) -> BoolArray:
         """Tell where the peg is half-way in the hole."""
-        tolerance = self._tolerance
-        return np.asarray(
-            (np.abs(states[..., 0]) < tolerance) & (np.abs(states[..., 1]) < tolerance)
-        )
+        near = np.abs(states[..., 0:2]) < self.model.hole_tolerance
+        return np.asarray(near.all(axis=-1))
 
     def scene(self) -> Scene:
         """Return the ground with the hole, and the peg."""
-        half_width, half_height = 0.5 * self.model.peg_width, 0.5 * self.model.peg_height
         reach = 2.0 * self.model.peg_height
         x, y = self.model.init_mean[:2]
         return Scene(
             axes=(0, 1),
             limits=(min(0.0, x) - reach, -reach, max(0.0, x) + reach, max(0.0, y) + reach),
             obstacles=self.world.obstacles,
-            body=[
-                (-half_width, -half_height),
-                (half_width, -half_height),
-                (half_width, half_height),
-                (-half_width, half_height),
-            ],
+            body=rectangle(self.model.peg_width, self.model.peg_height),
             angle=2,
             goal=(0.0, 0.0),
         )

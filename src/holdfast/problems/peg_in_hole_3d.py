@@ -16,44 +16,28 @@ from holdfast import _kernel
 from holdfast.arrays import BoolArray, FloatArray, IntArray
 from holdfast.errors import InvalidValueError
 from holdfast.geometry import FAR, BoxWorld
-from holdfast.problems._fields import (
+from holdfast.problems.problem import Scene
+from holdfast.problems.rigid_body import (
     Coordinate,
     Length,
+    PegPlanner,
+    PegProblem,
     PositiveVariance,
-    Step,
     Tolerance,
     Variance,
+    rectangle,
+    upright_limit,
     validated,
 )
-from holdfast.problems.problem import Scene
-from holdfast.problems.rigid_body import PegProblem, upright_limit
 
-__all__ = ["PegInHole3D", "PegInHole3DModel", "PegInHole3DPlanner"]
+__all__ = ["PegInHole3D", "PegInHole3DModel"]
 
 Pose = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
 PoseVariance = tuple[Variance, Variance, Variance, Variance, Variance, Variance]
 
 
 class PegInHole3DModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The section ``model``.
-
-    Attributes
-    ----------
-    peg_dim : tuple of float
-        The peg's size along x, y and z when upright, in metres.
-    hole_tolerance : float
-        Gap between peg and hole on each side and below, and half the goal's size.
-    map_dim : tuple of float
-        Half the map's size along x, y and z: its walls and its ceiling.
-    init_mean, init_cov : tuple of float
-        Mean and variances of the initial belief over (x, y, z, yaw, pitch, roll).
-    motion_cov : tuple of float
-        Variances of the motion noise.
-    sensing_cov : float
-        Variance of an observation.
-    collision_tol : float
-        Fraction of an action to which contact is located.
-    """
+    """The section ``model``; docs/problems.md has the meaning and the unit of each key."""
 
     peg_dim: tuple[Length, Length, Length] = (1.0, 1.0, 2.0)
     hole_tolerance: Length = 0.1
@@ -63,21 +47,6 @@ class PegInHole3DModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     motion_cov: PoseVariance = (0.005, 0.005, 0.005, 0.001, 0.001, 0.001)
     sensing_cov: PositiveVariance = 0.004
     collision_tol: Tolerance = 0.001
-
-
-class PegInHole3DPlanner(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The section ``state_space_planner``.
-
-    Attributes
-    ----------
-    translation_step_size : float
-        Largest size of each component of an action's translation, each on its own.
-    rotation_step_size : float
-        Largest size of each of its angular components.
-    """
-
-    translation_step_size: Step = 0.1
-    rotation_step_size: Step = 0.1
 
 
 class PegInHole3D(PegProblem):
@@ -92,14 +61,13 @@ class PegInHole3D(PegProblem):
     peg upright, and once the norm of the angles is below asin(tolerance / half the peg's height)
     it also lowers it.
 
-    The earlier work left no numbers for this problem, and the first ones tried (motion variances
-    0.01 and 0.0025, sensing variance 0.001, turning only within the tolerance of the axis and
-    standing still there) made it all but unsolvable: less than one trial in ten ended within 700
-    steps. The noise moved the peg faster than one coordinate at a time can be observed, such
-    precise observations left a few particles of hundreds in six dimensions, and an action that
-    looks at the angles only within the tolerance gives no reason to observe them before. With the
-    defaults here, 200 particles and a sensing interval of 4, about 95 % of the trials end within
-    700 steps, with an interval of 8 about 90 %; 100 particles are too few.
+    The earlier work left no numbers for this problem. Motion variances of 0.01 and 0.0025, a
+    sensing variance of 0.001 and turning only within the tolerance of the axis make it all but
+    unsolvable: the noise moves the peg faster than one coordinate at a time can be observed, such
+    precise observations leave a few particles of hundreds in six dimensions, and there is no reason
+    to observe the angles before they count. With the defaults here, 200 particles and a sensing
+    interval of 4, about 95 % of the trials end within 700 steps, with an interval of 8 about 90 %;
+    100 particles are too few.
 
     The resolution of each coordinate is what the motion noise blurs in a step, 0.071 m and
     0.032 rad: metres and radians are not added as if they were the same.
@@ -111,48 +79,30 @@ class PegInHole3D(PegProblem):
     """
 
     Model: ClassVar[type[PegInHole3DModel]] = PegInHole3DModel
-    StateSpacePlanner: ClassVar[type[PegInHole3DPlanner]] = PegInHole3DPlanner
+    model: PegInHole3DModel
 
     name = "peg_in_hole_3d"
     state_size = 6
     action_size = 6
     sensing_actions: Sequence[str] = ("x", "y", "z", "yaw", "pitch", "roll")
     state_labels: Sequence[str] = (
-        "x (m)",
-        "y (m)",
-        "z (m)",
-        "yaw (rad)",
-        "pitch (rad)",
-        "roll (rad)",
+        *("x (m)", "y (m)", "z (m)"),
+        *("yaw (rad)", "pitch (rad)", "roll (rad)"),
     )
     pose: Sequence[str | None] = ("x", "y", "z", "yaw", "pitch", "roll")
 
     def __init__(
         self,
         model: PegInHole3DModel | None = None,
-        state_space_planner: PegInHole3DPlanner | None = None,
+        state_space_planner: PegPlanner | None = None,
     ) -> None:
         model = validated("model", model or PegInHole3DModel())
-        planner = validated("state_space_planner", state_space_planner or PegInHole3DPlanner())
-        super().__init__(
-            BoxWorld(model.peg_dim, _plate_and_walls(model)),
-            init_mean=model.init_mean,
-            init_cov=model.init_cov,
-            motion_cov=model.motion_cov,
-            collision_tol=model.collision_tol,
-            sensing_cov=model.sensing_cov,
-            step_limits=(
-                *[planner.translation_step_size] * 3,
-                *[planner.rotation_step_size] * 3,
-            ),
-        )
+        planner = validated("state_space_planner", state_space_planner or PegPlanner())
+        super().__init__(model, planner, BoxWorld(model.peg_dim, _plate_and_walls(model)))
         # Where a coordinate moves without noise, the mean of the others has to do.
         self.resolution = np.where(
-            self.motion_variance > 0.0, np.sqrt(self.motion_variance), self.resolution
+            self.motion_variance > 0.0, self._motion_deviation, self.resolution
         )
-        self.model = model
-        self.state_space_planner = planner
-        self._tolerance = model.hole_tolerance
         self._half_width = 0.5 * min(model.peg_dim[0], model.peg_dim[1])
         self._upright_limit = upright_limit(model.hole_tolerance, 0.5 * model.peg_dim[2])
         self._path_policy = _kernel.PegPolicy3D(
@@ -172,17 +122,11 @@ class PegInHole3D(PegProblem):
         actions[..., 3:6] = np.where(near[..., np.newaxis], actions[..., 3:6], 0.0)
         return actions
 
-    def expected_path(
-        self, states: FloatArray, stage: int, offsets: Sequence[int], threads: int
-    ) -> tuple[FloatArray, IntArray]:
-        """Follow the policy without noise; the kernel has it as well."""
-        return self.world.follow(
-            self._path_policy, states, stage, offsets, self._collision_tolerance, threads
-        )
+    expected_path = PegProblem.follow_policy
 
     def is_goal(self, states: FloatArray) -> BoolArray:
         """Tell where the peg is half-way in the hole."""
-        near = np.abs(states[..., 0:3]) < self._tolerance
+        near = np.abs(states[..., 0:3]) < self.model.hole_tolerance
         return np.asarray(near.all(axis=-1))
 
     def scene(self) -> Scene:
@@ -190,19 +134,15 @@ class PegInHole3D(PegProblem):
 
         The peg is drawn without its angles, of which the section shows only one.
         """
-        half_x, half_z = 0.5 * self.model.peg_dim[0], 0.5 * self.model.peg_dim[2]
+        map_x, _, map_z = self.model.map_dim
+        size_x, _, size_z = self.model.peg_dim
         obstacles = self.world.obstacles
         cut = obstacles[(obstacles[:, 1] < 0.0) & (obstacles[:, 4] > 0.0)]
         return Scene(
             axes=(0, 2),
-            limits=(
-                -self.model.map_dim[0],
-                -2.0 * half_z,
-                self.model.map_dim[0],
-                self.model.map_dim[2],
-            ),
+            limits=(-map_x, -size_z, map_x, map_z),
             obstacles=cut[:, [0, 2, 3, 5]],
-            body=[(-half_x, -half_z), (half_x, -half_z), (half_x, half_z), (-half_x, half_z)],
+            body=rectangle(size_x, size_z),
             goal=(0.0, 0.0),
         )
 

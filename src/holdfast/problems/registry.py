@@ -25,13 +25,8 @@ GROUP = "holdfast.problems"
 class BuiltIn(NamedTuple):
     """One of holdfast's own problems.
 
-    Attributes
-    ----------
-    place : str
-        Module and class.
-    signature_keys : frozenset of str
-        Keys of the section ``model`` that only this problem has together. The thesis's files do
-        not name their problem; these keys tell it.
+    ``place`` is its module and class. Only this problem has all ``signature_keys`` in the section
+    ``model``: the thesis's files do not name their problem, these keys tell it.
     """
 
     place: str
@@ -63,15 +58,10 @@ def names() -> list[str]:
 
 
 def make(name: str, **settings: Any) -> Problem:
-    """Build a problem.
+    """Build a problem by its registered name, or ``module:Class``.
 
-    Parameters
-    ----------
-    name : str
-        A registered name, or ``module:Class``.
-    **settings
-        Keys of the sections ``model`` and ``state_space_planner`` of a configuration
-        (docs/problems.md); those left out have their defaults.
+    The settings are keys of the sections ``model`` and ``state_space_planner`` of a configuration
+    (docs/problems.md); those left out have their defaults.
 
     Raises
     ------
@@ -109,20 +99,10 @@ def make(name: str, **settings: Any) -> Problem:
 
 
 def problem_class(name: str, search_directory: Path | None = None) -> type[Any]:
-    """Find the class of a problem.
+    """Find the class of a problem by its registered name, or ``module:Class``.
 
-    Parameters
-    ----------
-    name : str
-        A registered name, or ``module:Class``.
-    search_directory : Path, optional
-        Directory in which ``module`` is looked for first. It goes on the import path and stays
-        there, as a script's directory does, for the module may import its neighbours later.
-
-    Returns
-    -------
-    type
-        Has the members of :class:`~holdfast.problems.problem.Problem`.
+    The search directory, in which ``module`` is looked for first, goes on the import path and stays
+    there, as a script's directory does, for the module may import its neighbours later.
 
     Raises
     ------
@@ -146,13 +126,7 @@ def problem_class(name: str, search_directory: Path | None = None) -> type[Any]:
 
 
 def problem_module(name: str) -> str | None:
-    """Return the module of a problem's class; None for a name that is not registered.
-
-    Parameters
-    ----------
-    name : str
-        A registered name, or ``module:Class``.
-    """
+    """Return the module of a problem's class; None for a name that is not registered."""
     place = name if ":" in name else None
     if name in BUILT_IN:
         place = BUILT_IN[name].place

@@ -4,24 +4,53 @@ A body moves by its executed action, stopped at contact, plus Gaussian noise tha
 until the body is free; it starts from a Gaussian, drawn in the same way. A problem of that kind
 adds only its obstacles, what it observes, its policy and its goal. Pegs share more: they observe
 one coordinate at a time, limit each component of an action on its own, and pay for their way.
+
+The settings of a problem are two structs, for the sections ``model`` and ``state_space_planner`` of
+a configuration; docs/problems.md has the meaning and the unit of each key. Every number has finite
+bounds, far outside anything sensible: they keep infinities and NaN out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 import msgspec
 import numpy as np
 
 from holdfast import numerics
-from holdfast.arrays import FloatArray
+from holdfast.arrays import FloatArray, IntArray
 from holdfast.errors import InvalidValueError
 from holdfast.geometry import MAX_NOISE_ATTEMPTS, BoxWorld, DiscWorld, RectangleWorld
 from holdfast.problems.problem import ProblemBase
 from holdfast.randomness import NOISE_FREE, Stream
 
-__all__ = ["PegProblem", "RigidBodyProblem", "constant", "upright_limit"]
+__all__ = [
+    "Coordinate",
+    "CoordinatePair",
+    "Length",
+    "PegPlanner",
+    "PegProblem",
+    "PositiveVariance",
+    "RigidBodyProblem",
+    "Seed",
+    "Tolerance",
+    "Variance",
+    "constant",
+    "rectangle",
+    "upright_limit",
+    "validated",
+]
+
+Coordinate = Annotated[float, msgspec.Meta(ge=-1e5, le=1e5)]
+CoordinatePair = tuple[Coordinate, Coordinate]
+Length = Annotated[float, msgspec.Meta(gt=0.0, le=1e5)]
+Variance = Annotated[float, msgspec.Meta(ge=0.0, le=1e10)]
+PositiveVariance = Annotated[float, msgspec.Meta(gt=0.0, le=1e10)]
+Tolerance = Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)]
+Seed = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+
+StructT = TypeVar("StructT", bound=msgspec.Struct)
 
 SMALLEST_RESOLUTION = 1e-3
 """The resolution of a problem without motion noise, where the noise cannot set it."""
@@ -39,24 +68,32 @@ def upright_limit(tolerance: float, half_height: float) -> float:
     return numerics.arcsin(min(tolerance / half_height, 1.0))
 
 
+def rectangle(width: float, height: float) -> list[tuple[float, float]]:
+    """Return the corners of a rectangle about its centre, counter-clockwise."""
+    x, y = 0.5 * width, 0.5 * height
+    return [(-x, -y), (x, -y), (x, y), (-x, y)]
+
+
+def validated(section: str, settings: StructT) -> StructT:
+    """Return settings whose fields have the declared types and bounds, or raise InvalidValueError.
+
+    msgspec checks what it decodes, not what a constructor is given.
+    """
+    try:
+        return msgspec.convert(msgspec.to_builtins(settings), type(settings))
+    except msgspec.ValidationError as error:
+        raise InvalidValueError(f"{section}: {error}") from error
+
+
 class RigidBodyProblem(ProblemBase):
     """A body that stops at contact; the state is its pose, the task action a change of pose.
 
-    Parameters
-    ----------
-    world : DiscWorld, RectangleWorld or BoxWorld
-        The body and its obstacles.
-    init_mean, init_cov : sequence of float
-        Mean and variances of the initial belief.
-    motion_cov : sequence of float
-        Variances of the motion noise.
-    collision_tol : float
-        Fraction of an action to which contact is located.
+    It is built of validated settings, of the types ``Model`` and ``StateSpacePlanner``. Every model
+    has ``init_mean``, ``init_cov``, ``motion_cov`` and ``collision_tol``. The world is the body and
+    its obstacles.
 
     Attributes
     ----------
-    Model, StateSpacePlanner : type
-        Of the problem's settings: it is built of one of each.
     resolution : float
         What the motion noise blurs in a step: the geometric mean of its standard deviations. The
         pegs in the plane and the capsule robot have the same deviation in every coordinate unless
@@ -66,6 +103,8 @@ class RigidBodyProblem(ProblemBase):
 
     Model: ClassVar[type[Any]]
     StateSpacePlanner: ClassVar[type[Any]]
+    _path_policy: Any
+    """The policy as the kernel has it, for ``expected_path``."""
 
     @classmethod
     def from_settings(
@@ -80,20 +119,19 @@ class RigidBodyProblem(ProblemBase):
 
     def __init__(
         self,
+        model: Any,
+        state_space_planner: Any,
         world: DiscWorld | RectangleWorld | BoxWorld,
-        *,
-        init_mean: Sequence[float],
-        init_cov: Sequence[float],
-        motion_cov: Sequence[float],
-        collision_tol: float,
     ) -> None:
+        self.model = model
+        self.state_space_planner = state_space_planner
         self.world = world
-        self.motion_variance = constant(motion_cov)
+        self.motion_variance = constant(model.motion_cov)
         self.resolution = _geometric_mean_deviation(self.motion_variance)
-        self._init_mean = constant(init_mean)
-        self._init_deviation = np.sqrt(constant(init_cov))
+        self._init_mean = constant(model.init_mean)
+        self._init_deviation = np.sqrt(constant(model.init_cov))
         self._motion_deviation = np.sqrt(self.motion_variance)
-        self._collision_tolerance = collision_tol
+        self._collision_tolerance = model.collision_tol
 
     def initial_states(self, stream: Stream, count: int) -> FloatArray:
         """Draw states of the initial Gaussian, each again until it is free of collision.
@@ -132,44 +170,53 @@ class RigidBodyProblem(ProblemBase):
             states, actions, self._motion_deviation, self._collision_tolerance, streams, threads
         )
 
+    def follow_policy(
+        self, states: FloatArray, stage: int, offsets: Sequence[int], threads: int
+    ) -> tuple[FloatArray, IntArray]:
+        """Follow the policy without noise, in the kernel.
+
+        A problem makes this its ``expected_path`` beside its own ``policy``: an inherited one
+        would not count, for it does not follow a policy that a subclass replaces.
+        """
+        return self.world.follow(
+            self._path_policy, states, stage, offsets, self._collision_tolerance, threads
+        )
+
+    def _check_sensing_action(self, sensing_action: int) -> None:
+        count = len(self.sensing_actions)
+        if not 0 <= sensing_action < count:
+            raise InvalidValueError(
+                f"sensing action: {sensing_action}, must be at least 0 and below {count}"
+            )
+
+
+class PegPlanner(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``state_space_planner`` of the pegs: the largest size of each component."""
+
+    translation_step_size: Length = 0.1
+    rotation_step_size: Length = 0.1
+
 
 class PegProblem(RigidBodyProblem):
     """A peg: one observed coordinate per sensing action, limited actions, reward for short ways.
 
-    Parameters
-    ----------
-    world, init_mean, init_cov, motion_cov, collision_tol
-        As for :class:`RigidBodyProblem`.
-    sensing_cov : float
-        Variance of every observation.
-    step_limits : sequence of float
-        Largest size of each component of an executed action.
+    The state's positions come first, then its angles. ``model.sensing_cov`` is the variance of
+    every observation.
     """
 
-    sensing_actions: Sequence[str]
-    _num_positions: ClassVar[int]
+    StateSpacePlanner: ClassVar[type[PegPlanner]] = PegPlanner
 
     def __init__(
-        self,
-        world: RectangleWorld | BoxWorld,
-        *,
-        init_mean: Sequence[float],
-        init_cov: Sequence[float],
-        motion_cov: Sequence[float],
-        collision_tol: float,
-        sensing_cov: float,
-        step_limits: Sequence[float],
+        self, model: Any, state_space_planner: PegPlanner, world: RectangleWorld | BoxWorld
     ) -> None:
-        super().__init__(
-            world,
-            init_mean=init_mean,
-            init_cov=init_cov,
-            motion_cov=motion_cov,
-            collision_tol=collision_tol,
-        )
-        self._observation_variance = constant([sensing_cov])
-        self._upper_limits = constant(step_limits)
-        self._lower_limits = constant([-limit for limit in step_limits])
+        super().__init__(model, state_space_planner, world)
+        positions = world.space_dimension
+        angles = self.action_size - positions
+        limits = [state_space_planner.translation_step_size] * positions
+        limits += [state_space_planner.rotation_step_size] * angles
+        self._upper_limits = constant(limits)
+        self._lower_limits = -self._upper_limits
+        self._observation_variance = constant([model.sensing_cov])
 
     def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray:
         """Return coordinate ``sensing_action`` of the states, shape ``(..., 1)``."""
@@ -197,12 +244,6 @@ class PegProblem(RigidBodyProblem):
             return np.asarray(rewards)
         shape = np.broadcast_shapes(states.shape[:-1], actions.shape[:-1])
         return np.broadcast_to(rewards, shape)
-
-    def _check_sensing_action(self, sensing_action: int) -> None:
-        if not 0 <= sensing_action < self.state_size:
-            raise InvalidValueError(
-                f"sensing action: {sensing_action}, must be at least 0 and below {self.state_size}"
-            )
 
 
 def _geometric_mean_deviation(variances: FloatArray) -> float:

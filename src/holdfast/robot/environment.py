@@ -139,12 +139,11 @@ class SimulatedEnvironment:
         noise = stream(self._seed, self._trial, self.step, Purpose.WORLD_OBSERVATION)
         if hasattr(problem, "sample_observation"):
             return checked.sample_observation(problem, self.state, sensing_action, noise)
-        mean = checked.observation_mean(problem, self.state, sensing_action)
-        variance = checked.observation_variance(problem, self.state, sensing_action, mean)
+        mean, variance = checked.prediction(problem, self.state, sensing_action)
         with np.errstate(invalid="ignore"):
             shown: FloatArray = mean + np.sqrt(variance) * noise.normal(mean.shape)
         if not np.isfinite(shown).all():
-            raise checked.unusable_prediction(problem, sensing_action, mean, variance)
+            checked.require_usable(problem, sensing_action, mean, variance)
         return shown
 
     def perform(self, task_action: FloatArray) -> float | None:
@@ -187,10 +186,10 @@ class ObservationSizes(dict[int, "int | None"]):
 
     def __missing__(self, sensing_action: int) -> int | None:
         problem = self._problem
-        size = None
+        size: int | None = None
         if not has_general_observations(problem):
             state = _initial_state(problem, stream(0, 0, 0, Purpose.INITIAL_BELIEF))
-            size = checked.observation_mean(problem, state, sensing_action).shape[-1]
+            size = int(checked.prediction(problem, state, sensing_action)[0].shape[-1])
         self[sensing_action] = size
         return size
 

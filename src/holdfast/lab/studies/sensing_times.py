@@ -374,8 +374,7 @@ def _mapping_s(problem: Problem, state: PlanningState) -> float:
         start = time.perf_counter()
         checked.policy(problem, states, state.stage)
         for sensing_action in range(len(problem.sensing_actions)):
-            mean = checked.observation_mean(problem, states, sensing_action)
-            checked.observation_variance(problem, states, sensing_action, mean)
+            checked.prediction(problem, states, sensing_action)
         seconds.append(time.perf_counter() - start)
     return float(np.median(seconds))
 
