@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from holdfast.cli.robot_run import RobotRun
     from holdfast.config.loader import Configuration
     from holdfast.outcome import TrialResult
-    from holdfast.recording.recorded_environment import RecordedEnvironment
     from holdfast.recording.tables import RunSummary
     from holdfast.service.health import HttpAddress
 
@@ -192,7 +191,6 @@ def main(arguments: Sequence[str]) -> int:
 
 def _run(options: RunOptions) -> int:
     from holdfast.cli.robot_run import RobotRun, is_robot_run, run_as_robot
-    from holdfast.recording.recorded_environment import RecordedEnvironment
     from holdfast.recording.recorder import Recorder
     from holdfast.recording.run_directory import (
         FIGURE_NAME,
@@ -233,18 +231,11 @@ def _run(options: RunOptions) -> int:
             notes.note(f"the run had {_listed(before)} before, and goes on with {_listed(now)}")
         display = RunDisplay(configuration, quiet=quiet or options.log == "json")
         recorder = Recorder(trial=0)
-        recorded: RecordedEnvironment | None = None
         robot = RobotRun()
         summary: RunSummary | None = None
         started = perf_counter()
 
         def on_result(result: TrialResult) -> None:
-            nonlocal recorded
-            if result.trial == recorder.trial and configuration.environment.object is not None:
-                # Its steps are in the journal until the result is.
-                unfinished = directory.journal.unfinished()
-                records = [] if unfinished is None else unfinished.records
-                recorded = RecordedEnvironment(result.trial, records, result)
             directory.add(result)
             display.show(result)
 
@@ -285,7 +276,7 @@ def _run(options: RunOptions) -> int:
             for text in _idle_services(configuration, summary, robot):
                 notes.note(text)
             with notes.while_it_lasts(f"drawing {FIGURE_NAME} ..."):
-                remark = draw_figure(configuration, directory, recorder, recorded)
+                remark = draw_figure(configuration, directory, recorder)
         except KeyboardInterrupt as interruption:
             command = options.resume_command(directory_path)
             finished = directory.journal.tally().finished

@@ -39,17 +39,13 @@ class RecordedEnvironment:
         result: TrialResult | None = None,
         simulated: SimulatedEnvironment | None = None,
     ) -> None:
-        self.result = result
+        self._result = result
         self._trial = trial
         self._simulated = simulated
         kinds = ObservedRecord | ActingRecord | PerformedRecord
         self._records = [record for record in records if isinstance(record, kinds)]
         self._next = 0
         self._step = 0
-
-    def from_the_beginning(self) -> RecordedEnvironment:
-        """Return the same world before the trial."""
-        return RecordedEnvironment(self._trial, self._records, self.result)
 
     @property
     def state(self) -> FloatArray | None:
@@ -92,17 +88,17 @@ class RecordedEnvironment:
 
     def is_done(self) -> Done:
         """Return whether the task was done, or had failed."""
-        if self.result is None:
+        if self._result is None:
             if self._next == len(self._records) and self._step:
                 raise EndOfRecordsError(self._trial)
             return False
-        if self._step < self.result.steps:
+        if self._step < self._result.steps:
             return False
-        return "failed" if self.result.failed else self.result.success
+        return "failed" if self._result.failed else self._result.success
 
     def _take(self) -> Record | None:
         if self._next == len(self._records):
-            if self.result is None:
+            if self._result is None:
                 raise EndOfRecordsError(self._trial)
             return None
         self._next += 1
