@@ -20,7 +20,6 @@ import msgspec
 
 from holdfast.outcome import Decisions, SensingDecision, TaskDecision
 from holdfast.protocol.records import ActingRecord
-from holdfast.recording.journal_file import find_journal
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.recording.run_directory import configuration_difference
 
@@ -112,8 +111,7 @@ def compare_runs(first: Path, second: Path) -> Comparison:
     """
     with ExitStack() as stack:
         one, other = (
-            stack.enter_context(JournalReader.read(find_journal(run, "compare")))
-            for run in (first, second)
+            stack.enter_context(JournalReader.read_run(run, "compare")) for run in (first, second)
         )
         notes: list[str] = []
         difference = _difference_of_runs(one.meta(), other.meta(), notes)

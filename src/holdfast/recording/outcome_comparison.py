@@ -20,7 +20,6 @@ import numpy as np
 from holdfast.arrays import FloatArray
 from holdfast.errors import HoldfastError, OutputError
 from holdfast.outcome import TrialResult
-from holdfast.recording.journal_file import find_journal
 from holdfast.recording.journal_reader import JournalReader
 from holdfast.recording.run_directory import first_difference
 
@@ -217,13 +216,12 @@ class _Run(NamedTuple):
 def _read(path: Path) -> _Run:
     from holdfast.config.yaml_document import read
 
-    journal_path = find_journal(path, "compare")
-    with JournalReader.read(journal_path) as journal:
+    with JournalReader.read_run(path, "compare") as journal:
         meta = journal.meta()
         results = {result.trial: result for result in journal.results()}
         journal.require_unchanged()
     text = meta.get("configuration", "")
-    configuration = read(text.encode(), f"the configuration in {journal_path}").data
+    configuration = read(text.encode(), f"the configuration in {journal.path}").data
     asked_for = int(configuration["simulator"]["num_trials"])
     return _Run(path, meta, configuration, results, len(results) >= asked_for)
 

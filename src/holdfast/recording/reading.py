@@ -28,7 +28,6 @@ from holdfast.recording.facts import (
     TrialBeginFact,
     TrialEndFact,
 )
-from holdfast.recording.journal_file import find_journal
 from holdfast.recording.journal_reader import JournalReader
 from holdfast.recording.replay import RecordedRun
 
@@ -146,7 +145,7 @@ def open_run(path: str | Path) -> RunArrays:
     run = Path(path)
     with RecordedRun(run, "open") as recorded:
         configuration, trials = recorded.configuration, recorded.trials
-    with JournalReader.read(find_journal(run, "open")) as journal:
+    with JournalReader.read_run(run, "open") as journal:
         rows = [
             [getattr(result, column) for column in TRIAL_COLUMNS] for result in journal.results()
         ]

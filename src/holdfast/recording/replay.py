@@ -38,7 +38,6 @@ from holdfast.recording.facts import (
     TrialEndFact,
 )
 from holdfast.recording.fingerprint import difference, fingerprint
-from holdfast.recording.journal_file import find_journal
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.recording.recorded_environment import RecordedEnvironment
 from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME
@@ -84,10 +83,10 @@ class RecordedRun:
 
     def __init__(self, run: Path, purpose: str = "export") -> None:
         self.path = run
-        path = find_journal(run, purpose)
-        directory = path.parent
         with ExitStack() as stack:
-            self._journal = stack.enter_context(JournalReader.read(path))
+            self._journal = stack.enter_context(JournalReader.read_run(run, purpose))
+            path = self._journal.path
+            directory = path.parent
             self._meta = self._journal.meta()
             self.configuration, self.world_is_simulated = _configuration(self._meta, path)
             self._estimate = self.configuration.planning.particle_filter.estimate

@@ -25,7 +25,7 @@ from holdfast.files import write_atomically
 from holdfast.outcome import TrialResult
 from holdfast.recording.fingerprint import difference, fingerprint
 from holdfast.recording.journal import Journal
-from holdfast.recording.journal_file import JOURNAL_NAME, Survives, require_writable
+from holdfast.recording.journal_file import JOURNAL_NAME, JournalFile, Survives
 from holdfast.recording.journal_reader import JournalReader
 from holdfast.recording.tables import RunSummary, SummaryBuilder, csv_lines
 from holdfast.recording.timings import count_answers, count_verified
@@ -144,7 +144,7 @@ class RunDirectory:
             raise OutputError(f"{path}: holds no {JOURNAL_NAME}, so no run to resume")
         try:
             _require_writable_directory(path)
-            require_writable(path / JOURNAL_NAME)
+            JournalFile(path / JOURNAL_NAME).require_writable()
         except OutputError as error:
             # If the journal is damaged as well, its reader raises first.
             JournalReader.read(path / JOURNAL_NAME).close()
