@@ -312,9 +312,9 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
 
 def print_files(directory: Path) -> None:
     """Print which files a run has left in its directory."""
-    from holdfast.recording.run_directory import output_names
+    from holdfast.recording.run_directory import OUTPUT_NAMES
 
-    names = [name for name in output_names() if (directory / name).exists()]
+    names = [name for name in OUTPUT_NAMES if (directory / name).exists()]
     sys.stdout.write(printable(f"\n{directory}/\n  {'  '.join(names)}\n"))
     sys.stdout.flush()
 
