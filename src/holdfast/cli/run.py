@@ -39,7 +39,7 @@ from holdfast.runtime.logs import log_option
 from holdfast.service.options import http_address
 
 if TYPE_CHECKING:
-    from holdfast.cli.robot_run import RobotRun
+    from holdfast.cli.robot_run import RobotFindings
     from holdfast.config.loader import Configuration
     from holdfast.outcome import TrialResult
     from holdfast.recording.tables import RunSummary
@@ -190,7 +190,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _run(options: RunOptions) -> int:
-    from holdfast.cli.robot_run import RobotRun, is_robot_run, run_as_robot
+    from holdfast.cli.robot_run import RobotFindings, is_robot_run, run_as_robot
     from holdfast.recording.recorder import Recorder
     from holdfast.recording.run_directory import (
         FIGURE_NAME,
@@ -219,8 +219,10 @@ def _run(options: RunOptions) -> int:
         directory_path = options.out or claim_default_directory(configuration, _RUNS)
         directory = RunDirectory.create(directory_path, configuration)
     with directory:
-        earlier = directory.journal.tally()
         notes = _Notes(options)
+        display = RunDisplay(
+            configuration, directory.journal.results(), quiet=quiet or options.log == "json"
+        )
         if options.resume_if_begun and (complete := directory.complete_summary()) is not None:
             manager.ready()  # otherwise it takes the end for a failed start
             manager.close()
@@ -229,9 +231,8 @@ def _run(options: RunOptions) -> int:
         before, now = directory.services_before, configuration.offload.services
         if before is not None and before != now:
             notes.note(f"the run had {_listed(before)} before, and goes on with {_listed(now)}")
-        display = RunDisplay(configuration, quiet=quiet or options.log == "json")
         recorder = Recorder(trial=0)
-        robot = RobotRun()
+        robot = RobotFindings()
         summary: RunSummary | None = None
         started = perf_counter()
 
@@ -240,7 +241,7 @@ def _run(options: RunOptions) -> int:
             display.show(result)
 
         try:
-            display.start(earlier, directory_path)
+            display.start(directory_path)
             try:
                 if maker is not None:
                     robot = run_as_robot(
@@ -279,7 +280,7 @@ def _run(options: RunOptions) -> int:
                 remark = draw_figure(configuration, directory, recorder)
         except KeyboardInterrupt as interruption:
             command = options.resume_command(directory_path)
-            finished = directory.journal.tally().finished
+            finished = len(directory.journal.finished())
             how = interrupted_by(interruption)
             notes.ended_early(
                 how,
@@ -347,7 +348,9 @@ def _listed(services: Sequence[str]) -> str:
     return words or "no service"
 
 
-def _idle_services(configuration: Configuration, summary: RunSummary, robot: RobotRun) -> list[str]:
+def _idle_services(
+    configuration: Configuration, summary: RunSummary, robot: RobotFindings
+) -> list[str]:
     """Name the services that decided nothing without a refusal: perhaps mistyped."""
     sensing = summary.sensing_decisions_by_service
     task = summary.task_answers_by_service

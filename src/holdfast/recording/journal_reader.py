@@ -29,7 +29,7 @@ from holdfast.recording.journal_file import (
     of_trials,
 )
 
-__all__ = ["SCHEMA_VERSION", "SESSION_SIZE", "JournalReader", "Tally", "UnfinishedTrial"]
+__all__ = ["SCHEMA_VERSION", "SESSION_SIZE", "JournalReader", "UnfinishedTrial"]
 
 SCHEMA_VERSION = 3
 """Raised whenever the tables or their content change form."""
@@ -40,14 +40,6 @@ SESSION_SIZE = 16
 _RESULT_DECODER = msgspec.msgpack.Decoder(TrialResult)
 _DECISIONS_DECODER = msgspec.msgpack.Decoder(Decisions)
 _KEPT_DECODER = msgspec.msgpack.Decoder(list[bytes])
-
-
-class Tally(NamedTuple):
-    """How many trials are finished, and how many of them succeeded and failed."""
-
-    finished: int
-    successes: int
-    failures: int
 
 
 class UnfinishedTrial(NamedTuple):
@@ -292,15 +284,6 @@ class JournalReader:
         """Return the numbers of the finished trials."""
         with self._errors():
             return {trial for (trial,) in self._connection.execute("SELECT trial FROM trials")}
-
-    def tally(self) -> Tally:
-        """Count the finished trials."""
-        finished = successes = failures = 0
-        for result in self.results():
-            finished += 1
-            successes += result.success
-            failures += result.failed
-        return Tally(finished, successes, failures)
 
     def results(self, *, with_decisions: bool = False) -> Iterator[TrialResult]:
         """Yield the results in the order of their trials."""

@@ -211,7 +211,7 @@ class RunDirectory:
         A process that was killed after the last trial may have left none, or an old one.
         """
         trials = self.configuration.simulator.num_trials
-        if self.journal.tally().finished < trials:
+        if len(self.journal.finished()) < trials:
             return None
         try:
             summary = msgspec.json.decode((self.path / SUMMARY_NAME).read_bytes(), type=RunSummary)
