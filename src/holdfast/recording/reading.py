@@ -40,8 +40,6 @@ class TrialArrays:
 
     Attributes
     ----------
-    trial : int
-        Its number.
     result : TrialResult or None
         None if the trial is not finished.
     task_actions : array of shape (T, action_size)
@@ -90,8 +88,6 @@ class RunArrays:
     ----------
     path : Path
         Its directory, or its journal.
-    configuration : Configuration
-        What it was run with.
     trials : tuple of int
         Numbers of all its trials, the one that was begun and not finished included.
     results : dict of arrays
@@ -116,7 +112,7 @@ class RunArrays:
         OutputError
             If there is no such trial, or the run is damaged or in use.
         HoldfastError
-            If a trial is decided otherwise when it is planned again.
+            If a trial is decided otherwise now.
         """
         chosen = sorted(set(self.trials if trials is None else trials))
         if lacking := set(chosen).difference(self.trials):
@@ -128,12 +124,7 @@ class RunArrays:
 
 
 def open_run(path: str | Path) -> RunArrays:
-    """Open a recorded run to be read as arrays.
-
-    Parameters
-    ----------
-    path : str or Path
-        The run's directory, or its journal. It is not changed.
+    """Open a recorded run, by its directory or journal, to be read as arrays; it is not changed.
 
     Raises
     ------

@@ -23,7 +23,6 @@ class RecordedEnvironment:
 
     Parameters
     ----------
-    trial : int
     records : sequence of Record
         In the order in which they were written; the one of the last performance may be missing.
     result : TrialResult or None
@@ -53,26 +52,14 @@ class RecordedEnvironment:
         return None if self._simulated is None else self._simulated.state
 
     def perform_sensing(self, sensing_action: int) -> FloatArray:
-        """Return the recorded observation.
-
-        Raises
-        ------
-        DecidedOtherwiseError
-            If another sensing action is recorded, or none.
-        """
+        """Return the recorded observation; DecidedOtherwiseError if it is of another action."""
         record = self._take()
         if not isinstance(record, ObservedRecord) or record.sensing_action != sensing_action:
             raise self._otherwise(record)
         return decode_floats(record.observation, len(record.observation) // 8)
 
     def perform(self, task_action: FloatArray) -> float | None:
-        """Return the recorded reward, None if there is none.
-
-        Raises
-        ------
-        DecidedOtherwiseError
-            If another task action is recorded, or none.
-        """
+        """Return the recorded reward; DecidedOtherwiseError if it is of another action."""
         record = self._take()
         if not isinstance(record, ActingRecord) or record.action != encode_floats(task_action):
             raise self._otherwise(record)

@@ -53,12 +53,7 @@ __all__ = ["RecordedRun"]
 class RecordedRun:
     """A recorded run, open to be read; to be used in a ``with`` statement.
 
-    Parameters
-    ----------
-    run : Path
-        Its directory, or its journal. Nobody may be using it; it is not changed.
-    purpose : str
-        A verb, for messages.
+    ``run`` is its directory, or its journal. Nobody may be using it; it is not changed.
 
     Attributes
     ----------
@@ -66,8 +61,6 @@ class RecordedRun:
         The settings that decide; it names no services and no environment.
     trials : tuple of int
         All trials that have facts, in order: the finished ones, and the unfinished one.
-    unfinished : int or None
-        The number of the latter.
     has_times : bool
         Whether the facts have the robot's times.
     untimed : tuple of int
@@ -132,12 +125,7 @@ class RecordedRun:
     ) -> Iterator[int]:
         """Write the facts of some trials to each sink, and yield each trial's number at its end.
 
-        Parameters
-        ----------
-        trials : sequence of int
-            Ascending; some of :attr:`trials`.
-        rate_hz : float
-            Steps a second, for a run without times.
+        ``trials`` ascend; a run without times has ``rate_hz`` steps a second.
 
         Raises
         ------

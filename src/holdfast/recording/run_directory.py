@@ -141,9 +141,6 @@ class RunDirectory:
     def resume(cls, path: Path, configuration: Configuration) -> Self:
         """Open the directory of a run that shall go on, perhaps to more trials than it had.
 
-        If a trial was begun and not finished, the journal has its steps:
-        :meth:`holdfast.recording.journal.Journal.unfinished`.
-
         Raises
         ------
         OutputError
@@ -224,13 +221,7 @@ class RunDirectory:
         self.journal.add(result, keep_steps=self.configuration.environment.object is not None)
 
     def write_tables(self, wall_time_s: float) -> RunSummary:
-        """Write ``trials.csv`` and ``summary.json`` from the journal.
-
-        Parameters
-        ----------
-        wall_time_s : float
-            Of this part of the run; that of earlier parts is added.
-        """
+        """Write ``trials.csv`` and ``summary.json``; the time of earlier parts is added."""
         total_s = self.earlier_wall_time_s + wall_time_s
         self.journal.set_meta("wall_time_s", repr(total_s))
         builder = SummaryBuilder()
