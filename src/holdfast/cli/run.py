@@ -274,19 +274,15 @@ def _run(options: RunOptions) -> int:
                 notes.note(f"{counted(robot.missed_ticks, 'tick')} of --rate {were} missed")
             for service, reason in robot.refusals.items():
                 notes.note(f"{service} was asked no more: {reason}")
-            for text in _idle_services(configuration, summary, robot):
-                notes.note(text)
+            _note_idle_services(configuration, summary, robot, notes)
             with notes.while_it_lasts(f"drawing {FIGURE_NAME} ..."):
                 remark = draw_figure(configuration, directory, recorder)
         except KeyboardInterrupt as interruption:
-            command = options.resume_command(directory_path)
-            finished = len(directory.journal.finished())
-            how = interrupted_by(interruption)
             notes.ended_early(
-                how,
-                f"{finished} of {configuration.simulator.num_trials} trials are finished and kept "
-                f"in {directory_path}",
-                command,
+                interrupted_by(interruption),
+                f"{len(directory.journal.finished())} of {configuration.simulator.num_trials} "
+                f"trials are finished and kept in {directory_path}",
+                options.resume_command(directory_path),
             )
             raise
         except HoldfastError as error:
@@ -348,24 +344,19 @@ def _listed(services: Sequence[str]) -> str:
     return words or "no service"
 
 
-def _idle_services(
-    configuration: Configuration, summary: RunSummary, robot: RobotFindings
-) -> list[str]:
+def _note_idle_services(
+    configuration: Configuration, summary: RunSummary, robot: RobotFindings, notes: _Notes
+) -> None:
     """Name the services that decided nothing without a refusal: perhaps mistyped."""
     sensing = summary.sensing_decisions_by_service
     task = summary.task_answers_by_service
     if sensing is None or task is None or not summary.finished:
-        return []
-    return [
-        f"{service} decided nothing"
-        + (
-            f": {robot.unreachable[service]}"
-            if service in robot.unreachable
-            else "; events.jsonl says why"
-        )
-        for service in configuration.offload.services
-        if service not in sensing and service not in task and service not in robot.refusals
-    ]
+        return
+    for service in configuration.offload.services:
+        if service not in {*sensing, *task, *robot.refusals}:
+            reason = robot.unreachable.get(service)
+            why = "; events.jsonl says why" if reason is None else f": {reason}"
+            notes.note(f"{service} decided nothing{why}")
 
 
 def _require_effect(options: RunOptions, configuration: Configuration, *, as_robot: bool) -> None:

@@ -68,12 +68,9 @@ def _place(name: str) -> Path:
 def account_of_user_error(error: BaseException, name: str) -> str | None:
     """Say what the user's code raised and where, without the frames of anybody else.
 
-    Returns
-    -------
-    str or None
-        The type and the message, then file, line and source of each frame of the user's, all of
-        bounded length; None if the user's code had no part in it, or only called what ends a
-        command in order (``print``, once the standard output has no reader).
+    It has the type and the message, then file, line and source of each frame of the user's, all of
+    bounded length. It is None if the user's code had no part in it, or only called what ends a
+    command in order (``print``, once the standard output has no reader).
     """
     ours = inner = False
     frames = []

@@ -74,14 +74,9 @@ never opened a second time.
 
 
 def find_journal(run: Path, purpose: str) -> Path:
-    """Return the journal of a run.
+    """Return the journal of a run, by its directory or the journal itself.
 
-    Parameters
-    ----------
-    run : Path
-        The run's directory, or the journal itself.
-    purpose : str
-        A verb, for messages: what the run is needed for.
+    ``purpose`` is a verb, for messages: what the run is needed for.
 
     Raises
     ------
@@ -267,15 +262,8 @@ def is_named(error: sqlite3.Error, *names: str) -> bool:
 class StepCount:
     """How many records of the unfinished trial were written, in a file beside the journal.
 
-    Parameters
-    ----------
-    synchronous : bool
-        Whether :meth:`begin` returns only when it is on the disk.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written; so do the methods.
+    If it is ``synchronous``, :meth:`begin` returns only when it is on the disk. All methods raise
+    OutputError if it cannot be written.
     """
 
     def __init__(self, path: Path, *, synchronous: bool) -> None:
