@@ -14,7 +14,7 @@ import numpy as np
 
 from holdfast import checked
 from holdfast.arrays import FloatArray, IntArray, in_brief
-from holdfast.config.settings import PlanningSettings, path_steps, unfit_for_path_entropy
+from holdfast.config.settings import PlanningSettings, path_steps, unfit_for_the_method
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.estimators import LARGEST, first_unbounded
 from holdfast.problem_attributes import has_own
@@ -58,7 +58,7 @@ def path_points(
     ProblemError
         If a function of the problem breaks its contract.
     """
-    if (unfit := unfit_for_path_entropy(settings)) is not None:
+    if (unfit := unfit_for_the_method(settings)) is not None:
         (section, key), reason = unfit
         raise InvalidValueError(f"{section}.{key} {reason}")
     offsets = path_steps(settings)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from holdfast.cli.robot_run import _Reasons, is_robot_run
+from holdfast.cli.robot_run import RobotFindings, is_robot_run
 from holdfast.config.loader import load
 
 
@@ -28,7 +28,7 @@ def test_a_robots_run(
 
 def test_reasons_are_the_last_ones() -> None:
     held: list[str] = []
-    reasons = _Reasons(lambda: held.append("once"))
+    reasons = RobotFindings(lambda: held.append("once"))
     reasons.event("holding", step=0, reason="a: has not appeared")
     reasons.event("holding", step=1, reason="a: has not appeared")
     assert held == ["once"]

@@ -15,7 +15,7 @@ from holdfast.errors import ConfigurationError
 PATH = Path("run.yaml")
 
 
-def source(text: str, overrides: dict[tuple[str, str], Any] | None = None) -> Source:
+def source(text: str, overrides: dict[str, Any] | None = None) -> Source:
     return Source(read(text.encode(), str(PATH)), PATH, overrides or {})
 
 
@@ -39,7 +39,7 @@ def test_a_section_that_is_refused(text: str, message: str) -> None:
 
 
 def test_a_value_given_instead_has_no_line() -> None:
-    given = source("simulator: {seed: 1}", {("simulator", "seed"): "x"})
+    given = source("simulator: {seed: 1}", {"simulator.seed": "x"})
     with pytest.raises(ConfigurationError, match=r"^simulator\.seed, given instead of "):
         given.section("simulator", SimulatorSettings)
     assert given.directory_of(("simulator", "seed")) == Path.cwd()

@@ -9,18 +9,12 @@ import pytest
 from holdfast.errors import OutputError
 from holdfast.recording.journal import Journal
 from holdfast.recording.journal_file import (
+    JournalFile,
     StepCount,
-    count_path,
     find_journal,
-    identity_of,
-    is_intact,
-    log_path,
     meta_checksum,
-    read_count,
-    require_writable,
-    step_checksum,
-    trial_checksum,
-    version_of_file,
+    of_steps,
+    of_trials,
 )
 
 
@@ -45,15 +39,15 @@ class TestFinding:
 
 class TestCount:
     def test_it_comes_back(self, tmp_path: Path) -> None:
-        path = count_path(tmp_path / "journal.sqlite")
-        assert read_count(path) is None
+        path = JournalFile(tmp_path / "journal.sqlite").count
+        assert StepCount.read(path) is None
         count = StepCount(path, synchronous=True)
         count.begin(3, 5)
         count.write(3, 6)
         count.close()
-        assert read_count(path) == (3, 6)
+        assert StepCount.read(path) == (3, 6)
         path.write_bytes(path.read_bytes()[:-1])
-        assert read_count(path) is None
+        assert StepCount.read(path) is None
 
     def test_it_cannot_be_written(self, tmp_path: Path) -> None:
         with pytest.raises(OutputError, match="count: cannot be written"):
@@ -63,11 +57,11 @@ class TestCount:
 class TestChecksums:
     def test_content_key_and_table_count(self) -> None:
         checksums = [
-            step_checksum(0, 1, b"data"),
-            step_checksum(1, 1, b"data"),
-            step_checksum(0, 2, b"data"),
-            step_checksum(0, 1, b"Data"),
-            trial_checksum(0, 1, b"data"),
+            of_steps(0, 1, b"data"),
+            of_steps(1, 1, b"data"),
+            of_steps(0, 2, b"data"),
+            of_steps(0, 1, b"Data"),
+            of_trials(0, 1, b"data"),
             meta_checksum("a", "b"),
             meta_checksum("b", "a"),
         ]
@@ -75,27 +69,26 @@ class TestChecksums:
 
     @pytest.mark.parametrize("row", [("text", 0), (None, 0), (b"data", "0"), (b"other", 0)])
     def test_a_value_of_another_type_is_not_intact(self, row: tuple[object, object]) -> None:
-        checksum = step_checksum(0, 1, b"data")
-        assert is_intact(b"data", checksum, step_checksum, 0, 1)
-        assert not is_intact(row[0], checksum, step_checksum, row[1], 1)
+        checksum = of_steps(0, 1, b"data")
+        assert of_steps.is_intact(b"data", checksum, 0, 1)
+        assert not of_steps.is_intact(row[0], checksum, row[1], 1)
 
 
 def test_a_journal_that_is_open_here_is_writable(tmp_path: Path) -> None:
     path = tmp_path / "journal.sqlite"
     with Journal.create(path, {}):
-        assert log_path(path).exists()
-        require_writable(path)
+        assert JournalFile(path).log.exists()
+        JournalFile(path).require_writable()
         with pytest.raises(OutputError, match="another process"):
             Journal.open(path)
     with pytest.raises(OutputError, match="cannot be written: No such file"):
-        require_writable(tmp_path / "missing")
+        JournalFile(tmp_path / "missing").require_writable()
 
 
 def test_a_file_that_is_replaced_is_another(tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     for path in (first, second):
         path.write_text("same")
-    identity, version = identity_of(first), version_of_file(first)
+    version = JournalFile(first).version()
     second.replace(first)
-    assert identity_of(first) != identity
-    assert version_of_file(first) != version
+    assert JournalFile(first).version()[:2] != version[:2]

@@ -16,10 +16,10 @@ from holdfast.protocol.records import (
     PausedRecord,
 )
 from holdfast.recording.run_directory import (
+    OUTPUT_NAMES,
     RunDirectory,
     claim_default_directory,
     latest_default_directory,
-    output_names,
 )
 
 
@@ -44,7 +44,7 @@ class TestRunDirectory:
             assert directory.journal.finished() == {0}
             assert directory.write_tables(wall_time_s=2.0).wall_time_s == 3.5
 
-    @pytest.mark.parametrize("name", output_names())
+    @pytest.mark.parametrize("name", OUTPUT_NAMES)
     def test_no_file_of_a_run_is_overwritten(self, tmp_path: Path, name: str) -> None:
         (tmp_path / "out").mkdir()
         (tmp_path / "out" / name).write_text("mine")

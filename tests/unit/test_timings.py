@@ -9,8 +9,14 @@ import pytest
 
 from holdfast.errors import OutputError
 from holdfast.lab.testbed.records import DecisionTable, time_of
-from holdfast.protocol.events import Timing
-from holdfast.recording.timings import TIMING_COLUMNS, AnswerCounts, TimingTable, count_answers
+from holdfast.protocol.events import Timing, VerificationNoted
+from holdfast.recording.timings import (
+    AnswerCounts,
+    EventTable,
+    VerificationCounts,
+    count_answers,
+    count_verified,
+)
 
 MOMENT_NS = 1_700_000_000_123_456_789
 
@@ -21,13 +27,15 @@ def timing(step: int = 9, service: str = "tcp/127.0.0.1:7447") -> Timing:
 
 def test_a_row(tmp_path: Path) -> None:
     path = tmp_path / "timings.csv"
-    table = TimingTable(path, clock=lambda: MOMENT_NS)
+    table = EventTable(path, Timing, clock=lambda: MOMENT_NS)
     table.add(timing())
     table.add(timing(service='a,"b"'))
     table.close()
     with path.open(newline="") as file:
         header, first, second = csv.reader(file)
-    assert tuple(header) == TIMING_COLUMNS
+    assert ",".join(header) == (
+        "trial,step,kind,service,status,waited_ms,round_trip_ms,computed_ms,time"
+    )
     assert first[:5] == ["2", "9", "task", "tcp/127.0.0.1:7447", "keep_alive"]
     assert first[5:] == ["1.500", "2.250", "0.750", "2023-11-14T22:13:20.123456Z"]
     assert second[3] == 'a,"b"'
@@ -35,13 +43,13 @@ def test_a_row(tmp_path: Path) -> None:
 
 def test_it_goes_on_after_a_row_that_was_cut_off(tmp_path: Path) -> None:
     path = tmp_path / "timings.csv"
-    table = TimingTable(path)
+    table = EventTable(path, Timing)
     table.add(timing(step=0))
     table.add(timing(step=9))
     table.close()
     whole = path.read_bytes()
     path.write_bytes(whole[:-5])
-    table = TimingTable(path)
+    table = EventTable(path, Timing)
     table.add(timing(step=18))
     table.close()
     with path.open(newline="") as file:
@@ -51,7 +59,7 @@ def test_it_goes_on_after_a_row_that_was_cut_off(tmp_path: Path) -> None:
 def test_it_is_read_while_it_grows(tmp_path: Path) -> None:
     """Whatever part of the file is there at the moment."""
     path = tmp_path / "timings.csv"
-    table = TimingTable(path, clock=lambda: MOMENT_NS)
+    table = EventTable(path, Timing, clock=lambda: MOMENT_NS)
     for step in (0, 9):
         table.add(timing(step=step))
     table.close()
@@ -75,13 +83,37 @@ def test_it_is_read_while_it_grows(tmp_path: Path) -> None:
 
 def test_it_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="cannot be written"):
-        TimingTable(tmp_path / "missing" / "timings.csv")
+        EventTable(tmp_path / "missing" / "timings.csv", Timing)
+
+
+class TestCountVerified:
+    def test_each_verdict_counts(self, tmp_path: Path) -> None:
+        path = tmp_path / "verification.csv"
+        table = EventTable(path, VerificationNoted, clock=lambda: MOMENT_NS)
+        cloud = "tcp/127.0.0.1:7447"
+        for step, kind, verdict in (
+            (0, "question", "asked"),
+            (0, "task", "same"),
+            (0, "sensing", "different"),
+            (9, "question", "asked"),
+            (9, "task", "not_deterministic"),
+            (18, "question", "left_out"),
+        ):
+            table.add(VerificationNoted(1, step, cloud, kind, verdict))
+        table.close()
+        head, first = path.read_text().splitlines()[:2]
+        assert head == "trial,step,service,kind,verdict,time"
+        assert first == f"1,0,{cloud},question,asked,2023-11-14T22:13:20.123456Z"
+        assert count_verified(path) == VerificationCounts(2, {cloud: 1}, 1, 1)
+
+    def test_there_is_no_table(self, tmp_path: Path) -> None:
+        assert count_verified(tmp_path / "verification.csv") is None
 
 
 class TestCountAnswers:
     def test_each_decision_of_a_finished_trial_counts_once(self, tmp_path: Path) -> None:
         path = tmp_path / "timings.csv"
-        table = TimingTable(path)
+        table = EventTable(path, Timing)
         cloud, local = 'tcp/"a",b:7447', "local"
         rows = [
             (0, 0, "sensing", cloud, 4.0),
@@ -100,11 +132,11 @@ class TestCountAnswers:
         table.close()
         counts = count_answers(path, {0, 1})
         assert counts == AnswerCounts({cloud: 2, local: 1}, {cloud: 2, local: 1}, 900.0)
-        assert list(counts.sensing) == [cloud, local]
+        assert list(counts.sensing_decisions_by_service) == [cloud, local]
 
     def test_damaged_rows_do_not_count(self, tmp_path: Path) -> None:
         path = tmp_path / "timings.csv"
-        table = TimingTable(path)
+        table = EventTable(path, Timing)
         table.add(timing())
         table.close()
         with path.open("ab") as file:

@@ -18,13 +18,7 @@ __all__ = ["COMMANDS", "Command", "run_application"]
 
 
 class Command(NamedTuple):
-    """A command of ``holdfast``.
-
-    Attributes
-    ----------
-    module : str
-        A name, because nothing outside the laboratory imports it.
-    """
+    """A command, and the name of its module: nothing outside the laboratory imports that."""
 
     module: str
     summary: str

@@ -189,17 +189,14 @@ def _write(recorded: RecordedRun, trials: Sequence[int], options: ExportOptions)
 
 
 def _notes(recorded: RecordedRun, trials: Sequence[int], rate_hz: float) -> list[str]:
-    """Return notes about the exported trials."""
     from holdfast.recording.run_directory import TIMINGS_NAME
 
     notes = []
     if not recorded.has_times:
         why = "the run was recorded without times"
-        if recorded.untimed:
-            lacking = counted(len(recorded.untimed), "trial")
-            why = (
-                f"{TIMINGS_NAME} lacks {lacking} from {recorded.untimed[0]} on; all have one clock"
-            )
+        if untimed := recorded.untimed:
+            lacking = counted(len(untimed), "trial")
+            why = f"{TIMINGS_NAME} lacks {lacking} from {untimed[0]} on; all have one clock"
         notes.append(f"{why}, so every step takes {1.0 / rate_hz:g} s (--rate)")
     blind = [trial for trial in trials if not recorded.beliefs_known(trial)]
     if blind:

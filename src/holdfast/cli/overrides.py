@@ -15,17 +15,7 @@ __all__ = ["Override", "combined", "parse_assignment"]
 
 
 class Override(NamedTuple):
-    """A value that replaces the file's.
-
-    Attributes
-    ----------
-    words : str
-        As on the command line.
-    key : str
-        ``section.key``.
-    value : object
-        Plain data.
-    """
+    """Plain data for a ``section.key`` instead of the file's, and its words on the command line."""
 
     words: str
     key: str
@@ -63,13 +53,7 @@ def parse_assignment(assignment: str) -> Override:
 
 
 def combined(overrides: Iterable[Override]) -> dict[str, Any]:
-    """Return the values by key.
-
-    Raises
-    ------
-    InvalidValueError
-        If two of them give different values to one key.
-    """
+    """Return the values by key; raise InvalidValueError if two of them contradict each other."""
     by_key: dict[str, Override] = {}
     for override in overrides:
         other = by_key.setdefault(override.key, override)

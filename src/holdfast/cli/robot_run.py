@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from holdfast.cli.run import RunOptions
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from holdfast.runtime.events import EventSink
     from holdfast.runtime.service_manager import ServiceManager
 
-__all__ = ["RobotRun", "is_robot_run", "run_as_robot"]
+__all__ = ["RobotFindings", "is_robot_run", "run_as_robot"]
 
 
-class RobotRun(NamedTuple):
-    """Findings of a robot's run besides its results.
+class RobotFindings:
+    """An event sink, for what a robot's run finds besides its results.
 
     Attributes
     ----------
@@ -31,16 +31,9 @@ class RobotRun(NamedTuple):
         Why a service could not be reached the last time, by its name.
     """
 
-    missed_ticks: int = 0
-    refusals: Mapping[str, str] = {}
-    unreachable: Mapping[str, str] = {}
-
-
-class _Reasons:
-    """An event sink that remembers which services refused for good or could not be reached."""
-
-    def __init__(self, on_first_hold: Callable[[], None]) -> None:
+    def __init__(self, on_first_hold: Callable[[], None] = lambda: None) -> None:
         self._on_hold: Callable[[], None] | None = on_first_hold
+        self.missed_ticks = 0
         self.refusals: dict[str, str] = {}
         self.unreachable: dict[str, str] = {}
 
@@ -75,7 +68,7 @@ def run_as_robot(
     on_result: Callable[[TrialResult], None],
     manager: ServiceManager,
     note: Callable[[str], None],
-) -> RobotRun:
+) -> RobotFindings:
     """Run the missing trials one after another.
 
     Raises
@@ -94,12 +87,11 @@ def run_as_robot(
                 "(recovery.launch) it launches a local service that decides meanwhile"
             )
 
-    reasons = _Reasons(hint)
-    sinks: list[EventSink] = []
+    findings = RobotFindings(hint)
+    sinks: list[EventSink] = [findings]
     if not options.quiet:
-        sinks.append(EventLog(sys.stderr, format=options.log, component="robot"))
-    sinks.append(reasons)
-    missed_ticks = perform_trials(
+        sinks.insert(0, EventLog(sys.stderr, format=options.log, component="robot"))
+    findings.missed_ticks = perform_trials(
         configuration,
         directory,
         maker,
@@ -108,4 +100,4 @@ def run_as_robot(
         sinks=sinks,
         watch=lambda events: RobotWatch(manager, options.health, events),
     )
-    return RobotRun(missed_ticks, reasons.refusals, reasons.unreachable)
+    return findings

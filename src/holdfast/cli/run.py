@@ -39,10 +39,9 @@ from holdfast.runtime.logs import log_option
 from holdfast.service.options import http_address
 
 if TYPE_CHECKING:
-    from holdfast.cli.robot_run import RobotRun
+    from holdfast.cli.robot_run import RobotFindings
     from holdfast.config.loader import Configuration
     from holdfast.outcome import TrialResult
-    from holdfast.recording.recorded_environment import RecordedEnvironment
     from holdfast.recording.tables import RunSummary
     from holdfast.service.health import HttpAddress
 
@@ -191,8 +190,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _run(options: RunOptions) -> int:
-    from holdfast.cli.robot_run import RobotRun, is_robot_run, run_as_robot
-    from holdfast.recording.recorded_environment import RecordedEnvironment
+    from holdfast.cli.robot_run import RobotFindings, is_robot_run, run_as_robot
     from holdfast.recording.recorder import Recorder
     from holdfast.recording.run_directory import (
         FIGURE_NAME,
@@ -221,8 +219,10 @@ def _run(options: RunOptions) -> int:
         directory_path = options.out or claim_default_directory(configuration, _RUNS)
         directory = RunDirectory.create(directory_path, configuration)
     with directory:
-        earlier = directory.journal.tally()
         notes = _Notes(options)
+        display = RunDisplay(
+            configuration, directory.journal.results(), quiet=quiet or options.log == "json"
+        )
         if options.resume_if_begun and (complete := directory.complete_summary()) is not None:
             manager.ready()  # otherwise it takes the end for a failed start
             manager.close()
@@ -231,25 +231,17 @@ def _run(options: RunOptions) -> int:
         before, now = directory.services_before, configuration.offload.services
         if before is not None and before != now:
             notes.note(f"the run had {_listed(before)} before, and goes on with {_listed(now)}")
-        display = RunDisplay(configuration, quiet=quiet or options.log == "json")
         recorder = Recorder(trial=0)
-        recorded: RecordedEnvironment | None = None
-        robot = RobotRun()
+        robot = RobotFindings()
         summary: RunSummary | None = None
         started = perf_counter()
 
         def on_result(result: TrialResult) -> None:
-            nonlocal recorded
-            if result.trial == recorder.trial and configuration.environment.object is not None:
-                # Its steps are in the journal until the result is.
-                unfinished = directory.journal.unfinished()
-                records = [] if unfinished is None else unfinished.records
-                recorded = RecordedEnvironment(result.trial, records, result)
             directory.add(result)
             display.show(result)
 
         try:
-            display.start(earlier, directory_path)
+            display.start(directory_path)
             try:
                 if maker is not None:
                     robot = run_as_robot(
@@ -282,19 +274,15 @@ def _run(options: RunOptions) -> int:
                 notes.note(f"{counted(robot.missed_ticks, 'tick')} of --rate {were} missed")
             for service, reason in robot.refusals.items():
                 notes.note(f"{service} was asked no more: {reason}")
-            for text in _idle_services(configuration, summary, robot):
-                notes.note(text)
+            _note_idle_services(configuration, summary, robot, notes)
             with notes.while_it_lasts(f"drawing {FIGURE_NAME} ..."):
-                remark = draw_figure(configuration, directory, recorder, recorded)
+                remark = draw_figure(configuration, directory, recorder)
         except KeyboardInterrupt as interruption:
-            command = options.resume_command(directory_path)
-            finished = directory.journal.tally().finished
-            how = interrupted_by(interruption)
             notes.ended_early(
-                how,
-                f"{finished} of {configuration.simulator.num_trials} trials are finished and kept "
-                f"in {directory_path}",
-                command,
+                interrupted_by(interruption),
+                f"{len(directory.journal.finished())} of {configuration.simulator.num_trials} "
+                f"trials are finished and kept in {directory_path}",
+                options.resume_command(directory_path),
             )
             raise
         except HoldfastError as error:
@@ -356,22 +344,19 @@ def _listed(services: Sequence[str]) -> str:
     return words or "no service"
 
 
-def _idle_services(configuration: Configuration, summary: RunSummary, robot: RobotRun) -> list[str]:
+def _note_idle_services(
+    configuration: Configuration, summary: RunSummary, robot: RobotFindings, notes: _Notes
+) -> None:
     """Name the services that decided nothing without a refusal: perhaps mistyped."""
     sensing = summary.sensing_decisions_by_service
     task = summary.task_answers_by_service
     if sensing is None or task is None or not summary.finished:
-        return []
-    return [
-        f"{service} decided nothing"
-        + (
-            f": {robot.unreachable[service]}"
-            if service in robot.unreachable
-            else "; events.jsonl says why"
-        )
-        for service in configuration.offload.services
-        if service not in sensing and service not in task and service not in robot.refusals
-    ]
+        return
+    for service in configuration.offload.services:
+        if service not in {*sensing, *task, *robot.refusals}:
+            reason = robot.unreachable.get(service)
+            why = "; events.jsonl says why" if reason is None else f": {reason}"
+            notes.note(f"{service} decided nothing{why}")
 
 
 def _require_effect(options: RunOptions, configuration: Configuration, *, as_robot: bool) -> None:

@@ -5,10 +5,12 @@ Progress goes to the standard error, so that the standard output holds results a
 
 from __future__ import annotations
 
+import functools
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from holdfast.printable import printable
 
@@ -18,7 +20,6 @@ if TYPE_CHECKING:
 
     from holdfast.config.loader import Configuration
     from holdfast.outcome import TrialResult
-    from holdfast.recording.journal_reader import Tally
     from holdfast.recording.tables import RunSummary
 
 __all__ = [
@@ -35,108 +36,78 @@ _PLAIN_INTERVAL_S = 5.0
 """Without a terminal, at most one line of progress in this time: logs stay short."""
 
 
-class ProgressLine(Protocol):
-    """Shows how many trials are finished, how fast, and how long the rest will take."""
+class ProgressLine:
+    """Shows how many trials are finished, how fast, and how long the rest will take.
+
+    This one shows nothing.
+    """
+
+    def __init__(self, total: int, noun: str) -> None:
+        self._total = total
+        self._noun = noun
+        self._finished_before = 0
+        self._started = perf_counter()
 
     def start(self, title: str, finished: int, note: str) -> None:
         """Begin, with what an earlier part has finished."""
-        ...
+        del note
+        self._finished_before = finished
+        self._started = perf_counter()
+        self.say(title)
 
     def show(self, finished: int, note: str) -> None:
         """Show how many are finished now, with a note."""
-        ...
 
     def say(self, text: str) -> None:
         """Show a line that stays."""
-        ...
 
     def stop(self) -> None:
         """End, and leave the terminal as it was."""
-        ...
+
+    def _rate(self, finished: int) -> float | None:
+        """Return how many are finished in a second."""
+        elapsed_s = perf_counter() - self._started
+        new = finished - self._finished_before
+        return new / elapsed_s if new and elapsed_s > 0.0 else None
+
+    def _speed(self, rate: float | None) -> str:
+        return "-" if rate is None else f"{rate:.3g} {self._noun}s/s"
 
 
 def progress_line(total: int, *, quiet: bool, noun: str = "trial") -> ProgressLine:
     """Return what suits the standard error: a moving line, a line now and then, or nothing."""
     if quiet:
-        return _Quiet()
-    if sys.stderr.isatty():
-        from rich.console import Console
-
-        return _Live(total, Console(stderr=True), noun)
-    return _Plain(total, noun)
+        return ProgressLine(total, noun)
+    return (_Live if sys.stderr.isatty() else _Plain)(total, noun)
 
 
-class _Quiet:
-    """Shows nothing."""
-
-    def start(self, title: str, finished: int, note: str) -> None: ...
-
-    def show(self, finished: int, note: str) -> None: ...
-
-    def say(self, text: str) -> None: ...
-
-    def stop(self) -> None: ...
-
-
-class _Speed:
-    """How many trials are finished in a second."""
-
-    def __init__(self, finished_before: int, noun: str) -> None:
-        self._finished_before = finished_before
-        self._noun = noun
-        self._started = perf_counter()
-
-    def rate(self, finished: int) -> float | None:
-        elapsed_s = perf_counter() - self._started
-        new = finished - self._finished_before
-        return new / elapsed_s if new and elapsed_s > 0.0 else None
-
-    def text(self, finished: int) -> str:
-        rate = self.rate(finished)
-        return "-" if rate is None else f"{rate:.3g} {self._noun}s/s"
-
-
-class _Plain:
+class _Plain(ProgressLine):
     """A line now and then, for logs."""
 
-    def __init__(self, total: int, noun: str) -> None:
-        self._total = total
-        self._noun = noun
-        self._speed = _Speed(0, noun)
-        self._last = 0.0
+    _last = 0.0
 
     def start(self, title: str, finished: int, note: str) -> None:
-        del note
-        self._speed = _Speed(finished, self._noun)
-        self._last = perf_counter()
-        self.say(title)
+        super().start(title, finished, note)
+        self._last = self._started
 
     def show(self, finished: int, note: str) -> None:
         now = perf_counter()
         if now - self._last < _PLAIN_INTERVAL_S or finished == self._total:
             return
         self._last = now
-        rate = self._speed.rate(finished)
+        rate = self._rate(finished)
         left = "" if rate is None else f", {duration((self._total - finished) / rate)}"
-        speed = self._speed.text(finished)
-        self.say(f"{finished}/{self._total} {self._noun}s, {note}, {speed}{left} left")
+        self.say(f"{finished}/{self._total} {self._noun}s, {note}, {self._speed(rate)}{left} left")
 
     def say(self, text: str) -> None:
         sys.stderr.write(f"{printable(text)}\n")
         sys.stderr.flush()
 
-    def stop(self) -> None: ...
 
+class _Live(ProgressLine):
+    """A line that moves, for people at a terminal."""
 
-class _Live:
-    """A line that moves, for people; the console is one of rich on a terminal."""
-
-    def __init__(self, total: int, console: Console, noun: str) -> None:
-        self._total = total
-        self._console = console
-        self._noun = noun
-        self._speed = _Speed(0, noun)
-        self._progress: Progress | None = None
+    _progress: Progress | None = None
 
     def start(self, title: str, finished: int, note: str) -> None:
         from rich.progress import (
@@ -148,8 +119,7 @@ class _Live:
             TimeRemainingColumn,
         )
 
-        self._speed = _Speed(finished, self._noun)
-        self.say(title)
+        super().start(title, finished, note)
         self._progress = Progress(
             BarColumn(bar_width=None),
             MofNCompleteColumn(),
@@ -170,7 +140,7 @@ class _Live:
 
     def show(self, finished: int, note: str) -> None:
         if self._progress is not None:
-            rate = self._speed.text(finished)
+            rate = self._speed(self._rate(finished))
             self._progress.update(self._task, completed=finished, note=note, rate=rate)
 
     def say(self, text: str) -> None:
@@ -180,40 +150,51 @@ class _Live:
         if self._progress is not None:
             self._progress.stop()
 
+    @functools.cached_property
+    def _console(self) -> Console:
+        from rich.console import Console
+
+        return Console(stderr=True)
+
 
 class RunDisplay:
-    """Shows how far a run is."""
+    """Shows how far a run is; ``earlier`` are the results of an earlier part of it."""
 
-    def __init__(self, configuration: Configuration, *, quiet: bool) -> None:
+    def __init__(
+        self, configuration: Configuration, earlier: Iterable[TrialResult], *, quiet: bool
+    ) -> None:
         self._configuration = configuration
         self._line = progress_line(configuration.simulator.num_trials, quiet=quiet)
         self._finished = 0
         self._successes = 0
         self._failures = 0
+        for result in earlier:
+            self._count(result)
 
-    def start(self, earlier: Tally, directory: Path) -> None:
-        """Begin, with what an earlier part of the run has finished."""
-        finished, self._successes, self._failures = earlier
-        self._finished = finished
+    def start(self, directory: Path) -> None:
+        """Begin."""
         simulator = self._configuration.simulator
         title = (
             f"{self._configuration.problem_name}, {counted(simulator.num_trials, 'trial')}, "
             f"seed {simulator.seed}"
         )
-        if finished:
-            title += f", {finished} finished before"
-        self._line.start(f"{title}; results in {directory}", finished, self._note())
+        if self._finished:
+            title += f", {self._finished} finished before"
+        self._line.start(f"{title}; results in {directory}", self._finished, self._note())
 
     def show(self, result: TrialResult) -> None:
         """Count one more finished trial."""
-        self._finished += 1
-        self._successes += result.success
-        self._failures += result.failed
+        self._count(result)
         self._line.show(self._finished, self._note())
 
     def stop(self) -> None:
         """End, and leave the terminal as it was."""
         self._line.stop()
+
+    def _count(self, result: TrialResult) -> None:
+        self._finished += 1
+        self._successes += result.success
+        self._failures += result.failed
 
     def _note(self) -> str:
         share = f"{100.0 * self._successes / self._finished:.1f} %" if self._finished else "-"
@@ -312,9 +293,9 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
 
 def print_files(directory: Path) -> None:
     """Print which files a run has left in its directory."""
-    from holdfast.recording.run_directory import output_names
+    from holdfast.recording.run_directory import OUTPUT_NAMES
 
-    names = [name for name in output_names() if (directory / name).exists()]
+    names = [name for name in OUTPUT_NAMES if (directory / name).exists()]
     sys.stdout.write(printable(f"\n{directory}/\n  {'  '.join(names)}\n"))
     sys.stdout.flush()
 

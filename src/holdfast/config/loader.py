@@ -59,13 +59,9 @@ class Configuration:
     Attributes
     ----------
     problem : Problem
-        The problem, built from ``model`` and ``state_space_planner``.
+        Built from ``model`` and ``state_space_planner``.
     problem_name : str
         Its registered name, or ``module:Class``.
-    planning : PlanningSettings
-        Settings of the planner.
-    simulator : SimulatorSettings
-        Trials, their length and their seed.
     model, state_space_planner : mapping
         The problem's two sections with all defaults filled in, as plain data.
     path : Path
@@ -76,12 +72,9 @@ class Configuration:
         Arguments of the problem's constructor that have their default because a file cannot hold
         it, so that they are not in ``model``.
     offload : OffloadSettings
-        Which services decide. ``tls`` is an absolute path.
-    recovery : RecoverySettings
-        The local service that decides while no other can.
+        ``tls`` is an absolute path.
     environment : EnvironmentSettings
-        The world that the robot acts on. ``directory`` is where its module was found; None for one
-        that is installed.
+        ``directory`` is where its module was found; None for one that is installed.
     """
 
     problem: Problem = field(compare=False, repr=False)
@@ -100,11 +93,8 @@ class Configuration:
     def to_yaml(self) -> str:
         """Return the resolved configuration as a file that loads to an equal configuration.
 
-        Returns
-        -------
-        str
-            YAML with every key, those of the defaults included. A comment names the arguments of
-            a problem's constructor whose defaults YAML cannot hold.
+        It has every key, those of the defaults included. A comment names the arguments of a
+        problem's constructor whose defaults YAML cannot hold.
         """
         comment = (
             "# The configuration of a holdfast run, resolved: every key, with the value in use.\n"
@@ -167,8 +157,6 @@ def load(
 
     Parameters
     ----------
-    path : str or Path
-        The YAML file.
     problem : str, optional
         Name of the problem, instead of the one that the file gives or implies.
     num_trials, seed : int, optional
@@ -186,15 +174,9 @@ def load(
     """
     path = Path(path)
     document = read(_content(path), str(path))
-    given: dict[str, Any] = {}
-    if num_trials is not None:
-        given["simulator.num_trials"] = num_trials
-    if seed is not None:
-        given["simulator.seed"] = seed
-    given |= overrides or {}
-    return _build(
-        document, path, problem, {_section_and_key(name): value for name, value in given.items()}
-    )
+    of_simulator = {"simulator.num_trials": num_trials, "simulator.seed": seed}
+    given = {name: value for name, value in of_simulator.items() if value is not None}
+    return _build(document, path, problem, {**given, **(overrides or {})})
 
 
 def settings_keys() -> dict[str, str]:
@@ -202,16 +184,10 @@ def settings_keys() -> dict[str, str]:
     keys = {}
     for section, schema in SETTINGS.items():
         defaults = msgspec.to_builtins(schema())
-        fields = msgspec.inspect.type_info(schema).fields  # type: ignore[attr-defined]
-        for item in fields:
+        for item in msgspec.inspect.type_info(schema).fields:  # type: ignore[attr-defined]
             default = json.dumps(defaults[item.encode_name])
             keys[f"{section}.{item.encode_name}"] = f"{described(item.type)}; default {default}"
     return keys
-
-
-def _section_and_key(name: str) -> tuple[str, str]:
-    section, _, key = name.partition(".")
-    return section, key
 
 
 def _content(path: Path) -> bytes:
@@ -234,10 +210,7 @@ def _content(path: Path) -> bytes:
 
 
 def _build(
-    document: Document,
-    path: Path,
-    problem_name: str | None,
-    overrides: Mapping[tuple[str, str], Any],
+    document: Document, path: Path, problem_name: str | None, overrides: Mapping[str, Any]
 ) -> Configuration:
     """Check everything and build the problem."""
     source = Source(document, path, overrides)
@@ -278,15 +251,12 @@ def _build(
             f" ({', '.join(actions)})",
         )
     return Configuration(
-        problem=built.problem,
+        **built._asdict(),
         problem_name=name,
         planning=planning,
         simulator=simulator,
-        model=built.model,
-        state_space_planner=built.state_space_planner,
         path=path,
         problem_directory=directory,
-        unlisted=built.unlisted,
         offload=offload,
         recovery=recovery,
         environment=environment,
@@ -306,20 +276,18 @@ def _checked_offload(
                 " in order of preference",
             )
     deadline_ms, timeout_ms = offload.decision_deadline_ms, offload.decision_timeout_ms
-    if deadline_ms is not None:
-        key = ("offload", "decision_deadline_ms")
-        if recovery.launch == "never":
-            raise source.error(
-                key,
-                f"is {deadline_ms:g}; then the local service decides instead, which is never there"
-                " with recovery.launch never; leave one of the two out",
-            )
-        if deadline_ms >= timeout_ms:
-            raise source.error(
-                key,
-                f"is {deadline_ms:g}; it must be below offload.decision_timeout_ms, after which a"
-                f" decision is given up, which is {timeout_ms:g}",
-            )
+    if deadline_ms is not None and recovery.launch == "never":
+        raise source.error(
+            ("offload", "decision_deadline_ms"),
+            f"is {deadline_ms:g}; then the local service decides instead, which is never there"
+            " with recovery.launch never; leave one of the two out",
+        )
+    if deadline_ms is not None and deadline_ms >= timeout_ms:
+        raise source.error(
+            ("offload", "decision_deadline_ms"),
+            f"is {deadline_ms:g}; it must be below offload.decision_timeout_ms, after which a"
+            f" decision is given up, which is {timeout_ms:g}",
+        )
     if offload.detection_timeout_ms > timeout_ms:
         raise source.error(
             ("offload", "detection_timeout_ms"),

@@ -7,7 +7,9 @@ so that a resolved configuration has all values in use.
 
 from __future__ import annotations
 
+import functools
 import inspect
+import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -40,7 +42,8 @@ def schemas_of(problem_class: type) -> dict[str, type[msgspec.Struct]]:
 def find_problem(source: Source, name: str | None) -> tuple[str, type, Path | None]:
     """Return the problem's name, its class and the directory where its module was looked up.
 
-    The name is given, written in the file, or inferred from its keys.
+    The name is given, written in the file, or inferred from its keys; the directory is None if the
+    problem is installed.
     """
     given = name is not None
     if name is None:
@@ -54,7 +57,15 @@ def find_problem(source: Source, name: str | None) -> tuple[str, type, Path | No
                 f"is {shown(source.problem)}; expected one of {', '.join(registry.names())},"
                 " or module:Class",
             )
-    directory = _problem_directory(source, name, given=given)
+    value, key = source.problem_directory, ("problem_directory",)
+    if value is not None and not isinstance(value, str):
+        raise source.error(key, f"is {shown(value)}; expected the path of a directory")
+    module, colon, _ = name.partition(":")
+    if value is not None and not colon and not given:
+        raise source.error(
+            key, f"is {shown(value)}; only a problem that is named module:Class has one"
+        )
+    directory = module_directory(source, key, value, module) if colon else None
     try:
         problem_class = registry.problem_class(
             name, search_directory=directory or source.path.absolute().parent
@@ -64,22 +75,6 @@ def find_problem(source: Source, name: str | None) -> tuple[str, type, Path | No
             raise
         raise UnknownProblemError(f"{source.place(('problem',))}: {error}") from error
     return name, problem_class, directory
-
-
-def _problem_directory(source: Source, name: str, *, given: bool) -> Path | None:
-    """Return the directory that holds the problem's module; None if it is installed."""
-    value = source.problem_directory
-    key = ("problem_directory",)
-    if value is not None and not isinstance(value, str):
-        raise source.error(key, f"is {shown(value)}; expected the path of a directory")
-    module, colon, _ = name.partition(":")
-    if not colon:
-        if value is not None and not given:
-            raise source.error(
-                key, f"is {shown(value)}; only a problem that is named module:Class has one"
-            )
-        return None
-    return module_directory(source, key, value, module)
 
 
 def _infer_problem(source: Source) -> str:
@@ -118,9 +113,6 @@ def build_problem(
     return build_from(source, name, problem_class).problem
 
 
-_NOT_PLAIN = object()
-
-
 class BuiltProblem(NamedTuple):
     """A problem and what it was built from.
 
@@ -143,11 +135,9 @@ def build_from(source: Source, name: str, problem_class: type) -> BuiltProblem:
     resolved: dict[str, dict[str, Any]] = {}
     unlisted: tuple[str, ...] = ()
     for section in ("model", "state_space_planner"):
-        if section in source.schemas:
-            settings = source.section(section, source.schemas[section])
-            resolved[section] = msgspec.to_builtins(settings)
-        else:
-            resolved[section] = source.sections[section]
+        resolved[section] = source.sections[section]
+        if (schema := source.schemas.get(section)) is not None:
+            resolved[section] = msgspec.to_builtins(source.section(section, schema))
     arguments = resolved
     if "model" not in source.schemas and "state_space_planner" not in source.schemas:
         defaults = _keyword_arguments(source, problem_class)
@@ -155,25 +145,21 @@ def build_from(source: Source, name: str, problem_class: type) -> BuiltProblem:
             section: {key: _in_the_form_of(defaults.get(key), value) for key, value in keys.items()}
             for section, keys in resolved.items()
         }
-        left = {
-            key: _as_plain(default)
-            for key, default in defaults.items()
-            if key not in resolved["model"] and key not in resolved["state_space_planner"]
+        given = {*resolved["model"], *resolved["state_space_planner"]}
+        left = {key: default for key, default in defaults.items() if key not in given}
+        unlisted = tuple(key for key, default in left.items() if not _is_plain(default))
+        resolved["model"] |= {
+            key: json.loads(json.dumps(default))  # which makes lists of tuples
+            for key, default in left.items()
+            if key not in unlisted
         }
-        unlisted = tuple(key for key, plain in left.items() if plain is _NOT_PLAIN)
-        resolved["model"].update(
-            {key: plain for key, plain in left.items() if plain is not _NOT_PLAIN}
-        )
-    model, planner = resolved["model"], resolved["state_space_planner"]
     # A class that only has the members of the protocol is built as ProblemBase builds.
-    build = getattr(problem_class, "from_settings", None)
+    build = getattr(problem_class, "from_settings", None) or functools.partial(
+        ProblemBase.from_settings.__func__,  # type: ignore[attr-defined]
+        problem_class,
+    )
     try:
-        if build is None:
-            problem = ProblemBase.from_settings.__func__(  # type: ignore[attr-defined]
-                problem_class, arguments["model"], arguments["state_space_planner"]
-            )
-        else:
-            problem = build(arguments["model"], arguments["state_space_planner"])
+        problem = build(arguments["model"], arguments["state_space_planner"])
         missing = [member for member in _needed_members(problem) if not hasattr(problem, member)]
     except KeyboardInterrupt:
         raise
@@ -186,7 +172,7 @@ def build_from(source: Source, name: str, problem_class: type) -> BuiltProblem:
         raise ConfigurationError(
             f"{source.path}: {name} is no problem: it lacks {', '.join(missing)}"
         )
-    return BuiltProblem(problem, model, planner, unlisted)
+    return BuiltProblem(problem, resolved["model"], resolved["state_space_planner"], unlisted)
 
 
 def _keyword_arguments(source: Source, problem_class: type) -> dict[str, Any]:
@@ -213,25 +199,18 @@ def _keyword_arguments(source: Source, problem_class: type) -> dict[str, Any]:
     }
 
 
-def _as_plain(value: Any) -> Any:
-    """Return what a file holds to mean ``value``; ``_NOT_PLAIN`` if there is no such thing."""
+def _is_plain(value: Any) -> bool:
+    """Return whether a file can hold a value, a tuple as a list."""
     if isinstance(value, list | tuple):
-        items = [_as_plain(item) for item in value]
-        return _NOT_PLAIN if any(item is _NOT_PLAIN for item in items) else items
+        return all(map(_is_plain, value))
     if isinstance(value, dict):
-        values = {key: _as_plain(item) for key, item in value.items()}
-        plain = all(isinstance(key, str) for key in values) and not any(
-            item is _NOT_PLAIN for item in values.values()
-        )
-        return values if plain else _NOT_PLAIN
+        return all(isinstance(key, str) and _is_plain(item) for key, item in value.items())
     # Exactly these types: a subclass (an enumeration, a NumPy number) would come back as another.
-    if value is None or type(value) in (bool, str):
-        return value
     if type(value) is int:
-        return value if -(2**63) <= value < 2**63 else _NOT_PLAIN
+        return -(2**63) <= value < 2**63
     if type(value) is float:
-        return value if abs(value) < float("inf") else _NOT_PLAIN
-    return _NOT_PLAIN
+        return abs(value) < float("inf")
+    return value is None or type(value) in (bool, str)
 
 
 def _in_the_form_of(default: Any, value: Any) -> Any:

@@ -2,9 +2,10 @@
 
 Each class is one section of the configuration file and has the key names of the thesis's YAML, so
 that its files load unchanged; the fields that the thesis does not have come after its own and have
-defaults. Bounds stand beside the fields, once. :func:`holdfast.config.loader.load` reports a breach
-of them with file, line, key and value; for settings that are made in Python :func:`check_settings`
-does, without the file, at the start of every trial.
+defaults. Bounds stand beside the fields, once, and docs/settings.md says of each key what it does.
+:func:`holdfast.config.loader.load` reports a breach of them with file, line, key and value; for
+settings that are made in Python :func:`check_settings` does, without the file, at the start of
+every trial.
 """
 
 from __future__ import annotations
@@ -28,7 +29,6 @@ __all__ = [
     "check_settings",
     "estimator_of",
     "path_steps",
-    "unfit_for_path_entropy",
     "unfit_for_the_method",
 ]
 
@@ -93,16 +93,13 @@ class ParticleFilterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=
     Attributes
     ----------
     num_particles : int
-        Number of particles, at least 1. The more the fewer steps a task takes; no other
-        change of the defaults was found to help over several problems (``docs/results.md``). The
-        thesis has 100.
+        The more the fewer steps a task takes; no other change of the defaults was found to help
+        over several problems (docs/results.md).
     resampling_threshold : float
-        Resample after an observation when the effective sample size is at most this fraction of
-        the number of particles. 1 (the default) resamples after every observation.
+        Resample when the effective sample size is at most this fraction of the particles.
     estimate : {"mean", "most_likely"}
-        The state for which the policy is asked: the mean of the belief, or the particle of the
-        greatest weight. Of equal weights, as all are after resampling, it is the first particle:
-        no more than a draw from the belief.
+        The state for which the policy is asked. Of equal weights, as all are after resampling, the
+        first particle is the most likely: no more than a draw from the belief.
     """
 
     num_particles: Annotated[int, msgspec.Meta(ge=1, le=MAX_PARTICLES)] = 300
@@ -118,13 +115,11 @@ class ActiveSensingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=T
     horizon : int
         Number H of entropies added up: now, and after each of H - 1 predicted steps.
     discount : float
-        Weight of the entropy, or for ``expected_return`` of the reward, h steps ahead is
-        ``discount**h``.
+        Weight ``discount**h`` of the entropy, or for ``expected_return`` the reward, h steps ahead.
     num_observation_samples : int
         Number M of hypothetical observations of each sensing action.
     num_nearest_neighbors : int
-        The k of ``nearest_neighbor`` and ``prior_neighbors``, below ``num_particles``; without
-        effect for the other estimators.
+        The k of the estimators that count neighbours.
     num_cores : int
         Threads of a decision; 0 means all cores (or what ``OMP_NUM_THREADS`` says). Changes time
         only, never a result. Moving 4,096 particles or more always uses all cores.
@@ -143,54 +138,42 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     Attributes
     ----------
     method : Method
-        What is minimised: an entropy, or the trace of the covariance of the actions; or what is
-        maximised: the expected return less the price of sensing. ``random`` and ``fixed`` use
-        no belief. ``path_entropy`` adds up the entropies of the actions at several steps of the
-        way that the policy leads each particle without noise.
+        ``path_entropy`` adds up the entropies of the actions at several steps of the way that the
+        policy leads each particle without noise.
     sensing_action : int
-        Index of the sensing action that ``fixed`` chooses.
+        What ``fixed`` chooses.
     estimator : Estimator or None
-        How the entropies are estimated. ``prior_neighbors`` has less bias where a sharp observation
-        leaves few particles: 300 choose about as well as 1,000 with ``nearest_neighbor``; at most
-        4,096. A mixture takes few particles for certainty: use it with so many that they lie closer
-        than its noise (docs/results.md). Distances between neighbours depend on the units of the
-        coordinates, unless ``resolution`` has a number for each; with the motion noise as its own,
-        the mixture does not. None: ``nearest_neighbor``, but ``prior_neighbors`` for
-        ``path_entropy`` with at most 500 particles.
+        ``prior_neighbors`` has less bias where a sharp observation leaves few particles: 300 choose
+        about as well as 1,000 with ``nearest_neighbor``. A mixture takes few particles for
+        certainty: use it with so many that they lie closer than its noise (docs/results.md).
+        None: see :func:`estimator_of`.
     actions : {"commanded", "executed"}
-        Whether ``action_entropy``, ``path_entropy`` and ``action_covariance`` take the policy's
-        actions before or after the limits of a step.
+        The policy's actions before or after the limits of a step.
     resolution : float, tuple of float or None
         Distance below which two actions (or, for ``state_entropy``, states) do not differ in
-        practice, in their unit, from 1e-150 to 1e150; for a mixture, the standard deviation of the
-        noise that blurs them.
-        With as many numbers as coordinates each has its own, in its own unit; then the choice does
-        not depend on units, that of ``action_covariance`` included. None takes the problem's
-        resolution, and for a mixture its motion noise, unless that has none for a coordinate,
-        there are more coordinates of a state than of an action, or the problem has a resolution of
-        states.
+        practice; for a mixture, the standard deviation of the noise that blurs them. One number for
+        each coordinate makes the choice independent of units. None takes the problem's, and for a
+        mixture its motion noise, unless that has none for a coordinate, there are more coordinates
+        of a state than of an action, or the problem has a resolution of states.
     path_offsets : tuple of int
-        At which steps of the path ``path_entropy`` takes the actions: strictly increasing, from 0
-        (the next action) to 10,000, 1 to 64 of them. The default takes the next action and the one
-        after the next sensing step.
+        Where on the path ``path_entropy`` takes the actions, in increasing order: 0 is the next.
     path_unit : {"sensing_intervals", "steps"}
-        What the offsets count. An interval is ``simulator.sensing_intervals + 1`` steps; the
-        offsets in steps are at most 10,000 as well.
+        Of the offsets. An interval is ``simulator.sensing_intervals + 1`` steps.
     path_discount : float
-        The entropy at offset h counts ``path_discount**h`` times, h in ``path_unit``; above 0,
-        at most 1. Before an action h intervals away, the robot senses h more times.
+        The entropy at offset h counts ``path_discount**h`` times, h in ``path_unit``: before an
+        action h intervals away, the robot senses h more times.
     rollout_reward : {"problem", "steps"}
-        Whose sum is the return of ``expected_return``: the problem's rewards, or -1 for each step
-        up to the goal. A problem without rewards has the steps in any case.
+        Whose sum is the return: the problem's rewards, or -1 for each step up to the goal, as for
+        any problem without rewards.
     rollout_steps : int
-        Steps after which a rollout of ``expected_return`` that has not reached the goal ends.
+        Steps after which a rollout that has not reached the goal ends.
     rollout_looks : int
-        In a rollout of ``expected_return`` the state gets known at each of so many of the next
-        sensing steps with equal chances, 1 over this number, and at the last one for sure.
+        In a rollout the state gets known at each of so many of the next sensing steps with equal
+        chances, 1 over this number, and at the last one for sure.
     max_observation_samples : int
-        Bound on the hypothetical observations of a sensing action with ``expected_return``: it
-        begins with ``num_observation_samples``, which must not be more, and doubles them for those
-        sensing actions whose return differs from the best one's by less than two standard errors.
+        ``expected_return`` begins with ``num_observation_samples`` and doubles them up to this for
+        those sensing actions whose return differs from the best one's by less than two standard
+        errors.
     """
 
     method: Method = "path_entropy"
@@ -215,8 +198,6 @@ class SimulatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
 
     Attributes
     ----------
-    num_trials : int
-        Number of trials.
     max_steps : int
         Steps after which a trial has failed.
     sensing_intervals : int
@@ -224,8 +205,6 @@ class SimulatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
         ``t % (sensing_intervals + 1) == 0``. (The thesis's spelling of the key.)
     verbosity : int
         Accepted because the thesis's files have it; without effect.
-    seed : int
-        Seed of every random stream.
     """
 
     num_trials: Annotated[int, msgspec.Meta(ge=1, le=10_000_000)] = 10
@@ -243,37 +222,33 @@ class OffloadSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     Attributes
     ----------
     services : tuple of str
-        Endpoints of the services in order of preference (``tcp/10.0.0.7:7447``);
-        at most 16, each once. None: the planner runs in the robot's own process.
+        Endpoints in order of preference. None: the planner runs in the robot's own process.
     detection_timeout_ms : float
         A service from which a decision is awaited and that shows no sign of progress for this long
         counts as dead. (A killed one is found sooner, by its broken link.)
     startup_timeout_ms : float
-        At the start of a run, how long to wait for a service that has never been seen yet.
+        How long a run waits at its start for a service that has never been seen yet.
     lease_ms : float
         How long this robot may be silent before services give up the link to it. It is silent while
         its own code computes, and a service has no hurry: of a robot that dies it hears by the end
-        of the link. How long a service may be silent is its own ``holdfast serve --lease-ms``; for
-        the local service, which the robot starts, it is this one.
+        of the link. A service's own lease is ``holdfast serve --lease-ms``; for the local service,
+        which the robot starts, it is this one.
     decision_deadline_ms : float or None
         A decision that is not there this long after it was needed is asked of the local service
         as well, if that is running; the first answer wins.
     max_hedged_share : float
-        Bound on the decisions that are asked of two services because of the deadline, as a share of
-        all.
+        Bound on such decisions, as a share of all.
     decision_timeout_ms : float
-        A decision that takes longer than this is given up even if its service shows progress.
+        A decision that takes longer is given up even if its service shows progress.
     verify_share : float
         Share of the services' answers that this robot computes again with its own planner while it
-        moves, from 0 to 1. A service whose answer differs is not asked again in the run. Answers
-        that differ from each other or break the problem's limits are always computed again.
+        moves. A service whose answer differs is not asked again in the run. Answers that differ
+        from each other or break the problem's limits are always computed again.
     tls : str or None
-        Directory with this robot's credentials, as ``holdfast keys`` makes it. In a file it may be
-        relative to that file.
+        Directory with this robot's credentials; in a file it may be relative to that file.
     name : str or None
-        The robot's name in the logs of services: at most 100 letters, digits, ``_``, ``-`` and
-        ``.``; with a certificate it must be the one in it. None takes the certificate's or, without
-        one, this machine's.
+        The robot's name in the logs of services; with a certificate it must be the one in it. None
+        takes the certificate's or, without one, this machine's.
     """
 
     services: Annotated[tuple[Text, ...], msgspec.Meta(max_length=MAX_SERVICES)] = ()
@@ -297,10 +272,10 @@ class RecoverySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         When it is started: once the services named are found dead, with the run, or never; then
         the robot holds still until one of them answers.
     launch_timeout_ms : float
-        A local service that has not been seen this long after its launch is ended and launched
-        again. Doubles with each such launch in a row, up to 8 times: a busy machine is only slow.
+        A local service that has not been seen this long after its launch is launched again. Doubles
+        with each such launch in a row, up to 8 times: a busy machine is only slow.
     relaunch_delay_ms : float
-        Pause after a failed launch; it doubles with each failure in a row, up to 32 times.
+        Pause after a failed launch; doubles with each failure in a row, up to 32 times.
     journal_survives : {"process_crash", "power_cut"}
         What each journalled step outlives: the end of the process (microseconds), or of the whole
         machine (the time that a disk takes to write).
@@ -320,16 +295,15 @@ class EnvironmentSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
     Attributes
     ----------
     object : str or None
-        Class of the user's environment, ``module:Class`` or the name of an entry point of the
-        group ``holdfast.environments``. None: the world is simulated from the problem.
+        ``module:Class``, or an entry point of the group ``holdfast.environments``. None: the world
+        is simulated from the problem.
     directory : str or None
-        Directory of the module of ``module:Class``. None: the file's own or the current one, else
-        the module is installed. In a file it may be relative to that file.
+        Directory of the module; in a file it may be relative to that file. None: the file's own or
+        the current one, else the module is installed.
     arguments : dict
         Plain data, passed to the class as keyword arguments.
     timeout_ms : float
-        Sensing, performing or any other call of the environment that takes longer than this has
-        failed.
+        Any call of the environment that takes longer has failed.
     """
 
     object: Text | None = None
@@ -370,12 +344,34 @@ def path_steps(settings: PlanningSettings) -> tuple[int, ...]:
     return tuple(offset * interval for offset in selector.path_offsets)
 
 
-def unfit_for_path_entropy(settings: PlanningSettings) -> tuple[tuple[str, str], str] | None:
-    """Return which key the method ``path_entropy`` cannot use as it is, and why; None if all fit.
+def unfit_for_the_method(settings: PlanningSettings) -> tuple[tuple[str, str], str] | None:
+    """Return which key ``selector.method`` cannot use as it is, and why; None if all fit.
 
     For what the bounds of a single key do not say.
     """
-    if settings.selector.method != "path_entropy":
+    method, particles = settings.selector.method, settings.particle_filter.num_particles
+    estimator = estimator_of(settings.selector, particles)
+    if method in ENTROPY_METHODS and estimator in NEIGHBOR_ESTIMATORS:
+        neighbors = settings.active_sensing.num_nearest_neighbors
+        if neighbors >= particles:
+            return ("active_sensing", "num_nearest_neighbors"), (
+                f"is {neighbors}; the {estimator} estimator needs it below "
+                f"particle_filter.num_particles, which is {particles}"
+            )
+        if estimator == "prior_neighbors" and particles > MAX_PRIOR_NEIGHBORS_POINTS:
+            return ("particle_filter", "num_particles"), (
+                f"is {particles}; the prior_neighbors estimator allows {MAX_PRIOR_NEIGHBORS_POINTS}"
+            )
+    if method == "expected_return":
+        first = settings.active_sensing.num_observation_samples
+        most = settings.selector.max_observation_samples
+        if most >= first:
+            return None
+        return ("selector", "max_observation_samples"), (
+            f"is {most}; with selector.method expected_return it must be at least "
+            f"active_sensing.num_observation_samples, which is {first}"
+        )
+    if method != "path_entropy":
         return None
     offsets = settings.selector.path_offsets
     key = ("selector", "path_offsets")
@@ -395,33 +391,6 @@ def unfit_for_path_entropy(settings: PlanningSettings) -> tuple[tuple[str, str],
             "selector.path_offsets are how far that looks ahead"
         )
     return None
-
-
-def unfit_for_the_method(settings: PlanningSettings) -> tuple[tuple[str, str], str] | None:
-    """Return which key ``selector.method`` cannot use as it is, and why; None if all fit."""
-    method, particles = settings.selector.method, settings.particle_filter.num_particles
-    estimator = estimator_of(settings.selector, particles)
-    if method in ENTROPY_METHODS and estimator in NEIGHBOR_ESTIMATORS:
-        neighbors = settings.active_sensing.num_nearest_neighbors
-        if neighbors >= particles:
-            return ("active_sensing", "num_nearest_neighbors"), (
-                f"is {neighbors}; the {estimator} estimator needs it below "
-                f"particle_filter.num_particles, which is {particles}"
-            )
-        if estimator == "prior_neighbors" and particles > MAX_PRIOR_NEIGHBORS_POINTS:
-            return ("particle_filter", "num_particles"), (
-                f"is {particles}; the prior_neighbors estimator allows {MAX_PRIOR_NEIGHBORS_POINTS}"
-            )
-    if method != "expected_return":
-        return unfit_for_path_entropy(settings)
-    first = settings.active_sensing.num_observation_samples
-    most = settings.selector.max_observation_samples
-    if most >= first:
-        return None
-    return ("selector", "max_observation_samples"), (
-        f"is {most}; with selector.method expected_return it must be at least "
-        f"active_sensing.num_observation_samples, which is {first}"
-    )
 
 
 def check_settings(settings: PlanningSettings) -> None:

@@ -71,15 +71,17 @@ class Source:
     ----------
     schemas : dict
         The type of each section that has one; a problem's own are added to it.
+    problem, problem_directory : object
+        What stands on top.
+    sections : dict
+        The data of each section, that of ``overrides`` (``section.key``) included.
     """
 
-    def __init__(
-        self, document: Document, path: Path, overrides: Mapping[tuple[str, str], Any]
-    ) -> None:
+    def __init__(self, document: Document, path: Path, overrides: Mapping[str, Any]) -> None:
         self.path = path
         self.schemas = dict(SETTINGS)
         self._document = document
-        self._overrides = frozenset(overrides)
+        self._overrides: set[KeyPath] = set()
         data = document.data
         if data is None:
             raise ConfigurationError(
@@ -102,10 +104,12 @@ class Source:
             if section is not None and not isinstance(section, Mapping):
                 raise self.error((name,), f"is {shown(section)}; expected a mapping of keys")
             self.sections[name] = dict(section or {})
-        for (name, key), value in overrides.items():
+        for given, value in overrides.items():
+            name, _, key = given.partition(".")
             if name not in SECTIONS:
                 raise self.unknown((name,), SECTIONS)
             self.sections[name][key] = value
+            self._overrides.add((name, key))
 
     def place(self, path: KeyPath) -> str:
         """Return the file, and the line of the value at ``path`` where there is one."""

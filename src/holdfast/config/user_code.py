@@ -12,12 +12,13 @@ KeyboardInterrupt, which is Ctrl-C, and passes on what has no account here.
 from __future__ import annotations
 
 import difflib
+import functools
 import importlib
 import re
 import sys
 import sysconfig
 import traceback
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -67,12 +68,9 @@ def _place(name: str) -> Path:
 def account_of_user_error(error: BaseException, name: str) -> str | None:
     """Say what the user's code raised and where, without the frames of anybody else.
 
-    Returns
-    -------
-    str or None
-        The type and the message, then file, line and source of each frame of the user's, all of
-        bounded length; None if the user's code had no part in it, or only called what ends a
-        command in order (``print``, once the standard output has no reader).
+    It has the type and the message, then file, line and source of each frame of the user's, all of
+    bounded length. It is None if the user's code had no part in it, or only called what ends a
+    command in order (``print``, once the standard output has no reader).
     """
     ours = inner = False
     frames = []
@@ -113,16 +111,11 @@ def in_words(error: BaseException) -> str:
 
 
 def _frames_listed(frames: list[traceback.FrameSummary]) -> str:
-    # A recursion has a thousand of them; a few from its beginning and its end are enough.
-    if len(frames) > 2 * _MAX_FRAMES:
-        left_out = len(frames) - 2 * _MAX_FRAMES
-        listed = [
-            *traceback.format_list(frames[:_MAX_FRAMES]),
-            f"  ... {left_out} more\n",
-            *traceback.format_list(frames[-_MAX_FRAMES:]),
-        ]
-    else:
-        listed = traceback.format_list(frames)
+    listed = traceback.format_list(frames)
+    left_out = len(frames) - 2 * _MAX_FRAMES
+    if left_out > 0:
+        # A recursion has a thousand of them; a few from its beginning and its end are enough.
+        listed[_MAX_FRAMES:-_MAX_FRAMES] = [f"  ... {left_out} more\n"]
     return "".join(listed).rstrip()
 
 
@@ -154,18 +147,14 @@ def find_class(
     Parameters
     ----------
     name : str
-        Of an entry point, or ``module:Class``.
+        Of an entry point of the ``group``, or ``module:Class``.
     what : str
         What it is for, usually the key of the configuration; messages begin with it.
-    group : str
-        Of the entry points.
-    built_in : iterable of str
-        Further names that messages suggest.
     search_directory : Path or None
         Directory in which ``module`` is looked for first. It goes on the import path and stays
         there, as a script's directory does, for the module may import its neighbours later.
-    error_type : type
-        What is raised.
+    built_in : iterable of str
+        Further names that messages suggest.
 
     Raises
     ------
@@ -173,30 +162,59 @@ def find_class(
         If the name is not registered, or the module or its class cannot be imported, whatever its
         import raises.
     """
-    if ":" in name:
-        return _imported_class(name, what, search_directory, error_type)
+    try:
+        if ":" in name:
+            found = _imported(name, search_directory)
+        else:
+            found = _registered(name, group, built_in, search_directory)
+    except ConfigurationError as error:
+        raise error_type(f"{what}: {error}") from error.__cause__
+    if not isinstance(found, type):
+        raise error_type(f"{what}: {name} is not a class but {type(found).__name__}")
+    return found
+
+
+def _registered(
+    name: str, group: str, built_in: Iterable[str], search_directory: Path | None
+) -> object:
     import importlib.metadata
 
     for entry_point in importlib.metadata.entry_points(group=group, name=name):
-        try:
-            loaded = entry_point.load()
-        except (ImportError, AttributeError) as error:
-            raise error_type(
-                f"{what}: {name} is registered as {entry_point.value}, which cannot be imported: "
-                f"{error}"
-            ) from error
-        except KeyboardInterrupt:
-            raise
-        except BaseException as error:
-            raise _not_imported(name, what, entry_point.value, error, error_type) from error
-        return _as_class(name, what, loaded, error_type)
+        value = entry_point.value
+        refused = f"{name} is registered as {value}, which cannot be imported"
+        return _loaded(entry_point.load, name, value, refused, (ImportError, AttributeError))
     known = sorted({*built_in, *registered_names(group)})
     likely = _classes_beside(name, search_directory) or difflib.get_close_matches(name, known, n=3)
-    suggestion = f"; did you mean {' or '.join(likely)}?" if likely else ""
-    raise error_type(
-        f"{what}: {name} is not a registered name{suggestion} "
+    raise ConfigurationError(
+        f"{name} is not a registered name{_did_you_mean(likely)} "
         f"(registered: {', '.join(known) or 'none'}; a class of your own is named module:Class)"
     )
+
+
+def _did_you_mean(likely: list[str]) -> str:
+    return f"; did you mean {' or '.join(likely)}?" if likely else ""
+
+
+def _loaded(
+    load: Callable[[], object],
+    name: str,
+    module: str,
+    refused: str,
+    refusals: tuple[type[Exception], ...],
+) -> object:
+    """Import something of the user's; ``refused`` introduces the errors that need no frames."""
+    try:
+        return load()
+    except refusals as error:
+        raise ConfigurationError(f"{refused}: {error}") from error
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        # The module is there, but does not come through its own import.
+        account = account_of_user_error(error, name)
+        raise ConfigurationError(
+            account or f"{name}: the module {module} raised {in_words(error)}"
+        ) from error
 
 
 def _classes_beside(name: str, directory: Path | None) -> list[str]:
@@ -225,59 +243,32 @@ def _classes_beside(name: str, directory: Path | None) -> list[str]:
     return []
 
 
-def _imported_class(
-    name: str, what: str, search_directory: Path | None, error_type: type[ConfigurationError]
-) -> type[Any]:
+def _imported(name: str, search_directory: Path | None) -> object:
     module_name, _, class_name = name.partition(":")
     if not all(part.isidentifier() for part in [*module_name.split("."), class_name]):
-        raise error_type(f"{what}: {name} is neither a registered name nor module:Class")
+        raise ConfigurationError(f"{name} is neither a registered name nor module:Class")
+    where = ""
     if search_directory is not None:
         if not search_directory.is_dir():
-            raise error_type(
-                f"{what}: {name} is looked for in {search_directory}, which is no directory"
+            raise ConfigurationError(
+                f"{name} is looked for in {search_directory}, which is no directory"
             )
+        where = f" (looked in {search_directory} first)"
         directory = str(search_directory.resolve())
         if directory not in sys.path:
             sys.path.insert(0, directory)
             importlib.invalidate_caches()
-    try:
-        module = importlib.import_module(module_name)
-    except ImportError as error:
-        where = "" if search_directory is None else f" (looked in {search_directory} first)"
-        raise error_type(
-            f"{what}: {name}: the module {module_name} cannot be imported{where}: {error}"
-        ) from error
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:
-        raise _not_imported(name, what, module_name, error, error_type) from error
+    module = _loaded(
+        functools.partial(importlib.import_module, module_name),
+        name,
+        module_name,
+        f"{name}: the module {module_name} cannot be imported{where}",
+        (ImportError,),
+    )
     if not hasattr(module, class_name):
         classes = [key for key, value in vars(module).items() if isinstance(value, type)]
         close = difflib.get_close_matches(class_name, classes, n=3)
-        suggestion = f"; did you mean {' or '.join(close)}?" if close else ""
-        raise error_type(
-            f"{what}: {name}: the module {module_name} has no {class_name}{suggestion}"
+        raise ConfigurationError(
+            f"{name}: the module {module_name} has no {class_name}{_did_you_mean(close)}"
         )
-    return _as_class(name, what, getattr(module, class_name), error_type)
-
-
-def _not_imported(
-    name: str,
-    what: str,
-    module_name: str,
-    error: BaseException,
-    error_type: type[ConfigurationError],
-) -> ConfigurationError:
-    """Return the error about a module that is there, but does not come through its own import."""
-    account = account_of_user_error(error, name)
-    if account is None:
-        account = f"{name}: the module {module_name} raised {in_words(error)}"
-    return error_type(f"{what}: {account}")
-
-
-def _as_class(
-    name: str, what: str, found: object, error_type: type[ConfigurationError]
-) -> type[Any]:
-    if not isinstance(found, type):
-        raise error_type(f"{what}: {name} is not a class but {type(found).__name__}")
-    return found
+    return getattr(module, class_name)

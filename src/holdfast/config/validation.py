@@ -35,18 +35,10 @@ KeyPath = tuple[str | int, ...]
 
 
 class Mismatch(NamedTuple):
-    """A value that does not fit its type.
+    """A value that does not fit its type: what is ``expected`` instead, in words.
 
-    Attributes
-    ----------
-    path : KeyPath
-        Where it is.
-    unknown : bool
-        Whether it has no type, because ``path`` ends with a key that is not one of ``allowed``.
-    missing : bool
-        Whether a key is needed here that is not there.
-    expected : str
-        What is allowed instead, in words.
+    If it is ``unknown``, its path ends with a key that is not one of ``allowed``; if it is
+    ``missing``, with a key that is needed and not there.
     """
 
     path: KeyPath

@@ -109,11 +109,9 @@ class _Loader(yaml.SafeLoader):
         # run out of stack, or of memory, before there is a tree.
         self._num_nodes += 1
         if self._depth >= MAX_DEPTH or self._num_nodes > MAX_VALUES:
-            what = (
-                f"more than {MAX_DEPTH} levels of lists and mappings"
-                if self._depth >= MAX_DEPTH
-                else f"more than {MAX_VALUES} keys and values"
-            )
+            what = f"more than {MAX_VALUES} keys and values"
+            if self._depth >= MAX_DEPTH:
+                what = f"more than {MAX_DEPTH} levels of lists and mappings"
             event = cast("Any", self).peek_event()  # PyYAML's stubs leave it without a type.
             raise _RefusedError(f"{what}; a configuration has far fewer", event.start_mark)
         self._depth += 1
@@ -204,11 +202,8 @@ class _Builder:
         mapping: dict[str, Any] = {}
         for key_node, value_node in node.value:
             if not isinstance(key_node, yaml.ScalarNode) or key_node.tag != _STR:
-                what = (
-                    f"{key_node.value:.80}"
-                    if isinstance(key_node, yaml.ScalarNode)
-                    else "a list or mapping"
-                )
+                is_scalar = isinstance(key_node, yaml.ScalarNode)
+                what = f"{key_node.value:.80}" if is_scalar else "a list or mapping"
                 raise _RefusedError(
                     f"{what} stands as a key, which only text may; if it is meant, quote it",
                     key_node.start_mark,
@@ -269,14 +264,7 @@ def _scalar(node: yaml.ScalarNode) -> Any:
 
 
 def read(content: bytes, name: str) -> Document:
-    """Read one YAML document.
-
-    Parameters
-    ----------
-    content : bytes
-        The document, in UTF-8.
-    name : str
-        What to call it in messages, usually its path.
+    """Read one YAML document in UTF-8; messages call it by its ``name``, usually its path.
 
     Raises
     ------
@@ -321,15 +309,6 @@ def _place(mark: yaml.Mark | None) -> str:
 def write(data: Mapping[str, Any]) -> str:
     """Write plain data as YAML that :func:`read` gives back unchanged.
 
-    Returns
-    -------
-    str
-        The document, with small lists and mappings within the sections on one line.
+    Small lists and mappings within the sections are on one line.
     """
-    return yaml.dump(
-        data,
-        Dumper=_Dumper,
-        sort_keys=False,
-        allow_unicode=True,
-        width=100,
-    )
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)

@@ -9,23 +9,22 @@ trial that one run has not finished is a difference as well.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Mapping
 from contextlib import ExitStack
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 
-from holdfast.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
+from holdfast.outcome import Decisions, SensingDecision, TaskDecision
 from holdfast.protocol.records import ActingRecord
-from holdfast.recording.journal_file import find_journal
-from holdfast.recording.journal_reader import JournalReader
+from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.recording.run_directory import configuration_difference
 
-__all__ = ["Comparison", "Difference", "compare_runs"]
+__all__ = ["Comparison", "Difference", "compare_runs", "difference_of_decisions"]
 
-_ABSENT = "not given"
 _ENDING = struct.Struct("<cQ32s")
 
 
@@ -76,24 +75,21 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
 
     def describe(self) -> str:
         """Return the finding in words: one line if the runs are identical, else three."""
-        difference = self.difference
-        if difference is None:
+        found = self.difference
+        if found is None:
             return (
                 f"identical: {_counted(self.trials, 'trial')}, "
                 f"{_counted(self.sensing_actions, 'sensing action')}, "
                 f"{_counted(self.task_actions, 'task action')} and every state digest"
             )
-        where = ""
-        if difference.trial is not None:
-            where += f"trial {difference.trial}, "
-        if difference.step is not None:
-            where += f"step {difference.step}, "
-        names = (self.first_run, self.second_run)
-        width = max(map(len, names)) + 1
-        lines = [f"different: {where}{difference.what}"]
-        for name, value in zip(names, (difference.first, difference.second), strict=True):
-            lines.append(f"  {f'{name}:':{width}} {value}")
-        return "\n".join(lines)
+        trial = "" if found.trial is None else f"trial {found.trial}, "
+        step = "" if found.step is None else f"step {found.step}, "
+        width = max(len(self.first_run), len(self.second_run)) + 1
+        return (
+            f"different: {trial}{step}{found.what}\n"
+            f"  {f'{self.first_run}:':{width}} {found.first}\n"
+            f"  {f'{self.second_run}:':{width}} {found.second}"
+        )
 
     def to_json(self) -> str:
         """Return the finding as indented JSON."""
@@ -114,77 +110,30 @@ def compare_runs(first: Path, second: Path) -> Comparison:
         If one is no run, is damaged, or is in use.
     """
     with ExitStack() as stack:
-        journals = [
-            stack.enter_context(JournalReader.read(find_journal(run, "compare")))
-            for run in (first, second)
-        ]
-        found = _Found()
-        _compare(journals[0], journals[1], found)
-        for journal in journals:
-            journal.require_unchanged()
+        one, other = (
+            stack.enter_context(JournalReader.read_run(run, "compare")) for run in (first, second)
+        )
+        notes: list[str] = []
+        difference = _difference_of_runs(one.meta(), other.meta(), notes)
+        same: Counter[str] = Counter()
+        if difference is None:
+            difference = _compare_trials(one, other, same, notes)
+        one.require_unchanged()
+        other.require_unchanged()
     return Comparison(
-        identical=found.difference is None,
+        identical=difference is None,
         first_run=str(first),
         second_run=str(second),
-        trials=found.trials,
-        sensing_actions=found.sensing_actions,
-        task_actions=found.task_actions,
-        difference=found.difference,
-        notes=tuple(found.notes),
+        trials=same["trials"],
+        sensing_actions=same["sensing_actions"],
+        task_actions=same["task_actions"],
+        difference=difference,
+        notes=tuple(notes),
     )
 
 
-class _Found:
-    """What has been found so far."""
-
-    def __init__(self) -> None:
-        self.difference: Difference | None = None
-        self.notes: list[str] = []
-        self.trials = 0
-        self.sensing_actions = 0
-        self.task_actions = 0
-
-
-class _Trial(NamedTuple):
-    """A trial of one run; without a result it is not finished."""
-
-    number: int
-    result: TrialResult | None
-    state: str
-
-
-def _compare(first: JournalReader, second: JournalReader, found: _Found) -> None:
-    found.difference = _difference_of_runs(first.meta(), second.meta(), found)
-    if found.difference is not None:
-        return
-    trials = (_trials(first), _trials(second))
-    counts = (len(first.finished()), len(second.finished()))
-    here, there = (next(own, None) for own in trials)
-    while here is not None or there is not None:
-        number = min(trial.number for trial in (here, there) if trial is not None)
-        one = here if here is not None and here.number == number else None
-        other = there if there is not None and there.number == number else None
-        if one is None or other is None or one.result is None or other.result is None:
-            found.difference = Difference(
-                what="state of the trial",
-                trial=number,
-                first=_state(one, counts[0]),
-                second=_state(other, counts[1]),
-            )
-            return
-        found.difference = _difference_of_trials(one.result, other.result)
-        if found.difference is not None:
-            return
-        _count(one.result, other.result, found)
-        here, there = (next(own, None) for own in trials)
-    if not found.trials:
-        found.difference = Difference(
-            what="number of finished trials: nothing to compare", first="0", second="0"
-        )
-
-
 def _difference_of_runs(
-    first: Mapping[str, str], second: Mapping[str, str], found: _Found
+    first: Mapping[str, str], second: Mapping[str, str], notes: list[str]
 ) -> Difference | None:
     """Return how the runs differ as wholes; what changes no decision is only noted."""
     import yaml
@@ -192,93 +141,94 @@ def _difference_of_runs(
     texts = [meta.get("configuration", "") for meta in (first, second)]
     configurations: list[Any] = [yaml.safe_load(text) for text in texts]
     for what, keys in (("problem", ("problem",)), ("seed", ("simulator", "seed"))):
-        values = [_value(configuration, keys) for configuration in configurations]
-        if values[0] != values[1]:
-            return Difference(what=what, first=str(values[0]), second=str(values[1]))
+        one, other = (_value(configuration, keys) for configuration in configurations)
+        if one != other:
+            return Difference(what=what, first=str(one), second=str(other))
     versions = [meta.get("holdfast_version", "of an unknown version") for meta in (first, second)]
     if versions[0] != versions[1]:
-        found.notes.append(f"made by holdfast {versions[0]} and by holdfast {versions[1]}")
+        notes.append(f"made by holdfast {versions[0]} and by holdfast {versions[1]}")
     if first.get("problem_sources") != second.get("problem_sources"):
-        found.notes.append("the source of the problem differs")
+        notes.append("the source of the problem differs")
     setting = configuration_difference(*texts)
     if setting is not None:
         key, old, new = setting
-        found.notes.append(f"{key} is {old} in the first run and {new} in the second")
+        notes.append(f"{key} is {old} in the first run and {new} in the second")
     return None
 
 
 def _value(configuration: Any, keys: tuple[str, ...]) -> Any:
     for key in keys:
         if not isinstance(configuration, Mapping) or key not in configuration:
-            return _ABSENT
+            return "not given"
         configuration = configuration[key]
     return configuration
 
 
-def _trials(journal: JournalReader) -> Iterator[_Trial]:
-    """Yield the trials of a run in order, the unfinished one in its place."""
-    unfinished = journal.unfinished()
-    begun = None
-    if unfinished is not None:
-        acted = sum(isinstance(record, ActingRecord) for record in unfinished.records)
-        begun = _Trial(
-            unfinished.trial, None, f"unfinished, {_counted(acted, 'task action')} so far"
+def _compare_trials(
+    first: JournalReader, second: JournalReader, same: Counter[str], notes: list[str]
+) -> Difference | None:
+    """Return where the trials first differ; ``same`` counts what does not."""
+    journals = (first, second)
+    finished = [journal.finished() for journal in journals]
+    begun = [journal.unfinished() for journal in journals]
+    numbers = {each.trial for each in begun if each is not None}.union(*finished)
+    results = [journal.results(with_decisions=True) for journal in journals]
+    for number in sorted(numbers):
+        if not all(number in each for each in finished):
+            one, other = map(_state_of, (number, number), finished, begun)
+            return Difference(what="state of the trial", trial=number, first=one, second=other)
+        result, counterpart = map(next, results)
+        assert result.decisions is not None
+        assert counterpart.decisions is not None
+        found = difference_of_decisions(result.decisions, counterpart.decisions, number)
+        if found is not None:
+            return found
+        same["trials"] += 1
+        same["sensing_actions"] += result.sensing_decisions
+        same["task_actions"] += result.steps
+        # Where there is no reward, earlier versions wrote 0.
+        outcomes = [
+            f"outcome {each.outcome}, reward {each.reward or 0.0!r}"
+            for each in (result, counterpart)
+        ]
+        if outcomes[0] != outcomes[1] and not any("the world" in note for note in notes):
+            notes.append(
+                f"the world answered otherwise: trial {number} has {outcomes[0]} in the first run "
+                f"and {outcomes[1]} in the second"
+            )
+    if not same:
+        return Difference(
+            what="number of finished trials: nothing to compare", first="0", second="0"
         )
-    for result in journal.results(with_decisions=True):
-        if begun is not None and begun.number < result.trial:
-            yield begun
-            begun = None
-        yield _Trial(result.trial, result, "finished")
-    if begun is not None:
-        yield begun
+    return None
 
 
-def _state(trial: _Trial | None, count: int) -> str:
-    if trial is None:
-        return f"not in this run, which has {_counted(count, 'finished trial')}"
-    return trial.state
+def _state_of(number: int, finished: set[int], begun: UnfinishedTrial | None) -> str:
+    if number in finished:
+        return "finished"
+    if begun is not None and begun.trial == number:
+        acted = sum(isinstance(record, ActingRecord) for record in begun.records)
+        return f"unfinished, {_counted(acted, 'task action')} so far"
+    return f"not in this run, which has {_counted(len(finished), 'finished trial')}"
 
 
-def _count(first: TrialResult, second: TrialResult, found: _Found) -> None:
-    found.trials += 1
-    found.sensing_actions += first.sensing_decisions
-    found.task_actions += first.steps
-    # Where there is no reward, earlier versions wrote 0.
-    outcomes = [
-        f"outcome {result.outcome}, reward {result.reward or 0.0!r}" for result in (first, second)
-    ]
-    if outcomes[0] != outcomes[1] and not any("the world" in note for note in found.notes):
-        found.notes.append(
-            f"the world answered otherwise: trial {first.trial} has {outcomes[0]} in the first run "
-            f"and {outcomes[1]} in the second"
-        )
-
-
-# ---------------------------------------------------------------------------------------------
-# One trial
-# ---------------------------------------------------------------------------------------------
-
-
-def _difference_of_trials(first: TrialResult, second: TrialResult) -> Difference | None:
-    one, other = first.decisions, second.decisions
-    assert one is not None
-    assert other is not None
-    if one == other:
+def difference_of_decisions(first: Decisions, second: Decisions, trial: int) -> Difference | None:
+    """Return where two sequences of decisions of a trial first differ, None if they do not."""
+    if first == second:
         return None
-    trial = first.trial
-    if one.action_size != other.action_size:
+    if first.action_size != second.action_size:
         return Difference(
             what="size of the task actions",
             trial=trial,
-            first=str(one.action_size),
-            second=str(other.action_size),
+            first=str(first.action_size),
+            second=str(second.action_size),
         )
-    for decision, counterpart in zip_longest(one, other):
-        found = _difference_of_decisions(decision, counterpart)
+    for decision, counterpart in zip_longest(first, second):
+        found = _difference_of_decision(decision, counterpart)
         if found is not None:
             step, what, values = found
             return Difference(what=what, trial=trial, step=step, first=values[0], second=values[1])
-    (steps, digest), (other_steps, other_digest) = _ending(one), _ending(other)
+    (steps, digest), (other_steps, other_digest) = _ending(first), _ending(second)
     if steps != other_steps:
         return Difference(
             what="number of steps", trial=trial, first=str(steps), second=str(other_steps)
@@ -298,7 +248,7 @@ def _ending(decisions: Decisions) -> tuple[int, bytes]:
     return (steps, digest) if kind == b"E" else (0, b"")
 
 
-def _difference_of_decisions(
+def _difference_of_decision(
     first: SensingDecision | TaskDecision | None, second: SensingDecision | TaskDecision | None
 ) -> tuple[int, str, tuple[str, str]] | None:
     """Return step, what differs and both values, None if nothing does."""

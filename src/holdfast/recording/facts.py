@@ -43,15 +43,7 @@ class Decider(NamedTuple):
 
 
 class TrialBeginFact(NamedTuple):
-    """A trial begins.
-
-    Attributes
-    ----------
-    time_ns : int
-        On the clock of the export.
-    beliefs_known : bool
-        Whether the facts of this trial have beliefs.
-    """
+    """A trial begins; ``beliefs_known`` says whether its facts have beliefs."""
 
     trial: int
     time_ns: int
@@ -71,7 +63,6 @@ class SensingFact(NamedTuple):
         The beliefs before and after the observation.
     entropies : array of shape (num_sensing_actions,) or None
         What was minimised, in nats; None if nothing was.
-    observation : array or None
     """
 
     trial: int
@@ -99,10 +90,8 @@ class TaskFact(NamedTuple):
     ----------
     action : array of shape (action_size,)
         As it was executed.
-    belief : Belief or None
-        From which it was chosen.
-    estimate : array of shape (state_size,) or None
-        The state with which the policy was evaluated.
+    belief, estimate : Belief or None, array of shape (state_size,) or None
+        From which it was chosen, and the state with which the policy was evaluated.
     true_state : array of shape (state_size,) or None
         Before the action.
     """
@@ -140,15 +129,7 @@ class TrialEndFact(NamedTuple):
 
 
 class EventFact(NamedTuple):
-    """A line of ``events.jsonl``.
-
-    Attributes
-    ----------
-    name : str
-        Such as ``status``.
-    fields : mapping
-        The other fields of the line.
-    """
+    """A line of ``events.jsonl``: its time, its name (such as ``status``) and its other fields."""
 
     time_ns: int
     name: str

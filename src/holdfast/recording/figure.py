@@ -43,6 +43,7 @@ _OBSTACLE = "#C9CDD2"
 _OBSTACLE_EDGE = "#8A9099"
 _BODY = "#4A4F57"
 _GOAL = "#1E8A4C"
+_ESTIMATED: Any = {"color": _BELIEF, "linestyle": (0, (4, 1.5))}
 
 # Ordered so that neighbours differ in lightness, too.
 _ACTION_COLORS = ("#1D3C78", "#E8A317", "#B5342B", "#54B5A6", "#7D3C98", "#9AA05A")
@@ -172,16 +173,8 @@ def _scatter_chosen(
 ) -> None:
     """Mark where a sensing action was chosen."""
     color, marker = _style_of(sensing_action)
-    panel.scatter(
-        x,
-        y,
-        s=_marker_size(record),
-        color=color,
-        marker=marker,
-        edgecolor="white",
-        linewidth=0.4,
-        zorder=4,
-    )
+    look: Any = {"color": color, "marker": marker, "edgecolor": "white", "linewidth": 0.4}
+    panel.scatter(x, y, s=_marker_size(record), zorder=4, **look)
 
 
 def _marker_size(record: TrialRecord) -> float:
@@ -189,17 +182,12 @@ def _marker_size(record: TrialRecord) -> float:
     return float(np.clip(1800.0 / max(len(record.sensing), 1), 7.0, 26.0))
 
 
-# ---------------------------------------------------------------------------------------------
-# The workspace
-# ---------------------------------------------------------------------------------------------
-
-
 def _draw_workspace(panel: Axes, problem: Problem, scene: Scene, record: TrialRecord) -> None:
     axes = list(scene.axes)
     panel.set_aspect("equal", anchor="N")
-    labels = _labels(problem)
-    panel.set_xlabel(labels[axes[0]])
-    panel.set_ylabel(labels[axes[1]])
+    x_label, y_label = (_labels(problem)[axis] for axis in axes)
+    panel.set_xlabel(x_label)
+    panel.set_ylabel(y_label)
     for spine in panel.spines.values():
         spine.set_visible(True)
 
@@ -214,12 +202,12 @@ def _draw_workspace(panel: Axes, problem: Problem, scene: Scene, record: TrialRe
     panel.set_ylim(y_min, y_max)
     _draw_bodies(panel, outlines)
     if len(estimates):
-        panel.plot(*estimates[:, axes].T, color=_BELIEF, linewidth=1.3, linestyle=(0, (4, 1.5)))
+        panel.plot(*estimates[:, axes].T, **_ESTIMATED, linewidth=1.3)
     if len(truth):
         panel.plot(*truth[:, axes].T, color=_TRUE, linewidth=1.3)
     for sensing in record.sensing if len(record.sensing) <= _MAX_MARKS else ():
-        place = way[sensing.step]
-        _scatter_chosen(panel, place[axes[0]], place[axes[1]], sensing.sensing_action, record)
+        x, y = way[sensing.step, axes]
+        _scatter_chosen(panel, x, y, sensing.sensing_action, record)
     if scene.points is not None:
         x, y = scene.points.T
         panel.scatter(x, y, s=42, facecolor="white", edgecolor=_GOAL, zorder=3)
@@ -284,12 +272,10 @@ def _draw_obstacles(panel: Axes, scene: Scene) -> None:
     ]
     # The faces are drawn over the edges, so that touching rectangles look like one.
     for width, face in ((1.4, "none"), (0.0, _OBSTACLE)):
-        panel.add_collection(
-            PolyCollection(
-                rectangles, facecolor=face, edgecolor=_OBSTACLE_EDGE, linewidth=width, zorder=1
-            ),
-            autolim=False,
+        drawn = PolyCollection(
+            rectangles, facecolor=face, edgecolor=_OBSTACLE_EDGE, linewidth=width, zorder=1
         )
+        panel.add_collection(drawn, autolim=False)
 
 
 def _draw_clouds(panel: Axes, sensing: Sequence[SensingRecord], axes: list[int]) -> None:
@@ -299,15 +285,8 @@ def _draw_clouds(panel: Axes, sensing: Sequence[SensingRecord], axes: list[int])
     chosen = np.unique(np.linspace(0, len(sensing) - 1, _NUM_CLOUDS).round().astype(int))
     clouds: list[FloatArray] = [sensing[0].before, *(sensing[index].after for index in chosen)]
     for cloud, opacity in zip(clouds, np.linspace(0.3, 0.8, len(clouds)), strict=True):
-        panel.scatter(
-            cloud[:, axes[0]],
-            cloud[:, axes[1]],
-            s=9,
-            color=_BELIEF,
-            alpha=float(opacity),
-            linewidth=0,
-            zorder=2,
-        )
+        x, y = cloud[:, axes].T
+        panel.scatter(x, y, s=9, color=_BELIEF, alpha=float(opacity), linewidth=0, zorder=2)
 
 
 def _outlines(scene: Scene, way: FloatArray) -> list[FloatArray]:
@@ -328,23 +307,20 @@ def _outlines(scene: Scene, way: FloatArray) -> list[FloatArray]:
 def _draw_bodies(panel: Axes, outlines: Sequence[FloatArray]) -> None:
     """Draw the outlines, the earlier the paler, and the last one in bold."""
     opacities = np.linspace(0.3, 1.0, len(outlines))
-    panel.add_collection(
-        LineCollection(
-            [np.vstack([outline, outline[:1]]) for outline in outlines],
-            colors=[to_rgba(_BODY, float(opacity)) for opacity in opacities],
-            linewidths=[0.8] * (len(outlines) - 1) + [1.6],
-            zorder=2.5,
-        ),
-        autolim=False,
+    lines = LineCollection(
+        [np.vstack([outline, outline[:1]]) for outline in outlines],
+        colors=[to_rgba(_BODY, float(opacity)) for opacity in opacities],
+        linewidths=[0.8] * (len(outlines) - 1) + [1.6],
+        zorder=2.5,
     )
+    panel.add_collection(lines, autolim=False)
 
 
 def _outline(body: FloatArray, scene: Scene, state: FloatArray) -> FloatArray:
     angle = 0.0 if scene.angle is None else float(state[scene.angle])
     cosine, sine = np.cos(angle), np.sin(angle)
-    turned = np.stack(
-        [cosine * body[:, 0] - sine * body[:, 1], sine * body[:, 0] + cosine * body[:, 1]], axis=1
-    )
+    x, y = body.T
+    turned = np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=1)
     return np.asarray(turned + state[list(scene.axes)], dtype=np.float64)
 
 
@@ -357,7 +333,7 @@ def _draw_workspace_legend(
     if record.true_states:
         handles.append(Line2D([], [], color=_TRUE, label="true path"))
     handles += [
-        Line2D([], [], color=_BELIEF, linestyle=(0, (4, 1.5)), label="estimated path"),
+        Line2D([], [], **_ESTIMATED, label="estimated path"),
         _dot(_BELIEF, "o", "particles, older ones paler", size=3.5),
         _dot(_TRUE, "o", f"start{of_estimate}", hollow=1.0),
     ]
@@ -396,22 +372,9 @@ def _action_handles(problem: Problem, record: TrialRecord) -> list[Line2D]:
 
 def _dot(color: str, marker: str, label: str, *, size: float = 6.0, hollow: float = 0.0) -> Line2D:
     """Return a legend's entry for a marker; a hollow one has an edge of this width."""
-    return Line2D(
-        [],
-        [],
-        color=color,
-        marker=marker,
-        linestyle="",
-        markersize=size,
-        markerfacecolor="white" if hollow else color,
-        markeredgewidth=hollow,
-        label=label,
-    )
-
-
-# ---------------------------------------------------------------------------------------------
-# Over the steps
-# ---------------------------------------------------------------------------------------------
+    inside = "white" if hollow else color
+    look: Any = {"markersize": size, "markerfacecolor": inside, "markeredgewidth": hollow}
+    return Line2D([], [], color=color, marker=marker, linestyle="", label=label, **look)
 
 
 def _stacked(rows: Sequence[FloatArray], width: int) -> FloatArray:
@@ -428,7 +391,7 @@ def _draw_coordinates(
     for index, (panel, label) in enumerate(zip(panels, _labels(problem), strict=True)):
         mean, two = estimates[:, index], 2.0 * deviations[:, index]
         panel.fill_between(steps, mean - two, mean + two, color=_BELIEF, alpha=0.22, linewidth=0)
-        panel.plot(steps, mean, color=_BELIEF, linewidth=1.1, linestyle=(0, (4, 1.5)))
+        panel.plot(steps, mean, **_ESTIMATED, linewidth=1.1)
         if len(truth):
             panel.plot(np.arange(len(truth)), truth[:, index], color=_TRUE, linewidth=1.1)
         if len(record.sensing) <= _MAX_MARKS:
@@ -441,46 +404,38 @@ def _draw_coordinates(
     if len(truth):
         handles.append(Line2D([], [], color=_TRUE, label="true"))
     handles += [
-        Line2D([], [], color=_BELIEF, linestyle=(0, (4, 1.5)), label="estimate"),
+        Line2D([], [], **_ESTIMATED, label="estimate"),
         Patch(facecolor=_BELIEF, alpha=0.22, label="± 2 standard deviations"),
     ]
     if not all(sensing.explained for sensing in record.sensing):
         handles.append(_dot(_TRUE, "x", "far from every particle", size=7.0, hollow=1.0))
-    panels[0].legend(
-        handles=handles,
-        loc="lower center",
-        bbox_to_anchor=(0.5, 1.0),
-        ncols=len(handles),
-        columnspacing=1.2,
-        handletextpad=0.5,
-    )
+    above: Any = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": len(handles)}
+    panels[0].legend(handles=handles, columnspacing=1.2, handletextpad=0.5, **above)
 
 
 def _scatter_sensing(panel: Axes, record: TrialRecord, heights: Sequence[float]) -> None:
     """Mark the sensing steps, one call for each sensing action."""
-    heights_array = np.asarray(heights, dtype=np.float64)
+    height = np.asarray(heights, dtype=np.float64)
     actions = np.array([sensing.sensing_action for sensing in record.sensing], dtype=int)
     steps = np.array([sensing.step for sensing in record.sensing], dtype=int)
     for action in np.unique(actions):
         chosen = actions == action
-        _scatter_chosen(panel, steps[chosen], heights_array[chosen], int(action), record)
+        _scatter_chosen(panel, steps[chosen], height[chosen], int(action), record)
 
 
 def _draw_choices(panel: Axes, problem: Problem, record: TrialRecord) -> None:
     """Draw a row for each sensing action, with a mark where it was chosen."""
     count = len(problem.sensing_actions)
     _scatter_sensing(panel, record, [float(sensing.sensing_action) for sensing in record.sensing])
-    unexplained = [sensing for sensing in record.sensing if not sensing.explained]
+    unexplained = [
+        (sensing.step, float(sensing.sensing_action))
+        for sensing in record.sensing
+        if not sensing.explained
+    ]
     if unexplained:
-        panel.scatter(
-            [sensing.step for sensing in unexplained],
-            [float(sensing.sensing_action) for sensing in unexplained],
-            s=3.0 * _marker_size(record),
-            marker="x",
-            color=_TRUE,
-            linewidth=0.9,
-            zorder=5,
-        )
+        x, y = zip(*unexplained, strict=True)
+        size = 3.0 * _marker_size(record)
+        panel.scatter(x, y, s=size, marker="x", color=_TRUE, linewidth=0.9, zorder=5)
     labels = [fill(str(label), _LABEL_WIDTH) for label in problem.sensing_actions]
     size = 9.0 if max(map(len, labels), default=0) <= _LABEL_WIDTH else _SMALLEST
     panel.set_yticks(range(count), labels, fontsize=size)
@@ -535,14 +490,7 @@ def _draw_entropies(panel: Axes, configuration: Configuration, record: TrialReco
         color, marker = _style_of(action)
         won = chosen == action
         # The alternatives are hollow, so that the choice stands out.
-        panel.scatter(
-            steps[~won],
-            entropies[~won, action],
-            s=0.6 * _marker_size(record),
-            facecolor="white",
-            edgecolor=color,
-            marker=marker,
-            linewidth=0.7,
-            zorder=3,
-        )
+        look: Any = {"facecolor": "white", "edgecolor": color, "marker": marker, "linewidth": 0.7}
+        size = 0.6 * _marker_size(record)
+        panel.scatter(steps[~won], entropies[~won, action], s=size, zorder=3, **look)
         _scatter_chosen(panel, steps[won], entropies[won, action], action, record)

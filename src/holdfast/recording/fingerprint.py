@@ -24,32 +24,20 @@ _SOURCES = "problem_sources"
 def fingerprint(configuration: Configuration) -> dict[str, str]:
     """Return the identity of a run's code, for its journal.
 
-    Returns
-    -------
-    dict of str
-        holdfast's version, without and with the digest of its core, and the digests of the
-        problem's sources, as JSON.
+    It has holdfast's version, without and with the digest of its core, and the digests of the
+    problem's sources, as JSON.
     """
+    module = problem_module(configuration.problem_name)
+    sources = problem_sources(type(configuration.problem), module)
     return {
         _VERSION: __version__,
         _CORE: core_version(),
-        _SOURCES: json.dumps(
-            problem_sources(
-                type(configuration.problem), problem_module(configuration.problem_name)
-            ),
-            sort_keys=True,
-        ),
+        _SOURCES: json.dumps(sources, sort_keys=True),
     }
 
 
 def difference(there: Mapping[str, str], here: Mapping[str, str]) -> str | None:
-    """Return in words how the code of two runs differs, None if it does not.
-
-    Parameters
-    ----------
-    there, here : mapping of str
-        What :func:`fingerprint` returned for the earlier run and for this one.
-    """
+    """Return in words how the code of an earlier run differs from that of this one, or None."""
     if there.get(_VERSION) != here[_VERSION]:
         return (
             f"it was made by holdfast {there.get(_VERSION, 'of an unknown version')}, "

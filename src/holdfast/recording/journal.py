@@ -19,7 +19,6 @@ log, as safe in a power cut, would wait for the disk.
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 import sqlite3
 from collections.abc import Iterator, Sequence
@@ -34,20 +33,15 @@ from holdfast.protocol.records import Record, encode_record
 from holdfast.recording.journal_file import (
     START_ANEW,
     FileIdentity,
+    JournalFile,
     StepCount,
     Survives,
     boot_id,
-    connect,
-    count_path,
-    identity_of,
-    log_path,
-    logs_of,
     meta_checksum,
+    of_steps,
+    of_trials,
     open_here,
-    require_file,
-    step_checksum,
     synchronize_directory,
-    trial_checksum,
 )
 from holdfast.recording.journal_reader import SCHEMA_VERSION, SESSION_SIZE, JournalReader
 
@@ -103,15 +97,7 @@ class Journal(JournalReader):
     def create(
         cls, path: Path, meta: dict[str, str], *, survives: Survives = "process_crash"
     ) -> Self:
-        """Create a journal where there is no file.
-
-        Parameters
-        ----------
-        path : Path
-        meta : dict of str
-            Notes about the run. The schema's version and a session are added.
-        survives : {"process_crash", "power_cut"}
-            What each appended step survives.
+        """Create a journal with notes about the run, to which its version and session are added.
 
         Raises
         ------
@@ -123,13 +109,13 @@ class Journal(JournalReader):
         unfinished = path.with_name(f".{path.name}.{os.getpid()}")
         unfinished.unlink(missing_ok=True)
         if not path.exists():
-            for log in logs_of(path):
+            for log in JournalFile(path).logs():
                 # SQLite would take it for the new journal's log.
                 raise OutputError(
                     f"{log}: is the log of a journal that is gone; restore that, or {START_ANEW}"
                 )
         try:
-            journal = cls(unfinished, connect(unfinished, create=True))
+            journal = cls(unfinished, JournalFile(unfinished).connect(create=True))
             try:
                 with journal._transaction():
                     for statement in _SCHEMA:
@@ -153,13 +139,7 @@ class Journal(JournalReader):
     def open(cls, path: Path, *, survives: Survives = "process_crash", check: bool = True) -> Self:
         """Open an existing journal to go on with it.
 
-        Parameters
-        ----------
-        path : Path
-        survives : {"process_crash", "power_cut"}
-            What each appended step survives.
-        check : bool
-            Whether to read all of it first, to find damage.
+        ``check`` reads all of it first, to find damage.
 
         Raises
         ------
@@ -167,8 +147,9 @@ class Journal(JournalReader):
             If there is none, it is no journal, damaged, another version's, or in use by another
             process.
         """
-        require_file(path)
-        journal = cls(path, connect(path, create=False), survives)
+        file = JournalFile(path)
+        file.require()
+        journal = cls(path, file.connect(), survives)
         try:
             journal._require_version()
             if check:
@@ -208,7 +189,7 @@ class Journal(JournalReader):
                     count_is_needless = True
             self._connection.execute("PRAGMA journal_mode = DELETE")
             if count_is_needless or self.unfinished_trial() is None:
-                count_path(self.path).unlink(missing_ok=True)
+                self._file.count.unlink(missing_ok=True)
 
     def _move_log(self) -> None:
         """Move the content of the log into the main file, and let both survive a power cut."""
@@ -220,8 +201,9 @@ class Journal(JournalReader):
     def _note_places(self) -> None:
         # Absolute, for the user's code may change the current directory.
         path = self.path.absolute()
+        files = (JournalFile(path), JournalFile(self._file.log.absolute()))
         try:
-            self._in_place = [(str(place), identity_of(place)) for place in (path, log_path(path))]
+            self._in_place = [(str(file.path), file.version()[:2]) for file in files]
         except OSError as error:
             raise OutputError(f"{error.filename}: cannot be read: {error.strerror}") from error
 
@@ -259,13 +241,7 @@ class Journal(JournalReader):
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
-        """Do all of what is inside or nothing; the result survives a power cut.
-
-        Raises
-        ------
-        LostJournalError
-            If the file was removed.
-        """
+        """Do all of what is inside or nothing; the result survives a power cut."""
         connection = self._connection
         raised = self.survives != "power_cut"
         with self._errors():
@@ -298,13 +274,7 @@ class Journal(JournalReader):
         )
 
     def restart(self, meta: dict[str, str]) -> None:
-        """Replace the notes about a run that has done nothing yet.
-
-        Raises
-        ------
-        OutputError
-            If a trial is finished or begun.
-        """
+        """Replace the notes about a run; raise OutputError if a trial is finished or begun."""
         if not self.is_empty():
             raise OutputError(f"{self.path}: holds trials that are finished or begun")
         with self._transaction():
@@ -353,14 +323,14 @@ class Journal(JournalReader):
         values: list[int | bytes] = []
         for record in records:
             data = encode_record(record)
-            values += (sequence, trial, data, step_checksum(sequence, trial, data))
+            values += (sequence, trial, data, of_steps(sequence, trial, data))
             sequence += 1
         # Until they are known to be written, the content of the file is not known.
         self._steps = None
         count = self._count_from(trial, steps.next_sequence) if first else self._count
         assert count is not None
         # One statement is a transaction by itself, in a fraction of the time.
-        insert = _insert_steps(len(records))
+        insert = f"INSERT INTO steps VALUES {', '.join(['(?, ?, ?, ?)'] * len(records))}"
         if first:
             with self._transaction():
                 self._note(
@@ -386,7 +356,7 @@ class Journal(JournalReader):
         """Begin to count, once what is in the journal was found to be enough to go on from."""
         if self._count is None:
             self._count = StepCount(
-                count_path(self.path.absolute()), synchronous=self.survives == "power_cut"
+                self._file.count.absolute(), synchronous=self.survives == "power_cut"
             )
             self._close.callback(self._count.close)
         self._count.begin(trial, number)
@@ -411,14 +381,9 @@ class Journal(JournalReader):
     # -- finished trials -----------------------------------------------------------------------
 
     def add(self, result: TrialResult, *, keep_steps: bool = False) -> None:
-        """Write a finished trial and delete its steps; when this returns, it is on the disk.
+        """Write a finished trial, with its decisions; when this returns, it is on the disk.
 
-        Parameters
-        ----------
-        result : TrialResult
-            With its decisions.
-        keep_steps : bool
-            Whether its steps stay, for :meth:`kept_steps`.
+        Its steps are deleted; ``keep_steps`` keeps them for :meth:`kept_steps`.
 
         Raises
         ------
@@ -430,26 +395,20 @@ class Journal(JournalReader):
         trial = result.trial
         outcome = self._encode(msgspec.structs.replace(result, decisions=None))
         decisions = self._encode(result.decisions)
-        row = (
-            trial,
-            outcome,
-            trial_checksum(trial, 0, outcome),
-            decisions,
-            trial_checksum(trial, 1, decisions),
-        )
+        checksums = of_trials(trial, 0, outcome), of_trials(trial, 1, decisions)
         self._steps = None
-        kept: bytes | None = None
-        if keep_steps:
-            unfinished = self.unfinished()
+        unfinished = self.unfinished() if keep_steps else None
+        with self._transaction():
+            self._connection.execute(
+                "INSERT INTO trials VALUES (?, ?, ?, ?, ?)",
+                (trial, outcome, checksums[0], decisions, checksums[1]),
+            )
             if unfinished is not None and unfinished.trial == trial:
                 kept = self._encode([encode_record(record) for record in unfinished.records])
-        with self._transaction():
-            self._connection.execute("INSERT INTO trials VALUES (?, ?, ?, ?, ?)", row)
-            if kept is not None:
                 self._connection.execute(_KEPT_STEPS)
                 self._connection.execute(
                     "INSERT INTO kept_steps VALUES (?, ?, ?)",
-                    (trial, kept, trial_checksum(trial, 2, kept)),
+                    (trial, kept, of_trials(trial, 2, kept)),
                 )
             dropped = self._connection.execute("DELETE FROM steps WHERE trial = ?", (trial,))
         if dropped.rowcount:
@@ -464,11 +423,6 @@ class _Steps(NamedTuple):
 
     trial: int
     next_sequence: int
-
-
-@functools.cache
-def _insert_steps(number: int) -> str:
-    return f"INSERT INTO steps VALUES {', '.join(['(?, ?, ?, ?)'] * number)}"
 
 
 def _first_rows(meta: dict[str, str]) -> dict[str, str]:

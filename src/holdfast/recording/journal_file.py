@@ -20,7 +20,6 @@ import sqlite3
 import struct
 import tempfile
 import weakref
-from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -30,28 +29,18 @@ __all__ = [
     "JOURNAL_NAME",
     "START_ANEW",
     "FileIdentity",
+    "JournalFile",
+    "RowChecksum",
     "StepCount",
     "Survives",
     "boot_id",
-    "connect",
-    "connect_to_read",
-    "count_path",
-    "damaged",
     "find_journal",
-    "identity_of",
-    "is_intact",
     "is_named",
-    "log_path",
-    "logs_of",
     "meta_checksum",
+    "of_steps",
+    "of_trials",
     "open_here",
-    "read_count",
-    "require_file",
-    "require_writable",
-    "step_checksum",
     "synchronize_directory",
-    "trial_checksum",
-    "version_of_file",
 ]
 
 JOURNAL_NAME = "journal.sqlite"
@@ -76,12 +65,6 @@ _PAGE_BYTES = 1024
 _SHARED_LOCK_START = 0x40000002
 _SHARED_LOCK_SIZE = 510
 
-# Copied for each row: creating one takes longer than hashing a step.
-_OF_META, _OF_STEPS, _OF_TRIALS = (
-    hashlib.blake2b(digest_size=_CHECKSUM_SIZE, person=person)
-    for person in (b"holdfast-meta", b"holdfast-step", b"holdfast-trial")
-)
-
 open_here: weakref.WeakValueDictionary[FileIdentity, object] = weakref.WeakValueDictionary()
 """Journals that this process has open for writing.
 
@@ -90,18 +73,10 @@ never opened a second time.
 """
 
 
-# -- finding ---------------------------------------------------------------------------------------
-
-
 def find_journal(run: Path, purpose: str) -> Path:
-    """Return the journal of a run.
+    """Return the journal of a run, by its directory or the journal itself.
 
-    Parameters
-    ----------
-    run : Path
-        The run's directory, or the journal itself.
-    purpose : str
-        A verb, for messages: what the run is needed for.
+    ``purpose`` is a verb, for messages: what the run is needed for.
 
     Raises
     ------
@@ -128,56 +103,137 @@ def find_journal(run: Path, purpose: str) -> Path:
     return run
 
 
-def require_file(path: Path) -> None:
-    """Raise OutputError unless there is a file with content.
+class JournalFile:
+    """A journal's file, and those beside it."""
 
-    SQLite would take an empty file for a new database, and remove the log beside it.
-    """
-    try:
-        size = path.stat().st_size if path.is_file() else None
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
-    if size is None:
-        raise OutputError(f"{path}: there is no journal of a run")
-    if size == 0:
-        raise OutputError(f"{path}: is empty, so no journal of a run; {START_ANEW}")
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.log = path.with_name(f"{path.name}-wal")  # where SQLite writes ahead
+        self.count = path.with_name(f"{path.name}-count")
 
+    def require(self) -> None:
+        """Raise OutputError unless there is a file with content.
 
-def require_writable(path: Path) -> None:
-    """Raise OutputError unless a journal can be written; SQLite's errors do not say why not."""
-    try:
-        if identity_of(path) not in open_here:
-            os.close(os.open(path, os.O_WRONLY | os.O_CLOEXEC))
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+        SQLite would take an empty file for a new database, and remove the log beside it.
+        """
+        try:
+            size = self.path.stat().st_size if self.path.is_file() else None
+        except OSError as error:
+            raise OutputError(f"{self.path}: cannot be read: {error.strerror}") from error
+        if size is None:
+            raise OutputError(f"{self.path}: there is no journal of a run")
+        if size == 0:
+            raise OutputError(f"{self.path}: is empty, so no journal of a run; {START_ANEW}")
 
+    def require_writable(self) -> None:
+        """Raise OutputError unless it can be written; SQLite's errors do not say why not."""
+        try:
+            if self.version()[:2] not in open_here:
+                os.close(os.open(self.path, os.O_WRONLY | os.O_CLOEXEC))
+        except OSError as error:
+            raise OutputError(f"{self.path}: cannot be written: {error.strerror}") from error
 
-def identity_of(path: Path) -> FileIdentity:
-    """Return device and inode. No other file has them while this one is open."""
-    status = path.stat()
-    return status.st_dev, status.st_ino
+    def version(self) -> tuple[int, int, int, int]:
+        """Return device, inode, size and time of change.
 
+        The first two are the file's identity: no other file has them while this one is open.
+        """
+        status = self.path.stat()
+        return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
-def version_of_file(path: Path) -> tuple[int, ...]:
-    """Return what changes when a file is replaced or written."""
-    status = path.stat()
-    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
+    def logs(self) -> list[Path]:
+        """Return the files beside a database that hold a part of its content."""
+        logs = (self.log, self.path.with_name(f"{self.path.name}-journal"))
+        return [log for log in logs if log.is_file() and log.stat().st_size]
 
+    def damaged(self, how: str) -> OutputError:
+        """Return the error of a damaged journal."""
+        return OutputError(
+            f"{self.path}: the journal is damaged ({how}), so the run cannot go on; restore the "
+            f"file, or {START_ANEW}"
+        )
 
-def log_path(path: Path) -> Path:
-    """Return where SQLite writes ahead."""
-    return path.with_name(f"{path.name}-wal")
+    def _in_use(self) -> OutputError:
+        return OutputError(f"{self.path}: another process is using this run")
 
+    def connect(self, *, create: bool = False) -> sqlite3.Connection:
+        """Open the database for this process alone; raise OutputError if that is not possible."""
+        path = self.path
+        try:
+            connection = sqlite3.connect(
+                f"{path.absolute().as_uri()}?mode={'rwc' if create else 'rw'}",
+                uri=True,
+                timeout=_BUSY_TIMEOUT_S,
+                isolation_level=None,
+            )
+        except sqlite3.Error as error:
+            raise OutputError(f"{path}: cannot be opened: {error}") from error
+        try:
+            if create:
+                connection.execute(f"PRAGMA page_size = {_PAGE_BYTES}")
+            # Two runs in one directory would corrupt each other, so the lock is held until the end.
+            # With it, the index of the log is in this process's memory.
+            connection.execute("PRAGMA locking_mode = EXCLUSIVE")
+            connection.execute("BEGIN EXCLUSIVE")
+            connection.execute("COMMIT")
+        except sqlite3.Error as error:
+            connection.close()
+            if is_named(error, "SQLITE_BUSY", "SQLITE_LOCKED"):
+                raise self._in_use() from error
+            if is_named(error, "SQLITE_READONLY", "SQLITE_CANTOPEN", "SQLITE_FULL"):
+                raise OutputError(f"{path}: cannot be written: {error}") from error
+            if is_named(error, "SQLITE_CORRUPT"):
+                raise self.damaged(str(error)) from error
+            raise OutputError(f"{path}: not a usable journal: {error}; {START_ANEW}") from error
+        return connection
 
-def count_path(path: Path) -> Path:
-    """Return where the number of records is."""
-    return path.with_name(f"{path.name}-count")
+    def connect_to_read(self, close: contextlib.ExitStack) -> sqlite3.Connection:
+        """Open the database without a lock and without changing its directory.
 
+        SQLite reads a log only where it may write beside it. So if there is a log, both are copied,
+        and the copy is read; a file without a log is read in place.
 
-def logs_of(path: Path) -> list[Path]:
-    """Return the files beside a database that hold a part of its content."""
-    logs = (log_path(path), path.with_name(f"{path.name}-journal"))
-    return [log for log in logs if log.is_file() and log.stat().st_size]
+        Raises
+        ------
+        OutputError
+            If it is in use or cannot be read.
+        """
+        path, copy = self.path, None
+        if self.version()[:2] in open_here:
+            raise OutputError(f"{path}: this process is using this run")
+        try:
+            with path.open("rb") as file:
+                try:
+                    # Held only while it is copied: then nobody can begin to write.
+                    fcntl.lockf(
+                        file, fcntl.LOCK_SH | fcntl.LOCK_NB, _SHARED_LOCK_SIZE, _SHARED_LOCK_START
+                    )
+                except (BlockingIOError, PermissionError) as error:
+                    raise self._in_use() from error
+                if logs := self.logs():
+                    folder = tempfile.TemporaryDirectory(
+                        prefix="holdfast-journal-", ignore_cleanup_errors=True
+                    )
+                    copy = JournalFile(Path(close.enter_context(folder)) / path.name)
+                    for source in (path, *logs):
+                        shutil.copyfile(source, copy.path.with_name(source.name))
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
+        try:
+            connection = (
+                sqlite3.connect(
+                    f"{path.absolute().as_uri()}?immutable=1", uri=True, isolation_level=None
+                )
+                if copy is None
+                else copy.connect()
+            )
+        except sqlite3.Error as error:
+            raise OutputError(f"{path}: cannot be opened: {error}") from error
+        except OutputError as error:
+            assert copy is not None
+            raise OutputError(str(error).replace(str(copy.path), str(path))) from error
+        connection.execute("PRAGMA query_only = ON")
+        return connection
 
 
 def synchronize_directory(path: Path) -> None:
@@ -197,124 +253,17 @@ def boot_id() -> str | None:
         return None
 
 
-# -- opening ---------------------------------------------------------------------------------------
-
-
-def connect(path: Path, *, create: bool) -> sqlite3.Connection:
-    """Open a database for this process alone; raise OutputError if that is not possible."""
-    try:
-        connection = sqlite3.connect(
-            f"{path.absolute().as_uri()}?mode={'rwc' if create else 'rw'}",
-            uri=True,
-            timeout=_BUSY_TIMEOUT_S,
-            isolation_level=None,
-        )
-    except sqlite3.Error as error:
-        raise OutputError(f"{path}: cannot be opened: {error}") from error
-    try:
-        if create:
-            connection.execute(f"PRAGMA page_size = {_PAGE_BYTES}")
-        # Two runs in one directory would corrupt each other, so the lock is held until the end.
-        # With it, the index of the log is in this process's memory.
-        connection.execute("PRAGMA locking_mode = EXCLUSIVE")
-        connection.execute("BEGIN EXCLUSIVE")
-        connection.execute("COMMIT")
-    except sqlite3.Error as error:
-        connection.close()
-        if is_named(error, "SQLITE_BUSY", "SQLITE_LOCKED"):
-            raise _in_use(path) from error
-        if is_named(error, "SQLITE_READONLY", "SQLITE_CANTOPEN", "SQLITE_FULL"):
-            raise OutputError(f"{path}: cannot be written: {error}") from error
-        if is_named(error, "SQLITE_CORRUPT"):
-            raise damaged(path, str(error)) from error
-        raise OutputError(f"{path}: not a usable journal: {error}; {START_ANEW}") from error
-    return connection
-
-
-def connect_to_read(path: Path, close: contextlib.ExitStack) -> sqlite3.Connection:
-    """Open a database without a lock and without changing its directory.
-
-    SQLite reads a log only where it may write beside it. So if there is a log, both are copied, and
-    the copy is read; a file without a log is read in place.
-
-    Raises
-    ------
-    OutputError
-        If it is in use or cannot be read.
-    """
-    if identity_of(path) in open_here:
-        raise OutputError(f"{path}: this process is using this run")
-    try:
-        with path.open("rb") as file:
-            try:
-                # Held only while it is copied: then nobody can begin to write.
-                fcntl.lockf(
-                    file, fcntl.LOCK_SH | fcntl.LOCK_NB, _SHARED_LOCK_SIZE, _SHARED_LOCK_START
-                )
-            except (BlockingIOError, PermissionError) as error:
-                raise _in_use(path) from error
-            logs = logs_of(path)
-            if logs:
-                folder = Path(
-                    close.enter_context(
-                        tempfile.TemporaryDirectory(
-                            prefix="holdfast-journal-", ignore_cleanup_errors=True
-                        )
-                    )
-                )
-                for source in (path, *logs):
-                    shutil.copyfile(source, folder / source.name)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
-    if logs:
-        try:
-            connection = connect(folder / path.name, create=False)
-        except OutputError as error:
-            raise OutputError(str(error).replace(str(folder / path.name), str(path))) from error
-    else:
-        try:
-            connection = sqlite3.connect(
-                f"{path.absolute().as_uri()}?immutable=1", uri=True, isolation_level=None
-            )
-        except sqlite3.Error as error:
-            raise OutputError(f"{path}: cannot be opened: {error}") from error
-    connection.execute("PRAGMA query_only = ON")
-    return connection
-
-
 def is_named(error: sqlite3.Error, *names: str) -> bool:
     """Return whether an error of SQLite has one of these names or a refinement of one."""
     # Those that Python's module raises by itself have no name.
     return str(getattr(error, "sqlite_errorname", "")).startswith(names)
 
 
-def damaged(path: Path, how: str) -> OutputError:
-    """Return the error of a damaged journal."""
-    return OutputError(
-        f"{path}: the journal is damaged ({how}), so the run cannot go on; restore the file, or "
-        f"{START_ANEW}"
-    )
-
-
-def _in_use(path: Path) -> OutputError:
-    return OutputError(f"{path}: another process is using this run")
-
-
-# -- the number of records -------------------------------------------------------------------------
-
-
 class StepCount:
     """How many records of the unfinished trial were written, in a file beside the journal.
 
-    Parameters
-    ----------
-    synchronous : bool
-        Whether :meth:`begin` returns only when it is on the disk.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written; so do the methods.
+    If it is ``synchronous``, :meth:`begin` returns only when it is on the disk. All methods raise
+    OutputError if it cannot be written.
     """
 
     def __init__(self, path: Path, *, synchronous: bool) -> None:
@@ -349,51 +298,48 @@ class StepCount:
         """Close the file and leave it where it is."""
         os.close(self._descriptor)
 
+    @staticmethod
+    def read(path: Path) -> tuple[int, int] | None:
+        """Return the trial and the number of its records, None if that is missing or damaged."""
+        try:
+            trial, number = _NUMBERS.unpack(path.read_bytes())
+        except (OSError, struct.error):
+            return None
+        return trial, number
 
-def read_count(path: Path) -> tuple[int, int] | None:
-    """Return the trial and the number of its records; None if the file is missing or damaged."""
-    try:
-        trial, number = _NUMBERS.unpack(path.read_bytes())
-    except (OSError, struct.error):
-        return None
-    return trial, number
+
+class RowChecksum:
+    """The checksums of the rows of a table, each over its content and its key."""
+
+    def __init__(self, table: bytes) -> None:
+        # Copied for each row: creating one takes longer than hashing a step.
+        self._empty = hashlib.blake2b(digest_size=_CHECKSUM_SIZE, person=table)
+
+    def __call__(self, first: int, second: int, data: bytes) -> bytes:
+        """Return the checksum of a row whose key is two numbers."""
+        checksum = self._empty.copy()
+        checksum.update(_NUMBERS.pack(first, second) + data)
+        return checksum.digest()
+
+    def is_intact(self, data: object, checksum: object, first: object, second: object) -> bool:
+        """Return whether a row has the right types and checksum; SQLite has a type a value."""
+        return (
+            isinstance(data, bytes)
+            and isinstance(first, int)
+            and isinstance(second, int)
+            and self(first, second, data) == checksum
+        )
 
 
-# -- checksums -------------------------------------------------------------------------------------
+of_steps = RowChecksum(b"holdfast-step")
+"""By the record's number and its trial."""
+
+of_trials = RowChecksum(b"holdfast-trial")
+"""By the trial, and 0 for its result, 1 for its decisions, 2 for its kept steps."""
+
+_of_meta = RowChecksum(b"holdfast-meta")
 
 
 def meta_checksum(key: str, value: str) -> bytes:
     """Return the checksum of a note about the run."""
-    return _checksum(_OF_META, len(key), len(value), f"{key}={value}".encode())
-
-
-def step_checksum(sequence: int, trial: int, data: bytes) -> bytes:
-    """Return the checksum of a record of the unfinished trial."""
-    return _checksum(_OF_STEPS, sequence, trial, data)
-
-
-def trial_checksum(trial: int, column: int, data: bytes) -> bytes:
-    """Return the checksum of a finished trial's result (0), decisions (1) or kept steps (2)."""
-    return _checksum(_OF_TRIALS, trial, column, data)
-
-
-def _checksum(empty: hashlib.blake2b, first: int, second: int, data: bytes) -> bytes:
-    checksum = empty.copy()
-    checksum.update(_NUMBERS.pack(first, second) + data)
-    return checksum.digest()
-
-
-def is_intact(
-    data: object,
-    checksum: object,
-    make: Callable[[int, int, bytes], bytes],
-    first: object,
-    second: object,
-) -> bool:
-    """Return whether a row has the right types and checksum; in SQLite each value has its type."""
-    return (
-        isinstance(data, bytes)
-        and isinstance(first, int)
-        and isinstance(second, int)
-        and make(first, second, data) == checksum
-    )
+    return _of_meta(len(key), len(value), f"{key}={value}".encode())

@@ -19,21 +19,17 @@ from holdfast.outcome import Decisions, TrialResult
 from holdfast.protocol.records import Record, decode_record
 from holdfast.recording.journal_file import (
     START_ANEW,
+    JournalFile,
+    StepCount,
     boot_id,
-    connect_to_read,
-    count_path,
-    damaged,
-    is_intact,
+    find_journal,
     is_named,
     meta_checksum,
-    read_count,
-    require_file,
-    step_checksum,
-    trial_checksum,
-    version_of_file,
+    of_steps,
+    of_trials,
 )
 
-__all__ = ["SCHEMA_VERSION", "SESSION_SIZE", "JournalReader", "Tally", "UnfinishedTrial"]
+__all__ = ["SCHEMA_VERSION", "SESSION_SIZE", "JournalReader", "UnfinishedTrial"]
 
 SCHEMA_VERSION = 3
 """Raised whenever the tables or their content change form."""
@@ -44,14 +40,6 @@ SESSION_SIZE = 16
 _RESULT_DECODER = msgspec.msgpack.Decoder(TrialResult)
 _DECISIONS_DECODER = msgspec.msgpack.Decoder(Decisions)
 _KEPT_DECODER = msgspec.msgpack.Decoder(list[bytes])
-
-
-class Tally(NamedTuple):
-    """How many trials are finished, and how many of them succeeded and failed."""
-
-    finished: int
-    successes: int
-    failures: int
 
 
 class UnfinishedTrial(NamedTuple):
@@ -92,6 +80,7 @@ class JournalReader:
 
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
         self.path = path
+        self._file = JournalFile(path)
         self._connection = connection
         self._version_read: tuple[int, ...] | None = None
         self._close = contextlib.ExitStack()
@@ -109,11 +98,12 @@ class JournalReader:
         OutputError
             If there is none, it is no journal, damaged, another version's, or in use.
         """
-        require_file(path)
+        file = JournalFile(path)
+        file.require()
         close = contextlib.ExitStack()
         try:
-            before = version_of_file(path)
-            journal = cls(path, connect_to_read(path, close))
+            before = file.version()
+            journal = cls(path, file.connect_to_read(close))
             journal._version_read = before
             close.push(journal._close.pop_all())
             journal._close = close
@@ -124,6 +114,11 @@ class JournalReader:
             close.close()
             raise
         return journal
+
+    @classmethod
+    def read_run(cls, run: Path, purpose: str) -> Self:
+        """Open the journal of a run to be read; see :func:`find_journal` and :meth:`read`."""
+        return cls.read(find_journal(run, purpose))
 
     def close(self) -> None:
         """Close the file. May be repeated."""
@@ -148,7 +143,7 @@ class JournalReader:
         if self._version_read is None:
             return
         with contextlib.suppress(OSError):
-            if self._version_read == version_of_file(self.path):
+            if self._version_read == self._file.version():
                 return
         raise OutputError(f"{self.path}: a run has written to it while it was read; try again")
 
@@ -168,7 +163,7 @@ class JournalReader:
         """Raise OutputError if the file can no longer be found under its name."""
 
     def _damaged(self, how: str) -> OutputError:
-        return damaged(self.path, how)
+        return self._file.damaged(how)
 
     @contextlib.contextmanager
     def _errors(self) -> Iterator[None]:
@@ -261,7 +256,7 @@ class JournalReader:
                 where = f"record {expected} of the unfinished trial {trial}"
                 if sequence != expected or number != trial:
                     raise self._damaged(f"{where} is missing")
-                if not is_intact(data, checksum, step_checksum, sequence, number):
+                if not of_steps.is_intact(data, checksum, sequence, number):
                     raise self._damaged(f"{where} has a wrong checksum")
                 try:
                     records.append(decode_record(data))
@@ -273,7 +268,7 @@ class JournalReader:
         boot = boot_id()
         all_counted = True
         if meta.get("steps_counted") == "1":
-            counted = read_count(count_path(self.path))
+            counted = StepCount.read(self._file.count)
             all_counted = counted is not None and counted[0] == trial and counted[1] <= len(records)
         return UnfinishedTrial(
             trial=trial,
@@ -290,22 +285,13 @@ class JournalReader:
         with self._errors():
             return {trial for (trial,) in self._connection.execute("SELECT trial FROM trials")}
 
-    def tally(self) -> Tally:
-        """Count the finished trials."""
-        finished = successes = failures = 0
-        for result in self.results():
-            finished += 1
-            successes += result.success
-            failures += result.failed
-        return Tally(finished, successes, failures)
-
     def results(self, *, with_decisions: bool = False) -> Iterator[TrialResult]:
         """Yield the results in the order of their trials."""
         with self._errors():
             for trial, blob, checksum in self._connection.execute(
                 "SELECT trial, result, result_checksum FROM trials ORDER BY trial"
             ):
-                if not is_intact(blob, checksum, trial_checksum, trial, 0):
+                if not of_trials.is_intact(blob, checksum, trial, 0):
                     raise self._damaged(f"the result of trial {trial} has a wrong checksum")
                 result = _RESULT_DECODER.decode(blob)
                 if with_decisions:
@@ -323,7 +309,7 @@ class JournalReader:
             ).fetchone()
             if row is None:
                 raise OutputError(f"{self.path}: trial {trial} is not in the journal")
-            if not is_intact(row[0], row[1], trial_checksum, trial, 1):
+            if not of_trials.is_intact(row[0], row[1], trial, 1):
                 raise self._damaged(f"the decisions of trial {trial} have a wrong checksum")
             return _DECISIONS_DECODER.decode(row[0])
 
@@ -341,7 +327,7 @@ class JournalReader:
             )
             if not row:
                 return None
-            if not is_intact(row[0], row[1], trial_checksum, trial, 2):
+            if not of_trials.is_intact(row[0], row[1], trial, 2):
                 raise self._damaged(f"the steps of trial {trial} have a wrong checksum")
             try:
                 return [decode_record(data) for data in _KEPT_DECODER.decode(row[0])]

@@ -20,7 +20,6 @@ import numpy as np
 from holdfast.arrays import FloatArray
 from holdfast.errors import HoldfastError, OutputError
 from holdfast.outcome import TrialResult
-from holdfast.recording.journal_file import find_journal
 from holdfast.recording.journal_reader import JournalReader
 from holdfast.recording.run_directory import first_difference
 
@@ -51,7 +50,6 @@ class OutcomeEffect(msgspec.Struct, frozen=True, kw_only=True):
         Of the run, in the comparison.
     baseline, run : float
         Rate of success, geometric mean of the steps, mean reward, median of the decision times.
-    effect : float
     interval : tuple of float, or None
         For ``effect``; None if no two trials differ in it, so nothing is known of its scatter.
     verdict : {"better", "worse", "no difference found", "too few trials"}
@@ -78,7 +76,6 @@ class RunOutcomes(msgspec.Struct, frozen=True, kw_only=True):
         As it was named.
     trials : int
         Compared trials: of pairs, or of this run alone.
-    effects : tuple of OutcomeEffect
     notes : tuple of str
         What else a person should know: trials left out, other versions of the code.
     """
@@ -148,7 +145,7 @@ def compare_outcomes(runs: Sequence[Path], *, paired: bool = True) -> OutcomeCom
     Parameters
     ----------
     runs : sequence of Path
-        Two or more: directories of runs, or their journals. Nobody may be using them.
+        Directories of runs, or their journals. Nobody may be using them.
     paired : bool
         Whether trials of one number are in the same world. If False, each run is a sample of its
         own, so that runs with other seeds can be compared.
@@ -161,13 +158,15 @@ def compare_outcomes(runs: Sequence[Path], *, paired: bool = True) -> OutcomeCom
     HoldfastError
         If SciPy is not installed.
     """
-    _require_scipy()
-    recorded = [_read(run) for run in runs]
-    baseline = recorded[0]
-    others = []
-    for other in recorded[1:]:
+    try:
+        import scipy  # noqa: F401
+    except ImportError as error:
+        raise HoldfastError(
+            "comparing outcomes needs scipy, not installed here: pip install 'holdfast[lab]'"
+        ) from error
+    baseline, *others = map(_read, runs)
+    for other in others:
         _require_comparable(baseline, other, paired=paired)
-        others.append(_compare(baseline, other, paired=paired))
     over = "pairs of trials" if paired else "trials"
     return OutcomeComparison(
         baseline=str(baseline.path),
@@ -175,57 +174,57 @@ def compare_outcomes(runs: Sequence[Path], *, paired: bool = True) -> OutcomeCom
         step_limit=baseline.step_limit,
         level=LEVEL,
         method=f"percentile bootstrap over {over}, {RESAMPLES:,} resamples, fixed seed",
-        runs=tuple(others),
+        runs=tuple(_compare(baseline, other, paired=paired) for other in others),
     )
 
 
-# -- reading ---------------------------------------------------------------------------------------
-
-
 class _Run(NamedTuple):
-    """What is compared of a run."""
+    """What is compared of a run.
+
+    Attributes
+    ----------
+    world : mapping
+        The settings that must be the same for outcomes to be comparable.
+    simulated : bool
+        Whether it is a simulated one.
+    """
 
     path: Path
-    meta: Mapping[str, str]
-    configuration: Mapping[str, Any]
+    problem_sources: str | None
     results: Mapping[int, TrialResult]
     is_finished: bool
-
-    @property
-    def seed(self) -> Any:
-        return self.configuration["simulator"]["seed"]
-
-    @property
-    def step_limit(self) -> int:
-        return int(self.configuration["simulator"]["max_steps"])
-
-    @property
-    def world(self) -> Mapping[str, Any]:
-        """What must be the same for outcomes to be comparable."""
-        return {
-            "problem": self.configuration["problem"],
-            "model": self.configuration.get("model"),
-            "simulator": {"max_steps": self.step_limit},
-            "environment": {"object": self.environment},
-        }
-
-    @property
-    def environment(self) -> Any:
-        return (self.configuration.get("environment") or {}).get("object")
+    seed: Any
+    step_limit: int
+    world: Mapping[str, Any]
+    simulated: bool
 
 
 def _read(path: Path) -> _Run:
     from holdfast.config.yaml_document import read
 
-    journal_path = find_journal(path, "compare")
-    with JournalReader.read(journal_path) as journal:
+    with JournalReader.read_run(path, "compare") as journal:
         meta = journal.meta()
         results = {result.trial: result for result in journal.results()}
         journal.require_unchanged()
     text = meta.get("configuration", "")
-    configuration = read(text.encode(), f"the configuration in {journal_path}").data
-    asked_for = int(configuration["simulator"]["num_trials"])
-    return _Run(path, meta, configuration, results, len(results) >= asked_for)
+    configuration = read(text.encode(), f"the configuration in {journal.path}").data
+    simulator = configuration["simulator"]
+    environment = (configuration.get("environment") or {}).get("object")
+    return _Run(
+        path=path,
+        problem_sources=meta.get("problem_sources"),
+        results=results,
+        is_finished=len(results) >= int(simulator["num_trials"]),
+        seed=simulator["seed"],
+        step_limit=int(simulator["max_steps"]),
+        world={
+            "problem": configuration["problem"],
+            "model": configuration.get("model"),
+            "simulator": {"max_steps": int(simulator["max_steps"])},
+            "environment": {"object": environment},
+        },
+        simulated=environment is None,
+    )
 
 
 def _require_comparable(baseline: _Run, other: _Run, *, paired: bool) -> None:
@@ -244,9 +243,6 @@ def _require_comparable(baseline: _Run, other: _Run, *, paired: bool) -> None:
         )
 
 
-# -- comparing -------------------------------------------------------------------------------------
-
-
 def _compare(baseline: _Run, other: _Run, *, paired: bool) -> RunOutcomes:
     notes = []
     if paired:
@@ -255,7 +251,7 @@ def _compare(baseline: _Run, other: _Run, *, paired: bool) -> RunOutcomes:
         left_out = len(baseline.results.keys() ^ other.results.keys())
         if left_out:
             notes.append(f"trials that only one of the runs has finished, left out: {left_out:,}")
-        if other.environment is not None:
+        if not other.simulated:
             notes.append(
                 "the world is not simulated: trials of one number need not be in the same world"
             )
@@ -267,7 +263,7 @@ def _compare(baseline: _Run, other: _Run, *, paired: bool) -> RunOutcomes:
             f"{other.path}: too few trials to compare with {baseline.path}: "
             f"{min(map(len, pairs))}; intervals need at least {_LEAST_TRIALS}"
         )
-    if other.meta.get("problem_sources") != baseline.meta.get("problem_sources"):
+    if other.problem_sources != baseline.problem_sources:
         notes.append("the source of the problem differs")
     return RunOutcomes(
         run=str(other.path),
@@ -285,10 +281,9 @@ def effects_of(
     If ``paired``, they are of the same trials in the same order. A measure that fewer than two
     trials of a run have is left out.
     """
-    effects = (
-        _effect_of(measure, (first, second), step_limit, paired=paired) for measure in _MEASURES
-    )
-    return tuple(effect for effect in effects if effect is not None)
+    pairs = (first, second)
+    effects = (_effect_of(measure, pairs, step_limit, paired=paired) for measure in _MEASURES)
+    return tuple(filter(None, effects))
 
 
 class _Measure(NamedTuple):
@@ -341,40 +336,40 @@ def _effect_of(
     if paired:
         known = [pair for pair in zip(*numbers, strict=True) if None not in pair]
         numbers = [[pair[which] for pair in known] for which in (0, 1)]
-    values = [
+    one, other = (
         np.array([number for number in each if number is not None], dtype=np.float64)
         for each in numbers
-    ]
-    if min(map(len, values)) < _LEAST_TRIALS:
+    )
+    trials = min(len(one), len(other))
+    if trials < _LEAST_TRIALS:
         return None
 
+    def compared(first: Any, second: Any) -> Any:
+        return second - first if measure.kind == "difference" else second / first
+
     def effect_of(first: FloatArray, second: FloatArray, axis: int) -> Any:
-        one, other = measure.summarise(first, axis), measure.summarise(second, axis)
-        return other - one if measure.kind == "difference" else other / one
+        return compared(measure.summarise(first, axis), measure.summarise(second, axis))
 
     interval = None
     with np.errstate(divide="ignore", invalid="ignore"):
-        effect = float(effect_of(values[0], values[1], 0))
+        effect = float(effect_of(one, other, 0))
         if not np.isfinite(effect):
             return None  # a ratio to no time at all
-        one, other = values
-        scatter = one, other
-        if paired:
-            scatter = (other - one if measure.kind == "difference" else other / one,) * 2
+        scatter = [compared(one, other)] if paired else [one, other]
         if max(map(np.ptp, scatter)) > 0.0:
-            interval = _bootstrap(values, effect_of, paired=paired)
+            interval = _bootstrap((one, other), effect_of, paired=paired)
     no_effect = 0.0 if measure.kind == "difference" else 1.0
     verdict: Verdict = "no difference found"
-    if min(map(len, values)) < _LEAST_FOR_A_VERDICT:
+    if trials < _LEAST_FOR_A_VERDICT:
         verdict = "too few trials"
     elif interval is not None and not interval[0] <= no_effect <= interval[1]:
         verdict = "better" if (effect > no_effect) == measure.more_is_better else "worse"
     return OutcomeEffect(
         measure=measure.name,
         kind=measure.kind,
-        trials=len(values[1]),
-        baseline=float(measure.summarise(values[0], 0)),
-        run=float(measure.summarise(values[1], 0)),
+        trials=len(other),
+        baseline=float(measure.summarise(one, 0)),
+        run=float(measure.summarise(other, 0)),
         effect=effect,
         interval=interval,
         verdict=verdict,
@@ -400,50 +395,24 @@ def _bootstrap(
     return float(found.low), float(found.high)
 
 
-def _require_scipy() -> None:
-    try:
-        import scipy  # noqa: F401
-    except ImportError as error:
-        raise HoldfastError(
-            "comparing outcomes needs scipy, not installed here: pip install 'holdfast[lab]'"
-        ) from error
-
-
-# -- showing ---------------------------------------------------------------------------------------
-
-_TITLES = {
-    "success_rate": "success",
-    "steps": "steps",
-    "reward": "reward",
-    "decision_ms": "decision time",
-}
-
-
 def _row(effect: OutcomeEffect) -> tuple[str, ...]:
-    def of_run(value: float) -> str:
-        match effect.measure:
-            case "success_rate":
-                return f"{value:.1%}"
-            case "decision_ms":
-                return f"{value:.3g} ms"
-        return f"{value:.4g}"
-
-    def of_effect(value: float) -> str:
-        if effect.kind == "ratio":
-            return f"{value:.3g}"
-        return f"{100 * value:+.1f}" if effect.measure == "success_rate" else f"{value:+.4g}"
-
-    unit = "points" if effect.measure == "success_rate" else ""
-    if effect.kind == "ratio":
-        unit = "times"
+    """Return what the table says of a measure."""
+    title, unit, of_run, of_effect = {
+        "success_rate": ("success", " points", "{:.1%}", "{:+.1f}"),
+        "steps": ("steps", " times", "{:.4g}", "{:.3g}"),
+        "reward": ("reward", "", "{:.4g}", "{:+.4g}"),
+        "decision_ms": ("decision time", " times", "{:.3g} ms", "{:.3g}"),
+    }[effect.measure]
+    scale = 100.0 if effect.measure == "success_rate" else 1.0
     low_high = "all alike"
     if effect.interval is not None:
-        low_high = f"[{of_effect(effect.interval[0])}, {of_effect(effect.interval[1])}]"
+        low, high = (of_effect.format(scale * end) for end in effect.interval)
+        low_high = f"[{low}, {high}]"
     return (
-        _TITLES[effect.measure],
-        of_run(effect.baseline),
-        of_run(effect.run),
-        f"{of_effect(effect.effect)} {unit}".rstrip(),
+        title,
+        of_run.format(effect.baseline),
+        of_run.format(effect.run),
+        of_effect.format(scale * effect.effect) + unit,
         low_high,
         effect.verdict,
     )

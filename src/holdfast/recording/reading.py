@@ -28,7 +28,6 @@ from holdfast.recording.facts import (
     TrialBeginFact,
     TrialEndFact,
 )
-from holdfast.recording.journal_file import find_journal
 from holdfast.recording.journal_reader import JournalReader
 from holdfast.recording.replay import RecordedRun
 
@@ -41,8 +40,6 @@ class TrialArrays:
 
     Attributes
     ----------
-    trial : int
-        Its number.
     result : TrialResult or None
         None if the trial is not finished.
     task_actions : array of shape (T, action_size)
@@ -91,8 +88,6 @@ class RunArrays:
     ----------
     path : Path
         Its directory, or its journal.
-    configuration : Configuration
-        What it was run with.
     trials : tuple of int
         Numbers of all its trials, the one that was begun and not finished included.
     results : dict of arrays
@@ -117,7 +112,7 @@ class RunArrays:
         OutputError
             If there is no such trial, or the run is damaged or in use.
         HoldfastError
-            If a trial is decided otherwise when it is planned again.
+            If a trial is decided otherwise now.
         """
         chosen = sorted(set(self.trials if trials is None else trials))
         if lacking := set(chosen).difference(self.trials):
@@ -129,12 +124,7 @@ class RunArrays:
 
 
 def open_run(path: str | Path) -> RunArrays:
-    """Open a recorded run to be read as arrays.
-
-    Parameters
-    ----------
-    path : str or Path
-        The run's directory, or its journal. It is not changed.
+    """Open a recorded run, by its directory or journal, to be read as arrays; it is not changed.
 
     Raises
     ------
@@ -146,7 +136,7 @@ def open_run(path: str | Path) -> RunArrays:
     run = Path(path)
     with RecordedRun(run, "open") as recorded:
         configuration, trials = recorded.configuration, recorded.trials
-    with JournalReader.read(find_journal(run, "open")) as journal:
+    with JournalReader.read_run(run, "open") as journal:
         rows = [
             [getattr(result, column) for column in TRIAL_COLUMNS] for result in journal.results()
         ]

@@ -23,7 +23,6 @@ class RecordedEnvironment:
 
     Parameters
     ----------
-    trial : int
     records : sequence of Record
         In the order in which they were written; the one of the last performance may be missing.
     result : TrialResult or None
@@ -39,7 +38,7 @@ class RecordedEnvironment:
         result: TrialResult | None = None,
         simulated: SimulatedEnvironment | None = None,
     ) -> None:
-        self.result = result
+        self._result = result
         self._trial = trial
         self._simulated = simulated
         kinds = ObservedRecord | ActingRecord | PerformedRecord
@@ -47,36 +46,20 @@ class RecordedEnvironment:
         self._next = 0
         self._step = 0
 
-    def from_the_beginning(self) -> RecordedEnvironment:
-        """Return the same world before the trial."""
-        return RecordedEnvironment(self._trial, self._records, self.result)
-
     @property
     def state(self) -> FloatArray | None:
         """The true state, where the world is simulated."""
         return None if self._simulated is None else self._simulated.state
 
     def perform_sensing(self, sensing_action: int) -> FloatArray:
-        """Return the recorded observation.
-
-        Raises
-        ------
-        DecidedOtherwiseError
-            If another sensing action is recorded, or none.
-        """
+        """Return the recorded observation; DecidedOtherwiseError if it is of another action."""
         record = self._take()
         if not isinstance(record, ObservedRecord) or record.sensing_action != sensing_action:
             raise self._otherwise(record)
         return decode_floats(record.observation, len(record.observation) // 8)
 
     def perform(self, task_action: FloatArray) -> float | None:
-        """Return the recorded reward, None if there is none.
-
-        Raises
-        ------
-        DecidedOtherwiseError
-            If another task action is recorded, or none.
-        """
+        """Return the recorded reward; DecidedOtherwiseError if it is of another action."""
         record = self._take()
         if not isinstance(record, ActingRecord) or record.action != encode_floats(task_action):
             raise self._otherwise(record)
@@ -92,17 +75,17 @@ class RecordedEnvironment:
 
     def is_done(self) -> Done:
         """Return whether the task was done, or had failed."""
-        if self.result is None:
+        if self._result is None:
             if self._next == len(self._records) and self._step:
                 raise EndOfRecordsError(self._trial)
             return False
-        if self._step < self.result.steps:
+        if self._step < self._result.steps:
             return False
-        return "failed" if self.result.failed else self.result.success
+        return "failed" if self._result.failed else self._result.success
 
     def _take(self) -> Record | None:
         if self._next == len(self._records):
-            if self.result is None:
+            if self._result is None:
                 raise EndOfRecordsError(self._trial)
             return None
         self._next += 1

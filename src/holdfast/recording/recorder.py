@@ -13,11 +13,7 @@ from holdfast.planning import PlanningState
 from holdfast.robot.environment import Environment
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver
 
-__all__ = [
-    "Recorder",
-    "SensingRecord",
-    "TrialRecord",
-]
+__all__ = ["Recorder", "SensingRecord", "TrialRecord"]
 
 MAX_PARTICLES_KEPT = 500
 """Particles kept of a belief; more would not show in a figure."""
@@ -32,7 +28,6 @@ class SensingRecord:
 
     Attributes
     ----------
-    observation : array
     entropies : array of shape (num_sensing_actions,) or None
         What was minimised; None if nothing was.
     before, after : array of shape (at most 500, state_size)
@@ -43,7 +38,6 @@ class SensingRecord:
 
     step: int
     sensing_action: int
-    observation: FloatArray
     entropies: FloatArray | None
     before: FloatArray
     after: FloatArray
@@ -63,9 +57,9 @@ class TrialRecord:
     actions : list of array
         Executed task actions.
     rewards : list of float
-        The rewards of the steps, NaN where the environment reported none.
+        NaN where the environment reported none.
     result : TrialResult or None
-        The outcome; None while the trial runs.
+        None while the trial runs.
     """
 
     true_states: list[FloatArray] = field(default_factory=list)
@@ -105,7 +99,6 @@ class Recorder(TrialObserver):
             SensingRecord(
                 step=step.before.step,
                 sensing_action=step.sensing_action,
-                observation=np.array(step.observation, dtype=np.float64),
                 entropies=None if entropies is None else np.array(entropies, dtype=np.float64),
                 before=_some_particles(step.before.belief),
                 after=_some_particles(step.after.belief),

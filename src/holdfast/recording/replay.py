@@ -12,6 +12,7 @@ decisions and their times, and no beliefs.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -38,7 +39,6 @@ from holdfast.recording.facts import (
     TrialEndFact,
 )
 from holdfast.recording.fingerprint import difference, fingerprint
-from holdfast.recording.journal_file import find_journal
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.recording.recorded_environment import RecordedEnvironment
 from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME
@@ -53,12 +53,7 @@ __all__ = ["RecordedRun"]
 class RecordedRun:
     """A recorded run, open to be read; to be used in a ``with`` statement.
 
-    Parameters
-    ----------
-    run : Path
-        Its directory, or its journal. Nobody may be using it; it is not changed.
-    purpose : str
-        A verb, for messages.
+    ``run`` is its directory, or its journal. Nobody may be using it; it is not changed.
 
     Attributes
     ----------
@@ -66,8 +61,6 @@ class RecordedRun:
         The settings that decide; it names no services and no environment.
     trials : tuple of int
         All trials that have facts, in order: the finished ones, and the unfinished one.
-    unfinished : int or None
-        The number of the latter.
     has_times : bool
         Whether the facts have the robot's times.
     untimed : tuple of int
@@ -84,10 +77,10 @@ class RecordedRun:
 
     def __init__(self, run: Path, purpose: str = "export") -> None:
         self.path = run
-        path = find_journal(run, purpose)
-        directory = path.parent
         with ExitStack() as stack:
-            self._journal = stack.enter_context(JournalReader.read(path))
+            self._journal = stack.enter_context(JournalReader.read_run(run, purpose))
+            path = self._journal.path
+            directory = path.parent
             self._meta = self._journal.meta()
             self.configuration, self.world_is_simulated = _configuration(self._meta, path)
             self._estimate = self.configuration.planning.particle_filter.estimate
@@ -132,12 +125,7 @@ class RecordedRun:
     ) -> Iterator[int]:
         """Write the facts of some trials to each sink, and yield each trial's number at its end.
 
-        Parameters
-        ----------
-        trials : sequence of int
-            Ascending; some of :attr:`trials`.
-        rate_hz : float
-            Steps a second, for a run without times.
+        ``trials`` ascend; a run without times has ``rate_hz`` steps a second.
 
         Raises
         ------
@@ -159,7 +147,7 @@ class RecordedRun:
                 yield self._replay_finished(result, output, clock)
         if begun is not None:
             yield self._replay_unfinished(begun, output, clock)
-        output.end()
+        output.at(math.inf, between_trials=True)
 
     def _replay_finished(self, result: TrialResult, output: _Output, clock: StepClock) -> int:
         trial, decisions = result.trial, result.decisions
@@ -173,9 +161,7 @@ class RecordedRun:
         if world is None:
             _write_decisions(result, decisions, times, output)
         else:
-            replay = _Replay(
-                trial, list(decisions), times, output, result, decisions, self._estimate
-            )
+            replay = _Replay(trial, list(decisions), times, output, result, self._estimate)
             self._run_again(trial, world, replay)
         return trial
 
@@ -192,7 +178,7 @@ class RecordedRun:
         simulated = self._simulated_world(trial) if self.world_is_simulated else None
         world = RecordedEnvironment(trial, begun.records, simulated=simulated)
         times = self._times(trial, steps, clock)
-        replay = _Replay(trial, expected, times, output, None, None, self._estimate)
+        replay = _Replay(trial, expected, times, output, None, self._estimate)
         try:
             self._run_again(trial, world, replay)
         except EndOfRecordsError:
@@ -251,7 +237,6 @@ class _Replay(TrialObserver):
         times: TrialTimes,
         output: _Output,
         result: TrialResult | None,
-        decisions: Decisions | None,
         estimate_kind: Literal["mean", "most_likely"],
     ) -> None:
         self._trial = trial
@@ -260,7 +245,6 @@ class _Replay(TrialObserver):
         self._times = times
         self._output = output
         self._result = result
-        self._decisions = decisions
         self._compared = 0
         self._steps = 0
         self._state: PlanningState | None = None
@@ -269,7 +253,9 @@ class _Replay(TrialObserver):
     def trial_began(self, environment: Environment, state: PlanningState) -> None:
         self._state = state
         self._true_state = _true_state(environment)
-        self._output.trial_begins(TrialBeginFact(self._trial, self._times.at(0, 0), True))
+        begin = TrialBeginFact(self._trial, self._times.at(0, 0), True)
+        for sink in self._output.at(begin.time_ns, between_trials=True):
+            sink.trial_begins(begin)
 
     def sensed(self, step: SensingStep) -> None:
         number, after = step.before.step, step.after
@@ -277,69 +263,69 @@ class _Replay(TrialObserver):
         self._require(SensingDecision(number, step.sensing_action, state_digest))
         entropies = step.sensing_info.entropies
         info = step.observation_info
-        self._output.sensed(
-            SensingFact(
-                trial=self._trial,
-                step=number,
-                decided_ns=self._times.at(number, 0),
-                observed_ns=self._times.at(number, 1),
-                sensing_action=step.sensing_action,
-                state_digest=state_digest,
-                decider=self._times.deciders.get((number, "sensing")),
-                before=step.before.belief,
-                after=after.belief,
-                stage=step.before.stage,
-                entropies=None if entropies is None else np.array(entropies, dtype=np.float64),
-                observation=np.asarray(step.observation, dtype=np.float64).reshape(-1),
-                explained=info.explained,
-                resampled=info.resampled,
-                effective_sample_size=info.effective_sample_size,
-                mahalanobis_distance=info.mahalanobis_distance,
-            )
+        fact = SensingFact(
+            trial=self._trial,
+            step=number,
+            decided_ns=self._times.at(number, 0),
+            observed_ns=self._times.at(number, 1),
+            sensing_action=step.sensing_action,
+            state_digest=state_digest,
+            decider=self._times.deciders.get((number, "sensing")),
+            before=step.before.belief,
+            after=after.belief,
+            stage=step.before.stage,
+            entropies=None if entropies is None else np.array(entropies, dtype=np.float64),
+            observation=np.asarray(step.observation, dtype=np.float64).reshape(-1),
+            explained=info.explained,
+            resampled=info.resampled,
+            effective_sample_size=info.effective_sample_size,
+            mahalanobis_distance=info.mahalanobis_distance,
         )
+        for sink in self._output.at(fact.decided_ns):
+            sink.sensed(fact)
         self._state = after
 
     def acted(self, step: TaskStep) -> None:
         number = step.state.step
         action = np.array(step.executed, dtype=np.float64)
         self._require(TaskDecision(number, tuple(action.tolist())))
-        self._output.acted(
-            TaskFact(
-                trial=self._trial,
-                step=number,
-                time_ns=self._times.at(number, 2),
-                action=action,
-                decider=self._times.deciders.get((number, "task")),
-                belief=step.state.belief,
-                stage=step.task_info.stage,
-                estimate=np.array(step.task_info.estimate, dtype=np.float64),
-                true_state=self._true_state,
-                reward=None if step.reward is None else float(step.reward),
-            )
+        fact = TaskFact(
+            trial=self._trial,
+            step=number,
+            time_ns=self._times.at(number, 2),
+            action=action,
+            decider=self._times.deciders.get((number, "task")),
+            belief=step.state.belief,
+            stage=step.task_info.stage,
+            estimate=np.array(step.task_info.estimate, dtype=np.float64),
+            true_state=self._true_state,
+            reward=None if step.reward is None else float(step.reward),
         )
+        for sink in self._output.at(fact.time_ns):
+            sink.acted(fact)
         self._true_state = _true_state(step.environment)
         self._steps = number + 1
         self._state = None  # the next one is not known before something is done in it
 
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
-        if self._decisions is None or result.decisions != self._decisions:
+        if self._result is None or result.decisions != self._result.decisions:
             raise DecidedOtherwiseError(self._trial, result.steps, None)
         self._state = state
         self.end_here()
 
     def end_here(self) -> None:
         belief = None if self._state is None else self._state.belief
-        self._output.trial_ends(
-            TrialEndFact(
-                trial=self._trial,
-                time_ns=self._times.at(self._steps, 3 if self._result is None else 0),
-                steps=self._steps,
-                result=self._result,
-                belief=belief,
-                estimate=None if belief is None else estimate(belief, self._estimate),
-                true_state=self._true_state,
-            )
+        end = TrialEndFact(
+            trial=self._trial,
+            time_ns=self._times.at(self._steps, 3 if self._result is None else 0),
+            steps=self._steps,
+            result=self._result,
+            belief=belief,
+            estimate=None if belief is None else estimate(belief, self._estimate),
+            true_state=self._true_state,
         )
+        for sink in self._output.at(end.time_ns):
+            sink.trial_ends(end)
 
     def _require(self, decision: SensingDecision | TaskDecision) -> None:
         kept = self._expected[self._compared] if self._compared < len(self._expected) else None
@@ -369,36 +355,32 @@ def _write_decisions(
 ) -> None:
     """Write the facts that follow from the decisions of a trial alone."""
     trial = result.trial
-    output.trial_begins(TrialBeginFact(trial, times.at(0, 0), False))
+    begin = TrialBeginFact(trial, times.at(0, 0), False)
+    for sink in output.at(begin.time_ns, between_trials=True):
+        sink.trial_begins(begin)
     for decision in decisions:
         step = decision.step
         if isinstance(decision, SensingDecision):
-            output.sensed(
-                SensingFact(
-                    trial=trial,
-                    step=step,
-                    decided_ns=times.at(step, 0),
-                    observed_ns=times.at(step, 1),
-                    sensing_action=decision.sensing_action,
-                    state_digest=decision.state_digest,
-                    decider=times.deciders.get((step, "sensing")),
-                )
+            chosen, state_digest = decision.sensing_action, decision.state_digest
+            decided_ns, observed_ns = times.at(step, 0), times.at(step, 1)
+            decider = times.deciders.get((step, "sensing"))
+            sensing = SensingFact(
+                trial, step, decided_ns, observed_ns, chosen, state_digest, decider
             )
+            for sink in output.at(decided_ns):
+                sink.sensed(sensing)
         else:
-            output.acted(
-                TaskFact(
-                    trial=trial,
-                    step=step,
-                    time_ns=times.at(step, 2),
-                    action=np.array(decision.action, dtype=np.float64),
-                    decider=times.deciders.get((step, "task")),
-                )
-            )
-    output.trial_ends(TrialEndFact(trial, times.at(result.steps, 0), result.steps, result))
+            decider = times.deciders.get((step, "task"))
+            task = TaskFact(trial, step, times.at(step, 2), np.array(decision.action), decider)
+            for sink in output.at(task.time_ns):
+                sink.acted(task)
+    end = TrialEndFact(trial, times.at(result.steps, 0), result.steps, result)
+    for sink in output.at(end.time_ns):
+        sink.trial_ends(end)
 
 
 class _Output:
-    """Writes facts to all sinks, with the events of the services in between.
+    """The sinks, which also get the events of the services, between the facts.
 
     Parameters
     ----------
@@ -415,35 +397,14 @@ class _Output:
         self._events = deque(events)
         self._with_others = with_others
 
-    def trial_begins(self, fact: TrialBeginFact) -> None:
-        self._write_events(fact.time_ns, between_trials=True)
-        for sink in self._sinks:
-            sink.trial_begins(fact)
-
-    def sensed(self, fact: SensingFact) -> None:
-        self._write_events(fact.decided_ns)
-        for sink in self._sinks:
-            sink.sensed(fact)
-
-    def acted(self, fact: TaskFact) -> None:
-        self._write_events(fact.time_ns)
-        for sink in self._sinks:
-            sink.acted(fact)
-
-    def trial_ends(self, fact: TrialEndFact) -> None:
-        self._write_events(fact.time_ns)
-        for sink in self._sinks:
-            sink.trial_ends(fact)
-
-    def end(self) -> None:
-        self._write_events(None, between_trials=True)
-
-    def _write_events(self, time_ns: int | None, *, between_trials: bool = False) -> None:
-        while self._events and (time_ns is None or self._events[0].time_ns <= time_ns):
+    def at(self, time_ns: float, *, between_trials: bool = False) -> Sequence[FactSink]:
+        """Write the events up to a time, and return the sinks."""
+        while self._events and self._events[0].time_ns <= time_ns:
             event = self._events.popleft()
             if self._with_others or not between_trials:
                 for sink in self._sinks:
                     sink.happened(event)
+        return self._sinks
 
 
 def _configuration(meta: Mapping[str, str], path: Path) -> tuple[Configuration, bool]:

@@ -7,11 +7,12 @@ and the run's logs, runs the robot's process, and closes all of them again.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+from holdfast.protocol.events import Timing, VerificationNoted
 from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME, VERIFICATION_NAME
-from holdfast.recording.timings import TimingTable, VerificationTable, count_verified
+from holdfast.recording.timings import EventTable, count_verified
 from holdfast.robot.links import make_links
 from holdfast.robot.process import RobotProcess
 from holdfast.runtime.events import BoundedEventLog
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
     from holdfast.outcome import TrialResult
     from holdfast.planning import PlanningState
-    from holdfast.protocol.events import Act, Sense, Timing, VerificationNoted
+    from holdfast.protocol.events import Act, Sense
     from holdfast.recording.run_directory import RunDirectory
     from holdfast.robot.environment import EnvironmentMaker
     from holdfast.robot.health import RobotWatch
@@ -76,16 +77,13 @@ def perform_trials(
         stack.callback(events.close)
         links = make_links(configuration, directory.path / RECOVERY_LOG_NAME, events)
         stack.callback(links.close)
-        timings = TimingTable(directory.path / TIMINGS_NAME)
+        timings = EventTable(directory.path / TIMINGS_NAME, Timing)
         stack.callback(timings.close)
-        on_verified: Callable[[VerificationNoted], None] = _ignore
-        distrusted: Collection[str] = ()
-        if configuration.offload.services:
+        earlier = verification = None
+        if configuration.offload.services:  # else there is nothing to verify, and no table
             earlier = count_verified(directory.path / VERIFICATION_NAME)
-            distrusted = () if earlier is None else earlier.wrong
-            verification = VerificationTable(directory.path / VERIFICATION_NAME)
+            verification = EventTable(directory.path / VERIFICATION_NAME, VerificationNoted)
             stack.callback(verification.close)
-            on_verified = verification.add
 
         def on_timing(timing: Timing) -> None:
             timings.add(timing)
@@ -100,9 +98,9 @@ def perform_trials(
             events,
             on_result,
             on_timing,
-            on_verified,
+            (lambda _: None) if verification is None else verification.add,
             rate_hz,
-            distrusted,
+            () if earlier is None else earlier.wrong_answers,
             watch=None if watch is None else watch(events),
             on_order=None if observer is None else observer.order,
         )
@@ -110,7 +108,3 @@ def perform_trials(
             observer.process(robot)
         robot.run(directory.journal.finished())
         return robot.missed_ticks
-
-
-def _ignore(verified: VerificationNoted) -> None:
-    """Do nothing: without services there is nothing to verify."""

@@ -10,6 +10,7 @@ times, never a decision.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -25,7 +26,7 @@ from holdfast.files import write_atomically
 from holdfast.outcome import TrialResult
 from holdfast.recording.fingerprint import difference, fingerprint
 from holdfast.recording.journal import Journal
-from holdfast.recording.journal_file import JOURNAL_NAME, Survives, require_writable
+from holdfast.recording.journal_file import JOURNAL_NAME, JournalFile, Survives
 from holdfast.recording.journal_reader import JournalReader
 from holdfast.recording.tables import RunSummary, SummaryBuilder, csv_lines
 from holdfast.recording.timings import count_answers, count_verified
@@ -35,6 +36,7 @@ __all__ = [
     "EVENTS_NAME",
     "FIGURE_NAME",
     "JOURNAL_NAME",
+    "OUTPUT_NAMES",
     "SUMMARY_NAME",
     "TIMINGS_NAME",
     "TRIALS_NAME",
@@ -44,7 +46,6 @@ __all__ = [
     "configuration_difference",
     "first_difference",
     "latest_default_directory",
-    "output_names",
 ]
 
 CONFIGURATION_NAME = "config.yaml"
@@ -54,6 +55,18 @@ SUMMARY_NAME = "summary.json"
 TIMINGS_NAME = "timings.csv"
 VERIFICATION_NAME = "verification.csv"
 TRIALS_NAME = "trials.csv"
+
+OUTPUT_NAMES = (
+    TRIALS_NAME,
+    SUMMARY_NAME,
+    CONFIGURATION_NAME,
+    FIGURE_NAME,
+    JOURNAL_NAME,
+    EVENTS_NAME,
+    TIMINGS_NAME,
+    VERIFICATION_NAME,
+)
+"""The last three are there only if services decided."""
 
 _SECTIONS_WITHOUT_DECISIONS = ("offload", "recovery")
 
@@ -93,7 +106,7 @@ class RunDirectory:
         """
         try:
             path.mkdir(parents=True, exist_ok=True)
-            taken = [name for name in output_names() if (path / name).exists()]
+            taken = [name for name in OUTPUT_NAMES if (path / name).exists()]
         except FileExistsError as error:
             raise OutputError(f"{path}: is a file, not a directory") from error
         except OSError as error:
@@ -110,7 +123,7 @@ class RunDirectory:
         try:
             if journal is not None:
                 journal.restart(meta)
-                for name in output_names():
+                for name in OUTPUT_NAMES:
                     if name not in (CONFIGURATION_NAME, JOURNAL_NAME):
                         (path / name).unlink(missing_ok=True)
             else:
@@ -128,9 +141,6 @@ class RunDirectory:
     def resume(cls, path: Path, configuration: Configuration) -> Self:
         """Open the directory of a run that shall go on, perhaps to more trials than it had.
 
-        If a trial was begun and not finished, the journal has its steps:
-        :meth:`holdfast.recording.journal.Journal.unfinished`.
-
         Raises
         ------
         OutputError
@@ -144,7 +154,7 @@ class RunDirectory:
             raise OutputError(f"{path}: holds no {JOURNAL_NAME}, so no run to resume")
         try:
             _require_writable_directory(path)
-            require_writable(path / JOURNAL_NAME)
+            JournalFile(path / JOURNAL_NAME).require_writable()
         except OutputError as error:
             # If the journal is damaged as well, its reader raises first.
             JournalReader.read(path / JOURNAL_NAME).close()
@@ -198,7 +208,7 @@ class RunDirectory:
         A process that was killed after the last trial may have left none, or an old one.
         """
         trials = self.configuration.simulator.num_trials
-        if self.journal.tally().finished < trials:
+        if len(self.journal.finished()) < trials:
             return None
         try:
             summary = msgspec.json.decode((self.path / SUMMARY_NAME).read_bytes(), type=RunSummary)
@@ -211,13 +221,7 @@ class RunDirectory:
         self.journal.add(result, keep_steps=self.configuration.environment.object is not None)
 
     def write_tables(self, wall_time_s: float) -> RunSummary:
-        """Write ``trials.csv`` and ``summary.json`` from the journal.
-
-        Parameters
-        ----------
-        wall_time_s : float
-            Of this part of the run; that of earlier parts is added.
-        """
+        """Write ``trials.csv`` and ``summary.json``; the time of earlier parts is added."""
         total_s = self.earlier_wall_time_s + wall_time_s
         self.journal.set_meta("wall_time_s", repr(total_s))
         builder = SummaryBuilder()
@@ -251,32 +255,10 @@ class RunDirectory:
         self.close()
 
 
-def output_names() -> tuple[str, ...]:
-    """Return the names of a run's files; the last three are there only if services decided."""
-    return (
-        TRIALS_NAME,
-        SUMMARY_NAME,
-        CONFIGURATION_NAME,
-        FIGURE_NAME,
-        JOURNAL_NAME,
-        EVENTS_NAME,
-        TIMINGS_NAME,
-        VERIFICATION_NAME,
-    )
-
-
 def claim_default_directory(configuration: Configuration, parent: Path) -> Path:
-    """Return a directory named after the configuration and the seed that is free for a new run.
+    """Return a directory in ``parent`` that is free for a new run; both are made if missing.
 
-    Parameters
-    ----------
-    parent : Path
-        Where it is made if it is not there; this one is made too.
-
-    Returns
-    -------
-    Path
-        ``<parent>/<stem of the configuration>-seed<seed>``, with ``-2``, ``-3``, ... if taken.
+    It is ``<stem of the configuration>-seed<seed>``, with ``-2``, ``-3``, ... if that is taken.
 
     Raises
     ------
@@ -289,12 +271,12 @@ def claim_default_directory(configuration: Configuration, parent: Path) -> Path:
             free.close()
             return path
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            parent.mkdir(parents=True, exist_ok=True)
             # Making it is also the test whether it is free, so two runs never share one.
             path.mkdir()
         except FileExistsError:
-            if not path.parent.is_dir():
-                raise OutputError(f"{path.parent}: is a file, not a directory") from None
+            if not parent.is_dir():
+                raise OutputError(f"{parent}: is a file, not a directory") from None
         except OSError as error:
             raise OutputError(f"{path}: cannot be made: {error.strerror}") from error
         else:
@@ -310,15 +292,12 @@ def latest_default_directory(configuration: Configuration, parent: Path) -> Path
     OutputError
         If there is none.
     """
-    latest: Path | None = None
-    for path in _default_directories(configuration, parent):
-        if not path.exists():
-            break
-        latest = path
-    if latest is None:
+    paths = _default_directories(configuration, parent)
+    made = list(itertools.takewhile(Path.exists, paths))
+    if not made:
         first = next(_default_directories(configuration, parent))
         raise OutputError(f"{first}: there is no such directory, so no run to resume; give --out")
-    return latest
+    return made[-1]
 
 
 def _default_directories(configuration: Configuration, parent: Path) -> Iterator[Path]:
@@ -374,17 +353,9 @@ def _require_same_configuration(path: Path, there: str, here: str) -> None:
 
 
 def configuration_difference(first: str, second: str) -> tuple[str, str, str] | None:
-    """Return the first key whose value changes a decision and differs, None if there is none.
+    """Return the first key that changes a decision and differs in two resolved configurations.
 
-    Parameters
-    ----------
-    first, second : str
-        Two resolved configurations (:meth:`holdfast.config.loader.Configuration.to_yaml`).
-
-    Returns
-    -------
-    tuple of str or None
-        Key and both values, for a person.
+    With both values, for a person; None if there is none.
     """
     import yaml
 
@@ -437,21 +408,15 @@ def _require_enough_trials(path: Path, journal: Journal, num_trials: int) -> Non
 
 def first_difference(there: Any, here: Any, key: str = "") -> tuple[str, str, str] | None:
     """Return the first key whose value differs, and both values, None if there is none."""
+    inner: dict[str, tuple[Any, Any]] = {}
     if isinstance(there, Mapping) and isinstance(here, Mapping):
-        for name in [*here, *(name for name in there if name not in here)]:
-            inner = f"{key}.{name}" if key else str(name)
-            found = first_difference(there.get(name), here.get(name), inner)
-            if found:
-                return found
-        return None
-    if isinstance(there, list) and isinstance(here, list) and len(there) == len(here):
-        for index, (old, new) in enumerate(zip(there, here, strict=True)):
-            found = first_difference(old, new, f"{key}[{index}]")
-            if found:
-                return found
-        return None
-    return None if there == here else (key or "the whole", _shown(there), _shown(here))
-
-
-def _shown(value: Any) -> str:
-    return "not given" if value is None else repr(value)
+        dot = "." if key else ""
+        inner = {f"{dot}{name}": (there.get(name), here.get(name)) for name in [*here, *there]}
+    elif isinstance(there, list) and isinstance(here, list) and len(there) == len(here):
+        pairs = zip(there, here, strict=True)
+        inner = {f"[{index}]": pair for index, pair in enumerate(pairs)}
+    elif there != here:
+        old, new = ("not given" if value is None else repr(value) for value in (there, here))
+        return key or "the whole", old, new
+    found = (first_difference(*pair, f"{key}{name}") for name, pair in inner.items())
+    return next(filter(None, found), None)

@@ -16,13 +16,7 @@ import numpy as np
 from holdfast.outcome import TRIAL_COLUMNS, TrialResult
 from holdfast.recording.timings import AnswerCounts, VerificationCounts
 
-__all__ = [
-    "RunSummary",
-    "SummaryBuilder",
-    "csv_lines",
-    "csv_row",
-    "wilson_interval",
-]
+__all__ = ["RunSummary", "SummaryBuilder", "csv_lines", "wilson_interval"]
 
 _NORMAL_QUANTILE_975 = 1.959963984540054
 
@@ -51,17 +45,10 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         Observations outside the validation gate of every particle.
     recoveries : int
         Times that the local service took over, in all processes of the run.
-    sensing_decisions_by_service, task_answers_by_service : dict of str to int, or None
-        Sensing decisions of each service, and its answers with task actions (one holds those up to
-        the next sensing step); None where ``timings.csv`` is not kept.
-    longest_wait_ms : float or None
-        The longest time that the robot stood still for a decision.
-    verified_answers : int or None
-        Answers of services that the robot's own planner computed again; None where no service
-        decided. For the next three see :class:`holdfast.recording.timings.VerificationCounts`.
-    wrong_answers : dict of str to int, or None
-        By service.
-    not_deterministic, unverified_answers : int or None
+    sensing_decisions_by_service, task_answers_by_service, longest_wait_ms
+        See :class:`holdfast.recording.timings.AnswerCounts`; None without services.
+    verified_answers, wrong_answers, not_deterministic, unverified_answers
+        See :class:`holdfast.recording.timings.VerificationCounts`; None without services.
     sensing_ms_median, sensing_ms_p99 : float or None
         Wall time of choosing a sensing action. Each decision counts once, as it was carried out,
         also those of earlier processes of a run that was resumed.
@@ -87,13 +74,13 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     sensing_decisions: int
     unexplained_observations: int
     recoveries: int
-    sensing_decisions_by_service: dict[str, int] | None
-    task_answers_by_service: dict[str, int] | None
-    longest_wait_ms: float | None
-    verified_answers: int | None
-    wrong_answers: dict[str, int] | None
-    not_deterministic: int | None
-    unverified_answers: int | None
+    sensing_decisions_by_service: dict[str, int] | None = None
+    task_answers_by_service: dict[str, int] | None = None
+    longest_wait_ms: float | None = None
+    verified_answers: int | None = None
+    wrong_answers: dict[str, int] | None = None
+    not_deterministic: int | None = None
+    unverified_answers: int | None = None
     sensing_ms_median: float | None
     sensing_ms_p99: float | None
     wall_time_s: float
@@ -104,22 +91,20 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         return msgspec.json.format(msgspec.json.encode(self), indent=2).decode() + "\n"
 
 
-def csv_row(result: TrialResult) -> list[str]:
-    """Return one row of ``trials.csv``; reading a number back gives the same number.
-
-    A value that is None, such as the reward of a trial without one, is an empty cell.
-    """
-    return [
-        "" if value is None else str(int(value)) if isinstance(value, bool) else str(value)
-        for value in (getattr(result, column) for column in TRIAL_COLUMNS)
-    ]
-
-
 def csv_lines(results: Iterable[TrialResult]) -> Iterator[str]:
-    """Yield the lines of ``trials.csv``, the head first; no value needs quotes."""
+    """Yield the lines of ``trials.csv``, the head first; no value needs quotes.
+
+    Reading a number back gives the same number. None, such as the reward of a trial without one, is
+    an empty cell.
+    """
     yield ",".join(TRIAL_COLUMNS) + "\n"
     for result in results:
-        yield ",".join(csv_row(result)) + "\n"
+        values = (getattr(result, column) for column in TRIAL_COLUMNS)
+        cells = (
+            "" if value is None else str(int(value)) if isinstance(value, bool) else str(value)
+            for value in values
+        )
+        yield ",".join(cells) + "\n"
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
@@ -212,13 +197,8 @@ class SummaryBuilder:
             sensing_decisions=self._sensing_decisions,
             unexplained_observations=self._unexplained,
             recoveries=self._recoveries,
-            sensing_decisions_by_service=None if answers is None else answers.sensing,
-            task_answers_by_service=None if answers is None else answers.task,
-            longest_wait_ms=None if answers is None else answers.longest_wait_ms,
-            verified_answers=None if verified is None else verified.verified,
-            wrong_answers=None if verified is None else verified.wrong,
-            not_deterministic=None if verified is None else verified.not_deterministic,
-            unverified_answers=None if verified is None else verified.unverified,
+            **{} if answers is None else answers._asdict(),
+            **{} if verified is None else verified._asdict(),
             sensing_ms_median=median,
             sensing_ms_p99=p99,
             wall_time_s=round(wall_time_s, 3),

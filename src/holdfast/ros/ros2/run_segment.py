@@ -272,7 +272,7 @@ class RunSegment:
         return Ending.PAUSED if paused else Ending.HELD
 
     def _run(self, directory: RunDirectory) -> None:
-        self.num_finished = directory.journal.tally().finished
+        self.num_finished = sum(1 for _ in directory.journal.results())
         if directory.complete_summary() is not None:
             return
         began = perf_counter()
