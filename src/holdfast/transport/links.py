@@ -117,8 +117,6 @@ class Link(asyncio.BufferedProtocol):
         Larger messages are not sent.
     has_answered : bool
         Whether an awaited reply came over it; set by the owner.
-    connecting : Task or None
-        Of an accepted connection; asyncio itself keeps no reference.
     closed : Future
         Done when the connection is closed.
     hello : Hello or None
@@ -172,7 +170,7 @@ class Link(asyncio.BufferedProtocol):
         self._ended = False
         self._notified = False
         self.closed: asyncio.Future[None] = self._loop.create_future()
-        self.connecting: asyncio.Task[object] | None = None
+        self._connecting: asyncio.Task[None] | None = None
         self.hello: Hello | None = None
         self.peer: PeerCertificate | None = None
         self.address: str | None = None
@@ -205,6 +203,10 @@ class Link(asyncio.BufferedProtocol):
     def protocol(self) -> asyncio.BaseProtocol:
         """Return the protocol for asyncio: the link itself, or an adapter around it."""
         return self
+
+    def begin(self, stream: socket.socket) -> None:
+        """Take over a connection, from the next turn of the loop on."""
+        self._connecting = self._loop.create_task(self.connect(stream))  # asyncio's are weak
 
     async def connect(self, stream: socket.socket) -> None:
         """Take over a connection; never raises."""

@@ -337,8 +337,7 @@ class _ServiceLinks(LinkOwner):
         }
         if len(unknown) >= _MAX_WITHOUT_HELLO:
             connection_to_drop(unknown).end("has said no hello, and others wait", abort=True)
-        link = self._make_link(network)
-        link.connecting = asyncio.get_running_loop().create_task(link.connect(connection))
+        self._make_link(network).begin(connection)
 
     def on_handshake(self, link: Link) -> None:
         if not self._handshake_is_enough or self._address.listens or self._links:

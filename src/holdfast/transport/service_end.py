@@ -365,8 +365,7 @@ class StreamServiceTransport(LinkOwner):
         return link
 
     def _accepted(self, endpoint: Endpoint, connection: socket.socket, network: bytes) -> None:
-        link = self._make_link(endpoint, network, dialled=False)
-        link.connecting = asyncio.get_running_loop().create_task(link.connect(connection))
+        self._make_link(endpoint, network, dialled=False).begin(connection)
 
     def on_handshake(self, link: Link) -> None:
         """Refuse a robot that is no longer trusted, before anything of it is read."""
