@@ -15,8 +15,7 @@ from typing import NamedTuple
 
 from holdfast.errors import CredentialsError
 from holdfast.transport.credentials import date_text, warn_if_open
-from holdfast.transport.endpoints import AUTHORITY_FILE, Role
-from holdfast.transport.revocation import REVOKED_FILE
+from holdfast.transport.endpoints import AUTHORITY_FILE, REVOKED_FILE, Role
 
 try:
     from cryptography import x509

@@ -24,6 +24,7 @@ __all__ = [
     "CERTIFICATE_FILE",
     "KEY_FILE",
     "MAX_SOCKET_PATH_BYTES",
+    "REVOKED_FILE",
     "SCHEMES",
     "Endpoint",
     "Role",
@@ -46,7 +47,8 @@ MAX_SOCKET_PATH_BYTES = 107
 """Bound on the path of a local socket, from the system's ``sockaddr_un``."""
 
 AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE = "authority.pem", "certificate.pem", "key.pem"
-"""Names of the credentials' files."""
+REVOKED_FILE = "revoked.pem"
+"""Names of the credentials' files, and of the list of revoked certificates beside them."""
 
 _RENAMED = {
     "quic": "over UDP, services are at udp/HOST:PORT",

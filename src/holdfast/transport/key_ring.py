@@ -55,8 +55,13 @@ from holdfast.transport.authority import (
     sign_certificate,
     sign_revocations,
 )
-from holdfast.transport.endpoints import AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, Role
-from holdfast.transport.revocation import REVOKED_FILE
+from holdfast.transport.endpoints import (
+    AUTHORITY_FILE,
+    CERTIFICATE_FILE,
+    KEY_FILE,
+    REVOKED_FILE,
+    Role,
+)
 
 if TYPE_CHECKING:
     from cryptography import x509

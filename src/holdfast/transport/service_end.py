@@ -21,6 +21,7 @@ from holdfast.transport.calls import too_large
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, IncomingCall
 from holdfast.transport.dialer import Dialer
 from holdfast.transport.endpoints import (
+    REVOKED_FILE,
     Endpoint,
     TlsFiles,
     check_credentials,
@@ -39,7 +40,6 @@ from holdfast.transport.frames import (
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.listener import MAX_SILENT, Listener, connection_to_drop
-from holdfast.transport.revocation import REVOKED_FILE, revoked_serials
 from holdfast.transport.schemes import load_scheme
 
 if TYPE_CHECKING:
@@ -333,6 +333,7 @@ class StreamServiceTransport(LinkOwner):
 
     def _read_credentials(self, tls: TlsFiles) -> None:
         # Imported here, because OpenSSL is slow to load.
+        from holdfast.transport.credentials import revoked_serials
         from holdfast.transport.tls import server_context
 
         context = server_context(tls, self._incarnation)

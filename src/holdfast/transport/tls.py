@@ -18,20 +18,22 @@ import contextlib
 import re
 import ssl
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from holdfast.errors import FrameError, TransportError
-from holdfast.transport.credentials import file_versions
+from holdfast.transport.credentials import file_versions, refuse_revoked
 from holdfast.transport.endpoints import AUTHORITY_FILE, TlsFiles
-from holdfast.transport.revocation import refuse_revoked
 
 __all__ = [
+    "REMEDIES",
     "ClientCredentials",
     "PeerCertificate",
     "TlsStream",
     "client_context",
     "common_name",
     "describe_certificate_error",
+    "make_context",
     "server_context",
 ]
 
@@ -44,8 +46,7 @@ service 0.2 s of computing. Python 3.11.2 (Debian 12) cannot choose X25519."""
 _READ_BYTES = 16 * 1024
 """The largest record."""
 
-
-_REMEDIES = {
+REMEDIES = {
     10: "; 'holdfast keys DIR --renew --{role} NAME' makes another",
     18: "; both ends need files of one 'holdfast keys DIR'",
     19: "; both ends need files of one 'holdfast keys DIR'",
@@ -109,7 +110,7 @@ def client_context(files: TlsFiles) -> ssl.SSLContext:
     TransportError
         If the credentials cannot be used.
     """
-    context = _context(ssl.PROTOCOL_TLS_CLIENT, files)
+    context = make_context(ssl.PROTOCOL_TLS_CLIENT, files)
     refuse_revoked(context, files.authority.parent)
     return context
 
@@ -125,29 +126,44 @@ def server_context(files: TlsFiles, incarnation: str) -> ssl.SSLContext:
     TransportError
         If the credentials cannot be used.
     """
-    context = _context(ssl.PROTOCOL_TLS_SERVER, files)
+    context = make_context(ssl.PROTOCOL_TLS_SERVER, files)
     context.num_tickets = 0  # no resumption: every link shows the certificate
     context.set_alpn_protocols([_alpn_name(incarnation), _ANY_INCARNATION])
     return context
 
 
-def _context(protocol: int, files: TlsFiles) -> ssl.SSLContext:
+def make_context(protocol: int, files: TlsFiles) -> ssl.SSLContext:
+    """Return a context with these credentials; raise TransportError if they cannot be used."""
     context = ssl.SSLContext(protocol)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     context.verify_mode = ssl.CERT_REQUIRED
     context.set_ecdh_curve(_KEY_EXCHANGE)
+    at = files.authority
     try:
-        context.load_verify_locations(cafile=files.authority)
+        context.load_verify_locations(cafile=at)
+        at = files.certificate
         # Without the empty password, an encrypted key would ask for one on the terminal.
         context.load_cert_chain(files.certificate, files.key, password="")
     except (OSError, ssl.SSLError) as error:
-        reason = str(error)
-        if getattr(error, "reason", None) == "KEY_VALUES_MISMATCH":
-            reason = f"{files.key.name} is not the key of {files.certificate.name}"
-        raise TransportError(
-            f"credentials {files.certificate.parent} cannot be used: {reason}"
-        ) from error
+        raise TransportError(_why_unusable(files, at, error)) from error
     return context
+
+
+def _why_unusable(files: TlsFiles, at: Path, error: OSError) -> str:
+    certificate, key = files.certificate, files.key
+    if not isinstance(error, ssl.SSLError):
+        return f"credentials {at.parent} cannot be used: {error.strerror}"
+    if at == files.authority:
+        return f"{at}: is no certificate in PEM form"
+    if error.reason == "KEY_VALUES_MISMATCH":
+        return f"{key}: is not the key of {certificate}"
+    if b"PRIVATE KEY" not in key.read_bytes():
+        return f"{key}: is no private key in PEM form"
+    if b"ENCRYPTED" in key.read_bytes():
+        return f"{key}: is encrypted; a key that a program reads by itself must not be"
+    if b"BEGIN CERTIFICATE" not in certificate.read_bytes():
+        return f"{certificate}: is no certificate in PEM form"
+    return f"{certificate} and {key} cannot be used: {error.reason or error}"
 
 
 class ClientCredentials:
@@ -310,7 +326,7 @@ class TlsStream:
         if isinstance(error, ssl.SSLCertVerificationError):
             role = "robot" if self._is_server else "service"
             fault = describe_certificate_error(error, role)
-            what_to_do = _REMEDIES.get(error.verify_code, "")
+            what_to_do = REMEDIES.get(error.verify_code, "")
             return f"has a certificate that {fault}{what_to_do.format(role=role)}"
         reason = error.reason or ""
         alert = reason.partition("_ALERT_")[2]
