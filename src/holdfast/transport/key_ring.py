@@ -43,17 +43,13 @@ from holdfast.transport.authority import (
     is_host,
     is_signed_by,
     key_pem,
-    new_authority,
     new_key,
     normal_host,
     public_key_of,
-    read_authority,
     read_certificate,
     read_file,
     read_revocations,
     role_of,
-    sign_certificate,
-    sign_revocations,
 )
 from holdfast.transport.endpoints import (
     AUTHORITY_FILE,
@@ -227,7 +223,7 @@ def make_credentials(
 
     home = directory / _AUTHORITY
     authority_is_new = not home.exists()
-    authority = new_authority(now) if authority_is_new else read_authority(home, now, warn)
+    authority = Authority.new(now) if authority_is_new else Authority.read(home, now, warn)
 
     # All refusals come before the first file is written.
     revoked = None if authority_is_new else read_revocations(home, authority.certificate)
@@ -324,7 +320,7 @@ def revoke_credentials(
     """
     now = (now or datetime.now(UTC)).replace(microsecond=0)
     home = directory / _AUTHORITY
-    authority = read_authority(home, now, warn)
+    authority = Authority.read(home, now, warn)
     issued = _read_issued(directory, authority.certificate)
     wanted: dict[int, Issued] = {}
     for name in names:
@@ -341,7 +337,7 @@ def revoke_credentials(
     numbers = {entry.serial_number for entry in listed or ()}
     new = [each._replace(revoked=now) for each in wanted.values() if each.serial not in numbers]
     if new:
-        content = sign_revocations(listed, [each.serial for each in new], authority, now)
+        content = authority.revoke(listed, [each.serial for each in new], now)
         write_atomically(home / REVOKED_FILE, content)
     if new or numbers:
         content = read_file(home / REVOKED_FILE)
@@ -460,7 +456,7 @@ def _party(
     if role == "service":
         before = _hosts_of_this_machine() if old is None else hosts_of(old)
         reached_at = tuple(dict.fromkeys(map(normal_host, (*before, *hosts))))
-    certificate = sign_certificate(place.name, role, reached_at, public_key, authority, now, end)
+    certificate = authority.certify(place.name, role, reached_at, public_key, now, end)
     made = MadeCredentials(place.name, role, place, reached_at, end, key is None)
     return _Party(made, certificate, key)
 
