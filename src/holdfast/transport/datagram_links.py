@@ -28,11 +28,7 @@ from typing import Any, Final
 
 from holdfast.errors import FrameError, KeysExhaustedError
 from holdfast.transport.datagram_cipher import AssociationKeys, DatagramCipher, require_cryptography
-from holdfast.transport.datagram_sockets import (
-    DATAGRAMS_AT_ONCE,
-    LARGEST_DATAGRAM,
-    DatagramSocket,
-)
+from holdfast.transport.datagram_sockets import DATAGRAMS_AT_ONCE, LARGEST_DATAGRAM, DatagramSocket
 from holdfast.transport.endpoints import Endpoint, Role
 from holdfast.transport.exchanges import (
     MESSAGE_OVERHEAD,
@@ -40,7 +36,6 @@ from holdfast.transport.exchanges import (
     RobotExchange,
     ServiceExchange,
 )
-from holdfast.transport.fair_scheduler import SLICE_S
 from holdfast.transport.frames import (
     CALL,
     END,
@@ -53,7 +48,7 @@ from holdfast.transport.frames import (
     FrameDecoder,
     encode_frame,
 )
-from holdfast.transport.link_settings import LinkSettings
+from holdfast.transport.link_settings import SLICE_S, LinkSettings
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.redundancy import Paths
 from holdfast.transport.schemes import Scheme
@@ -189,7 +184,7 @@ class _DatagramLink(Link):
         else:
             self._num_dropped += 1
             if self._num_dropped >= _MAX_DROPPED:
-                self.end(_OVERRUN, goodbye=_OVERRUN, refused=True)
+                self.refuse(_OVERRUN)
 
     def _handle_backlog(self) -> None:
         """Handle waiting messages for one slice."""
@@ -209,7 +204,7 @@ class _DatagramLink(Link):
         try:
             self._received(message, datagram=True)
         except FrameError as error:
-            self.end(str(error), goodbye=str(error), refused=True)
+            self.refuse(str(error))
 
     def _received(self, message: bytes, *, datagram: bool) -> None:
         raise NotImplementedError

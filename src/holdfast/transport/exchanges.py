@@ -45,12 +45,7 @@ from typing import Final, NamedTuple, cast
 import msgspec
 
 from holdfast.transport.datagram_cipher import KNOWN_AFTER, LOSS_SAMPLE, OVERHEAD
-from holdfast.transport.redundancy import (
-    MAX_TIMEOUT_S,
-    Paths,
-    RedundantSender,
-    RoundTripEstimator,
-)
+from holdfast.transport.redundancy import MAX_TIMEOUT_S, Paths, RedundantSender, RoundTripEstimator
 
 __all__ = [
     "KEEP_ALIVE_S",

@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Final
 
 from holdfast.errors import FrameError
 from holdfast.transport.endpoints import host_and_port
-from holdfast.transport.fair_scheduler import SLICE_S
 from holdfast.transport.frames import (
     GOODBYE,
     HELLO,
@@ -36,9 +35,9 @@ from holdfast.transport.frames import (
     encode_goodbye,
     read_goodbye,
 )
+from holdfast.transport.link_settings import SLICE_S, LinkSettings
 
 if TYPE_CHECKING:
-    from holdfast.transport.link_settings import LinkSettings
     from holdfast.transport.tls import PeerCertificate, TlsStream
 
 __all__ = ["OPENING_TIMEOUT_S", "Link", "LinkOwner"]
@@ -104,36 +103,7 @@ class LinkOwner(ABC):
 class Link(asyncio.BufferedProtocol):
     """One stream; a protocol for asyncio, to be connected by it.
 
-    Parameters
-    ----------
-    speaks_first : bool
-        Whether this end sends its hello first.
-
-    Attributes
-    ----------
-    began_at : float
-        By the loop's clock.
-    max_message_bytes : int
-        Larger messages are not sent.
-    has_answered : bool
-        Whether an awaited reply came over it; set by the owner.
-    closed : Future
-        Done when the connection is closed.
-    hello : Hello or None
-        The other end's, once it has come.
-    peer : PeerCertificate or None
-        The other end's, once TLS is established.
-    address : str or None
-        The other end's, HOST:PORT; None over a local socket, or not connected yet.
-    reason : str
-        Why the link has ended, as the rest of a sentence about the other end; empty if it was
-        closed normally.
-    said_goodbye : bool
-        Whether the other end has announced that it ends the link, now or soon.
-    refused : bool
-        Whether one end has refused the other, so that an immediate retry is of no use.
-    without_stream : bool
-        Whether it goes on without its stream.
+    ``speaks_first`` says whether this end sends its hello first.
     """
 
     def __init__(
@@ -148,7 +118,7 @@ class Link(asyncio.BufferedProtocol):
         self._settings = settings
         self._speaks_first = speaks_first
         self.tls = tls
-        self.max_message_bytes = settings.max_message_bytes
+        self.max_message_bytes = settings.max_message_bytes  # larger messages are not sent
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
         self._decoder = FrameDecoder(settings.max_message_bytes)
@@ -169,15 +139,23 @@ class Link(asyncio.BufferedProtocol):
         self._timer = self._loop.call_at(self._lease_ends_at, self._tick)
         self._ended = False
         self._notified = False
-        self.closed: asyncio.Future[None] = self._loop.create_future()
         self._connecting: asyncio.Task[None] | None = None
+        # Done when the connection is closed.
+        self.closed: asyncio.Future[None] = self._loop.create_future()
+        # The other end's, as soon as they are known; over a local socket there is no address.
         self.hello: Hello | None = None
         self.peer: PeerCertificate | None = None
         self.address: str | None = None
+        # Why the link has ended, as the rest of a sentence about the other end; "" if it was closed
+        # normally.
         self.reason = ""
+        # Whether the other end has announced that it ends the link, now or soon.
         self.said_goodbye = False
+        # Whether one end has refused the other, so that an immediate retry is of no use.
         self.refused = False
+        # Whether it goes on without its stream.
         self.without_stream = False
+        # Whether an awaited reply came over it; set by the owner.
         self.has_answered = False
 
     @property
@@ -253,16 +231,8 @@ class Link(asyncio.BufferedProtocol):
     ) -> None:
         """End the link; the owner is notified in a later turn of the loop. May be repeated.
 
-        Parameters
-        ----------
-        reason : str
-            About the other end, for :attr:`reason`.
-        goodbye : str or None
-            Sent to the other end before, as the reason; may be empty.
-        refused : bool
-            For :attr:`refused`.
-        abort : bool
-            Whether to drop unsent bytes.
+        ``reason`` is about the other end, which gets ``goodbye`` as the reason before, unless it is
+        None. ``abort`` drops unsent bytes.
         """
         if self._ended:
             return
@@ -296,6 +266,10 @@ class Link(asyncio.BufferedProtocol):
         transport.close()
         self._timer = self._loop.call_later(_CLOSE_TIMEOUT_S, transport.abort)
 
+    def refuse(self, reason: str) -> None:
+        """End the link, and tell the other end why."""
+        self.end(reason, goodbye=reason, refused=True)
+
     def _flush(self) -> None:
         """Send what only a stream can still deliver, before the link ends."""
 
@@ -311,7 +285,8 @@ class Link(asyncio.BufferedProtocol):
         self._transport = transport
         stream = transport.get_extra_info("socket")
         if stream is not None and stream.family != socket.AF_UNIX:
-            self.address = _address(transport.get_extra_info("peername"))
+            if peer := transport.get_extra_info("peername"):
+                self.address = host_and_port(str(peer[0]), peer[1])
             with contextlib.suppress(OSError):
                 stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 stream.setsockopt(
@@ -463,7 +438,7 @@ class Link(asyncio.BufferedProtocol):
             try:
                 self.peer = tls.peer()
             except FrameError as error:
-                self.end(str(error), goodbye=str(error), refused=True)
+                self.refuse(str(error))
                 return b""
             if self._speaks_first:
                 self._say_hello()
@@ -481,7 +456,7 @@ class Link(asyncio.BufferedProtocol):
             except FrameError as error:
                 refusal = str(error)
             if refusal is not None:
-                self.end(refusal, goodbye=refusal, refused=True)
+                self.refuse(refusal)
                 return
             if not self._speaks_first:
                 self._say_hello()
@@ -522,7 +497,7 @@ class Link(asyncio.BufferedProtocol):
             return
         valid_s = math.inf if self.peer is None else self.peer.expires_at - time.time()
         if valid_s <= 0.0:
-            self.end(_EXPIRED, goodbye=_EXPIRED, refused=True)
+            self.refuse(_EXPIRED)
             return
         transport = self._transport
         if self.hello is not None and transport is not None:
@@ -557,10 +532,3 @@ class Link(asyncio.BufferedProtocol):
         """Extend the lease of a peer from which this end does not read."""
         if self.hello is not None and (self._is_queued or self._is_paused):
             self._lease_ends_at = now + self._peer_lease_s
-
-
-def _address(found: object) -> str | None:
-    """Write the address of a socket as in an endpoint."""
-    if not isinstance(found, tuple):
-        return None
-    return host_and_port(str(found[0]), found[1])

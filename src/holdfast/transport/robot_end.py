@@ -27,15 +27,7 @@ from holdfast.transport.endpoints import (
     check_endpoint,
     check_name,
 )
-from holdfast.transport.frames import (
-    CALL,
-    END,
-    LAST,
-    REPLY,
-    Frame,
-    Hello,
-    encode_hello,
-)
+from holdfast.transport.frames import CALL, END, LAST, REPLY, Frame, Hello, encode_hello
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.listener import Listener, connection_to_drop

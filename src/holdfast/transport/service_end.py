@@ -28,15 +28,7 @@ from holdfast.transport.endpoints import (
     check_endpoint,
     check_name,
 )
-from holdfast.transport.frames import (
-    CALL,
-    END,
-    LAST,
-    REPLY,
-    Frame,
-    Hello,
-    encode_hello,
-)
+from holdfast.transport.frames import CALL, END, LAST, REPLY, Frame, Hello, encode_hello
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.listener import MAX_SILENT, Listener, connection_to_drop
@@ -299,7 +291,7 @@ class StreamServiceTransport(LinkOwner):
         for link in (*self._links, *self._without_hello):
             reason = None if link.peer is None or link.ended else objection(link.peer)
             if reason is not None:
-                link.end(reason, goodbye=reason, refused=True)
+                link.refuse(reason)
                 ended += 1
         return ended
 
@@ -373,7 +365,7 @@ class StreamServiceTransport(LinkOwner):
         assert link.peer is not None
         objection = self._objection(link.peer)
         if objection is not None:
-            link.end(objection, goodbye=objection, refused=True)
+            link.refuse(objection)
 
     def refusal(self, link: Link, hello: Hello) -> str | None:
         """Refuse a peer that is no robot, or that would exceed its share of links."""
@@ -398,8 +390,7 @@ class StreamServiceTransport(LinkOwner):
         if number <= numbers[name] + 1:
             return False
         oldest = next(link for link in standing if _certified(link) == most)
-        reason = f"has {number} links, and another robot needs one of {self._max_links}"
-        oldest.end(reason, goodbye=reason, refused=True)
+        oldest.refuse(f"has {number} links, and another robot needs one of {self._max_links}")
         return True
 
     def on_hello(self, link: Link, hello: Hello) -> None:
