@@ -19,6 +19,7 @@ from tests.contracts.wires import (
     StreamWire,
     connected,
     echo,
+    unreachable_into,
     until,
 )
 
@@ -58,7 +59,7 @@ class TestCertificates:
             outsider = StreamRobotTransport(
                 {"cloud": address},
                 tls=files,
-                on_unreachable=lambda *each: refusals.append(each),
+                on_event=unreachable_into(refusals),
             )
             tls.ends.append(outsider)
             inbox = Inbox()

@@ -61,7 +61,7 @@ class Robot:
             {"cloud": ServiceAddress(endpoint)},
             lease_ms=LEASE_MS,
             tls=TlsFiles.of(directory),
-            on_unreachable=lambda _, reason: self.refusals.append(reason),
+            on_event=lambda _, **fields: self.refusals.append(fields["reason"]),
         )
         self.transport.start(self.events.append)
 

@@ -109,8 +109,6 @@ class StreamServiceTransport(LinkOwner):
     ----------
     name : str
         Under which robots know the service.
-    incarnation : str
-        Of this process; unique among all processes of the service.
     listen, connect : sequence of str
         Endpoints at which robots connect, and of robots that listen.
     listening : sequence of socket
@@ -123,7 +121,7 @@ class StreamServiceTransport(LinkOwner):
     max_links : int or None
         Of robots, at the same time; None: :data:`MAX_LINKS`.
     tls : TlsFiles or None
-        The service's credentials, for ``tls``.
+        The service's credentials, for ``tls`` and ``udp``.
     on_event : callable or None
         Called for the log: ``link_refused`` with ``reason`` and, if known, ``robot``;
         ``robot_connected`` with ``robot``; ``robot_disconnected`` with ``robot`` and ``reason``.
@@ -151,14 +149,9 @@ class StreamServiceTransport(LinkOwner):
         tls: TlsFiles | None = None,
         on_event: Callable[..., None] | None = None,
         on_shutdown: Callable[[str], None] | None = None,
-        needs_endpoint: bool = True,
     ) -> None:
         check_name("name of a service", name)
         check_name("incarnation of a service", incarnation)
-        if needs_endpoint and not listen and not connect:
-            raise TransportError(
-                f"service {name} has no endpoint: give one, as in tcp/127.0.0.1:7447"
-            )
         self._listen = [check_endpoint(text, "service", listens=True) for text in listen]
         self._connect = [check_endpoint(text, "service", listens=False) for text in connect]
         for endpoint in (*self._listen, *self._connect):

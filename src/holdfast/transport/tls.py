@@ -171,7 +171,7 @@ class ClientCredentials:
 
     Parameters
     ----------
-    on_unusable : callable or None
+    on_unusable : callable
         Called with the reason when changed files cannot be used; the previous ones stay in use.
 
     Raises
@@ -180,7 +180,7 @@ class ClientCredentials:
         If they cannot be used at the beginning.
     """
 
-    def __init__(self, files: TlsFiles, on_unusable: Callable[[str], None] | None = None) -> None:
+    def __init__(self, files: TlsFiles, on_unusable: Callable[[str], None]) -> None:
         self._files = files
         self._on_unusable = on_unusable
         self._seen = file_versions(files)
@@ -194,8 +194,7 @@ class ClientCredentials:
             try:
                 self._context = client_context(self._files)
             except TransportError as error:
-                if self._on_unusable is not None:
-                    self._on_unusable(f"{error}; the previous ones stay in use")
+                self._on_unusable(f"{error}; the previous ones stay in use")
         return self._context
 
 
