@@ -248,7 +248,7 @@ class TestStreams:
         with pytest.raises(TransportError, match=r"tcp does not use the credentials"):
             StreamRobotTransport({"cloud": ServiceAddress("tcp/localhost:7447")}, tls=robot_tls)
         missing = TlsFiles(robot_tls.authority, tmp_path / "missing.pem", robot_tls.key)
-        with pytest.raises(TransportError, match=r"missing\.pem cannot be read: No such file"):
+        with pytest.raises(TransportError, match=r"missing\.pem: cannot be read: No such file"):
             StreamRobotTransport({"cloud": ServiceAddress("tls/localhost:7447")}, tls=missing)
 
     def test_a_robot_connects_to_a_port(self) -> None:

@@ -37,7 +37,6 @@ __all__ = [
     "AssociationKeys",
     "DatagramCipher",
     "ReplayWindow",
-    "association_of",
     "require_cryptography",
 ]
 
@@ -98,13 +97,6 @@ def require_cryptography() -> type[AESGCM]:
             "pip install cryptography; or use tls/..."
         ) from error
     return AESGCM
-
-
-def association_of(datagram: bytes) -> int | None:
-    """Return the association of a datagram; None if it is too short."""
-    if len(datagram) < OVERHEAD:
-        return None
-    return int.from_bytes(datagram[:4], "big")
 
 
 class ReplayWindow:

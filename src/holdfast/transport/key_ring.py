@@ -94,24 +94,14 @@ _PUBLIC_FILE = 0o644
 
 
 class MadeCredentials(NamedTuple):
-    """The credentials of one robot or service.
-
-    Attributes
-    ----------
-    directory : Path
-        To be copied to its machine.
-    hosts : tuple of str
-        Names and addresses under which robots may call a service; empty for a robot.
-    renewed : bool
-        Whether the key is the old one.
-    """
+    """The credentials of one robot or service."""
 
     name: str
     role: Role
-    directory: Path
-    hosts: tuple[str, ...]
+    directory: Path  # to be copied to its machine
+    hosts: tuple[str, ...]  # under which robots may call a service; empty for a robot
     expires: datetime
-    renewed: bool
+    renewed: bool  # whether the key is the old one
 
 
 class Issued(NamedTuple):
@@ -188,8 +178,6 @@ def make_credentials(
 
     Parameters
     ----------
-    directory : Path
-        Of all credentials; made if it does not exist.
     robots, services : sequence of str
         Their names; none at all means one robot ``robot`` and one service ``service``, or with
         ``renew`` or ``rotate`` all that are there.
@@ -199,10 +187,6 @@ def make_credentials(
         For which the certificates are valid; never longer than the authority.
     renew, rotate : bool
         Whether to replace existing certificates, except revoked ones; or keys as well.
-    now : datetime or None
-        With its time zone; None is the current time.
-    warn : callable
-        Takes warnings as text.
 
     Raises
     ------
@@ -299,16 +283,9 @@ def revoke_credentials(
 ) -> tuple[Issued, ...]:
     """Revoke certificates, and return those that were not revoked before.
 
-    An end that has the new list refuses them.
-    The list is written to the authority and beside each party's credentials. Entries are never
-    removed.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Robots and services; all their certificates are revoked.
-    serials : sequence of int
-        Numbers of single certificates.
+    An end that has the new list refuses them: all certificates of these robots and services, and
+    single ones by their numbers. The list is written to the authority and beside each party's
+    credentials. Entries are never removed.
 
     Raises
     ------

@@ -15,6 +15,7 @@ selects its own incarnation.
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import ssl
 from collections.abc import Callable, Mapping
@@ -84,22 +85,12 @@ _ALERTS = {
 
 
 class PeerCertificate(NamedTuple):
-    """The peer's certificate.
+    """The peer's certificate."""
 
-    Attributes
-    ----------
-    name : str
-        The common name.
-    expires_at : float
-        In seconds since 1970.
-    authorities : frozenset of bytes
-        The authority that signed it, as DER; several if some have the same name.
-    """
-
-    name: str
+    name: str  # the common name
     serial_number: int
-    expires_at: float
-    authorities: frozenset[bytes]
+    expires_at: float  # in seconds since 1970
+    authorities: frozenset[bytes]  # the one that signed it, as DER; several with one name
 
 
 def client_context(files: TlsFiles) -> ssl.SSLContext:
@@ -152,7 +143,8 @@ def make_context(protocol: int, files: TlsFiles) -> ssl.SSLContext:
 def _why_unusable(files: TlsFiles, at: Path, error: OSError) -> str:
     certificate, key = files.certificate, files.key
     if not isinstance(error, ssl.SSLError):
-        return f"credentials {at.parent} cannot be used: {error.strerror}"
+        absent = next((each for each in (certificate, key) if not os.access(each, os.R_OK)), at)
+        return f"{at if at == files.authority else absent}: cannot be read: {error.strerror}"
     if at == files.authority:
         return f"{at}: is no certificate in PEM form"
     if error.reason == "KEY_VALUES_MISMATCH":
@@ -205,21 +197,8 @@ def _alpn_name(incarnation: str) -> str:
 class TlsStream:
     """One end of TLS on one stream.
 
-    Parameters
-    ----------
-    host : str or None
-        For a robot: the name or address that the certificate must be for; None if the service has
-        dialled.
-    known : str or None
-        For a robot: the last incarnation of the service.
-
-    Attributes
-    ----------
-    established : bool
-        Whether the handshake is complete at this end. The robot's end completes it before the
-        service has checked the robot's certificate.
-    ended : bool
-        Whether the peer will send nothing more.
+    For a robot, ``host`` is the name or address that the certificate must be for, None if the
+    service has dialled, and ``known`` is the last incarnation of the service.
     """
 
     def __init__(
@@ -237,8 +216,10 @@ class TlsStream:
             self._incoming, self._outgoing, server_side=self._is_server, server_hostname=host
         )
         self._has_first_byte = False
+        # Whether the handshake is complete at this end. The robot's end completes it before the
+        # service has checked the robot's certificate.
         self.established = False
-        self.ended = False
+        self.ended = False  # whether the peer will send nothing more
 
     @property
     def is_known_incarnation(self) -> bool:
@@ -306,9 +287,9 @@ class TlsStream:
             raise FrameError(f"has a certificate that {error}") from error
         return PeerCertificate(
             name,
-            int(str(shown.get("serialNumber", "0")), 16),
-            float(ssl.cert_time_to_seconds(str(shown["notAfter"]))) if shown else 0.0,
-            self._authorities(shown.get("issuer")),
+            int(str(shown["serialNumber"]), 16),
+            float(ssl.cert_time_to_seconds(str(shown["notAfter"]))),
+            self._authorities(shown["issuer"]),
         )
 
     def _authorities(self, name: object) -> frozenset[bytes]:
