@@ -68,14 +68,9 @@ class LoadedCredentials(NamedTuple):
 def load_credentials(
     directory: Path | str, role: Role, *, warn: Callable[[str], object] = warnings.warn
 ) -> LoadedCredentials:
-    """Check a robot's or a service's credentials.
+    """Check the credentials in a robot's or a service's directory.
 
-    Parameters
-    ----------
-    directory : Path or str
-        With ``authority.pem``, ``certificate.pem`` and ``key.pem``.
-    warn : callable
-        Takes warnings as text: others can read the key, or the certificate expires soon.
+    It warns if others can read the key, or the certificate expires soon.
 
     Raises
     ------

@@ -82,13 +82,7 @@ class AssociationKeys(NamedTuple):
 
 
 def require_cryptography() -> type[AESGCM]:
-    """Return the cipher.
-
-    Raises
-    ------
-    TransportError
-        If the package ``cryptography`` is not installed.
-    """
+    """Return the cipher; raise TransportError if ``cryptography`` is not installed."""
     try:
         from cryptography.hazmat.primitives.ciphers.aead import AESGCM
     except ImportError as error:
@@ -101,8 +95,6 @@ def require_cryptography() -> type[AESGCM]:
 
 class ReplayWindow:
     """Accepts each counter once; ``newest`` is the highest so far, -1 at first."""
-
-    __slots__ = ("_seen", "newest")
 
     def __init__(self) -> None:
         self.newest = -1

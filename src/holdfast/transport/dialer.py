@@ -53,12 +53,8 @@ _Address: TypeAlias = str | tuple[Any, ...]
 class Dialer:
     """Makes links to an endpoint, from :meth:`start` to :meth:`stop`.
 
-    Parameters
-    ----------
-    on_failed : callable
-        Called with the reasons when an attempt has failed at each of the endpoint's addresses.
-    identity : str
-        Of this end; it determines the order of a name's addresses.
+    ``on_failed`` is called with the reasons when an attempt has failed at each of the endpoint's
+    addresses. The identity of this end determines the order of a name's addresses.
     """
 
     def __init__(

@@ -155,17 +155,8 @@ def decode_hello(payload: bytes) -> Hello:
 class FrameDecoder:
     """Decodes the frames of one stream, in pieces of any size.
 
-    Parameters
-    ----------
-    max_message_bytes : int
-        A larger request or reply is skipped.
-    more : mapping of int to int, optional
-        Bounds of further kinds.
-
-    Attributes
-    ----------
-    error : FrameError or None
-        The violation after the last frame. Nothing may be fed after it.
+    A request or reply above the bound is skipped. ``more`` has bounds of further kinds. ``error``
+    is the violation after the last frame, if any; nothing may be fed after it.
     """
 
     def __init__(self, max_message_bytes: int, more: Mapping[int, int] | None = None) -> None:

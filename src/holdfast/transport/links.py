@@ -93,7 +93,7 @@ class LinkOwner(ABC):
         """Replace a link that goes on with datagrams alone."""
 
     def on_datagrams_blocked(self, link: Link) -> None:  # noqa: B027 - optional
-        """Note, once, that no datagram gets through, so that everything goes on the stream."""
+        """Note that no datagram gets through, so that everything goes on the stream."""
 
     @abstractmethod
     def on_ended(self, link: Link) -> None:
@@ -134,7 +134,7 @@ class Link(asyncio.BufferedProtocol):
         self._unread, self._unread_at = b"", 0
         self._frames: deque[Frame] = deque()
         self._is_queued = self._is_paused = False
-        self._spoke = False
+        self._spoke_at = self._heard_at = now
         self._handed_over_bytes = self._progress_bytes = 0
         self._timer = self._loop.call_at(self._lease_ends_at, self._tick)
         self._ended = False
@@ -205,7 +205,7 @@ class Link(asyncio.BufferedProtocol):
             self.tls.send(data)
             data = self.tls.take()
         transport.write(data)
-        self._spoke = True
+        self._spoke_at = self._loop.time()
         self._handed_over_bytes += len(data)
         if transport.get_write_buffer_size() > self._max_unsent_bytes:
             self.end("does not read what it is sent", abort=True)
@@ -213,10 +213,6 @@ class Link(asyncio.BufferedProtocol):
     def send_message(self, kind: int, call: int, payload: bytes = b"") -> None:
         """Send a frame of a call; never waits."""
         self.send(encode_frame(kind, call, payload))
-
-    def say_goodbye(self) -> None:
-        """Ask the other end to end the link as soon as it can do without."""
-        self.send(encode_goodbye(""))
 
     def forget(self, call: int) -> None:
         """Ignore what still comes of a call."""
@@ -309,7 +305,7 @@ class Link(asyncio.BufferedProtocol):
         if self._ended:
             return
         self._unread, self._unread_at = bytes(self._settings.buffer[:nbytes]), 0
-        now = self._loop.time()
+        now = self._heard_at = self._loop.time()
         if self.hello is not None:
             self._lease_ends_at = now + self._peer_lease_s
         if self._settings.scheduler.may_run(self.owner, now):
@@ -501,9 +497,8 @@ class Link(asyncio.BufferedProtocol):
             return
         transport = self._transport
         if self.hello is not None and transport is not None:
-            if not self._spoke:
+            if self._owes_ping(now):
                 self.send(_PING)
-            self._spoke = False
             unsent = transport.get_write_buffer_size()
             sent_bytes = self._handed_over_bytes - unsent
             if unsent == 0 or sent_bytes != self._progress_bytes:
@@ -516,6 +511,10 @@ class Link(asyncio.BufferedProtocol):
         if self.hello is not None:
             due = min(due, now + self._ping_interval_s, now + valid_s)
         self._timer = self._loop.call_at(due, self._tick)
+
+    def _owes_ping(self, now: float) -> bool:
+        """Whether nothing was sent since the last tick, or little later."""
+        return self._spoke_at < now - 0.9 * self._ping_interval_s
 
     def _end_if_silent(self) -> None:
         if self._ended:

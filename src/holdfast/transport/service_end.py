@@ -28,7 +28,16 @@ from holdfast.transport.endpoints import (
     check_endpoint,
     check_name,
 )
-from holdfast.transport.frames import CALL, END, LAST, REPLY, Frame, Hello, encode_hello
+from holdfast.transport.frames import (
+    CALL,
+    END,
+    LAST,
+    REPLY,
+    Frame,
+    Hello,
+    encode_goodbye,
+    encode_hello,
+)
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.listener import MAX_SILENT, Listener, connection_to_drop
@@ -107,8 +116,6 @@ class StreamServiceTransport(LinkOwner):
 
     Parameters
     ----------
-    name : str
-        Under which robots know the service.
     listen, connect : sequence of str
         Endpoints at which robots connect, and of robots that listen.
     listening : sequence of socket
@@ -241,7 +248,7 @@ class StreamServiceTransport(LinkOwner):
         for link in list(self._without_hello):
             link.end("")
         for link in list(self._links):
-            link.say_goodbye()
+            link.send(encode_goodbye(""))
         self._resolve_if_all_gone()
         return self._gone
 

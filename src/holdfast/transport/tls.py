@@ -47,41 +47,32 @@ service 0.2 s of computing. Python 3.11.2 (Debian 12) cannot choose X25519."""
 _READ_BYTES = 16 * 1024
 """The largest record."""
 
+_ONE_AUTHORITY = "; both ends need files of one 'holdfast keys DIR'"
+
 REMEDIES = {
     10: "; 'holdfast keys DIR --renew --{role} NAME' makes another",
-    18: "; both ends need files of one 'holdfast keys DIR'",
-    19: "; both ends need files of one 'holdfast keys DIR'",
-    20: "; both ends need files of one 'holdfast keys DIR'",
+    18: _ONE_AUTHORITY,
+    19: _ONE_AUTHORITY,
+    20: _ONE_AUTHORITY,
     23: "; 'holdfast keys DIR --rotate --{role} NAME' makes a new key",
 }
-"""For a peer's certificate, by OpenSSL's error numbers."""
+"""For a certificate, by OpenSSL's error numbers."""
 
 _ALERTS = {
-    "both": {
-        "CERTIFICATE_EXPIRED": (
-            "it has expired by the clock there; 'holdfast keys DIR --renew --{role} NAME' makes "
-            "another"
-        ),
-        "CERTIFICATE_REVOKED": (
-            "it has been revoked; 'holdfast keys DIR --rotate --{role} NAME' makes a new key"
-        ),
-        "UNKNOWN_CA": (
-            f"it was not signed by the authority in {AUTHORITY_FILE} there; both ends need files "
-            "of one 'holdfast keys DIR'"
-        ),
-        "CERTIFICATE_REQUIRED": "there is none, and one is required",
-        "UNSUPPORTED_CERTIFICATE": "it is not for a {role}",
-        "DECRYPT_ERROR": "this end's key is not the certificate's",
-    },
-    "robot": {"BAD_CERTIFICATE": "it is not valid yet by the clock there, or is malformed"},
-    "service": {
-        "BAD_CERTIFICATE": (
-            "it does not name the host that the robot calls, or is not valid yet by the clock "
-            "there; the robot's log says which"
-        )
-    },
+    "CERTIFICATE_EXPIRED": f"it has expired by the clock there{REMEDIES[10]}",
+    "CERTIFICATE_REVOKED": f"it has been revoked{REMEDIES[23]}",
+    "UNKNOWN_CA": f"it was not signed by the authority in {AUTHORITY_FILE} there{_ONE_AUTHORITY}",
+    "CERTIFICATE_REQUIRED": "there is none, and one is required",
+    "UNSUPPORTED_CERTIFICATE": "it is not for a {role}",
+    "DECRYPT_ERROR": "this end's key is not the certificate's",
+    "BAD_CERTIFICATE": "it is not valid yet by the clock there, or is malformed",
 }
-"""The peer's alerts about this end's certificate (RFC 8446, section 6.2), by this end's role."""
+"""The peer's alerts about this end's certificate (RFC 8446, section 6.2)."""
+
+_BAD_SERVICE_CERTIFICATE = (
+    "it does not name the host that the robot calls, or is not valid yet by the clock there; the "
+    "robot's log says which"
+)
 
 
 class PeerCertificate(NamedTuple):
@@ -94,13 +85,7 @@ class PeerCertificate(NamedTuple):
 
 
 def client_context(files: TlsFiles) -> ssl.SSLContext:
-    """Return the context of a robot's links; handshakes refuse revoked certificates.
-
-    Raises
-    ------
-    TransportError
-        If the credentials cannot be used.
-    """
+    """Return the context of a robot's links; handshakes refuse revoked certificates."""
     context = make_context(ssl.PROTOCOL_TLS_CLIENT, files)
     refuse_revoked(context, files.authority.parent)
     return context
@@ -111,11 +96,6 @@ def server_context(files: TlsFiles, incarnation: str) -> ssl.SSLContext:
 
     Handshakes accept revoked certificates. The service refuses them afterwards, so its log has the
     name.
-
-    Raises
-    ------
-    TransportError
-        If the credentials cannot be used.
     """
     context = make_context(ssl.PROTOCOL_TLS_SERVER, files)
     context.num_tickets = 0  # no resumption: every link shows the certificate
@@ -161,15 +141,8 @@ def _why_unusable(files: TlsFiles, at: Path, error: OSError) -> str:
 class ClientCredentials:
     """A robot's credentials, read again for a new link if the files have changed.
 
-    Parameters
-    ----------
-    on_unusable : callable
-        Called with the reason when changed files cannot be used; the previous ones stay in use.
-
-    Raises
-    ------
-    TransportError
-        If they cannot be used at the beginning.
+    When changed files cannot be used, ``on_unusable`` is called with the reason, and the previous
+    ones stay in use. At the beginning TransportError is raised instead.
     """
 
     def __init__(self, files: TlsFiles, on_unusable: Callable[[str], None]) -> None:
@@ -228,8 +201,10 @@ class TlsStream:
         return self._known is not None and chosen == _alpn_name(self._known)
 
     def begin(self) -> None:
-        """Begin the handshake, at the robot's end."""
-        self._handshake()
+        """Begin the handshake, at the robot's end; or go on with it."""
+        with contextlib.suppress(ssl.SSLWantReadError):
+            self._tls.do_handshake()
+            self.established = True
 
     def receive(self, data: bytes) -> bytes:
         """Take bytes of the stream; return those of messages.
@@ -247,7 +222,7 @@ class TlsStream:
                 raise FrameError("does not speak TLS, and this endpoint does")
         self._incoming.write(data)
         if not self.established:
-            self._handshake()
+            self.begin()
             if not self.established:
                 return b""
         parts = []
@@ -312,7 +287,9 @@ class TlsStream:
         alert = reason.partition("_ALERT_")[2]
         if alert:
             own = "service" if self._is_server else "robot"
-            meaning = _ALERTS[own].get(alert, _ALERTS["both"].get(alert))
+            meaning = _ALERTS.get(alert)
+            if self._is_server and alert == "BAD_CERTIFICATE":
+                meaning = _BAD_SERVICE_CERTIFICATE
             if meaning is None:
                 return f"refuses this end's TLS ({alert.lower().replace('_', ' ')})"
             return f"refuses this end's certificate: {meaning.format(role=own)}"
@@ -323,19 +300,11 @@ class TlsStream:
         text = reason.lower().replace("_", " ") if reason else text
         return f"does not speak TLS 1.3 as expected: {text}"
 
-    def _handshake(self) -> None:
-        with contextlib.suppress(ssl.SSLWantReadError):
-            self._tls.do_handshake()
-            self.established = True
-
 
 def common_name(shown: Mapping[str, Any]) -> str:
-    """Return the common name in a certificate, which ``getpeercert`` has returned.
+    """Return the common name in a certificate of ``getpeercert``; raise ValueError if not one.
 
-    Raises
-    ------
-    ValueError
-        If there is not exactly one; the message continues a sentence about the certificate.
+    The message continues a sentence about the certificate.
     """
     subject = shown.get("subject", ())
     names = [str(value) for part in subject for key, value in part if key == "commonName"]
