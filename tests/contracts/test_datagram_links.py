@@ -435,12 +435,12 @@ class TestEnds:
         await udp.service("cloud", "b1").start(echo)
         _, target = place_of(udp)
         entry = free_port()
-        closed: list[str] = []
+        closed: list[tuple[str, str]] = []
         with Proxy(entry, target, "filtered"):
             robot = StreamRobotTransport(
                 {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")},
                 tls=robot_tls,
-                on_datagrams_blocked=closed.append,
+                on_event=lambda event, **fields: closed.append((event, fields["service"])),
             )
             inbox = Inbox()
             robot.start(inbox)
@@ -448,7 +448,7 @@ class TestEnds:
             await until(lambda: bool(closed))
             await answers(robot, inbox, 1)
             assert not robot.sends_datagrams("cloud")
-            assert closed == ["cloud"]
+            assert closed == [("no_datagrams", "cloud")]
             await robot.close()
 
     async def test_adrift_it_is_lost_when_nothing_comes(self, udp: StreamWire) -> None:
@@ -544,7 +544,7 @@ class TestWhatGoesTogether:
         robot = StreamRobotTransport(
             {"cloud": ServiceAddress(udp.endpoint("cloud").replace("udp", "tls"))},
             tls=robot_tls,
-            on_unreachable=lambda _, reason: refusals.append(reason),
+            on_event=lambda _, **fields: refusals.append(fields["reason"]),
         )
         robot.start(Inbox())
         await until(lambda: bool(refusals))

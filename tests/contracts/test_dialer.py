@@ -266,9 +266,9 @@ class TestRedialling:
         times: list[float] = []
         connect = Dialer._connect
 
-        def note(self: Dialer, *arguments: Any) -> None:
+        async def note(self: Dialer, *arguments: Any) -> None:
             times.append(asyncio.get_running_loop().time())
-            connect(self, *arguments)
+            await connect(self, *arguments)
 
         monkeypatch.setattr(Dialer, "_connect", note)
         return times

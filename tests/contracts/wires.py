@@ -199,7 +199,7 @@ class StreamWire:
             lease_ms=self.lease_ms,
             max_message_bytes=max_message_bytes,
             tls=self.robot_tls,
-            on_unreachable=lambda *refusal: self.refusals.append(refusal),
+            on_event=unreachable_into(self.refusals),
         )
         self.ends.append(robot)
         return robot
@@ -230,6 +230,16 @@ class StreamWire:
     async def close_on_loop(self) -> None:
         for end in self.ends:
             await end.close()
+
+
+def unreachable_into(refusals: list[tuple[str, str]]) -> Callable[..., None]:
+    """Return a log that keeps which services are unreachable, and why."""
+
+    def note(event: str, *, reason: str, service: str = "") -> None:
+        if event == "unreachable":
+            refusals.append((service, reason))
+
+    return note
 
 
 def unused_endpoint(protocol: str, directory: Path) -> str:

@@ -50,11 +50,9 @@ class TestAuthority:
 
 class TestSignatures:
     def test_it_knows_its_own_certificates_by_their_signature_not_their_name(self) -> None:
-        ours, other = authority.new_authority(NOW), authority.new_authority(NOW)
+        ours, other = authority.Authority.new(NOW), authority.Authority.new(NOW)
         key = authority.new_key()
-        made = authority.sign_certificate(
-            "anna", "robot", (), key.public_key(), ours, NOW, NOW + DAY
-        )
+        made = ours.certify("anna", "robot", (), key.public_key(), NOW, NOW + DAY)
         assert authority.is_signed_by(ours.certificate, made)
         assert not authority.is_signed_by(other.certificate, made)
         assert authority.common_name_of(made) == "anna"
@@ -63,16 +61,16 @@ class TestSignatures:
         assert authority.role_of(ours.certificate) is None
 
     def test_a_list_grows_and_keeps_what_was_revoked_when(self, tmp_path: Path) -> None:
-        ours = authority.new_authority(NOW)
+        ours = authority.Authority.new(NOW)
         for moment, serial in ((NOW, 7), (NOW + DAY, 8)):
             before = authority.read_revocations(tmp_path, ours.certificate)
-            content = authority.sign_revocations(before, [serial], ours, moment)
+            content = ours.revoke(before, [serial], moment)
             (tmp_path / "revoked.pem").write_bytes(content)
         revoked = authority.read_revocations(tmp_path, ours.certificate)
         assert revoked is not None
         assert [entry.serial_number for entry in revoked] == [7, 8]
         later, earlier = (each.revocation_date_utc for each in (revoked[1], revoked[0]))
         assert later - earlier == DAY
-        other = authority.new_authority(NOW)
+        other = authority.Authority.new(NOW)
         with pytest.raises(CredentialsError, match="was not signed by"):
             authority.read_revocations(tmp_path, other.certificate)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from holdfast.transport.fair_scheduler import SLICE_S, FairScheduler
+from holdfast.transport.link_settings import SLICE_S, FairScheduler
 
 
 class Busy:

@@ -271,7 +271,7 @@ class Ends:
             {"cloud": ServiceAddress(endpoint)},
             lease_ms=LEASE_MS,
             tls=self.files(name),
-            on_unreachable=lambda _, reason: said.put_nowait(reason),
+            on_event=lambda _, **fields: said.put_nowait(fields["reason"]),
         )
         self._ends.append(robot)
         robot.start(said.put_nowait)

@@ -133,15 +133,7 @@ def make_links(configuration: Configuration, log_path: Path | None, events: Even
             incarnation=os.urandom(8).hex(),
             lease_ms=offload.lease_ms,
             tls=tls,
-            on_unreachable=lambda service, reason: events.event(
-                "unreachable", service=service, reason=reason
-            ),
-            on_datagrams_blocked=lambda service: events.event(
-                "no_datagrams",
-                service=service,
-                reason="none gets through, so everything goes on the TLS stream; is UDP filtered?",
-            ),
-            on_unusable=tell_credentials,
+            on_event=events.event,
         )
         return Links(transport, launcher, stack.pop_all().close)
 

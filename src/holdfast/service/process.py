@@ -231,7 +231,6 @@ class _ServiceProcess:
             tls=None if credentials is None else credentials.files,
             on_event=lambda event, **fields: self._shell.note(event, **fields),
             on_shutdown=self._end_for_ros,
-            needs_endpoint=not extensions,
         )
 
         import msgspec

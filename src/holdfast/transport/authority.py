@@ -11,12 +11,11 @@ from collections.abc import Callable, Iterable, Sequence
 from datetime import datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from holdfast.errors import CredentialsError
 from holdfast.transport.credentials import date_text, warn_if_open
-from holdfast.transport.endpoints import AUTHORITY_FILE, Role
-from holdfast.transport.revocation import REVOKED_FILE
+from holdfast.transport.endpoints import AUTHORITY_FILE, REVOKED_FILE, Role
 
 try:
     from cryptography import x509
@@ -45,17 +44,13 @@ __all__ = [
     "is_host",
     "is_signed_by",
     "key_pem",
-    "new_authority",
     "new_key",
     "normal_host",
     "public_key_of",
-    "read_authority",
     "read_certificate",
     "read_file",
     "read_revocations",
     "role_of",
-    "sign_certificate",
-    "sign_revocations",
 ]
 
 AUTHORITY_DAYS = 3650
@@ -69,22 +64,138 @@ _BACKDATED = timedelta(days=1)
 _HOST_LABEL = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
 
 
+_USAGES: dict[Role, x509.ObjectIdentifier] = {
+    "robot": ExtendedKeyUsageOID.CLIENT_AUTH,
+    "service": ExtendedKeyUsageOID.SERVER_AUTH,
+}
+
+
 class Authority(NamedTuple):
     """The certificate that both ends trust, and its key."""
 
     certificate: x509.Certificate
     key: ec.EllipticCurvePrivateKey
 
+    @classmethod
+    def new(cls, now: datetime) -> Self:
+        """Make a key and a self-signed certificate."""
+        key = new_key()
+        serial = x509.random_serial_number()
+        # Two authorities must not have the same name: a chain is looked up by it.
+        name = _common_name(f"holdfast authority {serial:x}"[:40])
+        begin, end = now - _BACKDATED, now + timedelta(days=AUTHORITY_DAYS)
+        builder = _builder(name, name, key.public_key(), begin, end, signs_certificates=True)
+        return cls(builder.serial_number(serial).sign(key, hashes.SHA256()), key)
 
-def new_key() -> ec.EllipticCurvePrivateKey:
-    """Make a private key."""
-    return ec.generate_private_key(ec.SECP256R1())
+    @classmethod
+    def read(cls, home: Path, now: datetime, warn: Callable[[str], object]) -> Self:
+        """Read the authority's files; raise CredentialsError if one cannot be used."""
+        certificate = read_certificate(home / AUTHORITY_FILE)
+        path = home / AUTHORITY_KEY_FILE
+        try:
+            key = load_pem_private_key(read_file(path), password=None)
+        except (ValueError, TypeError) as error:
+            raise CredentialsError(f"{path}: is no private key in PEM form: {error}") from error
+        if not isinstance(key, ec.EllipticCurvePrivateKey):
+            raise CredentialsError(f"{path}: is no elliptic-curve key, as this program makes them")
+        if key.public_key() != certificate.public_key():
+            raise CredentialsError(f"{path}: is not the key of {home / AUTHORITY_FILE}")
+        warn_if_open(path, warn)
+        if certificate.not_valid_after_utc <= now:
+            raise CredentialsError(
+                f"{home / AUTHORITY_FILE}: has expired on "
+                f"{date_text(certificate.not_valid_after_utc.timestamp())}; make keys with a new "
+                f"authority in another directory"
+            )
+        return cls(certificate, key)
+
+    def certify(
+        self,
+        name: str,
+        role: Role,
+        hosts: Sequence[str],
+        public_key: ec.EllipticCurvePublicKey,
+        now: datetime,
+        end: datetime,
+    ) -> x509.Certificate:
+        """Certify a robot, or a service at some hosts, until ``end``."""
+        builder = (
+            _builder(
+                _common_name(name), self.certificate.subject, public_key, self._begin(now), end
+            )
+            .serial_number(x509.random_serial_number())
+            .add_extension(x509.ExtendedKeyUsage([_USAGES[role]]), critical=False)
+            .add_extension(self._identifier, critical=False)
+        )
+        if hosts:
+            names = [_general_name(host) for host in hosts]
+            builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
+        return builder.sign(self.key, hashes.SHA256())
+
+    def revoke(
+        self,
+        before: x509.CertificateRevocationList | None,
+        serials: Iterable[int],
+        now: datetime,
+    ) -> bytes:
+        """Return the next list in PEM: the entries of before, and these numbers as of now."""
+        number = 1
+        if before is not None:
+            number += before.extensions.get_extension_for_class(x509.CRLNumber).value.crl_number
+        builder = (
+            x509.CertificateRevocationListBuilder()
+            .issuer_name(self.certificate.subject)
+            .last_update(self._begin(now))
+            # A list that expires would lock everybody out.
+            .next_update(self.certificate.not_valid_after_utc)
+            .add_extension(x509.CRLNumber(number), critical=False)
+            .add_extension(self._identifier, critical=False)
+        )
+        entries = [x509.RevokedCertificateBuilder(serial, now).build() for serial in serials]
+        for entry in (*(before or ()), *entries):
+            builder = builder.add_revoked_certificate(entry)
+        return builder.sign(self.key, hashes.SHA256()).public_bytes(Encoding.PEM)
+
+    def _begin(self, now: datetime) -> datetime:
+        return max(now - _BACKDATED, self.certificate.not_valid_before_utc)
+
+    @property
+    def _identifier(self) -> x509.AuthorityKeyIdentifier:
+        return x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key())
 
 
-def public_key_of(certificate: x509.Certificate) -> ec.EllipticCurvePublicKey | None:
-    """Return a certificate's key; None if it is not of an elliptic curve."""
-    key = certificate.public_key()
-    return key if isinstance(key, ec.EllipticCurvePublicKey) else None
+def _builder(
+    subject: x509.Name,
+    issuer: x509.Name,
+    public_key: ec.EllipticCurvePublicKey,
+    begin: datetime,
+    end: datetime,
+    *,
+    signs_certificates: bool = False,
+) -> x509.CertificateBuilder:
+    usage = x509.KeyUsage(
+        digital_signature=not signs_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=signs_certificates,
+        crl_sign=signs_certificates,
+        encipher_only=False,
+        decipher_only=False,
+    )
+    path_length = 0 if signs_certificates else None
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(public_key)
+        .not_valid_before(begin)
+        .not_valid_after(end)
+        .add_extension(x509.BasicConstraints(signs_certificates, path_length), critical=True)
+        .add_extension(usage, critical=True)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(public_key), critical=False)
+    )
 
 
 def is_signed_by(authority: x509.Certificate, certificate: x509.Certificate) -> bool:
@@ -94,90 +205,6 @@ def is_signed_by(authority: x509.Certificate, certificate: x509.Certificate) -> 
     except (ValueError, TypeError, InvalidSignature):
         return False
     return True
-
-
-def common_name_of(certificate: x509.Certificate) -> str:
-    """Return the name in a certificate; empty if it has none."""
-    names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
-    return str(names[0].value) if names else ""
-
-
-def new_authority(now: datetime) -> Authority:
-    """Make a key and a self-signed certificate."""
-    key = new_key()
-    serial = x509.random_serial_number()
-    # Two authorities must not have the same name: a chain is looked up by it.
-    name = _common_name(f"holdfast authority {serial:x}"[:40])
-    certificate = (
-        x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(name)
-        .public_key(key.public_key())
-        .serial_number(serial)
-        .not_valid_before(now - _BACKDATED)
-        .not_valid_after(now + timedelta(days=AUTHORITY_DAYS))
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_key_usage(signs_certificates=True), critical=True)
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
-        .sign(key, hashes.SHA256())
-    )
-    return Authority(certificate, key)
-
-
-def read_authority(home: Path, now: datetime, warn: Callable[[str], object]) -> Authority:
-    """Read the authority's files; raise CredentialsError if one cannot be used."""
-    certificate = read_certificate(home / AUTHORITY_FILE)
-    path = home / AUTHORITY_KEY_FILE
-    try:
-        key = load_pem_private_key(read_file(path), password=None)
-    except (ValueError, TypeError) as error:
-        raise CredentialsError(f"{path}: is no private key in PEM form: {error}") from error
-    if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise CredentialsError(f"{path}: is no elliptic-curve key, as this program makes them")
-    if key.public_key() != certificate.public_key():
-        raise CredentialsError(f"{path}: is not the key of {home / AUTHORITY_FILE}")
-    warn_if_open(path, warn)
-    if certificate.not_valid_after_utc <= now:
-        raise CredentialsError(
-            f"{home / AUTHORITY_FILE}: has expired on "
-            f"{date_text(certificate.not_valid_after_utc.timestamp())}; make keys with a new "
-            f"authority in another directory"
-        )
-    return Authority(certificate, key)
-
-
-def sign_certificate(
-    name: str,
-    role: Role,
-    hosts: Sequence[str],
-    public_key: ec.EllipticCurvePublicKey,
-    authority: Authority,
-    now: datetime,
-    end: datetime,
-) -> x509.Certificate:
-    """Certify a robot, or a service at some hosts, until ``end``."""
-    usage = _usage_of(role)
-    builder = (
-        x509.CertificateBuilder()
-        .subject_name(_common_name(name))
-        .issuer_name(authority.certificate.subject)
-        .public_key(public_key)
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(max(now - _BACKDATED, authority.certificate.not_valid_before_utc))
-        .not_valid_after(end)
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_key_usage(signs_certificates=False), critical=True)
-        .add_extension(x509.ExtendedKeyUsage([usage]), critical=False)
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(public_key), critical=False)
-        .add_extension(
-            x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key()),
-            critical=False,
-        )
-    )
-    if hosts:
-        names = [_general_name(host) for host in hosts]
-        builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
-    return builder.sign(authority.key, hashes.SHA256())
 
 
 def read_revocations(
@@ -198,32 +225,25 @@ def read_revocations(
     return revoked
 
 
-def sign_revocations(
-    before: x509.CertificateRevocationList | None,
-    serials: Iterable[int],
-    authority: Authority,
-    now: datetime,
-) -> bytes:
-    """Return the next list in PEM: the entries of before, and these numbers as of now."""
-    number = 1
-    if before is not None:
-        number += before.extensions.get_extension_for_class(x509.CRLNumber).value.crl_number
-    builder = (
-        x509.CertificateRevocationListBuilder()
-        .issuer_name(authority.certificate.subject)
-        .last_update(max(now - _BACKDATED, authority.certificate.not_valid_before_utc))
-        # A list that expires would lock everybody out.
-        .next_update(authority.certificate.not_valid_after_utc)
-        .add_extension(x509.CRLNumber(number), critical=False)
-        .add_extension(
-            x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key()),
-            critical=False,
-        )
-    )
-    entries = [x509.RevokedCertificateBuilder(serial, now).build() for serial in serials]
-    for entry in (*(before or ()), *entries):
-        builder = builder.add_revoked_certificate(entry)
-    return builder.sign(authority.key, hashes.SHA256()).public_bytes(Encoding.PEM)
+def new_key() -> ec.EllipticCurvePrivateKey:
+    """Make a private key."""
+    return ec.generate_private_key(ec.SECP256R1())
+
+
+def public_key_of(certificate: x509.Certificate) -> ec.EllipticCurvePublicKey | None:
+    """Return a certificate's key; None if it is not of an elliptic curve."""
+    key = certificate.public_key()
+    return key if isinstance(key, ec.EllipticCurvePublicKey) else None
+
+
+def common_name_of(certificate: x509.Certificate) -> str:
+    """Return the name in a certificate; empty if it has none."""
+    names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return str(names[0].value) if names else ""
+
+
+def _common_name(name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
 
 
 def _general_name(host: str) -> x509.GeneralName:
@@ -248,32 +268,7 @@ def role_of(certificate: x509.Certificate) -> Role | None:
         usages = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
     except x509.ExtensionNotFound:
         return None
-    roles: tuple[Role, ...] = ("robot", "service")
-    return next((role for role in roles if list(usages) == [_usage_of(role)]), None)
-
-
-def _usage_of(role: Role) -> x509.ObjectIdentifier:
-    if role == "service":
-        return ExtendedKeyUsageOID.SERVER_AUTH
-    return ExtendedKeyUsageOID.CLIENT_AUTH
-
-
-def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
-    return x509.KeyUsage(
-        digital_signature=not signs_certificates,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        key_cert_sign=signs_certificates,
-        crl_sign=signs_certificates,
-        encipher_only=False,
-        decipher_only=False,
-    )
-
-
-def _common_name(name: str) -> x509.Name:
-    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    return next((role for role, usage in _USAGES.items() if list(usages) == [usage]), None)
 
 
 def read_certificate(path: Path) -> x509.Certificate:

@@ -1,24 +1,32 @@
-"""Checks credentials before a link is opened.
+"""Credentials before a link is opened: they are checked, and so is who has been revoked.
 
 TLS libraries report late, and in few words, why they refuse a certificate. So when a robot or a
 service starts, it performs the handshake of both ends in memory. If the peer would refuse these
 credentials, the error names the file and the reason.
 
-:mod:`holdfast.transport.key_ring` makes credentials.
+The authority's list of revoked certificates, ``revoked.pem`` beside the credentials, is an X.509
+certificate revocation list, and optional. A robot passes it to the ``ssl`` module, which checks it
+in each handshake. A service reads the serial numbers itself and checks them after each handshake,
+so it knows the name of the refused robot, and can end existing links. That is safe because
+:func:`load_credentials` has verified the signature in a handshake.
+
+All this needs only the standard library; :mod:`holdfast.transport.key_ring` makes credentials.
 """
 
 from __future__ import annotations
 
+import base64
+import binascii
 import os
+import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from holdfast.errors import CredentialsError, TransportError
-from holdfast.transport.endpoints import AUTHORITY_FILE, Role, TlsFiles
-from holdfast.transport.revocation import REVOKED_FILE, refuse_revoked
+from holdfast.transport.endpoints import AUTHORITY_FILE, REVOKED_FILE, Role, TlsFiles
 
 if TYPE_CHECKING:
     import ssl
@@ -29,6 +37,8 @@ __all__ = [
     "date_text",
     "file_versions",
     "load_credentials",
+    "refuse_revoked",
+    "revoked_serials",
     "warn_if_open",
 ]
 
@@ -37,6 +47,14 @@ EXPIRES_SOON_DAYS = 14
 
 _OPEN_TO_OTHERS = 0o077
 _GROUP_READS = 0o040
+
+_MAX_LIST_BYTES = 16 << 20
+"""Of a list: about 400,000 certificates."""
+
+_PEM_BLOCK = re.compile(rb"-----BEGIN ([A-Z0-9 ]+)-----(.*?)-----END \1-----", re.DOTALL)
+
+_INTEGER, _SEQUENCE, _TIMES = 0x02, 0x30, (0x17, 0x18)
+"""Tags of DER."""
 
 
 class LoadedCredentials(NamedTuple):
@@ -50,14 +68,9 @@ class LoadedCredentials(NamedTuple):
 def load_credentials(
     directory: Path | str, role: Role, *, warn: Callable[[str], object] = warnings.warn
 ) -> LoadedCredentials:
-    """Check a robot's or a service's credentials.
+    """Check the credentials in a robot's or a service's directory.
 
-    Parameters
-    ----------
-    directory : Path or str
-        With ``authority.pem``, ``certificate.pem`` and ``key.pem``.
-    warn : callable
-        Takes warnings as text: others can read the key, or the certificate expires soon.
+    It warns if others can read the key, or the certificate expires soon.
 
     Raises
     ------
@@ -128,32 +141,18 @@ def _check_handshake(files: TlsFiles, role: Role) -> tuple[str, float]:
     """Perform both ends' handshake in memory; return the certificate's name and end."""
     import ssl
 
-    from holdfast.transport.tls import common_name, describe_certificate_error
+    from holdfast.transport.tls import common_name, describe_certificate_error, make_context
 
-    authority, certificate, key = files.authority, files.certificate, files.key
+    authority, certificate = files.authority, files.certificate
     serving = role == "service"
-    ours = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if serving else ssl.PROTOCOL_TLS_CLIENT)
-    theirs = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT if serving else ssl.PROTOCOL_TLS_SERVER)
-    for context in (ours, theirs):
-        context.minimum_version = ssl.TLSVersion.TLSv1_3
-        context.check_hostname = False
-    ours.verify_mode = ssl.CERT_NONE
-    theirs.verify_mode = ssl.CERT_REQUIRED
+    protocols = ssl.PROTOCOL_TLS_SERVER, ssl.PROTOCOL_TLS_CLIENT
     try:
-        theirs.load_verify_locations(cafile=authority)
-    except ssl.SSLError as error:
-        raise CredentialsError(f"{authority}: is no certificate in PEM form") from error
-    try:
+        ours, theirs = (make_context(each, files) for each in protocols[:: 1 if serving else -1])
         refuse_revoked(theirs, authority.parent)
     except TransportError as error:
         raise CredentialsError(str(error)) from error
-    # A server needs some certificate; it is not checked here.
-    for context in (ours,) if serving else (ours, theirs):
-        try:
-            # Without the empty password, an encrypted key would ask for one on the terminal.
-            context.load_cert_chain(certificate, key, password="")
-        except ssl.SSLError as error:
-            raise CredentialsError(_unusable_pair(certificate, key, error)) from error
+    ours.check_hostname = theirs.check_hostname = False
+    ours.verify_mode = ssl.CERT_NONE  # the other end's stands for any
 
     to_ours, to_theirs = ssl.MemoryBIO(), ssl.MemoryBIO()
     near = ours.wrap_bio(to_ours, to_theirs, server_side=serving)
@@ -183,18 +182,6 @@ def _check_handshake(files: TlsFiles, role: Role) -> tuple[str, float]:
     return name, float(ssl.cert_time_to_seconds(str(shown["notAfter"])))
 
 
-def _unusable_pair(certificate: Path, key: Path, error: ssl.SSLError) -> str:
-    if error.reason == "KEY_VALUES_MISMATCH":
-        return f"{key}: is not the key of {certificate}"
-    if b"PRIVATE KEY" not in key.read_bytes():
-        return f"{key}: is no private key in PEM form"
-    if b"ENCRYPTED" in key.read_bytes():
-        return f"{key}: is encrypted; a key that a program reads by itself must not be"
-    if b"BEGIN CERTIFICATE" not in certificate.read_bytes():
-        return f"{certificate}: is no certificate in PEM form"
-    return f"{certificate} and {key} cannot be used: {error.reason or error}"
-
-
 _CRL_ERRORS = {
     3: f"is not of the authority beside it, {AUTHORITY_FILE}",
     8: f"was not signed by the authority beside it, {AUTHORITY_FILE}",
@@ -206,24 +193,112 @@ _CRL_ERRORS = {
 
 def _renewal_hint(certificate: Path, role: Role, verify_code: int) -> str:
     """Return the validity of a certificate, or how to get another one."""
-    if verify_code == 23:
-        return f"; 'holdfast keys DIR --rotate --{role} NAME' makes new ones"
+    from holdfast.transport.tls import REMEDIES
+
+    remedy = REMEDIES.get(verify_code, "").format(role=role)
     if verify_code not in (9, 10):
-        return ""
-    renew = (
-        f"; 'holdfast keys DIR --renew --{role} NAME' makes another" if verify_code == 10 else ""
-    )
+        return remedy
     try:
         from cryptography import x509
     except ImportError:
-        return renew
+        return remedy
     read = x509.load_pem_x509_certificate(certificate.read_bytes())
     return (
         f" (valid from {date_text(read.not_valid_before_utc.timestamp())}"
-        f" to {date_text(read.not_valid_after_utc.timestamp())}){renew}"
+        f" to {date_text(read.not_valid_after_utc.timestamp())}){remedy}"
     )
 
 
 def date_text(time_s: float) -> str:
     """Return a time, in seconds since 1970, as text."""
     return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M UTC")
+
+
+def refuse_revoked(context: ssl.SSLContext, directory: Path) -> None:
+    """Make handshakes refuse the certificates in a directory's list, if there is one.
+
+    Raises
+    ------
+    TransportError
+        If the list cannot be read. Its signature is checked in a handshake.
+    """
+    import ssl
+
+    path = directory / REVOKED_FILE
+    if not path.exists():
+        return
+    revoked_serials(path)  # checks that the file has no certificate, which would be trusted
+    try:
+        context.load_verify_locations(cafile=path)
+    except (OSError, ssl.SSLError) as error:
+        raise TransportError(f"{path}: is no revocation list in PEM form: {error}") from error
+    context.verify_flags |= ssl.VerifyFlags.VERIFY_CRL_CHECK_LEAF
+
+
+def revoked_serials(path: Path) -> frozenset[int]:
+    """Return the serial numbers in a list in PEM form; none if there is no such file.
+
+    Raises
+    ------
+    TransportError
+        If it cannot be read, or is no revocation list.
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read(_MAX_LIST_BYTES + 1)
+    except FileNotFoundError:
+        return frozenset()
+    except OSError as error:
+        raise TransportError(f"{path}: cannot be read: {error.strerror}") from error
+    if len(content) > _MAX_LIST_BYTES:
+        raise TransportError(f"{path}: is larger than {_MAX_LIST_BYTES} bytes")
+    blocks = _PEM_BLOCK.findall(content)
+    if [name for name, _ in blocks] != [b"X509 CRL"] or content.count(b"-----BEGIN") != 1:
+        raise TransportError(f"{path}: is no revocation list in PEM form")
+    try:
+        return frozenset(_serials(base64.b64decode(b"".join(blocks[0][1].split()), validate=True)))
+    except (binascii.Error, ValueError, IndexError) as error:
+        raise TransportError(f"{path}: is a malformed revocation list: {error}") from error
+
+
+def _serials(der: bytes) -> Iterator[int]:
+    """Yield the serial numbers in a list (RFC 5280, section 5.1)."""
+    ((tag, whole),) = _values(der)
+    _expect(tag, _SEQUENCE)
+    tag, signed = next(_values(whole))
+    _expect(tag, _SEQUENCE)
+    fields = list(_values(signed))
+    tags = [tag for tag, _ in fields]
+    # Version, algorithm, issuer, one or two times, then the entries if there are any.
+    at = next(index for index, tag in enumerate([*tags, _TIMES[0]]) if tag in _TIMES)
+    while at < len(fields) and tags[at] in _TIMES:
+        at += 1
+    if at < len(fields) and tags[at] == _SEQUENCE:
+        for tag, entry in _values(fields[at][1]):
+            _expect(tag, _SEQUENCE)
+            tag, serial = next(_values(entry), (0, b""))
+            _expect(tag, _INTEGER)
+            yield int.from_bytes(serial, "big", signed=True)
+
+
+def _values(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield tags and contents of consecutive DER values."""
+    at = 0
+    while at < len(data):
+        tag, size = data[at], data[at + 1]
+        at += 2
+        if size & 0x80:
+            count = size & 0x7F
+            if not 1 <= count <= 4:
+                raise ValueError(f"a length of {count} bytes")
+            size = int.from_bytes(data[at : at + count], "big")
+            at += count
+        if at + size > len(data):
+            raise ValueError(f"a value of {size} bytes where {len(data) - at} are left")
+        yield tag, data[at : at + size]
+        at += size
+
+
+def _expect(tag: int, expected: int) -> None:
+    if tag != expected:
+        raise ValueError(f"a value with the tag {tag:#04x} where {expected:#04x} belongs")

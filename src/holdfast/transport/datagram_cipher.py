@@ -37,7 +37,6 @@ __all__ = [
     "AssociationKeys",
     "DatagramCipher",
     "ReplayWindow",
-    "association_of",
     "require_cryptography",
 ]
 
@@ -83,13 +82,7 @@ class AssociationKeys(NamedTuple):
 
 
 def require_cryptography() -> type[AESGCM]:
-    """Return the cipher.
-
-    Raises
-    ------
-    TransportError
-        If the package ``cryptography`` is not installed.
-    """
+    """Return the cipher; raise TransportError if ``cryptography`` is not installed."""
     try:
         from cryptography.hazmat.primitives.ciphers.aead import AESGCM
     except ImportError as error:
@@ -100,17 +93,8 @@ def require_cryptography() -> type[AESGCM]:
     return AESGCM
 
 
-def association_of(datagram: bytes) -> int | None:
-    """Return the association of a datagram; None if it is too short."""
-    if len(datagram) < OVERHEAD:
-        return None
-    return int.from_bytes(datagram[:4], "big")
-
-
 class ReplayWindow:
     """Accepts each counter once; ``newest`` is the highest so far, -1 at first."""
-
-    __slots__ = ("_seen", "newest")
 
     def __init__(self) -> None:
         self.newest = -1

@@ -28,11 +28,7 @@ from typing import Any, Final
 
 from holdfast.errors import FrameError, KeysExhaustedError
 from holdfast.transport.datagram_cipher import AssociationKeys, DatagramCipher, require_cryptography
-from holdfast.transport.datagram_sockets import (
-    DATAGRAMS_AT_ONCE,
-    LARGEST_DATAGRAM,
-    DatagramSocket,
-)
+from holdfast.transport.datagram_sockets import DATAGRAMS_AT_ONCE, LARGEST_DATAGRAM, DatagramSocket
 from holdfast.transport.endpoints import Endpoint, Role
 from holdfast.transport.exchanges import (
     MESSAGE_OVERHEAD,
@@ -40,7 +36,6 @@ from holdfast.transport.exchanges import (
     RobotExchange,
     ServiceExchange,
 )
-from holdfast.transport.fair_scheduler import SLICE_S
 from holdfast.transport.frames import (
     CALL,
     END,
@@ -53,7 +48,7 @@ from holdfast.transport.frames import (
     FrameDecoder,
     encode_frame,
 )
-from holdfast.transport.link_settings import LinkSettings
+from holdfast.transport.link_settings import SLICE_S, LinkSettings
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.redundancy import Paths
 from holdfast.transport.schemes import Scheme
@@ -122,7 +117,6 @@ class _DatagramLink(Link):
         self._cipher: DatagramCipher | None = None
         self._due_at = float("inf")
         self._due: asyncio.TimerHandle | None = None
-        self._stream_heard_at = self._stream_spoke_at = self._loop.time()
         self._datagram_heard_at = self._datagram_sent_at = float("-inf")
         self._peer_address: Any = None
         self._backlog: deque[bytes] = deque()  # messages that wait for the scheduler
@@ -130,11 +124,6 @@ class _DatagramLink(Link):
         self._paths = Paths(self._send_datagram, self._send_on_stream, self._num_lost)
 
     # -- sending ---------------------------------------------------------------------------------
-
-    def send(self, data: bytes) -> None:
-        """Send frames on the stream; never waits."""
-        self._stream_spoke_at = self._loop.time()
-        super().send(data)
 
     def _send_on_stream(self, number: int, message: bytes) -> None:
         self.send(encode_frame(MESSAGE, number, message))
@@ -157,11 +146,6 @@ class _DatagramLink(Link):
         return 1 if self._cipher is None else self._cipher.window.num_lost  # 1: unknown
 
     # -- receiving -------------------------------------------------------------------------------
-
-    def buffer_updated(self, nbytes: int) -> None:
-        """Take received bytes of the stream."""
-        self._stream_heard_at = self._loop.time()
-        super().buffer_updated(nbytes)
 
     def take_datagram(self, datagram: bytes, address: Any) -> None:
         """Take a datagram with this link's association; it may be forged."""
@@ -189,7 +173,7 @@ class _DatagramLink(Link):
         else:
             self._num_dropped += 1
             if self._num_dropped >= _MAX_DROPPED:
-                self.end(_OVERRUN, goodbye=_OVERRUN, refused=True)
+                self.refuse(_OVERRUN)
 
     def _handle_backlog(self) -> None:
         """Handle waiting messages for one slice."""
@@ -209,7 +193,7 @@ class _DatagramLink(Link):
         try:
             self._received(message, datagram=True)
         except FrameError as error:
-            self.end(str(error), goodbye=str(error), refused=True)
+            self.refuse(str(error))
 
     def _received(self, message: bytes, *, datagram: bool) -> None:
         raise NotImplementedError
@@ -236,14 +220,17 @@ class _DatagramLink(Link):
         transport = self._transport
         now = self._loop.time()
         longest_s = max(_STREAM_SILENT_S, _STREAM_SILENT_LEASES * self._peer_lease_s)
-        silent = now > self._stream_heard_at + longest_s
+        silent = now > self._heard_at + longest_s
         if silent and transport is not None and not self.without_stream and self._detach():
             transport.abort()
+        super()._tick()
+
+    def _owes_ping(self, now: float) -> bool:
         heard_beside = now < self._datagram_heard_at + self._peer_lease_s
         spoke_beside = now < self._datagram_sent_at + self._ping_interval_s
-        if heard_beside and spoke_beside and now < self._stream_spoke_at + _STREAM_PING_S:
-            self._spoke = True  # datagrams show that this end lives
-        super()._tick()
+        if heard_beside and spoke_beside:  # datagrams show that this end lives
+            return now >= self._spoke_at + _STREAM_PING_S
+        return super()._owes_ping(now)
 
     def _notify_owner(self) -> None:
         if self._due is not None:
@@ -280,7 +267,6 @@ class RobotDatagramLink(_DatagramLink):
         self._socket: socket.socket | None = None
         self._sent: deque[bytes] = deque(maxlen=_REMEMBERED_DATAGRAMS)
         self._blocked_since: float | None = None
-        self._reported_blocked = False
 
     @property
     def sends_datagrams(self) -> bool:
@@ -448,8 +434,7 @@ class RobotDatagramLink(_DatagramLink):
         elif self._cipher is not None and not self._ended:
             if self._blocked_since is None:
                 self._blocked_since = now
-            elif now > self._blocked_since + _BLOCKED_AFTER_S and not self._reported_blocked:
-                self._reported_blocked = True
+            elif now > self._blocked_since + _BLOCKED_AFTER_S:
                 self._owner.on_datagrams_blocked(self)
 
     def _expire(self) -> None:
@@ -523,13 +508,8 @@ class ServiceDatagramLink(_DatagramLink):
 
     def _received(self, message: bytes, *, datagram: bool) -> None:
         arrived = self._exchange.received(message, datagram=datagram)
-        if arrived is None:
-            return
-        if len(arrived.payload) > self.max_message_bytes:
-            frame = Frame(CALL, arrived.number, b"", len(arrived.payload))
-        else:
-            frame = Frame(CALL, arrived.number, arrived.payload)
-        self._owner.on_frame(self, frame)
+        if arrived is not None:
+            self._owner.on_frame(self, Frame(CALL, arrived.number, arrived.payload))
 
     def _put(self, datagram: bytes) -> None:
         if self._socket is not None and self._peer_address is not None:
@@ -545,13 +525,7 @@ class ServiceDatagramLink(_DatagramLink):
 
 
 class DatagramScheme(Scheme):
-    """``udp``: datagrams beside a TLS stream.
-
-    Raises
-    ------
-    TransportError
-        If the package ``cryptography`` is not installed.
-    """
+    """``udp``: datagrams beside a TLS stream; raises as :func:`require_cryptography` does."""
 
     def __init__(self) -> None:
         require_cryptography()

@@ -8,7 +8,7 @@ import os
 import socket
 from typing import TYPE_CHECKING, Any, Final
 
-from holdfast.transport.datagram_cipher import AssociationKeys, association_of
+from holdfast.transport.datagram_cipher import AssociationKeys
 
 if TYPE_CHECKING:
     from holdfast.transport.datagram_links import ServiceDatagramLink
@@ -81,9 +81,6 @@ class DatagramSocket:
                 return
             except OSError:
                 continue  # a robot is gone
-            association = association_of(datagram)
-            if association is None:
-                continue
-            link = self._links.get(association)
+            link = self._links.get(int.from_bytes(datagram[:4]))  # the association
             if link is not None:
                 link.take_datagram(datagram, address)

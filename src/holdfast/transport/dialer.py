@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import errno
 import ipaddress
 import socket
 import threading
@@ -54,12 +53,8 @@ _Address: TypeAlias = str | tuple[Any, ...]
 class Dialer:
     """Makes links to an endpoint, from :meth:`start` to :meth:`stop`.
 
-    Parameters
-    ----------
-    on_failed : callable
-        Called with the reasons when an attempt has failed at each of the endpoint's addresses.
-    identity : str
-        Of this end; it determines the order of a name's addresses.
+    ``on_failed`` is called with the reasons when an attempt has failed at each of the endpoint's
+    addresses. The identity of this end determines the order of a name's addresses.
     """
 
     def __init__(
@@ -78,7 +73,7 @@ class Dialer:
         # Why the last attempt at each address failed, since the last success.
         self._failures: dict[_Address, str] = {}
         self._loop = asyncio.get_running_loop()
-        self._attempts: dict[socket.socket, tuple[_Address, asyncio.TimerHandle]] = {}
+        self._attempts: set[asyncio.Task[None]] = set()
         self._links: set[Link] = set()
         self._winner: Link | None = None
         self._least_pause_s = _FIRST_PAUSE_S
@@ -127,9 +122,8 @@ class Dialer:
         if self._next is not None:
             self._next.cancel()
             self._next = None
-        for stream in list(self._attempts):
-            self._forget(stream)
-            stream.close()
+        for attempt in self._attempts:
+            attempt.cancel()
 
     def succeeded(self) -> None:
         """Note that the right peer is there: the outage is over."""
@@ -170,35 +164,25 @@ class Dialer:
         self._attempted_at = now
         family, address = self._addresses[self._next_address % len(self._addresses)]
         self._next_address += 1
-        self._connect(family, address)
+        attempt = self._loop.create_task(self._connect(family, address))
+        self._attempts.add(attempt)
+        attempt.add_done_callback(self._attempts.discard)
 
-    def _connect(self, family: socket.AddressFamily, address: _Address) -> None:
+    async def _connect(self, family: socket.AddressFamily, address: _Address) -> None:
+        stream = None
         try:
             stream = socket.socket(family, socket.SOCK_STREAM)
-        except OSError as error:  # no descriptor is free
-            self._failed(address, error.errno)
+            stream.setblocking(False)
+            async with asyncio.timeout(_CONNECT_TIMEOUT_S):
+                await self._loop.sock_connect(stream, address)
+        except BaseException as error:
+            if stream is not None:
+                stream.close()
+            if not isinstance(error, OSError):
+                raise
+            no_answer = isinstance(error, TimeoutError)
+            self._failed(address, None if no_answer else error.errno)
             return
-        stream.setblocking(False)
-        number = stream.connect_ex(address)
-        if number == errno.EINPROGRESS:
-            timeout = self._loop.call_later(_CONNECT_TIMEOUT_S, self._give_up, stream)
-            self._attempts[stream] = address, timeout
-            self._loop.add_writer(stream, self._on_writable, stream)
-        else:
-            self._connected_or_failed(stream, address, number)
-
-    def _on_writable(self, stream: socket.socket) -> None:
-        number = stream.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-        self._connected_or_failed(stream, self._forget(stream), number)
-
-    def _connected_or_failed(self, stream: socket.socket, address: _Address, number: int) -> None:
-        if number:
-            stream.close()
-            self._failed(address, number)
-        else:
-            self._connected(stream)
-
-    def _connected(self, stream: socket.socket) -> None:
         now = self._loop.time()
         if now < self._connected_at + _NEXT_LINK_S:
             stream.close()
@@ -206,24 +190,13 @@ class Dialer:
         self._connected_at = now
         link = self._make_link()
         self._links.add(link)
-        link.connecting = self._loop.create_task(link.connect(stream))
-
-    def _give_up(self, stream: socket.socket) -> None:
-        address = self._forget(stream)
-        stream.close()
-        self._failed(address, errno.ETIMEDOUT)
-
-    def _forget(self, stream: socket.socket) -> _Address:
-        address, timeout = self._attempts.pop(stream)
-        timeout.cancel()
-        self._loop.remove_writer(stream)
-        return address
+        link.begin(stream)
 
     def _failed(self, address: _Address, number: int | None) -> None:
         # A host may have IPv4 and IPv6 addresses, and be reachable over one kind only.
         failures = {
             **self._failures,
-            address: "nothing answers" if number == errno.ETIMEDOUT else system_words(number),
+            address: system_words(number) if number else "nothing answers",
         }
         reasons = [failures.get(address) for _, address in self._addresses]
         # The addresses of a name may change with each look-up.

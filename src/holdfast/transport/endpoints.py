@@ -24,6 +24,7 @@ __all__ = [
     "CERTIFICATE_FILE",
     "KEY_FILE",
     "MAX_SOCKET_PATH_BYTES",
+    "REVOKED_FILE",
     "SCHEMES",
     "Endpoint",
     "Role",
@@ -46,7 +47,8 @@ MAX_SOCKET_PATH_BYTES = 107
 """Bound on the path of a local socket, from the system's ``sockaddr_un``."""
 
 AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE = "authority.pem", "certificate.pem", "key.pem"
-"""Names of the credentials' files."""
+REVOKED_FILE = "revoked.pem"
+"""Names of the credentials' files, and of the list of revoked certificates beside them."""
 
 _RENAMED = {
     "quic": "over UDP, services are at udp/HOST:PORT",
@@ -64,24 +66,12 @@ _NUMBERS = re.compile(r"[0-9.]+")
 
 
 class SchemeEntry(NamedTuple):
-    """The properties of a scheme that do not need its implementation.
+    """The properties of a scheme that do not need its implementation."""
 
-    Attributes
-    ----------
-    implementation : str
-        ``MODULE:CLASS``, a :class:`~holdfast.transport.schemes.Scheme`.
-    is_encrypted : bool
-        Whether both ends authenticate by a certificate.
-    place : {"address", "path", "name"}
-        The form of the place: ``HOST:PORT``, a path or a name in ROS 1.
-    services_listen : str
-        Why a robot cannot listen, as a sentence; empty if it can.
-    """
-
-    implementation: str
-    is_encrypted: bool = False
-    place: Literal["address", "path", "name"] = "address"
-    services_listen: str = ""
+    implementation: str  # MODULE:CLASS, a Scheme
+    is_encrypted: bool = False  # and both ends authenticate by a certificate
+    place: Literal["address", "path", "name"] = "address"  # HOST:PORT, a path, or a name in ROS 1
+    services_listen: str = ""  # why a robot cannot listen, as a sentence; empty if it can
 
 
 _STREAMS = "holdfast.transport.schemes:Scheme"
@@ -108,16 +98,9 @@ _ALLOWED = f"{', '.join([*SCHEMES][:-1])} and {[*SCHEMES][-1]}"
 
 
 class TlsFiles(msgspec.Struct, frozen=True):
-    """The credentials of one end, as files in PEM.
+    """The credentials of one end, as files in PEM: a certificate and its key.
 
-    Attributes
-    ----------
-    authority : Path
-        Certificate of the authority by which the other end must be certified.
-    certificate : Path
-        This end's own certificate.
-    key : Path
-        The private key of that certificate.
+    The other end must be certified by the authority.
     """
 
     authority: Path
@@ -133,15 +116,9 @@ class TlsFiles(msgspec.Struct, frozen=True):
 class Endpoint(NamedTuple):
     """A protocol and a place, checked. ``str`` gives the text back.
 
-    Attributes
-    ----------
-    protocol : str
-        A key of :data:`SCHEMES`.
-    host : str
-        Name or address, an IPv6 address without its brackets; for ``unix`` the path, for ``ros1``
-        the name in ROS 1.
-    port : int
-        0 means any free port, where something listens; for ``unix`` and ``ros1`` always 0.
+    The host is a name or address, an IPv6 address without its brackets; for ``unix`` the path, for
+    ``ros1`` the name in ROS 1. Port 0 means any free port, where something listens; for ``unix``
+    and ``ros1`` it is always 0.
     """
 
     protocol: str
@@ -195,31 +172,17 @@ class Endpoint(NamedTuple):
 
 
 class ServiceAddress(NamedTuple):
-    """How a robot and a service find each other.
-
-    Attributes
-    ----------
-    endpoint : str
-        See :func:`parse_endpoint`.
-    listens : bool
-        Whether the robot listens there and the service connects. A service that the robot launches
-        does, so the robot need not poll for it.
-    name : str or None
-        The name that the service must have; None accepts any.
-    """
+    """How a robot and a service find each other."""
 
     endpoint: str
+    # Whether the robot listens there and the service connects. A service that the robot launches
+    # does, so the robot need not poll for it.
     listens: bool = False
-    name: str | None = None
+    name: str | None = None  # that the service must have; None accepts any
 
 
 def parse_endpoint(text: str) -> Endpoint:
-    """Read an endpoint.
-
-    Parameters
-    ----------
-    text : str
-        ``PROTOCOL/HOST:PORT``, with an IPv6 address in brackets, ``unix/PATH`` or ``ros1/NAME``.
+    """Read ``PROTOCOL/HOST:PORT``, with an IPv6 address in brackets, or another endpoint.
 
     Raises
     ------
@@ -368,29 +331,18 @@ def check_credentials(endpoint: Endpoint, tls: TlsFiles | None) -> None:
     Raises
     ------
     TransportError
-        If they are missing, would not be used, or cannot be read.
+        If they are missing, or would not be used.
     """
     if endpoint.is_encrypted and tls is None:
         raise TransportError(
             f"endpoint {endpoint}: {endpoint.protocol} needs credentials (--tls DIR; "
             f"'holdfast keys DIR' makes them)"
         )
-    if tls is None:
-        return
-    if not endpoint.is_encrypted and not endpoint.is_local_socket:
+    if tls is not None and not endpoint.is_encrypted and not endpoint.is_local_socket:
         raise TransportError(
             f"endpoint {endpoint}: {endpoint.protocol} does not use the credentials that were "
             f"given (--tls); write tls/... or udp/..., or leave them out"
         )
-    if endpoint.is_encrypted:
-        for file in (tls.authority, tls.certificate, tls.key):
-            try:
-                with file.open("rb") as opened:
-                    opened.read(1)
-            except OSError as error:
-                raise TransportError(
-                    f"endpoint {endpoint}: credentials {file} cannot be read: {error.strerror}"
-                ) from error
 
 
 def _local_socket(text: str, protocol: str, path: str) -> Endpoint:

@@ -45,12 +45,7 @@ from typing import Final, NamedTuple, cast
 import msgspec
 
 from holdfast.transport.datagram_cipher import KNOWN_AFTER, LOSS_SAMPLE, OVERHEAD
-from holdfast.transport.redundancy import (
-    MAX_TIMEOUT_S,
-    Paths,
-    RedundantSender,
-    RoundTripEstimator,
-)
+from holdfast.transport.redundancy import MAX_TIMEOUT_S, Paths, RedundantSender, RoundTripEstimator
 
 __all__ = [
     "KEEP_ALIVE_S",
@@ -114,21 +109,11 @@ _PROGRESS_INTERVAL_S: Final = 0.06
 
 
 class ReceivedReply(NamedTuple):
-    """A reply, as it arrives at the robot.
+    """A reply, as it arrives at the robot."""
 
-    Attributes
-    ----------
-    call : int
-        As the robot has named it.
-    payload : bytes or None
-        None if the call ends without a further reply.
-    last : bool
-        Whether nothing more comes of the call.
-    """
-
-    call: int
-    payload: bytes | None
-    last: bool
+    call: int  # as the robot has named it
+    payload: bytes | None  # None if the call ends without a further reply
+    last: bool  # whether nothing more comes of the call
 
 
 class ReceivedRequest(NamedTuple):
@@ -162,30 +147,20 @@ class RobotExchange:
     The owner calls :meth:`expire` when :attr:`due` has come, and :meth:`received` with each
     message; each method may send. Times are seconds of any clock that never goes back.
 
-    Parameters
-    ----------
-    paths : Paths
-        Before :meth:`begin`, only the stream is used.
-
-    Attributes
-    ----------
-    open : bool
-        Whether datagrams are known to get through, in both directions.
-    unanswered_probes : int
-        Since the last datagram came.
+    Before :meth:`begin`, only the stream is used.
     """
 
     def __init__(self, paths: Paths) -> None:
         self._sender = RedundantSender(paths)
         self._requests: dict[int, _PendingRequest] = {}
         self._number = 0
-        self.unanswered_probes = 0
+        self.unanswered_probes = 0  # since the last datagram came
         self._probe_at = math.inf
         self._first_probes = 0
         self._unheard = 0
         self._unheard_since = math.inf
         self._hedges = False
-        self.open = False
+        self.open = False  # whether datagrams are known to get through, in both directions
         self.round_trip = RoundTripEstimator()
 
     @property
@@ -441,15 +416,7 @@ class ServiceExchange:
             self._repeat(number, cached, 0, datagram=False)
 
     def reply(self, number: int, payload: bytes | None, now: float, *, last: bool) -> None:
-        """Send a reply, if the robot still waits for it.
-
-        Parameters
-        ----------
-        payload : bytes or None
-            None is the end alone.
-        last : bool
-            Whether nothing more will come.
-        """
+        """Send a reply, if the robot still waits for it; without a payload it is the end alone."""
         cached = self._cached.get(number)
         if cached is None or cached.done:
             return

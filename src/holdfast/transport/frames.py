@@ -72,48 +72,24 @@ HEADER_BYTES: Final = _HEADER.size
 
 
 class Frame(NamedTuple):
-    """A received frame.
-
-    Attributes
-    ----------
-    payload : bytes
-        A large one is a ``bytearray`` that nothing else refers to.
-    skipped_bytes : int
-        Size of a message that is larger than allowed and was skipped; then the payload is empty.
-    """
+    """A received frame."""
 
     kind: int
     call: int
-    payload: bytes
-    skipped_bytes: int = 0
+    payload: bytes  # a large one is a bytearray that nothing else refers to
+    skipped_bytes: int = 0  # size of a message that is larger than allowed and was skipped
 
 
 class Hello(msgspec.Struct, frozen=True, omit_defaults=True):
-    """The first frame: identifies one end of a link.
+    """The first frame: identifies one end of a link."""
 
-    Attributes
-    ----------
-    version : int
-        :data:`WIRE_VERSION` of its code.
-    release : str
-        Of holdfast there.
-    name : str
-        A robot's may be empty.
-    incarnation : str
-        Of its process; a restarted process has another.
-    lease_ms : float
-        After this much silence it may be considered lost.
-    clock_s : float
-        The time at a service, in seconds since 1970; 0 is unknown.
-    """
-
-    version: int
-    release: str
+    version: int  # WIRE_VERSION of its code
+    release: str  # of holdfast there
     role: Role
-    name: str
-    incarnation: str
-    lease_ms: float
-    clock_s: float = 0.0
+    name: str  # a robot's may be empty
+    incarnation: str  # of its process; a restarted process has another
+    lease_ms: float  # after this much silence it may be considered lost
+    clock_s: float = 0.0  # the time at a service, in seconds since 1970; 0 is unknown
 
 
 class _Version(msgspec.Struct):
@@ -179,17 +155,8 @@ def decode_hello(payload: bytes) -> Hello:
 class FrameDecoder:
     """Decodes the frames of one stream, in pieces of any size.
 
-    Parameters
-    ----------
-    max_message_bytes : int
-        A larger request or reply is skipped.
-    more : mapping of int to int, optional
-        Bounds of further kinds.
-
-    Attributes
-    ----------
-    error : FrameError or None
-        The violation after the last frame. Nothing may be fed after it.
+    A request or reply above the bound is skipped. ``more`` has bounds of further kinds. ``error``
+    is the violation after the last frame, if any; nothing may be fed after it.
     """
 
     def __init__(self, max_message_bytes: int, more: Mapping[int, int] | None = None) -> None:
@@ -227,31 +194,28 @@ class FrameDecoder:
             self._feed(data, frames)
         except FrameError as error:
             self.error = error
+            self._buffer.clear()
         return frames
 
     def _feed(self, data: bytes, frames: list[Frame]) -> None:
         buffer = self._buffer
-        source: bytes | bytearray = data
-        if buffer:
-            buffer += data
-            source = buffer
-        end = len(source)
+        buffer += data
         at = 0
         if not self._has_magic:
-            if not MAGIC.startswith(source[: len(MAGIC)]):
-                raise FrameError(_describe_foreign(bytes(source[:16])))
-            if end >= len(MAGIC):
-                self._has_magic = True
-                at = len(MAGIC)
-        while self._has_magic:
-            if self._to_skip:
-                skipped = min(self._to_skip, end - at)
-                self._to_skip -= skipped
-                at += skipped
+            if not MAGIC.startswith(buffer[: len(MAGIC)]):
+                raise FrameError(_describe_foreign(bytes(buffer[:16])))
+            if len(buffer) < len(MAGIC):
+                return
+            self._has_magic = True
+            at = len(MAGIC)
+        while True:
+            skipped = min(self._to_skip, len(buffer) - at)
+            self._to_skip -= skipped
+            at += skipped
             start = at + _HEADER.size
-            if start > end:
+            if start > len(buffer):
                 break
-            size, kind, call = _HEADER.unpack_from(source, at)
+            size, kind, call = _HEADER.unpack_from(buffer, at)
             if size > self._bound(kind):
                 if kind not in (CALL, REPLY, LAST, MESSAGE):
                     raise FrameError(f"sends a frame of kind {kind} with {size} bytes")
@@ -259,10 +223,10 @@ class FrameDecoder:
                 self._to_skip = size
                 at = start
                 continue
-            if start + size > end:
+            if start + size > len(buffer):
                 break
             self._has_hello = True
-            if source is buffer and size >= _LARGE_BYTES:
+            if size >= _LARGE_BYTES:
                 # Not copied: that would block the loop for a tenth of a second.
                 behind = bytes(buffer[start + size :])
                 del buffer[start + size :], buffer[:start]
@@ -270,13 +234,10 @@ class FrameDecoder:
                 self._buffer = bytearray()
                 self._feed(behind, frames)
                 return
-            with memoryview(source) as view:
+            with memoryview(buffer) as view:
                 frames.append(Frame(kind, call, bytes(view[start : start + size])))
             at = start + size
-        if source is buffer:
-            del buffer[:at]
-        elif at < end:
-            buffer += memoryview(data)[at:]
+        del buffer[:at]
 
     def _bound(self, kind: int) -> int:
         if not self._has_hello:

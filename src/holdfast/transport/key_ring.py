@@ -43,20 +43,21 @@ from holdfast.transport.authority import (
     is_host,
     is_signed_by,
     key_pem,
-    new_authority,
     new_key,
     normal_host,
     public_key_of,
-    read_authority,
     read_certificate,
     read_file,
     read_revocations,
     role_of,
-    sign_certificate,
-    sign_revocations,
 )
-from holdfast.transport.endpoints import AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, Role
-from holdfast.transport.revocation import REVOKED_FILE
+from holdfast.transport.endpoints import (
+    AUTHORITY_FILE,
+    CERTIFICATE_FILE,
+    KEY_FILE,
+    REVOKED_FILE,
+    Role,
+)
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -93,24 +94,14 @@ _PUBLIC_FILE = 0o644
 
 
 class MadeCredentials(NamedTuple):
-    """The credentials of one robot or service.
-
-    Attributes
-    ----------
-    directory : Path
-        To be copied to its machine.
-    hosts : tuple of str
-        Names and addresses under which robots may call a service; empty for a robot.
-    renewed : bool
-        Whether the key is the old one.
-    """
+    """The credentials of one robot or service."""
 
     name: str
     role: Role
-    directory: Path
-    hosts: tuple[str, ...]
+    directory: Path  # to be copied to its machine
+    hosts: tuple[str, ...]  # under which robots may call a service; empty for a robot
     expires: datetime
-    renewed: bool
+    renewed: bool  # whether the key is the old one
 
 
 class Issued(NamedTuple):
@@ -187,8 +178,6 @@ def make_credentials(
 
     Parameters
     ----------
-    directory : Path
-        Of all credentials; made if it does not exist.
     robots, services : sequence of str
         Their names; none at all means one robot ``robot`` and one service ``service``, or with
         ``renew`` or ``rotate`` all that are there.
@@ -198,10 +187,6 @@ def make_credentials(
         For which the certificates are valid; never longer than the authority.
     renew, rotate : bool
         Whether to replace existing certificates, except revoked ones; or keys as well.
-    now : datetime or None
-        With its time zone; None is the current time.
-    warn : callable
-        Takes warnings as text.
 
     Raises
     ------
@@ -222,7 +207,7 @@ def make_credentials(
 
     home = directory / _AUTHORITY
     authority_is_new = not home.exists()
-    authority = new_authority(now) if authority_is_new else read_authority(home, now, warn)
+    authority = Authority.new(now) if authority_is_new else Authority.read(home, now, warn)
 
     # All refusals come before the first file is written.
     revoked = None if authority_is_new else read_revocations(home, authority.certificate)
@@ -298,16 +283,9 @@ def revoke_credentials(
 ) -> tuple[Issued, ...]:
     """Revoke certificates, and return those that were not revoked before.
 
-    An end that has the new list refuses them.
-    The list is written to the authority and beside each party's credentials. Entries are never
-    removed.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Robots and services; all their certificates are revoked.
-    serials : sequence of int
-        Numbers of single certificates.
+    An end that has the new list refuses them: all certificates of these robots and services, and
+    single ones by their numbers. The list is written to the authority and beside each party's
+    credentials. Entries are never removed.
 
     Raises
     ------
@@ -319,7 +297,7 @@ def revoke_credentials(
     """
     now = (now or datetime.now(UTC)).replace(microsecond=0)
     home = directory / _AUTHORITY
-    authority = read_authority(home, now, warn)
+    authority = Authority.read(home, now, warn)
     issued = _read_issued(directory, authority.certificate)
     wanted: dict[int, Issued] = {}
     for name in names:
@@ -336,7 +314,7 @@ def revoke_credentials(
     numbers = {entry.serial_number for entry in listed or ()}
     new = [each._replace(revoked=now) for each in wanted.values() if each.serial not in numbers]
     if new:
-        content = sign_revocations(listed, [each.serial for each in new], authority, now)
+        content = authority.revoke(listed, [each.serial for each in new], now)
         write_atomically(home / REVOKED_FILE, content)
     if new or numbers:
         content = read_file(home / REVOKED_FILE)
@@ -455,7 +433,7 @@ def _party(
     if role == "service":
         before = _hosts_of_this_machine() if old is None else hosts_of(old)
         reached_at = tuple(dict.fromkeys(map(normal_host, (*before, *hosts))))
-    certificate = sign_certificate(place.name, role, reached_at, public_key, authority, now, end)
+    certificate = authority.certify(place.name, role, reached_at, public_key, now, end)
     made = MadeCredentials(place.name, role, place, reached_at, end, key is None)
     return _Party(made, certificate, key)
 

@@ -1,30 +1,85 @@
-"""What all links of one end share: their settings, a receive buffer and a bound on memory."""
+"""What all links of one end share: settings, a receive buffer, time slices, a bound on memory."""
 
 from __future__ import annotations
 
+import asyncio
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
-from holdfast.transport.fair_scheduler import FairScheduler
 from holdfast.transport.frames import HEADER_BYTES
 
 if TYPE_CHECKING:
     from holdfast.transport.links import Link
 
-__all__ = ["LinkSettings", "PartialMessageBudget"]
+__all__ = ["SLICE_S", "FairScheduler", "LinkSettings", "PartialMessageBudget"]
 
 _RECEIVED_AT_ONCE_BYTES: Final = 256 * 1024
+
+SLICE_S: Final = 0.001
+
+_WINDOW_S: Final = 0.005
+"""An owner may use one slice per window without waiting."""
+
+
+class FairScheduler:
+    """A round-robin scheduler: a link that receives much does not delay the others.
+
+    One read of a socket can return hundreds of kilobytes with tens of thousands of messages. So a
+    link handles what it has received for a slice of one millisecond. What is left waits, and the
+    link reads nothing more meanwhile. In each turn of the event loop (or after ``pause_s``) one
+    waiting link runs for another slice, and all other links are read in between.
+
+    Links of one *owner* share their slices, however many they are: those with the same certificate,
+    and all those with an unfinished handshake. A link without TLS is an owner of its own.
+    """
+
+    def __init__(self, pause_s: float = 0.0) -> None:
+        self._pause_s = pause_s
+        self._waiting: OrderedDict[object, deque[Callable[[], None]]] = OrderedDict()
+        self._used_s: dict[object, float] = {}
+        self._window_ends_at = float("-inf")
+
+    def may_run(self, owner: object, now: float) -> bool:
+        """Return whether an owner may handle at once what it has just received."""
+        if now >= self._window_ends_at:
+            self._used_s.clear()
+            self._window_ends_at = now + _WINDOW_S
+        return owner not in self._waiting and self._used_s.get(owner, 0.0) < SLICE_S
+
+    def charge(self, owner: object, seconds: float) -> None:
+        """Add time that an owner has used."""
+        self._used_s[owner] = self._used_s.get(owner, 0.0) + seconds
+
+    def enqueue(self, owner: object, run_slice: Callable[[], None]) -> None:
+        """Run a slice when the owner's turn comes; it enqueues again if there is more."""
+        if not self._waiting:
+            self._schedule()
+        self._waiting.setdefault(owner, deque()).append(run_slice)
+
+    def _run_next(self) -> None:
+        owner, waiting = self._waiting.popitem(last=False)
+        run_slice = waiting.popleft()
+        if waiting:
+            self._waiting[owner] = waiting
+        if self._waiting:
+            self._schedule()
+        run_slice()
+
+    def _schedule(self) -> None:
+        loop = asyncio.get_running_loop()
+        if self._pause_s:
+            loop.call_later(self._pause_s, self._run_next)
+        else:
+            loop.call_soon(self._run_next)
 
 
 class PartialMessageBudget:
     """Bounds the memory that half-received messages of all links together take.
 
-    Parameters
-    ----------
-    max_bytes : int
-        Above it a link is ended: among the owners that hold at least half of the largest share,
-        the link whose message began first. So an owner that sends much cannot end the links of
-        owners that hold little.
+    Above the bound a link is ended: among the owners that hold at least half of the largest share,
+    the link whose message began first. So an owner that sends much cannot end the links of owners
+    that hold little.
     """
 
     def __init__(self, max_bytes: int) -> None:
@@ -62,13 +117,7 @@ class LinkSettings:
     pauses_for_readers : bool
         Whether reading pauses while the other end does not read.
     pause_s : float
-        Of the :class:`~holdfast.transport.fair_scheduler.FairScheduler`.
-
-    Attributes
-    ----------
-    buffer : memoryview
-        Takes received bytes. A link copies them out at once, so links on one event loop can share
-        it. Allocating a buffer takes longer than handling a short message.
+        Of the :class:`FairScheduler`.
     """
 
     def __init__(
@@ -86,4 +135,6 @@ class LinkSettings:
         self.pauses_for_readers = pauses_for_readers
         self.partial_messages = PartialMessageBudget(2 * (max_message_bytes + HEADER_BYTES))
         self.scheduler = FairScheduler(pause_s)
+        # Takes received bytes. Links copy them out at once and so can share it: allocating one
+        # takes longer than handling a short message.
         self.buffer = memoryview(bytearray(_RECEIVED_AT_ONCE_BYTES))

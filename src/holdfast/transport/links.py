@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Final
 
 from holdfast.errors import FrameError
 from holdfast.transport.endpoints import host_and_port
-from holdfast.transport.fair_scheduler import SLICE_S
 from holdfast.transport.frames import (
     GOODBYE,
     HELLO,
@@ -36,9 +35,9 @@ from holdfast.transport.frames import (
     encode_goodbye,
     read_goodbye,
 )
+from holdfast.transport.link_settings import SLICE_S, LinkSettings
 
 if TYPE_CHECKING:
-    from holdfast.transport.link_settings import LinkSettings
     from holdfast.transport.tls import PeerCertificate, TlsStream
 
 __all__ = ["OPENING_TIMEOUT_S", "Link", "LinkOwner"]
@@ -94,7 +93,7 @@ class LinkOwner(ABC):
         """Replace a link that goes on with datagrams alone."""
 
     def on_datagrams_blocked(self, link: Link) -> None:  # noqa: B027 - optional
-        """Note, once, that no datagram gets through, so that everything goes on the stream."""
+        """Note that no datagram gets through, so that everything goes on the stream."""
 
     @abstractmethod
     def on_ended(self, link: Link) -> None:
@@ -104,38 +103,7 @@ class LinkOwner(ABC):
 class Link(asyncio.BufferedProtocol):
     """One stream; a protocol for asyncio, to be connected by it.
 
-    Parameters
-    ----------
-    speaks_first : bool
-        Whether this end sends its hello first.
-
-    Attributes
-    ----------
-    began_at : float
-        By the loop's clock.
-    max_message_bytes : int
-        Larger messages are not sent.
-    has_answered : bool
-        Whether an awaited reply came over it; set by the owner.
-    connecting : Task or None
-        Of an accepted connection; asyncio itself keeps no reference.
-    closed : Future
-        Done when the connection is closed.
-    hello : Hello or None
-        The other end's, once it has come.
-    peer : PeerCertificate or None
-        The other end's, once TLS is established.
-    address : str or None
-        The other end's, HOST:PORT; None over a local socket, or not connected yet.
-    reason : str
-        Why the link has ended, as the rest of a sentence about the other end; empty if it was
-        closed normally.
-    said_goodbye : bool
-        Whether the other end has announced that it ends the link, now or soon.
-    refused : bool
-        Whether one end has refused the other, so that an immediate retry is of no use.
-    without_stream : bool
-        Whether it goes on without its stream.
+    ``speaks_first`` says whether this end sends its hello first.
     """
 
     def __init__(
@@ -150,7 +118,7 @@ class Link(asyncio.BufferedProtocol):
         self._settings = settings
         self._speaks_first = speaks_first
         self.tls = tls
-        self.max_message_bytes = settings.max_message_bytes
+        self.max_message_bytes = settings.max_message_bytes  # larger messages are not sent
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
         self._decoder = FrameDecoder(settings.max_message_bytes)
@@ -166,20 +134,28 @@ class Link(asyncio.BufferedProtocol):
         self._unread, self._unread_at = b"", 0
         self._frames: deque[Frame] = deque()
         self._is_queued = self._is_paused = False
-        self._spoke = False
+        self._spoke_at = self._heard_at = now
         self._handed_over_bytes = self._progress_bytes = 0
         self._timer = self._loop.call_at(self._lease_ends_at, self._tick)
         self._ended = False
         self._notified = False
+        self._connecting: asyncio.Task[None] | None = None
+        # Done when the connection is closed.
         self.closed: asyncio.Future[None] = self._loop.create_future()
-        self.connecting: asyncio.Task[object] | None = None
+        # The other end's, as soon as they are known; over a local socket there is no address.
         self.hello: Hello | None = None
         self.peer: PeerCertificate | None = None
         self.address: str | None = None
+        # Why the link has ended, as the rest of a sentence about the other end; "" if it was closed
+        # normally.
         self.reason = ""
+        # Whether the other end has announced that it ends the link, now or soon.
         self.said_goodbye = False
+        # Whether one end has refused the other, so that an immediate retry is of no use.
         self.refused = False
+        # Whether it goes on without its stream.
         self.without_stream = False
+        # Whether an awaited reply came over it; set by the owner.
         self.has_answered = False
 
     @property
@@ -206,6 +182,10 @@ class Link(asyncio.BufferedProtocol):
         """Return the protocol for asyncio: the link itself, or an adapter around it."""
         return self
 
+    def begin(self, stream: socket.socket) -> None:
+        """Take over a connection, from the next turn of the loop on."""
+        self._connecting = self._loop.create_task(self.connect(stream))  # asyncio's are weak
+
     async def connect(self, stream: socket.socket) -> None:
         """Take over a connection; never raises."""
         try:
@@ -225,7 +205,7 @@ class Link(asyncio.BufferedProtocol):
             self.tls.send(data)
             data = self.tls.take()
         transport.write(data)
-        self._spoke = True
+        self._spoke_at = self._loop.time()
         self._handed_over_bytes += len(data)
         if transport.get_write_buffer_size() > self._max_unsent_bytes:
             self.end("does not read what it is sent", abort=True)
@@ -233,10 +213,6 @@ class Link(asyncio.BufferedProtocol):
     def send_message(self, kind: int, call: int, payload: bytes = b"") -> None:
         """Send a frame of a call; never waits."""
         self.send(encode_frame(kind, call, payload))
-
-    def say_goodbye(self) -> None:
-        """Ask the other end to end the link as soon as it can do without."""
-        self.send(encode_goodbye(""))
 
     def forget(self, call: int) -> None:
         """Ignore what still comes of a call."""
@@ -251,16 +227,8 @@ class Link(asyncio.BufferedProtocol):
     ) -> None:
         """End the link; the owner is notified in a later turn of the loop. May be repeated.
 
-        Parameters
-        ----------
-        reason : str
-            About the other end, for :attr:`reason`.
-        goodbye : str or None
-            Sent to the other end before, as the reason; may be empty.
-        refused : bool
-            For :attr:`refused`.
-        abort : bool
-            Whether to drop unsent bytes.
+        ``reason`` is about the other end, which gets ``goodbye`` as the reason before, unless it is
+        None. ``abort`` drops unsent bytes.
         """
         if self._ended:
             return
@@ -294,6 +262,10 @@ class Link(asyncio.BufferedProtocol):
         transport.close()
         self._timer = self._loop.call_later(_CLOSE_TIMEOUT_S, transport.abort)
 
+    def refuse(self, reason: str) -> None:
+        """End the link, and tell the other end why."""
+        self.end(reason, goodbye=reason, refused=True)
+
     def _flush(self) -> None:
         """Send what only a stream can still deliver, before the link ends."""
 
@@ -309,7 +281,8 @@ class Link(asyncio.BufferedProtocol):
         self._transport = transport
         stream = transport.get_extra_info("socket")
         if stream is not None and stream.family != socket.AF_UNIX:
-            self.address = _address(transport.get_extra_info("peername"))
+            if peer := transport.get_extra_info("peername"):
+                self.address = host_and_port(str(peer[0]), peer[1])
             with contextlib.suppress(OSError):
                 stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 stream.setsockopt(
@@ -332,7 +305,7 @@ class Link(asyncio.BufferedProtocol):
         if self._ended:
             return
         self._unread, self._unread_at = bytes(self._settings.buffer[:nbytes]), 0
-        now = self._loop.time()
+        now = self._heard_at = self._loop.time()
         if self.hello is not None:
             self._lease_ends_at = now + self._peer_lease_s
         if self._settings.scheduler.may_run(self.owner, now):
@@ -461,7 +434,7 @@ class Link(asyncio.BufferedProtocol):
             try:
                 self.peer = tls.peer()
             except FrameError as error:
-                self.end(str(error), goodbye=str(error), refused=True)
+                self.refuse(str(error))
                 return b""
             if self._speaks_first:
                 self._say_hello()
@@ -479,7 +452,7 @@ class Link(asyncio.BufferedProtocol):
             except FrameError as error:
                 refusal = str(error)
             if refusal is not None:
-                self.end(refusal, goodbye=refusal, refused=True)
+                self.refuse(refusal)
                 return
             if not self._speaks_first:
                 self._say_hello()
@@ -520,13 +493,12 @@ class Link(asyncio.BufferedProtocol):
             return
         valid_s = math.inf if self.peer is None else self.peer.expires_at - time.time()
         if valid_s <= 0.0:
-            self.end(_EXPIRED, goodbye=_EXPIRED, refused=True)
+            self.refuse(_EXPIRED)
             return
         transport = self._transport
         if self.hello is not None and transport is not None:
-            if not self._spoke:
+            if self._owes_ping(now):
                 self.send(_PING)
-            self._spoke = False
             unsent = transport.get_write_buffer_size()
             sent_bytes = self._handed_over_bytes - unsent
             if unsent == 0 or sent_bytes != self._progress_bytes:
@@ -539,6 +511,10 @@ class Link(asyncio.BufferedProtocol):
         if self.hello is not None:
             due = min(due, now + self._ping_interval_s, now + valid_s)
         self._timer = self._loop.call_at(due, self._tick)
+
+    def _owes_ping(self, now: float) -> bool:
+        """Whether nothing was sent since the last tick, or little later."""
+        return self._spoke_at < now - 0.9 * self._ping_interval_s
 
     def _end_if_silent(self) -> None:
         if self._ended:
@@ -555,10 +531,3 @@ class Link(asyncio.BufferedProtocol):
         """Extend the lease of a peer from which this end does not read."""
         if self.hello is not None and (self._is_queued or self._is_paused):
             self._lease_ends_at = now + self._peer_lease_s
-
-
-def _address(found: object) -> str | None:
-    """Write the address of a socket as in an endpoint."""
-    if not isinstance(found, tuple):
-        return None
-    return host_and_port(str(found[0]), found[1])

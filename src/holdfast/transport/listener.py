@@ -61,18 +61,13 @@ class Listener:
     Parameters
     ----------
     endpoint : Endpoint
-        Port 0 takes a free one.
+        Port 0 takes a free one; the attribute has its number.
     accepted : callable
         Gets the socket of such a connection, and the network from which it came.
     speaks_first : bool
         Whether this end speaks first; then connections are delivered at once.
     listening : socket or None
         A socket that listens there already and is shared with its owner.
-
-    Attributes
-    ----------
-    endpoint : Endpoint
-        Where it listens, port 0 replaced.
 
     Raises
     ------

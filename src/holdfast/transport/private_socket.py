@@ -27,11 +27,6 @@ class PrivateSocket:
     set only after it can be connected to. Use it as a context, or call :meth:`remove`. What a
     process leaves that is killed before it can do that, the next one removes.
 
-    Attributes
-    ----------
-    endpoint : str
-        ``unix/PATH``.
-
     Raises
     ------
     TransportError

@@ -7,8 +7,8 @@ gets at most three times the load.
 
 from __future__ import annotations
 
-import heapq
 import math
+from collections import deque
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
@@ -33,18 +33,10 @@ _MIN_MARGIN_S: Final = 0.01
 
 
 class RoundTripEstimator:
-    """Mean and variation of round trips (RFC 6298), with a least margin of 10 ms.
-
-    Attributes
-    ----------
-    smoothed_s : float or None
-        Exponentially weighted mean; None before the first measurement.
-    """
-
-    __slots__ = ("_variation_s", "smoothed_s")
+    """Mean and variation of round trips (RFC 6298), with a least margin of 10 ms."""
 
     def __init__(self) -> None:
-        self.smoothed_s: float | None = None
+        self.smoothed_s: float | None = None  # the exponentially weighted mean, once measured
         self._variation_s = 0.0
 
     def add(self, seconds: float) -> None:
@@ -65,16 +57,10 @@ class RoundTripEstimator:
 
 
 class Paths(NamedTuple):
-    """The two paths to the other end.
+    """The two paths to the other end: each sends a message.
 
-    Attributes
-    ----------
-    datagram : callable
-        Sends a message as a datagram.
-    stream : callable
-        Sends a message on the stream; its first argument is the number of the request.
-    num_lost : callable
-        Returns how many of the other end's last datagrams were lost.
+    On the stream the number of its request goes with it. ``num_lost`` returns how many of the other
+    end's last datagrams were lost.
     """
 
     datagram: Callable[[bytes], None]
@@ -83,19 +69,12 @@ class Paths(NamedTuple):
 
 
 class RedundantSender:
-    """Sends messages as datagrams, with copies while the path loses some.
-
-    Attributes
-    ----------
-    num_lost : int
-        Of this end's last datagrams, as the other end reports; 1 until it has.
-    """
+    """Sends messages as datagrams, with copies while the path loses some."""
 
     def __init__(self, paths: Paths) -> None:
         self.paths = paths
-        self.num_lost = 1
-        self._copies: list[tuple[float, int, int, bytes, Callable[[], bool]]] = []
-        self._num_copies = 0
+        self.num_lost = 1  # of this end's last datagrams, as the other end reports
+        self._copies: deque[tuple[float, int, bytes, Callable[[], bool]]] = deque()
         self._budget_bytes = _EXTRA_BURST_BYTES
 
     @property
@@ -106,18 +85,13 @@ class RedundantSender:
     def send_first(self, kind: int, body: bytes, now: float, wanted: Callable[[], bool]) -> None:
         """Send a datagram for the first time.
 
-        Parameters
-        ----------
-        wanted : callable
-            Whether the copy is still of use when its time has come.
+        ``wanted`` says whether the copy is still of use when its time has come.
         """
         earned = _EXTRA_SHARE * _packet_bytes(body)
         self._budget_bytes = min(_EXTRA_BURST_BYTES, self._budget_bytes + earned)
         self.send_unbudgeted(kind, body)
         if self.num_lost:
-            self._num_copies += 1
-            copy = (now + COPY_DELAY_S, self._num_copies, kind, body, wanted)
-            heapq.heappush(self._copies, copy)
+            self._copies.append((now + COPY_DELAY_S, kind, body, wanted))
 
     def retransmit(self, kind: int, body: bytes) -> None:
         """Send a datagram again, if the budget allows it."""
@@ -142,7 +116,7 @@ class RedundantSender:
     def expire(self, now: float) -> None:
         """Send the copies that are due."""
         while self._copies and self._copies[0][0] <= now:
-            _, _, kind, body, wanted = heapq.heappop(self._copies)
+            _, kind, body, wanted = self._copies.popleft()
             if wanted():
                 self.retransmit(kind, body)
 

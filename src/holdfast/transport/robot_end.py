@@ -27,15 +27,7 @@ from holdfast.transport.endpoints import (
     check_endpoint,
     check_name,
 )
-from holdfast.transport.frames import (
-    CALL,
-    END,
-    LAST,
-    REPLY,
-    Frame,
-    Hello,
-    encode_hello,
-)
+from holdfast.transport.frames import CALL, END, LAST, REPLY, Frame, Hello, encode_hello
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.listener import Listener, connection_to_drop
@@ -56,11 +48,17 @@ _TAKES_NO_TLS = (
     "holdfast service, or is just ending"
 )
 
+_NO_DATAGRAMS = "none gets through, so everything goes on the TLS stream; is UDP filtered?"
+
 _MAX_WITHOUT_HELLO = 64
 """Connections to a listening robot without a hello yet."""
 
 _MAX_REPORTED_REASONS = 8
 """Reasons that are not reported again; bounded, as a service may send a new one each time."""
+
+
+def _unheard(_name: str, **_fields: object) -> None:
+    """Log nothing."""
 
 
 class StreamRobotTransport:
@@ -72,25 +70,18 @@ class StreamRobotTransport:
         Where each service is, by the robot's name for it.
     name : str
         The robot's; may be empty.
-    incarnation : str
-        Of this process.
     lease_ms : float
         After this much silence services consider this robot lost. A service's own lease is in its
         hello.
     max_message_bytes : int
         A larger request is refused here, a larger reply is dropped.
     tls : TlsFiles or None
-        The robot's credentials, for ``tls``.
-    on_unreachable : callable or None
-        Called with the service and the reason, as the rest of a sentence about it, when it cannot
-        be reached, refuses this robot or is another service. Recent reasons are not repeated until
-        the service has appeared.
-    on_datagrams_blocked : callable or None
-        Called once for a service at ``udp`` to which no datagram gets through, so that everything
-        goes on the stream.
-    on_unusable : callable or None
-        Called with the reason when replaced credentials cannot be used; the previous ones stay in
-        use.
+        The robot's credentials, for ``tls`` and ``udp``.
+    on_event : callable
+        Called for the log: ``unreachable`` with ``service`` and ``reason``, the rest of a sentence
+        about a service that cannot be reached, refuses this robot or is another one (recent reasons
+        are not repeated until it has appeared); ``no_datagrams`` with ``service`` and ``reason``,
+        once for each; ``credentials`` with ``reason``, when replaced ones cannot be used.
 
     Raises
     ------
@@ -107,9 +98,7 @@ class StreamRobotTransport:
         lease_ms: float = 400.0,
         max_message_bytes: int = DEFAULT_MAX_MESSAGE_BYTES,
         tls: TlsFiles | None = None,
-        on_unreachable: Callable[[str, str], None] | None = None,
-        on_datagrams_blocked: Callable[[str], None] | None = None,
-        on_unusable: Callable[[str], None] | None = None,
+        on_event: Callable[..., None] = _unheard,
     ) -> None:
         if name:
             check_name("name of a robot", name)
@@ -123,8 +112,7 @@ class StreamRobotTransport:
             pause_s=_PAUSE_S,
         )
         self.calls = CallTable()
-        self.on_unreachable = on_unreachable
-        self.on_datagrams_blocked = on_datagrams_blocked
+        self.on_event = on_event
         self._services: dict[str, _ServiceLinks] = {}
         credentials: ClientCredentials | None = None
         for service, address in services.items():
@@ -133,7 +121,9 @@ class StreamRobotTransport:
             if address.name is not None:
                 check_name("name of a service", address.name)
             if credentials is None and tls is not None and endpoint.is_encrypted:
-                credentials = ClientCredentials(tls, on_unusable)
+                credentials = ClientCredentials(
+                    tls, lambda reason: on_event("credentials", reason=reason)
+                )
             own = credentials if endpoint.is_encrypted else None
             self._services[service] = _ServiceLinks(self, service, address, endpoint, own)
         self._started = False
@@ -207,13 +197,7 @@ class StreamRobotTransport:
 
 
 class _ServiceLinks(LinkOwner):
-    """The links to one service, and the calls on them.
-
-    Attributes
-    ----------
-    endpoint : Endpoint
-        Where it listens or, for one that connects, where the robot does.
-    """
+    """The links to one service, and the calls on them."""
 
     def __init__(
         self,
@@ -250,7 +234,9 @@ class _ServiceLinks(LinkOwner):
         self._reported_reasons: deque[str] = deque(maxlen=_MAX_REPORTED_REASONS)
         self._reported_blocked = False
         self._stopped = False
-        self.endpoint = endpoint
+        self._endpoint = (
+            endpoint  # where it listens or, for one that connects, where the robot does
+        )
 
     @property
     def current(self) -> Link | None:
@@ -261,11 +247,11 @@ class _ServiceLinks(LinkOwner):
     def start(self) -> None:
         if self._address.listens:
             self._listener = Listener(
-                self.endpoint, self._accepted, speaks_first=self._credentials is not None
+                self._endpoint, self._accepted, speaks_first=self._credentials is not None
             )
         else:
             self._dialer = Dialer(
-                self.endpoint,
+                self._endpoint,
                 self._scheme,
                 self._make_link,
                 self._all_failed,
@@ -316,12 +302,12 @@ class _ServiceLinks(LinkOwner):
     def _make_link(self, network: bytes = b"") -> Link:
         tls = None
         if self._credentials is not None:
-            host = None if self._address.listens else self.endpoint.host
+            host = None if self._address.listens else self._endpoint.host
             tls = TlsStream(self._credentials.context(), host, self._incarnation)
         link = self._scheme.make_link(
             self,
             self._robot.settings,
-            self.endpoint,
+            self._endpoint,
             tls,
             role="robot",
             dialled=not self._address.listens,
@@ -337,8 +323,7 @@ class _ServiceLinks(LinkOwner):
         }
         if len(unknown) >= _MAX_WITHOUT_HELLO:
             connection_to_drop(unknown).end("has said no hello, and others wait", abort=True)
-        link = self._make_link(network)
-        link.connecting = asyncio.get_running_loop().create_task(link.connect(connection))
+        self._make_link(network).begin(connection)
 
     def on_handshake(self, link: Link) -> None:
         if not self._handshake_is_enough or self._address.listens or self._links:
@@ -464,10 +449,9 @@ class _ServiceLinks(LinkOwner):
 
     def on_datagrams_blocked(self, link: Link) -> None:
         del link
-        on_blocked = self._robot.on_datagrams_blocked
-        if on_blocked is not None and not self._reported_blocked:
+        if not self._reported_blocked:
             self._reported_blocked = True
-            on_blocked(self._name)
+            self._robot.on_event("no_datagrams", service=self._name, reason=_NO_DATAGRAMS)
 
     def on_ended(self, link: Link) -> None:
         self._made.pop(link, None)
@@ -508,7 +492,6 @@ class _ServiceLinks(LinkOwner):
             dialer.start(refused=link.refused)
 
     def _report_unreachable(self, reason: str) -> None:
-        on_unreachable = self._robot.on_unreachable
-        if on_unreachable is not None and reason not in self._reported_reasons:
+        if reason not in self._reported_reasons:
             self._reported_reasons.append(reason)
-            on_unreachable(self._name, reason)
+            self._robot.on_event("unreachable", service=self._name, reason=reason)

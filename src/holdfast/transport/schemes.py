@@ -37,15 +37,10 @@ def load_scheme(name: str) -> Scheme:
 
 
 class Scheme:
-    """Stream sockets: ``tcp``, ``tls`` and ``unix``.
-
-    Attributes
-    ----------
-    lookup_interval_s : float
-        Between two look-ups of a host while no peer is reached.
-    """
+    """Stream sockets: ``tcp``, ``tls`` and ``unix``."""
 
     lookup_interval_s: ClassVar[float] = 1.0
+    """Between two look-ups of a host while no peer is reached."""
 
     def make_link(
         self,

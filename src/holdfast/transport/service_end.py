@@ -21,6 +21,7 @@ from holdfast.transport.calls import too_large
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, IncomingCall
 from holdfast.transport.dialer import Dialer
 from holdfast.transport.endpoints import (
+    REVOKED_FILE,
     Endpoint,
     TlsFiles,
     check_credentials,
@@ -34,12 +35,12 @@ from holdfast.transport.frames import (
     REPLY,
     Frame,
     Hello,
+    encode_goodbye,
     encode_hello,
 )
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.listener import MAX_SILENT, Listener, connection_to_drop
-from holdfast.transport.revocation import REVOKED_FILE, revoked_serials
 from holdfast.transport.schemes import load_scheme
 
 if TYPE_CHECKING:
@@ -115,10 +116,6 @@ class StreamServiceTransport(LinkOwner):
 
     Parameters
     ----------
-    name : str
-        Under which robots know the service.
-    incarnation : str
-        Of this process; unique among all processes of the service.
     listen, connect : sequence of str
         Endpoints at which robots connect, and of robots that listen.
     listening : sequence of socket
@@ -131,7 +128,7 @@ class StreamServiceTransport(LinkOwner):
     max_links : int or None
         Of robots, at the same time; None: :data:`MAX_LINKS`.
     tls : TlsFiles or None
-        The service's credentials, for ``tls``.
+        The service's credentials, for ``tls`` and ``udp``.
     on_event : callable or None
         Called for the log: ``link_refused`` with ``reason`` and, if known, ``robot``;
         ``robot_connected`` with ``robot``; ``robot_disconnected`` with ``robot`` and ``reason``.
@@ -159,14 +156,9 @@ class StreamServiceTransport(LinkOwner):
         tls: TlsFiles | None = None,
         on_event: Callable[..., None] | None = None,
         on_shutdown: Callable[[str], None] | None = None,
-        needs_endpoint: bool = True,
     ) -> None:
         check_name("name of a service", name)
         check_name("incarnation of a service", incarnation)
-        if needs_endpoint and not listen and not connect:
-            raise TransportError(
-                f"service {name} has no endpoint: give one, as in tcp/127.0.0.1:7447"
-            )
         self._listen = [check_endpoint(text, "service", listens=True) for text in listen]
         self._connect = [check_endpoint(text, "service", listens=False) for text in connect]
         for endpoint in (*self._listen, *self._connect):
@@ -256,7 +248,7 @@ class StreamServiceTransport(LinkOwner):
         for link in list(self._without_hello):
             link.end("")
         for link in list(self._links):
-            link.say_goodbye()
+            link.send(encode_goodbye(""))
         self._resolve_if_all_gone()
         return self._gone
 
@@ -299,7 +291,7 @@ class StreamServiceTransport(LinkOwner):
         for link in (*self._links, *self._without_hello):
             reason = None if link.peer is None or link.ended else objection(link.peer)
             if reason is not None:
-                link.end(reason, goodbye=reason, refused=True)
+                link.refuse(reason)
                 ended += 1
         return ended
 
@@ -333,6 +325,7 @@ class StreamServiceTransport(LinkOwner):
 
     def _read_credentials(self, tls: TlsFiles) -> None:
         # Imported here, because OpenSSL is slow to load.
+        from holdfast.transport.credentials import revoked_serials
         from holdfast.transport.tls import server_context
 
         context = server_context(tls, self._incarnation)
@@ -365,15 +358,14 @@ class StreamServiceTransport(LinkOwner):
         return link
 
     def _accepted(self, endpoint: Endpoint, connection: socket.socket, network: bytes) -> None:
-        link = self._make_link(endpoint, network, dialled=False)
-        link.connecting = asyncio.get_running_loop().create_task(link.connect(connection))
+        self._make_link(endpoint, network, dialled=False).begin(connection)
 
     def on_handshake(self, link: Link) -> None:
         """Refuse a robot that is no longer trusted, before anything of it is read."""
         assert link.peer is not None
         objection = self._objection(link.peer)
         if objection is not None:
-            link.end(objection, goodbye=objection, refused=True)
+            link.refuse(objection)
 
     def refusal(self, link: Link, hello: Hello) -> str | None:
         """Refuse a peer that is no robot, or that would exceed its share of links."""
@@ -398,8 +390,7 @@ class StreamServiceTransport(LinkOwner):
         if number <= numbers[name] + 1:
             return False
         oldest = next(link for link in standing if _certified(link) == most)
-        reason = f"has {number} links, and another robot needs one of {self._max_links}"
-        oldest.end(reason, goodbye=reason, refused=True)
+        oldest.refuse(f"has {number} links, and another robot needs one of {self._max_links}")
         return True
 
     def on_hello(self, link: Link, hello: Hello) -> None:

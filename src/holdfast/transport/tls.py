@@ -15,23 +15,26 @@ selects its own incarnation.
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import ssl
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from holdfast.errors import FrameError, TransportError
-from holdfast.transport.credentials import file_versions
+from holdfast.transport.credentials import file_versions, refuse_revoked
 from holdfast.transport.endpoints import AUTHORITY_FILE, TlsFiles
-from holdfast.transport.revocation import refuse_revoked
 
 __all__ = [
+    "REMEDIES",
     "ClientCredentials",
     "PeerCertificate",
     "TlsStream",
     "client_context",
     "common_name",
     "describe_certificate_error",
+    "make_context",
     "server_context",
 ]
 
@@ -44,72 +47,46 @@ service 0.2 s of computing. Python 3.11.2 (Debian 12) cannot choose X25519."""
 _READ_BYTES = 16 * 1024
 """The largest record."""
 
+_ONE_AUTHORITY = "; both ends need files of one 'holdfast keys DIR'"
 
-_REMEDIES = {
+REMEDIES = {
     10: "; 'holdfast keys DIR --renew --{role} NAME' makes another",
-    18: "; both ends need files of one 'holdfast keys DIR'",
-    19: "; both ends need files of one 'holdfast keys DIR'",
-    20: "; both ends need files of one 'holdfast keys DIR'",
+    18: _ONE_AUTHORITY,
+    19: _ONE_AUTHORITY,
+    20: _ONE_AUTHORITY,
     23: "; 'holdfast keys DIR --rotate --{role} NAME' makes a new key",
 }
-"""For a peer's certificate, by OpenSSL's error numbers."""
+"""For a certificate, by OpenSSL's error numbers."""
 
 _ALERTS = {
-    "both": {
-        "CERTIFICATE_EXPIRED": (
-            "it has expired by the clock there; 'holdfast keys DIR --renew --{role} NAME' makes "
-            "another"
-        ),
-        "CERTIFICATE_REVOKED": (
-            "it has been revoked; 'holdfast keys DIR --rotate --{role} NAME' makes a new key"
-        ),
-        "UNKNOWN_CA": (
-            f"it was not signed by the authority in {AUTHORITY_FILE} there; both ends need files "
-            "of one 'holdfast keys DIR'"
-        ),
-        "CERTIFICATE_REQUIRED": "there is none, and one is required",
-        "UNSUPPORTED_CERTIFICATE": "it is not for a {role}",
-        "DECRYPT_ERROR": "this end's key is not the certificate's",
-    },
-    "robot": {"BAD_CERTIFICATE": "it is not valid yet by the clock there, or is malformed"},
-    "service": {
-        "BAD_CERTIFICATE": (
-            "it does not name the host that the robot calls, or is not valid yet by the clock "
-            "there; the robot's log says which"
-        )
-    },
+    "CERTIFICATE_EXPIRED": f"it has expired by the clock there{REMEDIES[10]}",
+    "CERTIFICATE_REVOKED": f"it has been revoked{REMEDIES[23]}",
+    "UNKNOWN_CA": f"it was not signed by the authority in {AUTHORITY_FILE} there{_ONE_AUTHORITY}",
+    "CERTIFICATE_REQUIRED": "there is none, and one is required",
+    "UNSUPPORTED_CERTIFICATE": "it is not for a {role}",
+    "DECRYPT_ERROR": "this end's key is not the certificate's",
+    "BAD_CERTIFICATE": "it is not valid yet by the clock there, or is malformed",
 }
-"""The peer's alerts about this end's certificate (RFC 8446, section 6.2), by this end's role."""
+"""The peer's alerts about this end's certificate (RFC 8446, section 6.2)."""
+
+_BAD_SERVICE_CERTIFICATE = (
+    "it does not name the host that the robot calls, or is not valid yet by the clock there; the "
+    "robot's log says which"
+)
 
 
 class PeerCertificate(NamedTuple):
-    """The peer's certificate.
+    """The peer's certificate."""
 
-    Attributes
-    ----------
-    name : str
-        The common name.
-    expires_at : float
-        In seconds since 1970.
-    authorities : frozenset of bytes
-        The authority that signed it, as DER; several if some have the same name.
-    """
-
-    name: str
+    name: str  # the common name
     serial_number: int
-    expires_at: float
-    authorities: frozenset[bytes]
+    expires_at: float  # in seconds since 1970
+    authorities: frozenset[bytes]  # the one that signed it, as DER; several with one name
 
 
 def client_context(files: TlsFiles) -> ssl.SSLContext:
-    """Return the context of a robot's links; handshakes refuse revoked certificates.
-
-    Raises
-    ------
-    TransportError
-        If the credentials cannot be used.
-    """
-    context = _context(ssl.PROTOCOL_TLS_CLIENT, files)
+    """Return the context of a robot's links; handshakes refuse revoked certificates."""
+    context = make_context(ssl.PROTOCOL_TLS_CLIENT, files)
     refuse_revoked(context, files.authority.parent)
     return context
 
@@ -119,52 +96,56 @@ def server_context(files: TlsFiles, incarnation: str) -> ssl.SSLContext:
 
     Handshakes accept revoked certificates. The service refuses them afterwards, so its log has the
     name.
-
-    Raises
-    ------
-    TransportError
-        If the credentials cannot be used.
     """
-    context = _context(ssl.PROTOCOL_TLS_SERVER, files)
+    context = make_context(ssl.PROTOCOL_TLS_SERVER, files)
     context.num_tickets = 0  # no resumption: every link shows the certificate
     context.set_alpn_protocols([_alpn_name(incarnation), _ANY_INCARNATION])
     return context
 
 
-def _context(protocol: int, files: TlsFiles) -> ssl.SSLContext:
+def make_context(protocol: int, files: TlsFiles) -> ssl.SSLContext:
+    """Return a context with these credentials; raise TransportError if they cannot be used."""
     context = ssl.SSLContext(protocol)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     context.verify_mode = ssl.CERT_REQUIRED
     context.set_ecdh_curve(_KEY_EXCHANGE)
+    at = files.authority
     try:
-        context.load_verify_locations(cafile=files.authority)
+        context.load_verify_locations(cafile=at)
+        at = files.certificate
         # Without the empty password, an encrypted key would ask for one on the terminal.
         context.load_cert_chain(files.certificate, files.key, password="")
     except (OSError, ssl.SSLError) as error:
-        reason = str(error)
-        if getattr(error, "reason", None) == "KEY_VALUES_MISMATCH":
-            reason = f"{files.key.name} is not the key of {files.certificate.name}"
-        raise TransportError(
-            f"credentials {files.certificate.parent} cannot be used: {reason}"
-        ) from error
+        raise TransportError(_why_unusable(files, at, error)) from error
     return context
+
+
+def _why_unusable(files: TlsFiles, at: Path, error: OSError) -> str:
+    certificate, key = files.certificate, files.key
+    if not isinstance(error, ssl.SSLError):
+        absent = next((each for each in (certificate, key) if not os.access(each, os.R_OK)), at)
+        return f"{at if at == files.authority else absent}: cannot be read: {error.strerror}"
+    if at == files.authority:
+        return f"{at}: is no certificate in PEM form"
+    if error.reason == "KEY_VALUES_MISMATCH":
+        return f"{key}: is not the key of {certificate}"
+    if b"PRIVATE KEY" not in key.read_bytes():
+        return f"{key}: is no private key in PEM form"
+    if b"ENCRYPTED" in key.read_bytes():
+        return f"{key}: is encrypted; a key that a program reads by itself must not be"
+    if b"BEGIN CERTIFICATE" not in certificate.read_bytes():
+        return f"{certificate}: is no certificate in PEM form"
+    return f"{certificate} and {key} cannot be used: {error.reason or error}"
 
 
 class ClientCredentials:
     """A robot's credentials, read again for a new link if the files have changed.
 
-    Parameters
-    ----------
-    on_unusable : callable or None
-        Called with the reason when changed files cannot be used; the previous ones stay in use.
-
-    Raises
-    ------
-    TransportError
-        If they cannot be used at the beginning.
+    When changed files cannot be used, ``on_unusable`` is called with the reason, and the previous
+    ones stay in use. At the beginning TransportError is raised instead.
     """
 
-    def __init__(self, files: TlsFiles, on_unusable: Callable[[str], None] | None = None) -> None:
+    def __init__(self, files: TlsFiles, on_unusable: Callable[[str], None]) -> None:
         self._files = files
         self._on_unusable = on_unusable
         self._seen = file_versions(files)
@@ -178,8 +159,7 @@ class ClientCredentials:
             try:
                 self._context = client_context(self._files)
             except TransportError as error:
-                if self._on_unusable is not None:
-                    self._on_unusable(f"{error}; the previous ones stay in use")
+                self._on_unusable(f"{error}; the previous ones stay in use")
         return self._context
 
 
@@ -190,21 +170,8 @@ def _alpn_name(incarnation: str) -> str:
 class TlsStream:
     """One end of TLS on one stream.
 
-    Parameters
-    ----------
-    host : str or None
-        For a robot: the name or address that the certificate must be for; None if the service has
-        dialled.
-    known : str or None
-        For a robot: the last incarnation of the service.
-
-    Attributes
-    ----------
-    established : bool
-        Whether the handshake is complete at this end. The robot's end completes it before the
-        service has checked the robot's certificate.
-    ended : bool
-        Whether the peer will send nothing more.
+    For a robot, ``host`` is the name or address that the certificate must be for, None if the
+    service has dialled, and ``known`` is the last incarnation of the service.
     """
 
     def __init__(
@@ -222,8 +189,10 @@ class TlsStream:
             self._incoming, self._outgoing, server_side=self._is_server, server_hostname=host
         )
         self._has_first_byte = False
+        # Whether the handshake is complete at this end. The robot's end completes it before the
+        # service has checked the robot's certificate.
         self.established = False
-        self.ended = False
+        self.ended = False  # whether the peer will send nothing more
 
     @property
     def is_known_incarnation(self) -> bool:
@@ -232,8 +201,10 @@ class TlsStream:
         return self._known is not None and chosen == _alpn_name(self._known)
 
     def begin(self) -> None:
-        """Begin the handshake, at the robot's end."""
-        self._handshake()
+        """Begin the handshake, at the robot's end; or go on with it."""
+        with contextlib.suppress(ssl.SSLWantReadError):
+            self._tls.do_handshake()
+            self.established = True
 
     def receive(self, data: bytes) -> bytes:
         """Take bytes of the stream; return those of messages.
@@ -251,7 +222,7 @@ class TlsStream:
                 raise FrameError("does not speak TLS, and this endpoint does")
         self._incoming.write(data)
         if not self.established:
-            self._handshake()
+            self.begin()
             if not self.established:
                 return b""
         parts = []
@@ -291,9 +262,9 @@ class TlsStream:
             raise FrameError(f"has a certificate that {error}") from error
         return PeerCertificate(
             name,
-            int(str(shown.get("serialNumber", "0")), 16),
-            float(ssl.cert_time_to_seconds(str(shown["notAfter"]))) if shown else 0.0,
-            self._authorities(shown.get("issuer")),
+            int(str(shown["serialNumber"]), 16),
+            float(ssl.cert_time_to_seconds(str(shown["notAfter"]))),
+            self._authorities(shown["issuer"]),
         )
 
     def _authorities(self, name: object) -> frozenset[bytes]:
@@ -310,13 +281,15 @@ class TlsStream:
         if isinstance(error, ssl.SSLCertVerificationError):
             role = "robot" if self._is_server else "service"
             fault = describe_certificate_error(error, role)
-            what_to_do = _REMEDIES.get(error.verify_code, "")
+            what_to_do = REMEDIES.get(error.verify_code, "")
             return f"has a certificate that {fault}{what_to_do.format(role=role)}"
         reason = error.reason or ""
         alert = reason.partition("_ALERT_")[2]
         if alert:
             own = "service" if self._is_server else "robot"
-            meaning = _ALERTS[own].get(alert, _ALERTS["both"].get(alert))
+            meaning = _ALERTS.get(alert)
+            if self._is_server and alert == "BAD_CERTIFICATE":
+                meaning = _BAD_SERVICE_CERTIFICATE
             if meaning is None:
                 return f"refuses this end's TLS ({alert.lower().replace('_', ' ')})"
             return f"refuses this end's certificate: {meaning.format(role=own)}"
@@ -327,19 +300,11 @@ class TlsStream:
         text = reason.lower().replace("_", " ") if reason else text
         return f"does not speak TLS 1.3 as expected: {text}"
 
-    def _handshake(self) -> None:
-        with contextlib.suppress(ssl.SSLWantReadError):
-            self._tls.do_handshake()
-            self.established = True
-
 
 def common_name(shown: Mapping[str, Any]) -> str:
-    """Return the common name in a certificate, which ``getpeercert`` has returned.
+    """Return the common name in a certificate of ``getpeercert``; raise ValueError if not one.
 
-    Raises
-    ------
-    ValueError
-        If there is not exactly one; the message continues a sentence about the certificate.
+    The message continues a sentence about the certificate.
     """
     subject = shown.get("subject", ())
     names = [str(value) for part in subject for key, value in part if key == "commonName"]
