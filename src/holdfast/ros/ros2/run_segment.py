@@ -110,12 +110,12 @@ def make_world(node: Any, parameters: NodeParameters) -> World:
         If that cannot be; the message names the parameter.
     """
     configuration = parameters.configuration
-    if parameters.environment == "configuration":
+    if parameters.own.environment == "configuration":
         return World(load_environment(configuration), lambda _: None)
     # Other threads than the robot's use it.
     problem = Configuration.from_plain(configuration.plain()).problem
     timeout_ms = configuration.environment.timeout_ms
-    if parameters.environment == "executive":
+    if parameters.own.environment == "executive":
         handover = DecisionHandover(problem, configuration.planning.sensing_interval)
         return World(
             ExecutiveMaker(handover, configuration.problem, timeout_ms),
