@@ -71,7 +71,6 @@ _SECOND_LOOK_S = 1.0
 _KEPT_S = 5.0
 """Longest time that calls wait for a master; after it they are refused."""
 
-_LOCKED_EVERY_S = 1.0
 _BACKLOG = 1024
 
 
@@ -110,10 +109,12 @@ class MasterGuard:
             If nothing can be guarded.
         """
         directory = self._settings.directory or own_directory()
+        if not os.access(directory, os.W_OK | os.X_OK):
+            raise GuardError(f"{directory}: is no directory that can be written to")
         port = self._settings.address.port
         self._journal = directory / f"master-{port}.journal"
-        with GuardLock(directory / f"master-{port}.lock", port) as lock:
-            helpers = [asyncio.create_task(_keep_lock(lock))]
+        helpers: list[asyncio.Task[None]] = []
+        with GuardLock(port):
             try:
                 self._new_socket(0.0)
                 # Missing software is reported now, not when the master dies.
@@ -560,12 +561,6 @@ class MasterGuard:
         self._let_go()
         if self._listening is not None:
             self._listening.close()
-
-
-async def _keep_lock(lock: GuardLock) -> None:
-    while True:
-        lock.keep()
-        await asyncio.sleep(_LOCKED_EVERY_S)
 
 
 def _words_of(error: Exception) -> str:
