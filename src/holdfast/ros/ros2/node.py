@@ -50,6 +50,7 @@ from holdfast.ros.ros2.parameters import (
 )
 from holdfast.ros.ros2.run_segment import Ending, RunSegment, SegmentResult, make_world
 from holdfast.ros.ros2.telemetry import PublishedDecision, Telemetry
+from holdfast.ros.ros2_connections import Connections
 from holdfast.runtime.log_lines import fields_as_text
 
 __all__ = ["NUM_THREADS", "HoldfastNode"]
@@ -123,6 +124,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             automatically_declare_parameters_from_overrides=True,
         )
         self._declare()
+        self._robot = Connections(self)
         # Guards the fields below.
         self._changed = threading.RLock()
         self._parameters_read: NodeParameters | None = None
@@ -228,7 +230,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             read = read_parameters(self._values())
             check_services(read.configuration)
             layout = pose_layout(read.configuration.problem)
-            make_world(self, read)
+            make_world(self._robot, read)
             # Whether a run can begin there, or go on.
             RunDirectory.resume_if_begun(read.run_directory, read.configuration).close()
         except Exception as error:  # noqa: BLE001 - rclpy would hide it
@@ -322,7 +324,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         assert read is not None
         assert diagnostics is not None
         configuration = read.configuration
-        world = make_world(self, read)
+        world = make_world(self._robot, read)
         telemetry = Telemetry(
             configuration,
             self._show_order,

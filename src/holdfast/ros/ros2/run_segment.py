@@ -101,7 +101,7 @@ class World(NamedTuple):
     handover: DecisionHandover | None = None
 
 
-def make_world(node: Any, parameters: NodeParameters) -> World:
+def make_world(connections: Any, parameters: NodeParameters) -> World:
     """Make what the parameters name, for one segment of a run.
 
     Raises
@@ -124,14 +124,13 @@ def make_world(node: Any, parameters: NodeParameters) -> World:
             handover=handover,
         )
     from holdfast.ros.robot_interface import RobotInterface
-    from holdfast.ros.ros2_environment import cancel_ros_environments, make_ros_environment
+    from holdfast.ros.ros2_environment import make_ros_environment
 
     # Invalid parameters are reported now, not when a trial begins.
     RobotInterface(parameters.mapping, problem.sensing_actions, problem.action_size)
-    make: Any = functools.partial(make_ros_environment, node, parameters.mapping)
+    make: Any = functools.partial(make_ros_environment, connections, parameters.mapping)
     maker = EnvironmentMaker("the robot", problem, configuration.simulator.seed, timeout_ms, make)
-
-    return World(maker, lambda _: cancel_ros_environments(node))
+    return World(maker, lambda _: connections.cancel())
 
 
 class RunSegment:
