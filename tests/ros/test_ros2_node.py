@@ -538,7 +538,7 @@ class TestParameters:
             ("model.peg_widht", "1.0", "did you mean peg_width?"),
             ("rate_hz", "-1.0", "rate_hz is -1.0; expected a number >= 0 and <= 10000"),
             ("rate_hz", "fast", 'rate_hz is "fast"; expected a number >= 0'),
-            ("environment.kind", "real", "expected one of configuration, ros, executive"),
+            ("environment.kind", "real", "expected one of configuration, executive, ros"),
             ("offload.services", "['tcp/nowhere']", "offload.services[0]: "),
             ("assignments", "['offload=1']", "assignments[0] is 'offload=1'; expected SECTION.KEY"),
             ("run_directory", "/proc/none", "/proc/none: cannot be made"),

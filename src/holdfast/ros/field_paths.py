@@ -78,7 +78,7 @@ def check_path(message_type: Any, path: Path, key: str) -> None:
         If not; the message lists the fields that are there.
     """
     try:
-        _Place(message_type(), path, grow=True).value()
+        _holder(message_type(), path, grow=True)
     except _NoSuchFieldError as error:
         raise ConfigurationError(f"{key}: {_type_name(message_type)} {error}") from None
 
@@ -92,7 +92,7 @@ def read_field(message: Any, path: Path) -> Any:
         If the message's array is too short for the path.
     """
     try:
-        return _Place(message, path).value()
+        return _part(_holder(message, path), path[-1])
     except _NoSuchFieldError as error:
         raise EnvironmentFailedError(f"{_type_name(type(message))} {error}") from None
 
@@ -127,8 +127,12 @@ def write(message: Any, path: Path, value: Any) -> None:
         If it does not fit: a fraction into an integer, three numbers into an array of two.
     """
     try:
-        place = _Place(message, path, grow=True)
-        place.set(_fitting(place.value(), value))
+        holder, part = _holder(message, path, grow=True), path[-1]
+        fitting = _fitting(_part(holder, part), value)
+        if isinstance(part, str):
+            setattr(holder, part, fitting)
+        else:
+            holder[part] = fitting
     except _NoSuchFieldError as error:
         raise EnvironmentFailedError(f"{_type_name(type(message))} {error}") from None
     except (TypeError, ValueError, OverflowError, AssertionError) as error:
@@ -142,45 +146,35 @@ class _NoSuchFieldError(Exception):
     """A path leads nowhere."""
 
 
-class _Place:
-    """A field in a message, and what holds it."""
-
-    def __init__(self, message: Any, path: Path, *, grow: bool = False) -> None:
-        holder, declared = message, None
-        for depth, part in enumerate(path):
-            if isinstance(part, str):
-                fields = _fields(holder)
-                if part not in fields:
-                    there = ", ".join(fields) or "none"
-                    raise _NoSuchFieldError(
-                        f"has no field {_written(path[: depth + 1])}; there: {there}"
-                    )
-                declared = fields[part]
-            else:
-                if not hasattr(holder, "__len__") or isinstance(holder, str | bytes):
-                    raise _NoSuchFieldError(f"has no array {_written(path[:depth])}")
-                size = len(holder)
-                if part >= size and not (grow and _grow(holder, part + 1, declared)):
-                    raise _NoSuchFieldError(
-                        f"has {size} elements in {_written(path[:depth])}, and "
-                        f"{_written(path[: depth + 1])} is meant"
-                    )
-                declared = _element(declared)
-            if depth < len(path) - 1:
-                holder = getattr(holder, part) if isinstance(part, str) else holder[part]
-        self._holder = holder
-        self._last = path[-1]
-
-    def value(self) -> Any:
-        if isinstance(self._last, str):
-            return getattr(self._holder, self._last)
-        return self._holder[self._last]
-
-    def set(self, value: Any) -> None:
-        if isinstance(self._last, str):
-            setattr(self._holder, self._last, value)
+def _holder(message: Any, path: Path, *, grow: bool = False) -> Any:
+    """Return what holds the field that a path names: the last part of the path is in it."""
+    holder, declared = message, None
+    for depth, part in enumerate(path):
+        if isinstance(part, str):
+            fields = _fields(holder)
+            if part not in fields:
+                there = ", ".join(fields) or "none"
+                raise _NoSuchFieldError(
+                    f"has no field {_written(path[: depth + 1])}; there: {there}"
+                )
+            declared = fields[part]
         else:
-            self._holder[self._last] = value
+            if not hasattr(holder, "__len__") or isinstance(holder, str | bytes):
+                raise _NoSuchFieldError(f"has no array {_written(path[:depth])}")
+            size = len(holder)
+            if part >= size and not (grow and _grow(holder, part + 1, declared)):
+                raise _NoSuchFieldError(
+                    f"has {size} elements in {_written(path[:depth])}, and "
+                    f"{_written(path[: depth + 1])} is meant"
+                )
+            declared = _element(declared)
+        if depth < len(path) - 1:
+            holder = _part(holder, part)
+    return holder
+
+
+def _part(holder: Any, part: str | int) -> Any:
+    return getattr(holder, part) if isinstance(part, str) else holder[part]
 
 
 def _fitting(old: Any, value: Any) -> Any:

@@ -14,8 +14,8 @@ and the journal from here.
 
 Started as ``process.py SOCKET CONTROL STATE JOURNAL`` (three descriptors and a path) it loads all
 that it needs, says ``warm`` on CONTROL, and waits. On ``go`` it reads what the guard has left in
-STATE, or the journal if nothing is there, takes the connections that come to SOCKET, and says
-``serving``. If CONTROL ends before, it ends; afterwards it needs nobody.
+STATE, takes the connections that come to SOCKET, and says ``serving``. If CONTROL ends before, it
+ends; afterwards it needs nobody.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ import struct
 import sys
 import threading
 import time
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Dict, List, NoReturn, Tuple  # noqa: UP035 (older Python)
 from zlib import crc32
@@ -55,9 +56,8 @@ _WORKERS = 8
 """Threads that tell nodes of changes. One that a stopped node blocks is lost to the others; stock
 masters have three."""
 
-_TABLES = ("parameters", "publishers", "subscribers", "services", "types", "parameter_subscribers")
 
-
+@dataclass
 class MasterState:
     """A master's state.
 
@@ -73,18 +73,12 @@ class MasterState:
         Of each topic the type of its messages.
     """
 
-    def __init__(self) -> None:
-        self.parameters: dict[str, Any] = {}
-        self.publishers: Registrations = {}
-        self.subscribers: Registrations = {}
-        self.services: dict[str, tuple[str, str, str]] = {}
-        self.types: dict[str, str] = {}
-        self.parameter_subscribers: Registrations = {}
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, MasterState) and vars(self) == vars(other)
-
-    __hash__ = None  # type: ignore[assignment]  # it changes
+    parameters: dict[str, Any] = field(default_factory=dict)
+    publishers: Registrations = field(default_factory=dict)
+    subscribers: Registrations = field(default_factory=dict)
+    services: dict[str, tuple[str, str, str]] = field(default_factory=dict)
+    types: dict[str, str] = field(default_factory=dict)
+    parameter_subscribers: Registrations = field(default_factory=dict)
 
     def apply(self, table: str, key: str | None, value: Any) -> None:
         """Set a key of a table, or with None all of it; the value None removes the key."""
@@ -122,6 +116,9 @@ class MasterState:
                 found.update(registered)
         found.update((node, uri) for node, uri, _ in self.services.values())
         return found
+
+
+_TABLES = [table.name for table in fields(MasterState)]
 
 
 def parameter_names(tree: dict[str, Any], space: str = "/") -> list[str]:
@@ -425,13 +422,10 @@ def _load() -> Any:
     class JournalledMaster(rosmaster.master_api.ROSMasterHandler):  # type: ignore[misc, name-defined, unused-ignore]
         """The stock master's calls, and one more."""
 
-        def __init__(self, path: Path, content: bytes = b"") -> None:
+        def __init__(self, path: Path, content: bytes) -> None:
             super().__init__(_WORKERS)
             # Twice, since what is written down shares nothing with what the master changes.
-            state, written = (
-                (_state_in(content) if content else read_journal(path)) or MasterState()
-                for _ in range(2)
-            )
+            state, written = _state_in(content), _state_in(content)
             manager = self.reg_manager = JournalledRegistrations(self.thread_pool)
             self.publishers = manager.publishers
             self.subscribers = manager.subscribers
