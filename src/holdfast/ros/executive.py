@@ -121,10 +121,7 @@ class DecisionHandover:
     def perform(self, due: DueDecision) -> DecideRequest:
         """Publish a decision and wait for its outcome.
 
-        Raises
-        ------
-        EnvironmentFailedError
-            If the run ends first.
+        Raises EnvironmentFailedError if the run ends first.
         """
         with self._changed:
             self._answer = None

@@ -29,10 +29,8 @@ _ELEMENT = re.compile(r"sequence<([^,>]+)(?:, *[0-9]+)?>|(.+)\[[0-9]+\]")
 def find_type(name: str, key: str, kinds: tuple[str, ...] = ("srv", "action", "msg")) -> Any:
     """Import a generated type, such as ``std_srvs/srv/Trigger``; ``key`` names it in messages.
 
-    Raises
-    ------
-    ConfigurationError
-        If it is written in another way, is of another kind, or cannot be imported.
+    Raises ConfigurationError if it is written in another way, is of another kind, or cannot be
+    imported.
     """
     found = _TYPE.fullmatch(name)
     if found is None or found[2] not in kinds:
@@ -51,10 +49,7 @@ def find_type(name: str, key: str, kinds: tuple[str, ...] = ("srv", "action", "m
 def parse_path(text: str, key: str) -> Path:
     """Read a path.
 
-    Raises
-    ------
-    ConfigurationError
-        If it is none.
+    Raises ConfigurationError if it is none.
     """
     path: list[str | int] = []
     for part in text.split("."):
@@ -72,10 +67,7 @@ def parse_path(text: str, key: str) -> Path:
 def check_path(message_type: Any, path: Path, key: str) -> None:
     """Check that messages of a type have a field.
 
-    Raises
-    ------
-    ConfigurationError
-        If not; the message lists the fields that are there.
+    Raises ConfigurationError if not; the message lists the fields that are there.
     """
     try:
         _holder(message_type(), path, grow=True)
@@ -86,10 +78,7 @@ def check_path(message_type: Any, path: Path, key: str) -> None:
 def read_field(message: Any, path: Path) -> Any:
     """Return the value of a field.
 
-    Raises
-    ------
-    EnvironmentFailedError
-        If the message's array is too short for the path.
+    Raises EnvironmentFailedError if the message's array is too short for the path.
     """
     try:
         return _part(_holder(message, path), path[-1])
@@ -100,10 +89,7 @@ def read_field(message: Any, path: Path) -> Any:
 def read_numbers(message: Any, path: Path) -> list[float]:
     """Return a field that is a number, or an array of numbers, as a list.
 
-    Raises
-    ------
-    EnvironmentFailedError
-        If it is neither.
+    Raises EnvironmentFailedError if it is neither.
     """
     value = read_field(message, path)
     try:
@@ -121,10 +107,8 @@ def read_numbers(message: Any, path: Path) -> list[float]:
 def write(message: Any, path: Path, value: Any) -> None:
     """Set a field, converted to its type; arrays become as long as the path needs.
 
-    Raises
-    ------
-    EnvironmentFailedError
-        If it does not fit: a fraction into an integer, three numbers into an array of two.
+    Raises EnvironmentFailedError if it does not fit: a fraction into an integer, three numbers into
+    an array of two.
     """
     try:
         holder, part = _holder(message, path, grow=True), path[-1]

@@ -79,10 +79,7 @@ _ERRORS = frozenset(("wrong_answer", "not_deterministic", "state_diverged", "sto
 def require_rosbags() -> None:
     """Make sure that rosbags is there.
 
-    Raises
-    ------
-    MissingRosbagsError
-        If it is not.
+    Raises MissingRosbagsError if it is not.
     """
     try:
         import rosbags.rosbag2  # noqa: F401

@@ -90,10 +90,7 @@ class Ros1Server:
     def start(self) -> bool:
         """Offer the service; return whether the master knows it already.
 
-        Raises
-        ------
-        TransportError
-            If it cannot listen.
+        Raises TransportError if it cannot listen.
         """
         self._loop = LoopThread("holdfast-ros1")
         try:

@@ -143,10 +143,8 @@ class Ros2Environment:
     def perform_sensing(self, sensing_action: int) -> FloatArray:
         """Perform a sensing action and return the observation, shape ``(observation_size,)``.
 
-        Raises
-        ------
-        EnvironmentFailedError
-            If the robot does not answer in time, refuses, or returns no valid observation.
+        Raises EnvironmentFailedError if the robot does not answer in time, refuses, or returns no
+        valid observation.
         """
         call = self._interface.calls.get("sense")
         topic = self._interface.observation
@@ -198,10 +196,8 @@ class Ros2Environment:
     def perform(self, task_action: FloatArray) -> float | None:
         """Perform a task action and return its reward, or None where there is none.
 
-        Raises
-        ------
-        EnvironmentFailedError
-            If the robot rejects it, fails, or does not answer in time. It may have moved.
+        Raises EnvironmentFailedError if the robot rejects it, fails, or does not answer in time. It
+        may have moved.
         """
         call = self._interface.calls["act"]
         request = self._request(call)
@@ -266,10 +262,7 @@ class Ros2Environment:
     def is_done(self) -> Done:
         """Return whether the task is done; always False if the robot does not report it.
 
-        Raises
-        ------
-        EnvironmentFailedError
-            If the robot does not answer in time.
+        Raises EnvironmentFailedError if the robot does not answer in time.
         """
         call = self._interface.calls.get("done")
         if call is None:
@@ -544,10 +537,7 @@ class CountingRos2Environment(Ros2Environment):
     def steps_performed(self) -> int:
         """Return how many task actions have been performed in this trial.
 
-        Raises
-        ------
-        EnvironmentFailedError
-            If the robot does not answer in time.
+        Raises EnvironmentFailedError if the robot does not answer in time.
         """
         return self._count()
 

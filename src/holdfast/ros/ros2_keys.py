@@ -67,10 +67,7 @@ class Attachment(NamedTuple):
     def decode(cls, data: bytes) -> Attachment:
         """Read one.
 
-        Raises
-        ------
-        InvalidValueError
-            If the bytes are none.
+        Raises InvalidValueError if the bytes are none.
         """
         if len(data) == _ATTACHMENT.size:
             number, timestamp, size, gid = _ATTACHMENT.unpack(data)
@@ -85,10 +82,7 @@ class Attachment(NamedTuple):
 def check_domain(domain: int, key: str = "domain") -> int:
     """Return a domain of ROS 2.
 
-    Raises
-    ------
-    InvalidValueError
-        If it is none; the message names ``key``.
+    Raises InvalidValueError if it is none; the message names ``key``.
     """
     if not 0 <= domain <= MAX_DOMAIN:
         raise InvalidValueError(f"{key} {domain}: ROS 2's domains are from 0 to {MAX_DOMAIN}")
@@ -98,10 +92,7 @@ def check_domain(domain: int, key: str = "domain") -> int:
 def check_service_name(name: str, key: str = "name") -> str:
     """Return a service's name without the slash that it may begin with.
 
-    Raises
-    ------
-    InvalidValueError
-        If ROS 2 would not allow it; the message names ``key``.
+    Raises InvalidValueError if ROS 2 would not allow it; the message names ``key``.
     """
     if not _NAME.fullmatch(name) or "__" in name or len(name) > _MAX_NAME:
         raise InvalidValueError(

@@ -95,10 +95,7 @@ class Ros2Server:
     def start(self) -> None:
         """Offer the service; with a router, as soon as that is there.
 
-        Raises
-        ------
-        TransportError
-            If nothing can listen at the endpoint.
+        Raises TransportError if nothing can listen at the endpoint.
         """
         self._session.open()
         self._worker.start()

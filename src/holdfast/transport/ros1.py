@@ -368,10 +368,7 @@ class RosScheme(Scheme):
     def look_up(self, endpoint: Endpoint) -> tuple[str, int, socket.AddressFamily]:
         """Ask the master where a service is; takes at most two seconds.
 
-        Raises
-        ------
-        TransportError
-            If that is not known; the message gives the reason.
+        Raises TransportError if that is not known; the message gives the reason.
         """
         master = RosEnvironment.of().master
         loop = asyncio.new_event_loop()

@@ -167,10 +167,7 @@ class RosNode:
 
         After ``within_s`` without an answer, registration goes on in the background.
 
-        Raises
-        ------
-        TransportError
-            If it cannot listen.
+        Raises TransportError if it cannot listen.
         """
         environment = self._environment
         try:

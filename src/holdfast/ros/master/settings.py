@@ -153,10 +153,7 @@ class GuardLock:
 
     It is a socket without a file, which the system removes with the process.
 
-    Raises
-    ------
-    GuardError
-        If there is one already.
+    Raises GuardError if there is one already.
     """
 
     def __init__(self, port: int) -> None:

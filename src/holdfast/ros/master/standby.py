@@ -93,10 +93,7 @@ class MasterProcess:
 
     It inherits ``listening``, which need not be bound yet.
 
-    Raises
-    ------
-    GuardError
-        If it cannot be started.
+    Raises GuardError if it cannot be started.
     """
 
     def __init__(self, settings: GuardSettings, listening: socket.socket, journal: Path) -> None:
@@ -126,10 +123,7 @@ class MasterProcess:
     async def warm(self) -> None:
         """Wait until it has loaded what it needs.
 
-        Raises
-        ------
-        GuardError
-            If it cannot.
+        Raises GuardError if it cannot.
         """
         if self._warm:
             return
@@ -145,12 +139,7 @@ class MasterProcess:
     async def serve(self, state: MasterState) -> None:
         """Make it the master, with this state.
 
-        Raises
-        ------
-        GuardError
-            If it does not begin.
-        OSError
-            If there is no room for the state.
+        Raises GuardError if it does not begin. Raises OSError if there is no room for the state.
         """
         await self.warm()
         self._state.write(master_process.journal_of(state))

@@ -132,10 +132,8 @@ def read_parameters(values: Mapping[str, Any]) -> NodeParameters:
 
     ``values`` are plain data by the parameter's name; None means not given.
 
-    Raises
-    ------
-    HoldfastError
-        If a value cannot be used; the message names the parameter, the value and what is allowed.
+    Raises HoldfastError if a value cannot be used; the message names the parameter, the value and
+    what is allowed.
     """
     given = {name: value for name, value in values.items() if value is not None}
     of_own = {name: given[name] for name in OWN if name in given}

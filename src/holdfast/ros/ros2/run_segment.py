@@ -104,10 +104,7 @@ class World(NamedTuple):
 def make_world(connections: Any, parameters: NodeParameters) -> World:
     """Make what the parameters name, for one segment of a run.
 
-    Raises
-    ------
-    HoldfastError
-        If that cannot be; the message names the parameter.
+    Raises HoldfastError if that cannot be; the message names the parameter.
     """
     configuration = parameters.configuration
     if parameters.own.environment == "configuration":
