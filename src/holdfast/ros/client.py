@@ -42,7 +42,6 @@ class DecisionService(Protocol):
     @property
     def name(self) -> str:
         """Name of the service, for messages."""
-        ...
 
     def ask(self, request: DecisionRequest, deadline_s: float) -> DecisionAnswer:
         """Ask, and wait at most ``deadline_s`` for the answer.
@@ -52,11 +51,9 @@ class DecisionService(Protocol):
         TransportError
             If there is no answer; the message gives the reason.
         """
-        ...
 
     def close(self) -> None:
         """End all requests; may be called from another thread, and repeated."""
-        ...
 
 
 class _Outcome(NamedTuple):
@@ -70,11 +67,8 @@ class _Outcome(NamedTuple):
 class _Asker:
     """Asks one service on its own thread, one request at a time.
 
-    Parameters
-    ----------
-    is_last_resort : bool
-        Whether no other service is left. Then the deadline doubles with each request that misses
-        it, since asking anew would take even longer.
+    The deadline of a last resort doubles with each request that misses it, since asking anew would
+    take even longer.
     """
 
     def __init__(

@@ -63,16 +63,9 @@ NodeAnswer: TypeAlias = NodeReport | Literal["gone"] | None
 class Reconciled(NamedTuple):
     """A new master's state.
 
-    Attributes
-    ----------
-    gone : tuple of str
-        Nodes that have ended.
-    silent : tuple of str
-        Nodes that did not answer, which are kept.
-    lost_services : tuple of str
-        Services that no longer exist.
-    doubtful : MasterState
-        The part of the state that no answer has confirmed.
+    ``gone`` are the nodes that have ended, and ``lost_services`` the services that no longer exist.
+    The ``silent`` nodes did not answer and are kept. ``doubtful`` is the part of the state that no
+    answer has confirmed.
     """
 
     state: MasterState
@@ -134,14 +127,8 @@ def reconcile(
 ) -> Reconciled:
     """Merge the last master's state with the answers of nodes and services.
 
-    Parameters
-    ----------
-    known : MasterState
-        Not changed.
-    nodes : mapping
-        Answers by the URI of the node's XML-RPC server.
-    services : mapping
-        Whether each service is offered where it was; None if that is unknown.
+    ``nodes`` has the answers by the URI of the node's XML-RPC server, and ``services`` whether each
+    service is offered where it was; None if that is unknown.
     """
     uris = known.nodes()
     sharing = Counter(uris.values())
@@ -196,12 +183,8 @@ def _doubtful(
 def unregistrations(before: MasterState, after: MasterState) -> list[tuple[str, tuple[str, ...]]]:
     """Return the calls to a master that remove what is in one state and not in another.
 
-    Each call names the address, too, so it does not affect a node restarted at another address.
-
-    Returns
-    -------
-    list of tuple
-        Methods and their arguments, the first of which is the node's name.
+    They are methods and their arguments, the first of which is the node's name. Each names the
+    address, too, so it does not affect a node restarted at another address.
     """
     calls: list[tuple[str, tuple[str, ...]]] = []
     for table, method in _REGISTRATIONS.items():

@@ -61,16 +61,9 @@ masters have three."""
 class MasterState:
     """A master's state.
 
-    Attributes
-    ----------
-    parameters : dict
-        The tree; a namespace is a dict.
-    publishers, subscribers, parameter_subscribers : dict
-        Registrations by topic, or by parameter.
-    services : dict
-        Of each service the node's name, the URI of its XML-RPC server, and the service's own URI.
-    types : dict
-        Of each topic the type of its messages.
+    ``parameters`` is a tree, in which a namespace is a dict. Registrations are by topic, or by
+    parameter. ``services`` has the node's name, the URI of its XML-RPC server, and the service's
+    own URI; ``types`` has the type of each topic's messages.
     """
 
     parameters: dict[str, Any] = field(default_factory=dict)
@@ -170,12 +163,7 @@ def read_journal(journal: Path | int) -> MasterState | None:
 
     A descriptor stays open; while it is, the file is readable even if it is removed.
 
-    Raises
-    ------
-    OSError
-        If there is one, and it cannot be read.
-    ValueError
-        If what is there is no journal.
+    Raises OSError if it cannot be read, and ValueError if what is there is no journal.
     """
     try:
         with open(journal, "rb", closefd=not isinstance(journal, int)) as file:
@@ -208,12 +196,8 @@ def _state_in(content: bytes) -> MasterState:
 def write_journal(path: Path, state: MasterState) -> int:
     """Write a journal anew, in one piece, and return its size in bytes.
 
-    Its directory is made if it is gone.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written; the one before is still there then.
+    Its directory is made if it is gone. If it cannot be written (OSError), the one before is still
+    there.
     """
     content = journal_of(state)
     new = path.with_name(f"{path.name}.new")

@@ -30,15 +30,7 @@ _PEER = struct.Struct("3i")
 
 
 class MasterAddress(NamedTuple):
-    """A master's address.
-
-    Attributes
-    ----------
-    host : str
-        In the nodes' ``ROS_MASTER_URI``.
-    bind : str
-        The address of this machine at which it listens.
-    """
+    """A master's address: ``host`` is what ``ROS_MASTER_URI`` names, ``bind`` where it listens."""
 
     host: str
     port: int
@@ -57,19 +49,10 @@ class MasterAddress(NamedTuple):
 
     @classmethod
     def of(cls, environment: Mapping[str, str], port: int | None = None) -> Self:
-        """Read ROS's variables.
+        """Read ``ROS_MASTER_URI``, ``ROS_HOSTNAME``, ``ROS_IP`` and ``ROS_IPV6``.
 
-        Parameters
-        ----------
-        environment : mapping
-            ``ROS_MASTER_URI``, ``ROS_HOSTNAME``, ``ROS_IP`` and ``ROS_IPV6`` count.
-        port : int, optional
-            Instead of that of the URI.
-
-        Raises
-        ------
-        GuardError
-            If the URI is none, or names another machine.
+        ``port`` replaces that of the URI. Raises GuardError if the URI is none, or names another
+        machine.
         """
         text = environment.get("ROS_MASTER_URI") or f"http://localhost:{DEFAULT_PORT}"
         try:
@@ -110,19 +93,7 @@ def _is_here(host: str) -> bool:
 
 
 class GuardSettings(NamedTuple):
-    """How to guard a master.
-
-    Attributes
-    ----------
-    python : str
-        ROS's Python.
-    directory : Path or None
-        Of the journal; None for one of this user that is cleared when the machine restarts.
-    silent_s : float
-        A master that has been silent for this long is replaced.
-    rosout : bool
-        Whether ``/rosout`` is to run, too, as with ``roscore``.
-    """
+    """How to guard a master; the options of ``holdfast ros1-guard`` say what each means."""
 
     address: MasterAddress
     python: str = "/usr/bin/python3"

@@ -79,16 +79,8 @@ class PublishedDecision:
 class Telemetry:
     """Publishes orders and beliefs, on its own thread.
 
-    Parameters
-    ----------
-    on_order, on_belief : callable
-        Show them.
-    on_notice : callable
-        Is called when there is something else that changed.
-    on_failure : callable
-        Gets the first error that any of this came to: to look on must not end a run.
-    belief_rate_hz : float
-        Beliefs shown a second, at most.
+    ``on_order`` and ``on_belief`` show them, ``on_notice`` shows what else has changed.
+    ``on_failure`` gets the first error of any of these: to look on must not end a run.
     """
 
     def __init__(
