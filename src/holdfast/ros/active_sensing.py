@@ -230,19 +230,11 @@ def checked_state(
 ) -> PlanningState | None:
     """Return the state that a message has, or None if it has no particles.
 
-    Parameters
-    ----------
-    state_size : int
-        Coordinates of a state.
-    states : array of shape (num_particles * state_size,)
-        Particle after particle.
-    weights : array of shape (num_particles,)
+    ``states`` has shape ``(num_particles * state_size,)``, particle after particle, and ``weights``
+    ``(num_particles,)``.
 
-    Raises
-    ------
-    CheckpointError
-        If this is no state: numbers that are missing or not finite, weights that are negative or
-        do not sum to 1, a negative seed.
+    Raises CheckpointError if this is no state: numbers that are missing or not finite, weights that
+    are negative or do not sum to 1, a negative seed.
     """
     if not weights.size and not states.size:
         return None

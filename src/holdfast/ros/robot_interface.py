@@ -156,18 +156,9 @@ _Texts = str | list[Annotated[str, msgspec.Meta(min_length=1)]]
 class RobotCall(NamedTuple):
     """One role: whom to call, and which field takes what.
 
-    Attributes
-    ----------
-    kind : str
-        ``srv``, ``action`` or ``msg``.
-    type : type
-        The generated class.
-    paths : dict of str to list of tuple
-        By key (``trial``, ``index``, ``action``, ...) the fields that it names. Those of
-        ``observation`` are in ``observation``.
-    observation : list of str
-        With ``{index}`` and ``{label}`` still in them.
-    constants : list of (path, value)
+    ``kind`` is ``srv``, ``action`` or ``msg``, and ``type`` the generated class. ``paths`` has by
+    key (``trial``, ``index``, ``action``, ...) the fields that it names, except those of
+    ``observation``, which still have ``{index}`` and ``{label}`` in them.
     """
 
     role: str
@@ -210,27 +201,12 @@ class ObservationTopic(NamedTuple):
 class RobotInterface:
     """A robot's interface, as parameters map it.
 
-    Parameters
-    ----------
-    parameters : mapping of str to object
-        Those of :data:`ROBOT_PARAMETERS`, by name, and of the settings ``environment.timeout_ms``.
-    sensing_actions : sequence of str
-        The problem's labels.
-    action_size : int
-        Coordinates of the problem's task actions.
+    The parameters are those of :data:`ROBOT_PARAMETERS`, by name, and ``environment.timeout_ms``.
+    ``calls`` has the roles that are there. ``timeout_s`` is for an observation that nobody is asked
+    for, and for each call by default.
 
-    Attributes
-    ----------
-    calls : dict of str to RobotCall
-        By role; those that are not there are missing.
-    timeout_s : float
-        For an observation that nobody is asked for, and for each call by default.
-
-    Raises
-    ------
-    ConfigurationError
-        If a parameter is unknown, of another type or out of its bounds, a type cannot be imported,
-        or does not have a field that a parameter names. The message names the parameter.
+    Raises ConfigurationError if a parameter is unknown, of another type or out of its bounds, a
+    type cannot be imported, or does not have a field that a parameter names.
     """
 
     def __init__(

@@ -30,23 +30,12 @@ MAX_WAITING = 64
 
 
 class Ros1Server:
-    """Offers a configuration's typed service in ROS 1.
+    """Offers a configuration's typed service in ROS 1, by a node of the same name.
 
-    Parameters
-    ----------
-    name : str
-        Of the service, and of its node.
-    ros_environment : RosEnvironment or None
-        None reads ROS's variables.
-    on_shutdown : callable or None
-        Gets the reason when ``rosnode kill``, or the master for a name conflict, ends this node.
-    on_event : callable or None
-        Gets changes of the registration; see :class:`~holdfast.transport.ros1_node.RosNode`.
+    ``on_shutdown`` gets the reason when ``rosnode kill``, or the master for a name conflict, ends
+    this node; ``on_event`` is that of a :class:`~holdfast.transport.ros1_node.RosNode`.
 
-    Raises
-    ------
-    TransportError
-        If the name is none.
+    Raises TransportError if the name is none.
     """
 
     def __init__(

@@ -67,22 +67,12 @@ def make_ros_environment(
 ) -> Ros2Environment:
     """Make the environment of a trial: a robot that is reached through ROS.
 
-    Parameters
-    ----------
-    parameters : mapping of str to object
-        See :data:`~holdfast.ros.robot_interface.ROBOT_PARAMETERS`.
-    seed : int
-        Not used: the robot is real.
-    resumed : bool, optional
-        Whether the robot's process has died during this trial. If not, the robot is brought to its
-        start (``environment.reset``).
+    The parameters are :data:`~holdfast.ros.robot_interface.ROBOT_PARAMETERS`. The robot is real, so
+    ``seed`` is not used. It is brought to its start (``environment.reset``) unless the trial is
+    ``resumed``, because the robot's process has died in the midst of it.
 
-    Raises
-    ------
-    ConfigurationError
-        If a parameter cannot be used.
-    EnvironmentFailedError
-        If a service is missing for ``environment.discovery_timeout_ms``, or the reset fails.
+    Raises ConfigurationError if a parameter cannot be used, and EnvironmentFailedError if a service
+    is missing for ``environment.discovery_timeout_ms``, or the reset fails.
     """
     del seed
     interface = RobotInterface(parameters, problem.sensing_actions, problem.action_size)

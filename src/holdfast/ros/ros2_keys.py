@@ -45,14 +45,8 @@ _ATTACHMENT = struct.Struct("<qqB16s")
 class Attachment(NamedTuple):
     """What goes with a request, and comes back with its answer.
 
-    Attributes
-    ----------
-    sequence_number : int
-        The client's, from 0 up.
-    source_timestamp : int
-        When it was sent, in nanoseconds since 1970.
-    gid : bytes
-        The client's identity, 16 bytes.
+    The client has a number for each request, from 0 up, and an identity of 16 bytes. The time is in
+    nanoseconds since 1970.
     """
 
     sequence_number: int

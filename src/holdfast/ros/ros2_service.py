@@ -45,23 +45,12 @@ _MAX_WAITING = 16
 class Ros2Server:
     """Offers a typed service to nodes of ROS 2.
 
-    Parameters
-    ----------
-    service : ActiveSensing
-        It is asked on one thread.
-    name : str
-        The service's name in ROS 2.
-    endpoint : str
-        Of the router, or where to listen, as in ``tcp/localhost:7447``.
-    on_event : callable or None
-        Gets events, from any thread: ``ros2_waiting`` (``reason``) while the
-        router is not there, then ``ros2_connected`` (``endpoint``); ``ros2_refused``
-        (``reason``) of a request that is none; ``ros2_failed`` (``reason``, ``where``) of a defect.
+    ``endpoint`` is the router's, or where to listen, as in ``tcp/localhost:7447``. ``on_event`` is
+    called from any thread: with ``ros2_waiting`` (``reason``) while the router is not there, then
+    ``ros2_connected`` (``endpoint``); with ``ros2_refused`` (``reason``) of a request that is none,
+    and ``ros2_failed`` (``reason``, ``where``) of a defect.
 
-    Raises
-    ------
-    InvalidValueError
-        If a parameter cannot be used, or Zenoh or rosbags is not installed.
+    Raises InvalidValueError if a parameter cannot be used, or Zenoh or rosbags is not installed.
     """
 
     def __init__(
