@@ -42,16 +42,10 @@ _MAX_RESPONSE_BYTES: Final = 256 * 1024 * 1024
 
 
 class HttpHead(NamedTuple):
-    """The head of an HTTP request or response.
+    """The head of an HTTP message.
 
-    Attributes
-    ----------
-    line : str
-        The first one.
-    size : int
-        Of the content, in bytes; -1 if not given.
-    ends : bool
-        Whether the connection ends after this message.
+    It is the first line, the content's size in bytes (-1: not given), and whether the connection
+    ends after the message.
     """
 
     line: str

@@ -425,17 +425,11 @@ def _load() -> Any:
             self.path = str(path)
 
         def restore(self, manager: Any, state: MasterState) -> None:
-            register = manager.register_again
-            for registrations, table in (
-                (self.publishers, state.publishers),
-                (self.subscribers, state.subscribers),
-                (self.param_subscribers, state.parameter_subscribers),
-            ):
-                for key, registered in table.items():
-                    for node, uri in registered:
-                        register(registrations, key, node, uri)
-            for service, (node, uri, own_uri) in state.services.items():
-                register(self.services, service, node, uri, own_uri)
+            for table, registrations in manager.tables().items():
+                for key, registered in getattr(state, table).items():
+                    # Of a service there is one, with its own URI.
+                    for each in [registered] if table == "services" else registered:
+                        manager.register_again(registrations, key, *each)
             self.param_server.parameters = state.parameters
 
         def tell_subscribers(self) -> None:
