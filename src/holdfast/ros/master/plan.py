@@ -132,17 +132,16 @@ def reconcile(
     """
     uris = known.nodes()
     sharing = Counter(uris.values())
-    state = MasterState()
+    state, doubtful = MasterState(), MasterState()
     state.parameters = known.parameters
     state.types = dict(known.types)
     for table in _REGISTRATIONS:
-        kept = getattr(state, table)
         for key, registered in getattr(known, table).items():
-            staying = [
-                (node, uri) for node, uri in registered if _still(table, key, nodes.get(uri))
-            ]
-            if staying:
-                kept[key] = staying
+            staying = [each for each in registered if _still(table, key, nodes.get(each[1]))]
+            silent = [each for each in registered if nodes.get(each[1]) is None]
+            for kept, part in ((state, staying), (doubtful, silent)):
+                if part:
+                    getattr(kept, table)[key] = part
     for node, uri in uris.items():
         answer = nodes.get(uri)
         # Two names at one address: one node has died, and the topics are the other's.
@@ -151,33 +150,18 @@ def reconcile(
             _add(state, state.subscribers, node, uri, answer.subscriptions)
     for topic in state.publishers:
         state.types.setdefault(topic, _ANY_TYPE)
-    state.services = {
-        service: where
-        for service, where in known.services.items()
-        if services.get(service) is not False
-    }
+    for service, where in known.services.items():
+        if services.get(service) is not False:
+            state.services[service] = where
+        if services.get(service) is None:
+            doubtful.services[service] = where
     return Reconciled(
         state,
         gone=tuple(node for node, uri in uris.items() if nodes.get(uri) == "gone"),
         silent=tuple(node for node, uri in uris.items() if nodes.get(uri) is None),
         lost_services=tuple(known.services.keys() - state.services.keys()),
-        doubtful=_doubtful(known, nodes, services),
+        doubtful=doubtful,
     )
-
-
-def _doubtful(
-    known: MasterState, nodes: Mapping[str, NodeAnswer], services: Mapping[str, bool | None]
-) -> MasterState:
-    part = MasterState()
-    for table in _REGISTRATIONS:
-        for key, registered in getattr(known, table).items():
-            silent = [(node, uri) for node, uri in registered if nodes.get(uri) is None]
-            if silent:
-                getattr(part, table)[key] = silent
-    part.services = {
-        service: where for service, where in known.services.items() if services.get(service) is None
-    }
-    return part
 
 
 def unregistrations(before: MasterState, after: MasterState) -> list[tuple[str, tuple[str, ...]]]:
