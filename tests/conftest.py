@@ -70,7 +70,7 @@ REAL = (
     "unit/test_ending_signals.py",
     "unit/test_robot_links.py",
     "unit/test_loop_thread.py",
-    "unit/test_master_settings.py::TestAddress",
+    "unit/test_master_settings.py",
     "unit/test_probe.py",
     "unit/test_recovery_launcher.py",
     "unit/test_ros1_client.py",

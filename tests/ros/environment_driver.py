@@ -24,7 +24,8 @@ from rclpy.node import Node
 
 from holdfast.config.loader import load
 from holdfast.errors import ConfigurationError, EnvironmentFailedError
-from holdfast.ros.ros2_environment import cancel_ros_environments, make_ros_environment
+from holdfast.ros.ros2_connections import Connections
+from holdfast.ros.ros2_environment import make_ros_environment
 
 
 def _plain(value: Any) -> Any:
@@ -44,6 +45,7 @@ def main() -> None:
     executor = MultiThreadedExecutor(num_threads=4)
     executor.add_node(node)
     threading.Thread(target=executor.spin, daemon=True).start()
+    connections = Connections(node)
     commands: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     environment: Any = None
 
@@ -51,7 +53,7 @@ def main() -> None:
         nonlocal environment
         if command["do"] == "make":
             environment = make_ros_environment(
-                node,
+                connections,
                 command.get("parameters", {}),
                 configuration.problem,
                 0,
@@ -84,7 +86,7 @@ def main() -> None:
     for line in sys.stdin:
         command = json.loads(line)
         if command["do"] == "cancel":
-            cancel_ros_environments(node)
+            connections.cancel()
             say({"id": command["id"], "result": None})
         else:
             commands.put(command)

@@ -464,7 +464,8 @@ master_process = sys.modules["master_process"] = importlib.util.module_from_spec
 spec.loader.exec_module(master_process)
 make = master_process._load()
 path = pathlib.Path(sys.argv[2])
-stock, ours = rosmaster.master_api.ROSMasterHandler(1), make(path)
+nothing = master_process.journal_of(master_process.MasterState())
+stock, ours = rosmaster.master_api.ROSMasterHandler(1), make(path, nothing)
 draw = random.Random(int(sys.argv[3]))
 
 def apis(handler):
@@ -509,15 +510,14 @@ for step in range(600):
     assert answer[::2] == expected[::2], (call, answer, expected)
     if not step % 20:
         # Another one, from what is written down.
-        (path.parent / "copy").write_bytes(path.read_bytes())
-        again = make(path.parent / "copy")
+        again = make(path.parent / "copy", path.read_bytes())
         assert apis(again) == apis(ours) == apis(stock), (step, call, apis(again), apis(stock))
         assert [sorted(map(str, table)) for table in again.getSystemState("/x")[2]] == [
             sorted(map(str, table)) for table in stock.getSystemState("/x")[2]]
         again._shutdown()
         if not step % 100:
             ours._shutdown()
-            ours = make(path)
+            ours = make(path, path.read_bytes())
 print("the same")
 import os
 sys.stdout.flush()

@@ -23,7 +23,13 @@ from tests.unit.test_ros_client import in_process
 
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import TransportError
-from holdfast.ros.active_sensing import DecisionAnswer, DecisionRequest, ErrorCode, RequestKind
+from holdfast.ros.active_sensing import (
+    ActiveSensing,
+    DecisionAnswer,
+    DecisionRequest,
+    ErrorCode,
+    RequestKind,
+)
 from holdfast.ros.messages import md5_sum
 from holdfast.ros.ros1_client import Ros1Client, Ros1Service
 from holdfast.ros.ros1_service import MAX_WAITING, Ros1Server
@@ -457,14 +463,23 @@ def test_a_request_that_is_no_message_is_answered_with_the_reason(around: Ros1) 
 
 
 async def test_too_many_requests_at_once_are_told_so(
-    around: Ros1, here: RosEnvironment, configuration: Configuration
+    around: Ros1,
+    here: RosEnvironment,
+    configuration: Configuration,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     service = Ros1Server(configuration, ros_environment=here)
     hold = threading.Event()
-    service._decisions.submit(hold.wait)
+    decide = ActiveSensing.answer
+
+    def answer(self: ActiveSensing, request: DecisionRequest) -> DecisionAnswer:
+        hold.wait()
+        return decide(self, request)
+
+    monkeypatch.setattr(ActiveSensing, "answer", answer)
     assert service.start()
     loop = asyncio.get_running_loop()
-    asked = [Ros1Service(CLOUD, here) for _ in range(MAX_WAITING + 1)]
+    asked = [Ros1Service(CLOUD, here) for _ in range(MAX_WAITING + 2)]
     with ThreadPoolExecutor(len(asked)) as askers:
         answers = [
             loop.run_in_executor(askers, each.ask, DecisionRequest(RequestKind.INITIALIZE), 60.0)
@@ -473,15 +488,18 @@ async def test_too_many_requests_at_once_are_told_so(
         (busy,), _ = await asyncio.wait(answers, return_when=asyncio.FIRST_COMPLETED)
         hold.set()
         errors = [answer.error for answer in await asyncio.gather(*answers)]
-    assert (await busy).message == f"{MAX_WAITING} requests wait, and {MAX_WAITING} are allowed"
-    assert sorted(errors) == [ErrorCode.OK] * MAX_WAITING + [ErrorCode.BUSY]
+    assert (await busy).message == f"{MAX_WAITING} requests are waiting already"
+    assert sorted(errors) == [ErrorCode.OK] * (MAX_WAITING + 1) + [ErrorCode.BUSY]
     for each in asked:
         each.close()
     service.close(1.0)
 
 
 async def test_a_defect_costs_its_request_alone(
-    around: Ros1, here: RosEnvironment, configuration: Configuration
+    around: Ros1,
+    here: RosEnvironment,
+    configuration: Configuration,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     told: list[str] = []
     service = Ros1Server(
@@ -496,10 +514,10 @@ async def test_a_defect_costs_its_request_alone(
             None, asker.ask, DecisionRequest(RequestKind.INITIALIZE), 30.0
         )
 
-    answers, service._answers = service._answers, None  # type: ignore[assignment]
-    with pytest.raises(TransportError, match="it answers: the service has failed: AttributeError"):
-        await ask()
-    service._answers = answers
+    with monkeypatch.context() as defect:
+        defect.setattr(ActiveSensing, "answer", None)
+        with pytest.raises(TransportError, match="it answers: the service has failed: TypeError"):
+            await ask()
     assert (await ask()).error is ErrorCode.OK
     assert told == ["ros_master", "ros_request_failed"]
     asker.close()

@@ -446,13 +446,7 @@ class TestRobotsThatFail:
     def test_one_that_dies_in_the_middle(self, driver: Driver, odd: Start, what: str) -> None:
         odd(**{what: "die"})
         # Nobody tells of a process that was killed; its middleware's lease ends some time after.
-        driver.do(
-            "make",
-            parameters={
-                f"environment.{what}.timeout_ms": 3000,
-                "environment.discovery_timeout_ms": 1000,
-            },
-        )
+        driver.do("make", parameters={f"environment.{what}.timeout_ms": 3000})
         call = ("perform_sensing", 0) if what == "sense" else ("perform", ACTION)
         error = driver.error(*call)
         assert f"robot/{what} (environment.{what}.name)" in error

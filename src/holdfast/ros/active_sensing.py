@@ -23,7 +23,7 @@ from holdfast.arrays import FloatArray
 from holdfast.belief import Belief
 from holdfast.config.loader import Configuration
 from holdfast.config.user_code import account_of_user_error
-from holdfast.errors import CheckpointError, HoldfastError, ProblemError
+from holdfast.errors import CheckpointError, HoldfastError, InvalidValueError, ProblemError
 from holdfast.planning import Planner, PlanningState
 from holdfast.robot.session_configuration import session_configuration_of
 
@@ -168,8 +168,9 @@ class ActiveSensing:
             return self._answer(request)
         except HoldfastError as error:
             # Only the author can fix a problem that breaks its contract.
-            code = ErrorCode.PROBLEM_FAILED if isinstance(error, ProblemError) else None
-            return self.refusal(code or ErrorCode.BAD_REQUEST, str(error))
+            is_problem = isinstance(error, ProblemError)
+            code = ErrorCode.PROBLEM_FAILED if is_problem else ErrorCode.BAD_REQUEST
+            return self.refusal(code, str(error))
         except Exception as error:
             account = account_of_user_error(error, self._problem_name)
             if account is None:
@@ -182,21 +183,17 @@ class ActiveSensing:
             state = planner.init(request.seed, request.trial)
             return DecisionAnswer(ErrorCode.OK, "", self.configuration, state)
         if request.kind not in (RequestKind.CHOOSE_SENSING_ACTION, RequestKind.CHOOSE_TASK_ACTIONS):
-            return self.refusal(
-                ErrorCode.BAD_REQUEST,
-                f"kind {request.kind}: there are "
-                + ", ".join(f"{kind.value} {kind.name}" for kind in RequestKind),
-            )
+            known = ", ".join(f"{kind.value} {kind.name}" for kind in RequestKind)
+            raise InvalidValueError(f"kind {request.kind}: there are {known}")
         if request.state is None:
-            return self.refusal(ErrorCode.BAD_REQUEST, "state: there are no particles in it")
+            raise InvalidValueError("state: there are no particles in it")
         state = request.state
         planner.check(state)
         needs_sensing = planner.needs_sensing(state)
         if request.kind == RequestKind.CHOOSE_SENSING_ACTION:
             if not needs_sensing:
-                return self.refusal(
-                    ErrorCode.BAD_REQUEST,
-                    f"step {state.step} needs no sensing action; ask for CHOOSE_TASK_ACTIONS",
+                raise InvalidValueError(
+                    f"step {state.step} needs no sensing action; ask for CHOOSE_TASK_ACTIONS"
                 )
             chosen, info = planner.choose_sensing_action(state)
             entropies = _NO_ENTROPIES if info.entropies is None else info.entropies
@@ -204,9 +201,8 @@ class ActiveSensing:
         if needs_sensing:
             state, _ = planner.observe(state, request.sensing_action, request.observation)
         elif request.observation.size:
-            return self.refusal(
-                ErrorCode.BAD_REQUEST,
-                f"observation of {request.observation.size} values: step {state.step} needs none",
+            raise InvalidValueError(
+                f"observation of {request.observation.size} values: step {state.step} needs none"
             )
         actions, ahead = planner.plan_until_sensing(state, self._max_actions)
         return DecisionAnswer(
@@ -230,19 +226,11 @@ def checked_state(
 ) -> PlanningState | None:
     """Return the state that a message has, or None if it has no particles.
 
-    Parameters
-    ----------
-    state_size : int
-        Coordinates of a state.
-    states : array of shape (num_particles * state_size,)
-        Particle after particle.
-    weights : array of shape (num_particles,)
+    ``states`` has shape ``(num_particles * state_size,)``, particle after particle, and ``weights``
+    ``(num_particles,)``.
 
-    Raises
-    ------
-    CheckpointError
-        If this is no state: numbers that are missing or not finite, weights that are negative or
-        do not sum to 1, a negative seed.
+    Raises CheckpointError if this is no state: numbers that are missing or not finite, weights that
+    are negative or do not sum to 1, a negative seed.
     """
     if not weights.size and not states.size:
         return None

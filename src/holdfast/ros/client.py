@@ -42,7 +42,6 @@ class DecisionService(Protocol):
     @property
     def name(self) -> str:
         """Name of the service, for messages."""
-        ...
 
     def ask(self, request: DecisionRequest, deadline_s: float) -> DecisionAnswer:
         """Ask, and wait at most ``deadline_s`` for the answer.
@@ -52,11 +51,9 @@ class DecisionService(Protocol):
         TransportError
             If there is no answer; the message gives the reason.
         """
-        ...
 
     def close(self) -> None:
         """End all requests; may be called from another thread, and repeated."""
-        ...
 
 
 class _Outcome(NamedTuple):
@@ -70,11 +67,8 @@ class _Outcome(NamedTuple):
 class _Asker:
     """Asks one service on its own thread, one request at a time.
 
-    Parameters
-    ----------
-    is_last_resort : bool
-        Whether no other service is left. Then the deadline doubles with each request that misses
-        it, since asking anew would take even longer.
+    The deadline of a last resort doubles with each request that misses it, since asking anew would
+    take even longer.
     """
 
     def __init__(
@@ -90,7 +84,6 @@ class _Asker:
         self._is_last_resort = is_last_resort
         self._outcomes = outcomes
         self._requests: queue.SimpleQueue[tuple[int, DecisionRequest] | None] = queue.SimpleQueue()
-        self.asked = 0
         self.busy = False
         self.reason = ""
         self.not_before = 0.0
@@ -101,15 +94,13 @@ class _Asker:
         """Ask, unless an earlier request is open or the last one has just failed."""
         if not self.busy and monotonic() >= self.not_before:
             self.busy = True
-            self.asked = number
             self._requests.put((number, request))
 
-    def take(self, outcome: _Outcome) -> bool:
-        """Note an outcome of this service; return whether it was an answer."""
+    def take(self, outcome: _Outcome) -> None:
+        """Note an outcome of this service."""
         self.busy = False
         self.reason = outcome.reason
         self.not_before = 0.0 if outcome.answer is not None else monotonic() + _AGAIN_S
-        return outcome.answer is not None
 
     def close(self) -> None:
         """End the thread."""
@@ -224,7 +215,9 @@ class ActiveSensingClient:
             self._cloud.ask(self._number, request)
             if not self._cloud_decides:
                 self._recovery.ask(self._number, request)
-            answer = self._hear(0.01 if held else self._wait_s(until))
+            # Time itself matters when the deadline is over.
+            left = until - monotonic()
+            answer = self._hear(0.01 if held else min(_AGAIN_S, left) if left > 0 else _AGAIN_S)
             if answer is not None:
                 return answer
             waited = monotonic() - began
@@ -238,11 +231,6 @@ class ActiveSensingClient:
     def _cloud_decides(self) -> bool:
         return self.status is not Status.LOCAL_RECOVERY
 
-    def _wait_s(self, until: float) -> float:
-        """Return how long to wait for an outcome before time itself matters."""
-        left = until - monotonic()
-        return min(_AGAIN_S, left) if left > 0 else _AGAIN_S
-
     def _hear(self, timeout_s: float) -> DecisionAnswer | None:
         """Take the available outcomes, after waiting for one; stop at the wanted answer."""
         block = timeout_s > 0
@@ -255,7 +243,8 @@ class ActiveSensingClient:
             if outcome is None or self._closed:
                 self._outcomes.put(None)  # for the next caller
                 raise TransportError("this client is closed")
-            answered = outcome.asker.take(outcome)
+            outcome.asker.take(outcome)
+            answered = outcome.answer is not None
             if outcome.asker is self._cloud:
                 is_wanted = outcome.number == self._number or outcome.took_s <= self._deadline_s
                 if answered and is_wanted and not self._cloud_decides:

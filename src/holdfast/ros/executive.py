@@ -54,18 +54,10 @@ class DecideCode(enum.IntEnum):
 
 
 class DueDecision(NamedTuple):
-    """A decision whose outcome is awaited.
+    """A decision whose outcome is awaited; ``trial`` and ``number`` identify it.
 
-    Attributes
-    ----------
-    trial, number : int
-        Identify it.
-    step : int
-        Task actions before it.
-    sensing_action : int or None
-        None for a task action.
-    task_action : array of shape (action_size,)
-        Empty for a sensing action.
+    ``sensing_action`` is None for a task action, and ``task_action``, of shape ``(action_size,)``,
+    is empty for a sensing action. ``step`` counts the task actions before it.
     """
 
     trial: int
@@ -96,9 +88,7 @@ class DecideReply(NamedTuple):
 class DecisionHandover:
     """Hands a run's decisions to an executive and its outcomes back; usable from any thread.
 
-    It serves one run, until that ends or is held.
-
-    Only callers' threads may use ``problem``.
+    It serves one run, until that ends or is held. Only callers' threads may use ``problem``.
     """
 
     def __init__(self, problem: Problem, sensing_interval: int) -> None:
@@ -121,10 +111,7 @@ class DecisionHandover:
     def perform(self, due: DueDecision) -> DecideRequest:
         """Publish a decision and wait for its outcome.
 
-        Raises
-        ------
-        EnvironmentFailedError
-            If the run ends first.
+        Raises EnvironmentFailedError if the run ends first.
         """
         with self._changed:
             self._answer = None

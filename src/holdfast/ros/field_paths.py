@@ -29,10 +29,8 @@ _ELEMENT = re.compile(r"sequence<([^,>]+)(?:, *[0-9]+)?>|(.+)\[[0-9]+\]")
 def find_type(name: str, key: str, kinds: tuple[str, ...] = ("srv", "action", "msg")) -> Any:
     """Import a generated type, such as ``std_srvs/srv/Trigger``; ``key`` names it in messages.
 
-    Raises
-    ------
-    ConfigurationError
-        If it is written in another way, is of another kind, or cannot be imported.
+    Raises ConfigurationError if it is written in another way, is of another kind, or cannot be
+    imported.
     """
     found = _TYPE.fullmatch(name)
     if found is None or found[2] not in kinds:
@@ -51,10 +49,7 @@ def find_type(name: str, key: str, kinds: tuple[str, ...] = ("srv", "action", "m
 def parse_path(text: str, key: str) -> Path:
     """Read a path.
 
-    Raises
-    ------
-    ConfigurationError
-        If it is none.
+    Raises ConfigurationError if it is none.
     """
     path: list[str | int] = []
     for part in text.split("."):
@@ -72,13 +67,10 @@ def parse_path(text: str, key: str) -> Path:
 def check_path(message_type: Any, path: Path, key: str) -> None:
     """Check that messages of a type have a field.
 
-    Raises
-    ------
-    ConfigurationError
-        If not; the message lists the fields that are there.
+    Raises ConfigurationError if not; the message lists the fields that are there.
     """
     try:
-        _Place(message_type(), path, grow=True).value()
+        _holder(message_type(), path, grow=True)
     except _NoSuchFieldError as error:
         raise ConfigurationError(f"{key}: {_type_name(message_type)} {error}") from None
 
@@ -86,13 +78,10 @@ def check_path(message_type: Any, path: Path, key: str) -> None:
 def read_field(message: Any, path: Path) -> Any:
     """Return the value of a field.
 
-    Raises
-    ------
-    EnvironmentFailedError
-        If the message's array is too short for the path.
+    Raises EnvironmentFailedError if the message's array is too short for the path.
     """
     try:
-        return _Place(message, path).value()
+        return _part(_holder(message, path), path[-1])
     except _NoSuchFieldError as error:
         raise EnvironmentFailedError(f"{_type_name(type(message))} {error}") from None
 
@@ -100,10 +89,7 @@ def read_field(message: Any, path: Path) -> Any:
 def read_numbers(message: Any, path: Path) -> list[float]:
     """Return a field that is a number, or an array of numbers, as a list.
 
-    Raises
-    ------
-    EnvironmentFailedError
-        If it is neither.
+    Raises EnvironmentFailedError if it is neither.
     """
     value = read_field(message, path)
     try:
@@ -121,14 +107,16 @@ def read_numbers(message: Any, path: Path) -> list[float]:
 def write(message: Any, path: Path, value: Any) -> None:
     """Set a field, converted to its type; arrays become as long as the path needs.
 
-    Raises
-    ------
-    EnvironmentFailedError
-        If it does not fit: a fraction into an integer, three numbers into an array of two.
+    Raises EnvironmentFailedError if it does not fit: a fraction into an integer, three numbers into
+    an array of two.
     """
     try:
-        place = _Place(message, path, grow=True)
-        place.set(_fitting(place.value(), value))
+        holder, part = _holder(message, path, grow=True), path[-1]
+        fitting = _fitting(_part(holder, part), value)
+        if isinstance(part, str):
+            setattr(holder, part, fitting)
+        else:
+            holder[part] = fitting
     except _NoSuchFieldError as error:
         raise EnvironmentFailedError(f"{_type_name(type(message))} {error}") from None
     except (TypeError, ValueError, OverflowError, AssertionError) as error:
@@ -142,45 +130,35 @@ class _NoSuchFieldError(Exception):
     """A path leads nowhere."""
 
 
-class _Place:
-    """A field in a message, and what holds it."""
-
-    def __init__(self, message: Any, path: Path, *, grow: bool = False) -> None:
-        holder, declared = message, None
-        for depth, part in enumerate(path):
-            if isinstance(part, str):
-                fields = _fields(holder)
-                if part not in fields:
-                    there = ", ".join(fields) or "none"
-                    raise _NoSuchFieldError(
-                        f"has no field {_written(path[: depth + 1])}; there: {there}"
-                    )
-                declared = fields[part]
-            else:
-                if not hasattr(holder, "__len__") or isinstance(holder, str | bytes):
-                    raise _NoSuchFieldError(f"has no array {_written(path[:depth])}")
-                size = len(holder)
-                if part >= size and not (grow and _grow(holder, part + 1, declared)):
-                    raise _NoSuchFieldError(
-                        f"has {size} elements in {_written(path[:depth])}, and "
-                        f"{_written(path[: depth + 1])} is meant"
-                    )
-                declared = _element(declared)
-            if depth < len(path) - 1:
-                holder = getattr(holder, part) if isinstance(part, str) else holder[part]
-        self._holder = holder
-        self._last = path[-1]
-
-    def value(self) -> Any:
-        if isinstance(self._last, str):
-            return getattr(self._holder, self._last)
-        return self._holder[self._last]
-
-    def set(self, value: Any) -> None:
-        if isinstance(self._last, str):
-            setattr(self._holder, self._last, value)
+def _holder(message: Any, path: Path, *, grow: bool = False) -> Any:
+    """Return what holds the field that a path names: the last part of the path is in it."""
+    holder, declared = message, None
+    for depth, part in enumerate(path):
+        if isinstance(part, str):
+            fields = _fields(holder)
+            if part not in fields:
+                there = ", ".join(fields) or "none"
+                raise _NoSuchFieldError(
+                    f"has no field {_written(path[: depth + 1])}; there: {there}"
+                )
+            declared = fields[part]
         else:
-            self._holder[self._last] = value
+            if not hasattr(holder, "__len__") or isinstance(holder, str | bytes):
+                raise _NoSuchFieldError(f"has no array {_written(path[:depth])}")
+            size = len(holder)
+            if part >= size and not (grow and _grow(holder, part + 1, declared)):
+                raise _NoSuchFieldError(
+                    f"has {size} elements in {_written(path[:depth])}, and "
+                    f"{_written(path[: depth + 1])} is meant"
+                )
+            declared = _element(declared)
+        if depth < len(path) - 1:
+            holder = _part(holder, part)
+    return holder
+
+
+def _part(holder: Any, part: str | int) -> Any:
+    return getattr(holder, part) if isinstance(part, str) else holder[part]
 
 
 def _fitting(old: Any, value: Any) -> Any:

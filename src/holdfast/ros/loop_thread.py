@@ -26,10 +26,7 @@ class LoopThread:
     def run(self, coroutine: Coroutine[Any, Any, _T], within_s: float) -> _T:
         """Run a coroutine there, and wait at most ``within_s`` for its result.
 
-        Raises
-        ------
-        TransportError
-            If it takes longer.
+        Raises TransportError if it takes longer.
         """
         future = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
         try:

@@ -39,21 +39,11 @@ _DISC_POINTS = 49
 
 
 class Marker(NamedTuple):
-    """A shape.
+    """A shape, as ``visualization_msgs/Marker`` has it.
 
-    Attributes
-    ----------
-    kind : str
-        A constant of ``visualization_msgs/Marker``: ``CUBE``, ``LINE_STRIP``, ...
-    pose : tuple of float
-        Position and quaternion (x, y, z, w).
-    scale : tuple of float
-        Metres.
-    color : tuple of float
-        Red, green, blue and opacity, 0 to 1.
-    points : sequence of (x, y, z)
-    moves_with_frame : bool
-        Whether it follows its frame.
+    ``kind`` is a constant of that message (``CUBE``, ``LINE_STRIP``, ...), ``pose`` a position and
+    a quaternion (x, y, z, w). Lengths are in metres; colours are red, green, blue and opacity, 0 to
+    1.
     """
 
     kind: str

@@ -79,10 +79,7 @@ _ERRORS = frozenset(("wrong_answer", "not_deterministic", "state_diverged", "sto
 def require_rosbags() -> None:
     """Make sure that rosbags is there.
 
-    Raises
-    ------
-    MissingRosbagsError
-        If it is not.
+    Raises MissingRosbagsError if it is not.
     """
     try:
         import rosbags.rosbag2  # noqa: F401
@@ -95,24 +92,11 @@ def require_rosbags() -> None:
 class McapSink:
     """Writes the facts of a run as ROS 2 messages; to be used in a ``with`` statement.
 
-    Parameters
-    ----------
-    directory : Path
-        Where the file is made, with the ``metadata.yaml`` of a rosbag2; it must not be there yet.
-    notes : mapping of str to str
-        What the file's metadata is to say of the run.
+    The file is made in ``directory``, which must not be there yet, with the ``metadata.yaml`` of a
+    rosbag2, which gets the ``notes``.
 
-    Attributes
-    ----------
-    has_poses : bool
-        Whether the problem says which coordinates are a pose.
-
-    Raises
-    ------
-    MissingRosbagsError
-        If rosbags is not installed.
-    ProblemError
-        If what the problem says of its pose cannot be.
+    Raises MissingRosbagsError if rosbags is not installed, and ProblemError if what the problem
+    says of its pose cannot be.
     """
 
     def __init__(

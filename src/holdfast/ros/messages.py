@@ -76,10 +76,7 @@ _EVENT_INFO = (
 def typestore() -> Typestore:
     """Return rosbags' store of the types that the service is made of.
 
-    Raises
-    ------
-    InvalidValueError
-        If rosbags is not installed.
+    Raises InvalidValueError if rosbags is not installed.
     """
     try:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -164,10 +161,7 @@ def _hashed_text(store: Typestore, name: str) -> str:
 def encode_request(request: DecisionRequest, serialization: Serialization = "cdr") -> bytes:
     """Return a request as a message.
 
-    Raises
-    ------
-    InvalidValueError
-        If a number does not fit into its field, or the text is none.
+    Raises InvalidValueError if a number does not fit into its field, or the text is none.
     """
     types = typestore().types
     message = types[f"{SERVICE}_Request"](
@@ -187,12 +181,8 @@ def decode_request(
 ) -> DecisionRequest:
     """Return the request that a message has.
 
-    Raises
-    ------
-    InvalidValueError
-        If it is no message of this type.
-    CheckpointError
-        If its state is none.
+    Raises InvalidValueError if it is no message of this type. Raises CheckpointError if its state
+    is none.
     """
     message = _decode(data, "Request", serialization)
     return DecisionRequest(
@@ -209,10 +199,7 @@ def decode_request(
 def encode_answer(answer: DecisionAnswer, serialization: Serialization = "cdr") -> bytes:
     """Return an answer as a message.
 
-    Raises
-    ------
-    InvalidValueError
-        If a number does not fit into its field, or a text is none.
+    Raises InvalidValueError if a number does not fit into its field, or a text is none.
     """
     types = typestore().types
     actions = answer.task_actions
@@ -232,12 +219,8 @@ def encode_answer(answer: DecisionAnswer, serialization: Serialization = "cdr") 
 def decode_answer(data: bytes | memoryview, serialization: Serialization = "cdr") -> DecisionAnswer:
     """Return the answer that a message has.
 
-    Raises
-    ------
-    InvalidValueError
-        If it is no message of this type, or its fields contradict each other.
-    CheckpointError
-        If its state is none.
+    Raises InvalidValueError if it is no message of this type, or its fields contradict each other.
+    Raises CheckpointError if its state is none.
     """
     message = _decode(data, "Response", serialization)
     try:

@@ -42,30 +42,19 @@ points up. For y it is a quarter turn about x."""
 class PoseLayout(NamedTuple):
     """Where in a state the coordinates of a pose are.
 
-    Attributes
-    ----------
-    indices : tuple of (int or None)
-        For each of :data:`POSE_COORDINATES`, the state's coordinate, None if it has none.
-    upright : tuple of float
-        Quaternion (x, y, z, w) by which the problem's frame is turned in a frame whose z points up.
+    ``indices`` has for each of :data:`POSE_COORDINATES` the state's coordinate, None if there is
+    none; ``upright`` is the quaternion (x, y, z, w) by which the problem's frame is turned in a
+    frame whose z points up.
     """
 
     indices: tuple[int | None, ...]
     upright: tuple[float, float, float, float]
 
     def poses(self, states: npt.ArrayLike) -> FloatArray:
-        """Return the poses of states.
+        """Return the poses of states of shape ``(..., state_size)``, in metres and radians.
 
-        Parameters
-        ----------
-        states : array of shape (..., state_size)
-            Metres and radians.
-
-        Returns
-        -------
-        array of shape (..., 7)
-            Position x, y, z in metres and unit quaternion x, y, z, w, in the order in which
-            ``geometry_msgs/Pose`` has them.
+        They have shape ``(..., 7)``: position x, y, z in metres and unit quaternion x, y, z, w, in
+        the order in which ``geometry_msgs/Pose`` has them.
         """
         array = np.asarray(states, dtype=np.float64)
         coordinates = np.zeros((*array.shape[:-1], len(POSE_COORDINATES)))
@@ -101,15 +90,7 @@ class PoseLayout(NamedTuple):
 def pose_layout(problem: Any) -> PoseLayout | None:
     """Return where in a problem's states the pose is, by its attributes ``pose`` and ``up``.
 
-    Returns
-    -------
-    PoseLayout or None
-        None if the problem does not say.
-
-    Raises
-    ------
-    ProblemError
-        If these attributes are invalid.
+    It is None if the problem does not say. Raises ProblemError if these attributes are invalid.
     """
     words = getattr(problem, "pose", None)
     if words is None or (isinstance(words, tuple | list) and not words):

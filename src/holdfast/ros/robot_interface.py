@@ -22,16 +22,17 @@ parameters name.
 
 from __future__ import annotations
 
-import difflib
-import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+import msgspec
+
+from holdfast.config.validation import close_match, dotted, find_mismatch
 from holdfast.config.yaml_document import read
 from holdfast.errors import ConfigurationError
 from holdfast.ros.field_paths import Path, check_path, find_type, parse_path
 
-__all__ = ["ROBOT_PARAMETERS", "ObservationTopic", "RobotCall", "RobotInterface"]
+__all__ = ["ROBOT_PARAMETERS", "ROLES", "ObservationTopic", "RobotCall", "RobotInterface"]
 
 _SENSE, _ACT, _ACT_SERVICE, _TRIAL = (
     f"holdfast_interfaces/{name}" for name in ("srv/Sense", "action/Act", "srv/Act", "srv/Trial")
@@ -118,53 +119,46 @@ ROBOT_PARAMETERS: Mapping[str, tuple[object, str]] = {
 A list that is empty may be left out, and one of a single text may be that text.
 """
 
+_TOLD = {"success": "success", "message": "message"}
+_SENT = {"trial": "trial", "step": "step"}
+
 # Which field takes what, in the ready-made types. The parameters can say it otherwise.
-_READY_MADE: Mapping[tuple[str, str], Mapping[str, object]] = {
+_READY_MADE: Mapping[tuple[str, str], Mapping[str, Any]] = {
     ("sense", _SENSE): {
-        "trial": "trial",
-        "step": "step",
+        **(_SENT | _TOLD),
         "index": "sensing_action",
         "observation": ["observation"],
     },
     **{
-        ("act", name): {
-            "trial": "trial",
-            "step": "step",
-            "action": ["task_action"],
-            "reward": "reward",
-        }
+        ("act", name): {**(_SENT | _TOLD), "action": ["task_action"], "reward": "reward"}
         for name in (_ACT, _ACT_SERVICE)
     },
-    ("done", _TRIAL): {"trial": "trial", "done": "done", "failed": "failed"},
-    ("steps", _TRIAL): {"trial": "trial", "steps": "steps"},
-    ("reset", _TRIAL): {"trial": "trial", "constants": ["begin: true"]},
+    ("done", _TRIAL): {**_TOLD, "trial": "trial", "done": "done", "failed": "failed"},
+    ("steps", _TRIAL): {**_TOLD, "trial": "trial", "steps": "steps"},
+    ("reset", _TRIAL): {**_TOLD, "trial": "trial", "constants": ["begin: true"]},
 }
 
 _PART = 0.45
 """Of ``environment.timeout_ms``: it is for a task action and for asking whether it was the last."""
 
-_OF_THE_SETTINGS = ("kind", "object", "directory", "timeout_ms", "arguments")
-"""Keys of the section ``environment`` that are not about ROS."""
+_TIMEOUT = "environment.timeout_ms"
 
-_REQUEST_KEYS = ("trial", "step", "index", "label", "fields", "action")
-_ANSWER_KEYS = ("success", "message", "reward", "done", "failed", "steps")
+_REQUEST_KEYS = frozenset(("trial", "step", "index", "label", "fields", "action"))
+_ANSWER_KEYS = frozenset(("success", "message", "reward", "done", "failed", "steps"))
+"""Parameters that name fields of a request, or of an answer."""
+
+_Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+_Finite = Annotated[float, msgspec.Meta(ge=-1e300, le=1e300)]
+_Numbers = _Finite | list[_Finite]
+_Texts = str | list[Annotated[str, msgspec.Meta(min_length=1)]]
 
 
 class RobotCall(NamedTuple):
     """One role: whom to call, and which field takes what.
 
-    Attributes
-    ----------
-    kind : str
-        ``srv``, ``action`` or ``msg``.
-    type : type
-        The generated class.
-    paths : dict of str to list of tuple
-        By key (``trial``, ``index``, ``action``, ...) the fields that it names. Those of
-        ``observation`` are in ``observation``.
-    observation : list of str
-        With ``{index}`` and ``{label}`` still in them.
-    constants : list of (path, value)
+    ``kind`` is ``srv``, ``action`` or ``msg``, and ``type`` the generated class. ``paths`` has by
+    key (``trial``, ``index``, ``action``, ...) the fields that it names, except those of
+    ``observation``, which still have ``{index}`` and ``{label}`` in them.
     """
 
     role: str
@@ -207,151 +201,119 @@ class ObservationTopic(NamedTuple):
 class RobotInterface:
     """A robot's interface, as parameters map it.
 
-    Parameters
-    ----------
-    parameters : mapping of str to object
-        Those of :data:`ROBOT_PARAMETERS`, by name, with or without ``environment.`` before it;
-        sections may be mappings themselves. Of the settings' own section ``environment``
-        ``timeout_ms`` is read, and its other keys are left alone.
-    sensing_actions : sequence of str
-        The problem's labels.
-    action_size : int
-        Coordinates of the problem's task actions.
+    The parameters are those of :data:`ROBOT_PARAMETERS`, by name, and ``environment.timeout_ms``.
+    ``calls`` has the roles that are there. ``timeout_s`` is for an observation that nobody is asked
+    for, and for each call by default.
 
-    Attributes
-    ----------
-    calls : dict of str to RobotCall
-        By role; those that are not there are missing.
-    timeout_s : float
-        For an observation that nobody is asked for, and for each call by default.
-
-    Raises
-    ------
-    ConfigurationError
-        If a parameter is unknown, of another type or out of its bounds, a type cannot be imported,
-        or does not have a field that a parameter names. The message names the parameter.
+    Raises ConfigurationError if a parameter is unknown, of another type or out of its bounds, a
+    type cannot be imported, or does not have a field that a parameter names.
     """
 
     def __init__(
-        self, parameters: Mapping[str, object], sensing_actions: Sequence[str], action_size: int
+        self, parameters: Mapping[str, Any], sensing_actions: Sequence[str], action_size: int
     ) -> None:
-        given = _flat(parameters)
+        values = _given(parameters)
         self._sensing_actions = list(sensing_actions)
         self._action_size = action_size
-        self._values = _Values(given)
-        self._timeout_ms = self._values.positive("environment.timeout_ms", 60_000.0)
+        self._timeout_ms = float(parameters.get(_TIMEOUT, 60_000.0))
         self.timeout_s = 1e-3 * _PART * self._timeout_ms
-        discovery_ms = self._values.positive("environment.discovery_timeout_ms", 5000.0)
-        self.discovery_timeout_s = 1e-3 * discovery_ms
-        self.observation = self._observation_topic()
+        self.discovery_timeout_s = 1e-3 * values.get("environment.discovery_timeout_ms", 5000.0)
+        self.observation = self._observation_topic(_section(values, "environment.observation."))
         own = self.observation is not None or any(
-            self._values.text(f"environment.{role}.type") not in ready
-            for role, ready in (("sense", ("", _SENSE)), ("act", ("", _ACT, _ACT_SERVICE)))
+            values.get(f"environment.{role}.type", ready[0]) not in ready
+            for role, ready in (("sense", (_SENSE,)), ("act", (_ACT, _ACT_SERVICE)))
         )
         self.calls: dict[str, RobotCall] = {}
         for role in ROLES:
-            call = self._call(role, own=own)
+            call = self._call(role, _section(values, f"environment.{role}."), own=own)
             if call is not None:
                 self.calls[role] = call
         self._check_whole()
+        self._check_step(values)
 
-    def _observation_topic(self) -> ObservationTopic | None:
-        values, section = self._values, "environment.observation."
-        name = values.text(f"{section}topic")
-        if not name:
+    def _observation_topic(self, given: Mapping[str, Any]) -> ObservationTopic | None:
+        section = "environment.observation."
+        if "topic" not in given:
             for key in ("type", "fields"):
-                if values.texts(f"{section}{key}"):
+                if key in given:
                     raise ConfigurationError(f"{section}{key} needs {section}topic")
             return None
-        type_name = values.text(f"{section}type")
+        type_name = given.get("type", "")
         found = find_type(type_name, f"{section}type", ("msg",))
-        fields = values.texts(f"{section}fields")
+        fields = given.get("fields", [])
         if not fields:
             raise ConfigurationError(
                 f"{section}fields is empty; it must name the fields of {type_name} that are the "
                 "observation"
             )
         self._check_observation(found, fields, f"{section}fields")
-        taken = values.text(f"{section}taken") or "after"
+        taken = given.get("taken", "after")
         if taken not in ("after", "during"):
             raise ConfigurationError(f"{section}taken is {taken!r}; it must be 'after' or 'during'")
-        return ObservationTopic(name, type_name, found, fields, taken == "during")
+        return ObservationTopic(given["topic"], type_name, found, fields, taken == "during")
 
-    def _call(self, role: str, *, own: bool) -> RobotCall | None:
-        values, section = self._values, f"environment.{role}."
-        type_name = values.text(f"{section}type")
-        by_default = own and (not type_name or role in ("done", "steps", "reset"))
+    def _call(self, role: str, given: dict[str, Any], *, own: bool) -> RobotCall | None:
+        section = f"environment.{role}."
         default_name, default_type = _DEFAULTS[role]
-        name = values.text(f"{section}name") or ("" if by_default else default_name)
+        nobody = own and ("type" not in given or role not in ("sense", "act"))
+        name = given.pop("name", "" if nobody else default_name)
         if name in ("", "none"):
-            for key in (*_OF_ALL, *_OWN[role]):
-                if key != "name" and values.is_given(f"{section}{key}"):
-                    raise ConfigurationError(f"{section}{key} needs {section}name")
+            for key in given:
+                raise ConfigurationError(f"{section}{key} needs {section}name")
             return None
-        type_name = type_name or default_type
+        type_name = given.pop("type", default_type)
         kinds = ("srv", "action", "msg") if role == "done" else ("srv", "action")
         found = find_type(type_name, f"{section}type", kinds)
         kind = type_name.split("/")[1]
-        ready: Mapping[str, object] = {}
-        if (role, type_name) in _READY_MADE:
-            answered = {"success": "success", "message": "message"}
-            ready = {**_READY_MADE[role, type_name], **answered}
-        texts = {
-            key: values.texts(f"{section}{key}", ready.get(key, []))
-            for key, (default, _) in (*_OF_ALL.items(), *_OWN[role].items())
-            if isinstance(default, str | list) and key not in ("name", "type", "scale", "values")
-        }
-        if role == "sense" and self.observation is not None:
-            if values.is_given(f"{section}observation"):
-                raise ConfigurationError(
-                    f"{section}observation and environment.observation.topic are both given; the "
-                    "observation comes from one of them"
-                )
-            texts["observation"] = []
+        if role == "sense" and self.observation is not None and "observation" in given:
+            raise ConfigurationError(
+                f"{section}observation and environment.observation.topic are both given; the "
+                "observation comes from one of them"
+            )
+        values = {**_READY_MADE.get((role, type_name), {}), **given}
+        observation = values.get("observation", []) if self.observation is None else []
+        constants = [
+            self._constant(text, f"{section}constants") for text in values.get("constants", ())
+        ]
         paths = {
-            key: [parse_path(text, f"{section}{key}") for text in given]
-            for key, given in texts.items()
-            if key not in ("observation", "constants") and given
+            key: [parse_path(text, f"{section}{key}") for text in _listed(value)]
+            for key, value in values.items()
+            if key in _REQUEST_KEYS | _ANSWER_KEYS
         }
-        constants = [self._constant(text, f"{section}constants") for text in texts["constants"]]
-        request, answer = {
-            "srv": ("Request", "Response"),
-            "action": ("Goal", "Result"),
-            "msg": (None, None),
-        }[kind]
-        if request is not None:
-            for key in _REQUEST_KEYS:
-                for path in paths.get(key, ()):
-                    check_path(getattr(found, request), path, f"{section}{key}")
-            for path, _ in constants:
-                check_path(getattr(found, request), path, f"{section}constants")
-        elif constants or any(key in paths for key in (*_REQUEST_KEYS, "success", "message")):
-            raise ConfigurationError(f"{section}type is a message, so nothing is requested of it")
-        answers = found if answer is None else getattr(found, answer)
-        for key in _ANSWER_KEYS:
-            for path in paths.get(key, ()):
-                check_path(answers, path, f"{section}{key}")
-        self._check_observation(answers, texts.get("observation", []), f"{section}observation")
+        if kind == "msg":
+            if constants or not paths.keys() <= {"done", "failed"}:
+                raise ConfigurationError(
+                    f"{section}type is a message, so nothing is requested of it"
+                )
+            request, answer = None, found
+        elif kind == "action":
+            request, answer = found.Goal, found.Result
+        else:
+            request, answer = found.Request, found.Response
+        for key, named in paths.items():
+            for path in named:
+                message = request if key in _REQUEST_KEYS else answer
+                check_path(message, path, f"{section}{key}")
+        for path, _ in constants:
+            check_path(request, path, f"{section}constants")
+        self._check_observation(answer, observation, f"{section}observation")
         call = RobotCall(
             role,
             name,
             type_name,
             kind,
             found,
-            1e-3 * values.positive(f"{section}timeout_ms", _PART * self._timeout_ms),
+            1e-3 * values.get("timeout_ms", _PART * self._timeout_ms),
             paths,
-            texts.get("observation", []),
+            observation,
             constants,
-            values.numbers(f"{section}scale") if role == "act" else (),
-            values.numbers(f"{section}values") if role == "sense" else (),
+            values.get("scale", ()),
+            values.get("values", ()),
         )
         self._check_sizes(call)
         return call
 
     def _check_sizes(self, call: RobotCall) -> None:
-        for key, paths in call.paths.items():
-            if len(paths) > 1 and key not in ("fields", "action"):
-                raise ConfigurationError(f"{call.key(key)} must name one field")
         if call.role == "sense":
             fields, values = len(call.paths.get("fields", ())), len(call.values)
             needed = fields * len(self._sensing_actions)
@@ -398,16 +360,6 @@ class RobotInterface:
                 "environment.sense.observation is empty; it must name the fields of "
                 f"{sense.type_name} that are the observation"
             )
-        if "steps" not in calls:
-            for role, call in calls.items():
-                if "step" in call.paths:
-                    if self._values.is_given(call.key("step")):
-                        raise ConfigurationError(
-                            f"{call.key('step')} needs environment.steps.name: without a count of "
-                            "the robot's own nobody knows it after a restart"
-                        )
-                    paths = {key: path for key, path in call.paths.items() if key != "step"}
-                    calls[role] = call._replace(paths=paths)
         # Performing a task action and asking whether the task is done share one deadline.
         done = calls.get("done")
         both_s = calls["act"].timeout_s + (0.0 if done is None else done.timeout_s)
@@ -416,6 +368,19 @@ class RobotInterface:
                 f"environment.act.timeout_ms and environment.done.timeout_ms are {1e3 * both_s:g} "
                 f"together; that must not be more than environment.timeout_ms, {self._timeout_ms:g}"
             )
+
+    def _check_step(self, values: Mapping[str, Any]) -> None:
+        """Send no step to a robot that keeps no count: nobody knows it after a restart."""
+        if "steps" in self.calls:
+            return
+        for role, call in self.calls.items():
+            if call.key("step") in values:
+                raise ConfigurationError(
+                    f"{call.key('step')} needs environment.steps.name: without a count of the "
+                    "robot's own nobody knows it after a restart"
+                )
+            paths = {key: path for key, path in call.paths.items() if key != "step"}
+            self.calls[role] = call._replace(paths=paths)
 
     def _check_observation(self, message_type: Any, texts: Sequence[str], key: str) -> None:
         for text in texts:
@@ -436,81 +401,37 @@ def observation_path(text: str, index: int, label: str, key: str) -> Path:
     return parse_path(text.replace("{index}", str(index)).replace("{label}", label), key)
 
 
-class _Values:
-    """Parameters by name, held to their types."""
-
-    def __init__(self, given: Mapping[str, object]) -> None:
-        self._given = given
-        for key in given:
-            if key not in ROBOT_PARAMETERS and key.split(".")[1] not in _OF_THE_SETTINGS:
-                close = difflib.get_close_matches(key, ROBOT_PARAMETERS, n=1)
-                suggestion = f"; did you mean {close[0]}?" if close else ""
-                raise ConfigurationError(f"{key} is no parameter of a robot{suggestion}")
-
-    def is_given(self, key: str) -> bool:
-        value = self._given.get(key)
-        return (
-            value is not None
-            and not (isinstance(value, str | Sequence) and len(value) == 0)
-            and value != ROBOT_PARAMETERS[key][0]
-        )
-
-    def text(self, key: str) -> str:
-        value = self._given.get(key)
-        if value is None:
-            return ""
-        if not isinstance(value, str):
-            raise ConfigurationError(f"{key} is {value!r:.80}; it must be a text")
-        return value
-
-    def texts(self, key: str, default: object = ()) -> list[str]:
-        value = self._given.get(key)
-        if not self.is_given(key):
-            value = default
-        if isinstance(value, str):
-            return [value] if value else []
-        if not isinstance(value, Sequence) or not all(
-            isinstance(entry, str) and entry for entry in value
-        ):
-            raise ConfigurationError(f"{key} is {value!r:.80}; it must be a text, or a list of it")
-        return list(value)
-
-    def numbers(self, key: str) -> list[float]:
-        value = self._given.get(key)
-        if value is None:
-            return []
-        entries = list(value) if isinstance(value, Sequence) else [value]
-        numbers = [_number(entry) for entry in entries]
-        if isinstance(value, str) or None in numbers:
-            raise ConfigurationError(f"{key} is {value!r:.80}; it must be a list of finite numbers")
-        return [number for number in numbers if number is not None]
-
-    def positive(self, key: str, default: float) -> float:
-        value = self._given.get(key)
-        if value is None or (value == 0 and ROBOT_PARAMETERS.get(key, (1,))[0] == 0):
-            return default
-        number = _number(value)
-        if number is None or not number > 0.0:
-            raise ConfigurationError(f"{key} is {value!r:.80}; it must be a number above 0")
-        return number
-
-
-def _number(value: object) -> float | None:
-    """Return a finite number; None if it is anything else."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        return None
-    return float(value)
-
-
-def _flat(parameters: Mapping[str, object], prefix: str = "environment.") -> dict[str, object]:
-    """Return the parameters of the environment by their whole names."""
-    flat: dict[str, object] = {}
+def _given(parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the parameters that say more than their defaults, of their types."""
+    values: dict[str, Any] = {}
     for key, value in parameters.items():
-        name = f"{prefix}{key.removeprefix('environment.')}"
-        if key == "environment" and isinstance(value, Mapping):
-            flat.update(_flat(value))
-        elif isinstance(value, Mapping):
-            flat.update(_flat(value, f"{name}."))
-        else:
-            flat[name] = value
-    return flat
+        if key == _TIMEOUT:
+            continue
+        if key not in ROBOT_PARAMETERS:
+            hint = close_match(key, ROBOT_PARAMETERS)
+            raise ConfigurationError(f"{key} is no parameter of a robot{hint}")
+        default, _ = ROBOT_PARAMETERS[key]
+        if value in (None, "", [], default):
+            continue
+        if mismatch := find_mismatch(value, _type_of(key, default)):
+            raise ConfigurationError(f"{dotted((key, *mismatch.path))} {mismatch.in_words()}")
+        values[key] = _listed(value) if isinstance(default, list) else value
+    return values
+
+
+def _type_of(key: str, default: object) -> Any:
+    if isinstance(default, float):
+        return _Positive
+    if key.endswith((".scale", ".values")):
+        return _Numbers
+    return _Texts if isinstance(default, list) else str
+
+
+def _section(values: Mapping[str, Any], section: str) -> dict[str, Any]:
+    return {
+        key.removeprefix(section): value for key, value in values.items() if key.startswith(section)
+    }
+
+
+def _listed(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]

@@ -157,16 +157,14 @@ class Ros1Service:
 
     def _connected(self, until: float) -> socket.socket:
         place, where = self._found(until)
-        stream = socket.socket(socket.AF_INET6 if ":" in place[0] else socket.AF_INET)
+        try:
+            stream = socket.create_connection(place, _left(until))
+        except ConnectionRefusedError:
+            raise TransportError(
+                f"nobody listens at {host_and_port(*place)}, where {where}: it is dead"
+            ) from None
         try:
             stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            stream.settimeout(_left(until))
-            try:
-                stream.connect(place)
-            except ConnectionRefusedError:
-                raise TransportError(
-                    f"nobody listens at {host_and_port(*place)}, where {where}: it is dead"
-                ) from None
             self._take(stream)
             fields = {
                 "callerid": self._caller,
@@ -216,14 +214,8 @@ class Ros1Service:
         until = monotonic() + within_s
         assert parts.hostname is not None and parts.port is not None
         master = f"http://{host_and_port(_address(parts.hostname, until), parts.port)}/"
-        loop = asyncio.new_event_loop()
-        try:
-            asked = call(
-                master, "lookupService", self.name, within_s=_left(until), caller=self._caller
-            )
-            return str(loop.run_until_complete(asked))
-        finally:
-            loop.close()
+        asked = call(master, "lookupService", self.name, within_s=_left(until), caller=self._caller)
+        return str(asyncio.run(asked))
 
     def _disconnect(self) -> None:
         with self._lock:

@@ -1,20 +1,18 @@
 """The typed service in ROS 1: a node that stock clients in rospy and roscpp call.
 
-A loop on its own thread serves the clients and the master. Another thread decides, one request
-after another. Requests beyond a limit are refused as busy, so that the client can ask elsewhere.
+A loop on its own thread serves the clients and the master. Another thread decides.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import threading
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import TransportError
 from holdfast.ros.active_sensing import ActiveSensing, ErrorCode
+from holdfast.ros.decision_thread import DecisionThread
 from holdfast.ros.loop_thread import LoopThread
 from holdfast.ros.messages import MAX_BYTES, answer_message, encode_answer
 from holdfast.ros.ros1_client import service_type
@@ -26,27 +24,16 @@ __all__ = ["MAX_WAITING", "Ros1Server"]
 _START_S = 5.0
 
 MAX_WAITING = 64
-"""Most waiting requests; further ones are refused as busy."""
+"""Requests that may wait besides the one that is being answered."""
 
 
 class Ros1Server:
-    """Offers a configuration's typed service in ROS 1.
+    """Offers a configuration's typed service in ROS 1, by a node of the same name.
 
-    Parameters
-    ----------
-    name : str
-        Of the service, and of its node.
-    ros_environment : RosEnvironment or None
-        None reads ROS's variables.
-    on_shutdown : callable or None
-        Gets the reason when ``rosnode kill``, or the master for a name conflict, ends this node.
-    on_event : callable or None
-        Gets changes of the registration; see :class:`~holdfast.transport.ros1_node.RosNode`.
+    ``on_shutdown`` gets the reason when ``rosnode kill``, or the master for a name conflict, ends
+    this node; ``on_event`` is that of a :class:`~holdfast.transport.ros1_node.RosNode`.
 
-    Raises
-    ------
-    TransportError
-        If the name is none.
+    Raises TransportError if the name is none.
     """
 
     def __init__(
@@ -59,6 +46,7 @@ class Ros1Server:
         on_event: Callable[..., None] | None = None,
     ) -> None:
         self._answers = ActiveSensing(configuration)
+        self._decisions = DecisionThread(MAX_WAITING)
         self._node = RosNode(
             name,
             ros_environment or RosEnvironment.of(),
@@ -67,10 +55,6 @@ class Ros1Server:
             max_message_bytes=MAX_BYTES,
         )
         self._node.offer(name, service_type(), self._answer)
-        self._lock = threading.Lock()
-        self._waiting = 0
-        self._takes_more = True
-        self._decisions = ThreadPoolExecutor(1, "holdfast-ros1-decisions")
         self._loop: LoopThread | None = None
 
     @property
@@ -81,19 +65,16 @@ class Ros1Server:
     @property
     def is_busy(self) -> bool:
         """Whether answers are owed."""
-        return self._waiting > 0
+        return self._decisions.is_busy
 
     def take_no_more(self) -> None:
         """Answer the waiting requests, and refuse later ones as busy."""
-        self._takes_more = False
+        self._decisions.take_no_more()
 
     def start(self) -> bool:
         """Offer the service; return whether the master knows it already.
 
-        Raises
-        ------
-        TransportError
-            If it cannot listen.
+        Raises TransportError if it cannot listen.
         """
         self._loop = LoopThread("holdfast-ros1")
         try:
@@ -108,22 +89,12 @@ class Ros1Server:
         if loop is not None:
             with contextlib.suppress(TransportError):
                 loop.run(self._node.close(timeout_s / 2), timeout_s)
-            self._decisions.shutdown(wait=False, cancel_futures=True)
+            self._decisions.close(0.0)
             loop.close(timeout_s)
 
     async def _answer(self, request: bytes) -> bytes:
-        busy = "" if self._takes_more else "this service ends"
-        if self._waiting >= MAX_WAITING:
-            busy = f"{self._waiting} requests wait, and {MAX_WAITING} are allowed"
-        if busy:
-            return encode_answer(self._answers.refusal(ErrorCode.BUSY, busy), "ros1")
-        with self._lock:
-            self._waiting += 1
-        future = self._decisions.submit(answer_message, self._answers, request, "ros1")
-        # It counts until it is done, even if the client has left long before.
-        future.add_done_callback(self._decided)
+        future = self._decisions.submit(
+            lambda: answer_message(self._answers, request, "ros1"),
+            lambda reason: encode_answer(self._answers.refusal(ErrorCode.BUSY, reason), "ros1"),
+        )
         return await asyncio.wrap_future(future)
-
-    def _decided(self, _: Future[bytes]) -> None:
-        with self._lock:
-            self._waiting -= 1

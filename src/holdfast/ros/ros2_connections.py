@@ -15,7 +15,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from holdfast.ros.robot_interface import RobotCall
 
-__all__ = ["CallClients", "Connections", "Instant", "TopicBuffer", "connections_of"]
+__all__ = ["CallClients", "Connections", "Instant", "TopicBuffer"]
 
 _MESSAGES_KEPT = 10
 
@@ -76,21 +76,29 @@ class CallClients(NamedTuple):
 class Connections:
     """A node's clients and subscriptions, kept from trial to trial to save discovery.
 
-    Attributes
-    ----------
-    environments : WeakSet
-        Those that use them; guarded by ``lock``.
+    An executor must spin the node in other threads than those that use this.
     """
 
     def __init__(self, node: Node) -> None:
-        # Weak: connections must not keep their node alive.
-        self._node = weakref.ref(node)
+        self.node = node
         # Answers arrive whatever else the node does in its callbacks.
         self._group = ReentrantCallbackGroup()
         self._clients: dict[tuple[str, str], CallClients] = {}
         self._topics: dict[tuple[str, str], TopicBuffer] = {}
-        self.lock = threading.Lock()
-        self.environments: weakref.WeakSet[Any] = weakref.WeakSet()
+        self._lock = threading.Lock()
+        self._users: weakref.WeakSet[Any] = weakref.WeakSet()
+
+    def add_user(self, environment: Any) -> None:
+        """Have :meth:`cancel` reach an environment, as long as that exists."""
+        with self._lock:
+            self._users.add(environment)
+
+    def cancel(self, why: str = "cancelled") -> None:
+        """Cancel all existing environments, from any thread; later ones are not affected."""
+        with self._lock:
+            environments = list(self._users)
+        for environment in environments:
+            environment.cancel(why)
 
     def clients(self, call: RobotCall) -> CallClients:
         """Return the clients of a call."""
@@ -123,29 +131,11 @@ class Connections:
                 if latched
                 else QoSProfile(depth=_MESSAGES_KEPT, reliability=ReliabilityPolicy.BEST_EFFORT)
             )
-            self._open().create_subscription(
+            self.node.create_subscription(
                 message_type, name, topic.take, quality, callback_group=self._group
             )
             self._topics[key] = topic
         return self._topics[key]
 
     def _client(self, service_type: Any, name: str) -> Any:
-        return self._open().create_client(service_type, name, callback_group=self._group)
-
-    def _open(self) -> Node:
-        node = self._node()
-        assert node is not None
-        return node
-
-
-_CONNECTIONS: weakref.WeakKeyDictionary[Node, Connections] = weakref.WeakKeyDictionary()
-_CONNECTIONS_LOCK = threading.Lock()
-
-
-def connections_of(node: Node) -> Connections:
-    """Return the connections of a node, which are made with the first call."""
-    with _CONNECTIONS_LOCK:
-        connections = _CONNECTIONS.get(node)
-        if connections is None:
-            connections = _CONNECTIONS[node] = Connections(node)
-        return connections
+        return self.node.create_client(service_type, name, callback_group=self._group)

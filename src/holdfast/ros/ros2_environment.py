@@ -23,7 +23,6 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NoReturn
 
 import numpy as np
-from rclpy.node import Node
 
 from holdfast.arrays import FloatArray, in_brief
 from holdfast.errors import EnvironmentFailedError
@@ -33,12 +32,11 @@ from holdfast.robot.environment import ObservationSizes
 from holdfast.ros.deadlines import Absence, Deadline
 from holdfast.ros.field_paths import read_field, read_numbers, write
 from holdfast.ros.robot_interface import RobotCall, RobotInterface, observation_path
-from holdfast.ros.ros2_connections import CallClients, Instant, connections_of
+from holdfast.ros.ros2_connections import CallClients, Connections, Instant
 
 __all__ = [
     "CountingRos2Environment",
     "Ros2Environment",
-    "cancel_ros_environments",
     "make_ros_environment",
 ]
 
@@ -60,7 +58,7 @@ _STATUS_S = 1.0
 
 
 def make_ros_environment(
-    node: Node,
+    connections: Connections,
     parameters: Mapping[str, object],
     problem: Problem,
     seed: int,
@@ -69,57 +67,33 @@ def make_ros_environment(
 ) -> Ros2Environment:
     """Make the environment of a trial: a robot that is reached through ROS.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        An executor must spin it in other threads.
-    parameters : mapping of str to object
-        See :data:`~holdfast.ros.robot_interface.ROBOT_PARAMETERS`.
-    seed : int
-        Not used: the robot is real.
-    trial : int
-        Sent where a parameter names a field for it.
-    resumed : bool, optional
-        Whether the robot's process has died during this trial. If not, the robot is brought to its
-        start (``environment.reset``).
+    The parameters are :data:`~holdfast.ros.robot_interface.ROBOT_PARAMETERS`. The robot is real, so
+    ``seed`` is not used. It is brought to its start (``environment.reset``) unless the trial is
+    ``resumed``, because the robot's process has died in the midst of it.
 
-    Returns
-    -------
-    Ros2Environment
-        A :class:`CountingRos2Environment` if the robot reports its count.
-
-    Raises
-    ------
-    ConfigurationError
-        If a parameter cannot be used.
-    EnvironmentFailedError
-        If a service is missing for ``environment.discovery_timeout_ms``, or the reset fails.
+    Raises ConfigurationError if a parameter cannot be used, and EnvironmentFailedError if a service
+    is missing for ``environment.discovery_timeout_ms``, or the reset fails.
     """
     del seed
     interface = RobotInterface(parameters, problem.sensing_actions, problem.action_size)
     made = CountingRos2Environment if "steps" in interface.calls else Ros2Environment
-    return made(node, interface, problem, trial, resumed=resumed)
-
-
-def cancel_ros_environments(node: Node, why: str = "cancelled") -> None:
-    """Cancel all existing environments of a node, from any thread.
-
-    See :meth:`Ros2Environment.cancel`. Environments made later are not affected.
-    """
-    connections = connections_of(node)
-    with connections.lock:
-        environments = list(connections.environments)
-    for environment in environments:
-        environment.cancel(why)
+    return made(connections, interface, problem, trial, resumed=resumed)
 
 
 class Ros2Environment:
     """A robot that is reached through ROS."""
 
     def __init__(
-        self, node: Node, interface: RobotInterface, problem: Problem, trial: int, *, resumed: bool
+        self,
+        connections: Connections,
+        interface: RobotInterface,
+        problem: Problem,
+        trial: int,
+        *,
+        resumed: bool,
     ) -> None:
-        self._node = node
+        self._connections = connections
+        self._node = connections.node
         self._interface = interface
         self._problem = problem
         self._trial = trial
@@ -128,11 +102,9 @@ class Ros2Environment:
         # Guards the waits alone: an answer, or a cancellation, notifies.
         self._news = threading.Condition()
         self._cancelled: str | None = None
-        self._connections = connections_of(node)
-        with self._connections.lock:
-            self._connections.environments.add(self)
+        connections.add_user(self)
         self._clients = {
-            role: self._connections.clients(call)
+            role: connections.clients(call)
             for role, call in interface.calls.items()
             if call.kind != "msg"
         }
@@ -140,13 +112,11 @@ class Ros2Environment:
         self._done_topic = (
             None
             if done is None or done.kind != "msg"
-            else self._connections.topic(done.name, done.type, latched=True)
+            else connections.topic(done.name, done.type, latched=True)
         )
         topic = interface.observation
         self._observations = (
-            None
-            if topic is None
-            else self._connections.topic(topic.name, topic.type, latched=False)
+            None if topic is None else connections.topic(topic.name, topic.type, latched=False)
         )
         self._find_servers()
         reset = interface.calls.get("reset")
@@ -163,10 +133,8 @@ class Ros2Environment:
     def perform_sensing(self, sensing_action: int) -> FloatArray:
         """Perform a sensing action and return the observation, shape ``(observation_size,)``.
 
-        Raises
-        ------
-        EnvironmentFailedError
-            If the robot does not answer in time, refuses, or returns no valid observation.
+        Raises EnvironmentFailedError if the robot does not answer in time, refuses, or returns no
+        valid observation.
         """
         call = self._interface.calls.get("sense")
         topic = self._interface.observation
@@ -218,10 +186,8 @@ class Ros2Environment:
     def perform(self, task_action: FloatArray) -> float | None:
         """Perform a task action and return its reward, or None where there is none.
 
-        Raises
-        ------
-        EnvironmentFailedError
-            If the robot rejects it, fails, or does not answer in time. It may have moved.
+        Raises EnvironmentFailedError if the robot rejects it, fails, or does not answer in time. It
+        may have moved.
         """
         call = self._interface.calls["act"]
         request = self._request(call)
@@ -286,10 +252,7 @@ class Ros2Environment:
     def is_done(self) -> Done:
         """Return whether the task is done; always False if the robot does not report it.
 
-        Raises
-        ------
-        EnvironmentFailedError
-            If the robot does not answer in time.
+        Raises EnvironmentFailedError if the robot does not answer in time.
         """
         call = self._interface.calls.get("done")
         if call is None:
@@ -325,8 +288,6 @@ class Ros2Environment:
     def close(self) -> None:
         """Leave the robot where it is."""
         self.cancel("closed")
-        with self._connections.lock:
-            self._connections.environments.discard(self)
 
     def _count(self) -> int:
         call = self._interface.calls["steps"]
@@ -566,10 +527,7 @@ class CountingRos2Environment(Ros2Environment):
     def steps_performed(self) -> int:
         """Return how many task actions have been performed in this trial.
 
-        Raises
-        ------
-        EnvironmentFailedError
-            If the robot does not answer in time.
+        Raises EnvironmentFailedError if the robot does not answer in time.
         """
         return self._count()
 

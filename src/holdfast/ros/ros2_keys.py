@@ -45,14 +45,8 @@ _ATTACHMENT = struct.Struct("<qqB16s")
 class Attachment(NamedTuple):
     """What goes with a request, and comes back with its answer.
 
-    Attributes
-    ----------
-    sequence_number : int
-        The client's, from 0 up.
-    source_timestamp : int
-        When it was sent, in nanoseconds since 1970.
-    gid : bytes
-        The client's identity, 16 bytes.
+    The client has a number for each request, from 0 up, and an identity of 16 bytes. The time is in
+    nanoseconds since 1970.
     """
 
     sequence_number: int
@@ -67,10 +61,7 @@ class Attachment(NamedTuple):
     def decode(cls, data: bytes) -> Attachment:
         """Read one.
 
-        Raises
-        ------
-        InvalidValueError
-            If the bytes are none.
+        Raises InvalidValueError if the bytes are none.
         """
         if len(data) == _ATTACHMENT.size:
             number, timestamp, size, gid = _ATTACHMENT.unpack(data)
@@ -85,10 +76,7 @@ class Attachment(NamedTuple):
 def check_domain(domain: int, key: str = "domain") -> int:
     """Return a domain of ROS 2.
 
-    Raises
-    ------
-    InvalidValueError
-        If it is none; the message names ``key``.
+    Raises InvalidValueError if it is none; the message names ``key``.
     """
     if not 0 <= domain <= MAX_DOMAIN:
         raise InvalidValueError(f"{key} {domain}: ROS 2's domains are from 0 to {MAX_DOMAIN}")
@@ -98,10 +86,7 @@ def check_domain(domain: int, key: str = "domain") -> int:
 def check_service_name(name: str, key: str = "name") -> str:
     """Return a service's name without the slash that it may begin with.
 
-    Raises
-    ------
-    InvalidValueError
-        If ROS 2 would not allow it; the message names ``key``.
+    Raises InvalidValueError if ROS 2 would not allow it; the message names ``key``.
     """
     if not _NAME.fullmatch(name) or "__" in name or len(name) > _MAX_NAME:
         raise InvalidValueError(

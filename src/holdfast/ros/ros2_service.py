@@ -1,22 +1,21 @@
 """The typed service on rmw_zenoh's wire, without ROS.
 
-Zenoh's threads only queue requests. One thread answers them; a request that finds the queue full is
-refused as busy, so that the client can ask another service.
+Zenoh's threads only queue requests; another thread answers them.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import queue
-import threading
 import traceback
+from collections.abc import Callable
 from time import time_ns
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from holdfast.errors import InvalidValueError
 from holdfast.ros import messages
 from holdfast.ros.active_sensing import ActiveSensing, ErrorCode
+from holdfast.ros.decision_thread import DecisionThread
 from holdfast.ros.ros2_keys import (
     NO_HASH,
     Attachment,
@@ -45,23 +44,12 @@ _MAX_WAITING = 16
 class Ros2Server:
     """Offers a typed service to nodes of ROS 2.
 
-    Parameters
-    ----------
-    service : ActiveSensing
-        It is asked on one thread.
-    name : str
-        The service's name in ROS 2.
-    endpoint : str
-        Of the router, or where to listen, as in ``tcp/localhost:7447``.
-    on_event : callable or None
-        Gets events, from any thread: ``ros2_waiting`` (``reason``) while the
-        router is not there, then ``ros2_connected`` (``endpoint``); ``ros2_refused``
-        (``reason``) of a request that is none; ``ros2_failed`` (``reason``, ``where``) of a defect.
+    ``endpoint`` is the router's, or where to listen, as in ``tcp/localhost:7447``. ``on_event`` is
+    called from any thread: with ``ros2_waiting`` (``reason``) while the router is not there, then
+    ``ros2_connected`` (``endpoint``); with ``ros2_refused`` (``reason``) of a request that is none,
+    and ``ros2_failed`` (``reason``, ``where``) of a defect.
 
-    Raises
-    ------
-    InvalidValueError
-        If a parameter cannot be used, or Zenoh or rosbags is not installed.
+    Raises InvalidValueError if a parameter cannot be used, or Zenoh or rosbags is not installed.
     """
 
     def __init__(
@@ -78,52 +66,32 @@ class Ros2Server:
         self._name = check_service_name(name)
         self._domain = check_domain(domain)
         self._on_event = on_event or ignore_event
-        self._busy_answer = messages.encode_answer(
-            service.refusal(ErrorCode.BUSY, f"{_MAX_WAITING} requests are waiting already")
-        )
-        self._requests: queue.SimpleQueue[_Query | None] = queue.SimpleQueue()
-        self._takes_requests = True
-        self._num_open = 0
-        self._lock = threading.Lock()
+        self._decisions = DecisionThread(_MAX_WAITING)
         self._zenoh_error = zenoh_module().ZError
         self._tokens: list[zenoh.LivelinessToken] = []
         self._session = ZenohSession(
             endpoint, listens=listens, on_open=self._declare, on_event=self._on_event
         )
-        self._worker = threading.Thread(target=self._work, name="ros2-service", daemon=True)
 
     def start(self) -> None:
         """Offer the service; with a router, as soon as that is there.
 
-        Raises
-        ------
-        TransportError
-            If nothing can listen at the endpoint.
+        Raises TransportError if nothing can listen at the endpoint.
         """
         self._session.open()
-        self._worker.start()
 
     @property
     def is_busy(self) -> bool:
         """Whether answers are owed."""
-        return self._num_open > 0
+        return self._decisions.is_busy
 
     def take_no_more(self) -> None:
         """Answer the waiting requests, and refuse later ones as busy."""
-        self._takes_requests = False
+        self._decisions.take_no_more()
 
     def close(self, timeout_s: float) -> None:
         """Stop; wait so long at most for a request that is being answered."""
-        self._takes_requests = False
-        if self._worker.ident is not None:
-            with contextlib.suppress(queue.Empty):
-                while (waiting := self._requests.get_nowait()) is not None:
-                    # Without an answer, which ends it at the other side.
-                    waiting.query.drop()
-                    with self._lock:
-                        self._num_open -= 1
-            self._requests.put(None)
-            self._worker.join(timeout_s)
+        self._decisions.close(timeout_s)
         self._session.close()
 
     def _declare(self, session: zenoh.Session) -> None:
@@ -146,53 +114,38 @@ class Ros2Server:
             query.reply_err(str(error))
             query.drop()
             return
-        waiting = _Query(query, key, attachment)
-        with self._lock:
-            takes_it = self._takes_requests and self._num_open <= _MAX_WAITING
-            self._num_open += takes_it
-        if takes_it:
-            self._requests.put(waiting)
-        else:
-            self._reply(waiting, self._busy_answer)
-
-    def _work(self) -> None:
-        while (waiting := self._requests.get()) is not None:
-            try:
-                self._reply(waiting, self._answer(waiting.query))
-            except Exception as error:  # noqa: BLE001 - else no later request would be answered
-                reason = f"{type(error).__name__}: {error}"
-                where = traceback.extract_tb(error.__traceback__)[-1]
-                self._on_event("ros2_failed", reason=reason, where=f"{where.name}:{where.lineno}")
-                with contextlib.suppress(self._zenoh_error):
-                    waiting.query.reply_err(f"a defect of the service: {reason}")
-                    waiting.query.drop()
-            finally:
-                with self._lock:
-                    self._num_open -= 1
-            # Nothing of it is held while the thread waits for the next.
-            del waiting
-
-    def _answer(self, query: zenoh.Query) -> bytes:
-        payload = query.payload
-        return messages.answer_message(
-            self._service,
-            b"" if payload is None else payload.to_bytes(),
-            on_refused=lambda reason: self._on_event("ros2_refused", reason=reason),
+        send = functools.partial(self._send, query, key, attachment)
+        future = self._decisions.submit(
+            functools.partial(self._answer, query, send),
+            lambda reason: send(
+                messages.encode_answer(self._service.refusal(ErrorCode.BUSY, reason))
+            ),
         )
+        # Without an answer, which ends it at the other side.
+        future.add_done_callback(lambda answered: query.drop() if answered.cancelled() else None)
 
-    def _reply(self, waiting: _Query, answer: bytes) -> None:
-        query, key, asked = waiting
+    def _answer(self, query: zenoh.Query, send: Callable[[bytes], None]) -> None:
+        try:
+            payload = query.payload
+            answer = messages.answer_message(
+                self._service,
+                b"" if payload is None else payload.to_bytes(),
+                on_refused=lambda reason: self._on_event("ros2_refused", reason=reason),
+            )
+        except Exception as error:  # noqa: BLE001 - else there would be no answer
+            reason = f"{type(error).__name__}: {error}"
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            self._on_event("ros2_failed", reason=reason, where=f"{where.name}:{where.lineno}")
+            with contextlib.suppress(self._zenoh_error):
+                query.reply_err(f"a defect of the service: {reason}")
+                query.drop()
+        else:
+            send(answer)
+
+    def _send(self, query: zenoh.Query, key: str, asked: Attachment, answer: bytes) -> None:
         attachment = asked._replace(source_timestamp=time_ns())
         try:
             query.reply(key, answer, encoding="application/cdr", attachment=attachment.encode())
             query.drop()
         except self._zenoh_error as error:
             self._on_event("ros2_refused", reason=f"the answer cannot be sent: {error}")
-
-
-class _Query(NamedTuple):
-    """A request that waits."""
-
-    query: zenoh.Query
-    key: str
-    attachment: Attachment

@@ -64,10 +64,7 @@ class ZenohSession:
     def open(self) -> None:
         """Listen, or begin to connect.
 
-        Raises
-        ------
-        TransportError
-            If the endpoint cannot be listened at.
+        Raises TransportError if the endpoint cannot be listened at.
         """
         if self._listens:
             self._open()
@@ -78,10 +75,7 @@ class ZenohSession:
     def get(self, until: float) -> zenoh.Session:
         """Return the session; wait for it until this time of the monotonic clock.
 
-        Raises
-        ------
-        TransportError
-            If the endpoint does not answer, or this is closed.
+        Raises TransportError if the endpoint does not answer, or this is closed.
         """
         with self._changed:
             while self._session is None:
@@ -195,10 +189,7 @@ def _configuration(endpoint: str, *, listens: bool) -> zenoh.Config:
 def zenoh_module() -> ModuleType:
     """Return the module zenoh, which is imported only if it is needed.
 
-    Raises
-    ------
-    InvalidValueError
-        If it is not installed; the message says what mends it.
+    Raises InvalidValueError if it is not installed; the message says what mends it.
     """
     try:
         import zenoh

@@ -42,16 +42,10 @@ _MAX_RESPONSE_BYTES: Final = 256 * 1024 * 1024
 
 
 class HttpHead(NamedTuple):
-    """The head of an HTTP request or response.
+    """The head of an HTTP message.
 
-    Attributes
-    ----------
-    line : str
-        The first one.
-    size : int
-        Of the content, in bytes; -1 if not given.
-    ends : bool
-        Whether the connection ends after this message.
+    It is the first line, the content's size in bytes (-1: not given), and whether the connection
+    ends after the message.
     """
 
     line: str
@@ -73,12 +67,8 @@ class HttpHead(NamedTuple):
 async def message(reader: asyncio.StreamReader, max_bytes: int, begun: bytes = b"") -> bytes:
     """Read a message of TCPROS after its length; ``begun`` are bytes of the length read before.
 
-    Raises
-    ------
-    TransportError
-        If it is larger than allowed; the message continues a sentence about the sender.
-    EOFError, OSError
-        If none arrives.
+    Raises TransportError if it is larger than allowed; the message continues a sentence about the
+    sender. Raises EOFError, OSError if none arrives.
     """
     size = int.from_bytes(begun + await reader.readexactly(4 - len(begun)), "little")
     if size > max_bytes:
@@ -116,14 +106,8 @@ class Connection:
     async def call(self, method: str, *arguments: object, within_s: float) -> Any:
         """Call a method with the caller's name and these arguments; return its value.
 
-        Raises
-        ------
-        GoneError
-            If nobody listens there.
-        SilentError
-            If no response came in time.
-        CallError
-            If the response reports an error or is malformed.
+        Raises GoneError if nobody listens there. Raises SilentError if no response came in time.
+        Raises CallError if the response reports an error or is malformed.
         """
         return _value_of(await self._request(method, (self._caller, *arguments), within_s), method)
 

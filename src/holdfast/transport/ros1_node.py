@@ -110,16 +110,9 @@ class Topic:
 class RosNode:
     """A node; all methods are called on the loop's thread.
 
-    Parameters
-    ----------
-    on_shutdown : callable or None
-        Called with the reason when this node has to end: on request, or because another node has
-        taken its name.
-    on_event : callable or None
-        Called with ``ros_master``, ``status`` (``registered``, ``unreachable``) and ``reason``; and
-        with ``ros_request_failed``, ``service`` and ``reason``.
-    max_message_bytes : int
-        A caller that sends a larger request loses the connection.
+    ``on_shutdown`` gets the reason when this node has to end: on request, or because another node
+    has taken its name. ``on_event`` is called with ``ros_master``, ``status`` (``registered``,
+    ``unreachable``) and ``reason``; and with ``ros_request_failed``, ``service`` and ``reason``.
     """
 
     def __init__(
@@ -167,10 +160,7 @@ class RosNode:
 
         After ``within_s`` without an answer, registration goes on in the background.
 
-        Raises
-        ------
-        TransportError
-            If it cannot listen.
+        Raises TransportError if it cannot listen.
         """
         environment = self._environment
         try:

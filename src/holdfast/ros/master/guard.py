@@ -23,8 +23,9 @@ import os
 import signal
 import socket
 import uuid
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
 from time import monotonic
+from typing import Any
 from urllib.parse import urlsplit
 
 from holdfast.errors import CallError, GoneError, GuardError, SilentError
@@ -71,7 +72,6 @@ _SECOND_LOOK_S = 1.0
 _KEPT_S = 5.0
 """Longest time that calls wait for a master; after it they are refused."""
 
-_LOCKED_EVERY_S = 1.0
 _BACKLOG = 1024
 
 
@@ -110,29 +110,28 @@ class MasterGuard:
             If nothing can be guarded.
         """
         directory = self._settings.directory or own_directory()
+        if not os.access(directory, os.W_OK | os.X_OK):
+            raise GuardError(f"{directory}: is no directory that can be written to")
         port = self._settings.address.port
         self._journal = directory / f"master-{port}.journal"
-        with GuardLock(directory / f"master-{port}.lock", port) as lock:
-            helpers = [asyncio.create_task(_keep_lock(lock))]
+        with GuardLock(port):
             try:
                 self._new_socket(0.0)
                 # Missing software is reported now, not when the master dies.
                 await self._next_master().warm()
                 how = await self._begin()
                 ready(how)
-                if self._settings.rosout:
-                    helpers.append(asyncio.create_task(self._help(self._rosout.keep())))
+                helpers = [self._rosout.keep()] if self._settings.rosout else []
                 if how == "started":
-                    helpers.append(asyncio.create_task(self._help(set_versions(self._uri))))
-                await self._watch()
+                    helpers.append(set_versions(self._uri))
+                with _running(*map(self._help, helpers)):
+                    await self._watch()
             except Exception:
                 # They continue without a guard, and the next one finds them.
                 self._own = None
                 self._rosout.release()
                 raise
             finally:
-                for helper in helpers:
-                    helper.cancel()
                 await self._close()
 
     async def _help(self, work: Coroutine[None, None, None]) -> None:
@@ -144,10 +143,10 @@ class MasterGuard:
 
     async def _begin(self) -> str:
         """Find a master, or start one."""
-        connection = Connection(self._uri)
         try:
-            await connection.call("getPid", within_s=self._settings.silent_s)
-            await self._recognise(connection)
+            with contextlib.closing(Connection(self._uri)) as connection:
+                await connection.call("getPid", within_s=self._settings.silent_s)
+                await self._recognise(connection)
         except GoneError:
             pass
         except SilentError as error:
@@ -159,8 +158,6 @@ class MasterGuard:
             if self._unwritten is not None:
                 raise GuardError(f"{self._unwritten}; name another --directory")
             return "found"
-        finally:
-            connection.close()
         known = self._known()
         nodes, services = await ask_everyone(known)
         others = {uri for node, uri in known.nodes().items() if node != ROSOUT}
@@ -192,11 +189,9 @@ class MasterGuard:
 
     async def _watch_own(self, master: MasterProcess) -> str:
         """Wait for the end of the master that was started here, and return the reason."""
-        loading = asyncio.create_task(self._load_spare_later())
-        looking = asyncio.create_task(self._help(self._look_again()))
-        ended = asyncio.create_task(master.process.wait())
-        silent = asyncio.create_task(self._silent())
-        try:
+        looking = self._help(self._look_again())
+        watching = (master.process.wait(), self._silent())
+        with _running(self._load_spare_later(), looking), _running(*watching) as (ended, silent):
             await asyncio.wait((ended, silent), return_when=asyncio.FIRST_COMPLETED)
             if ended.done():
                 reason = how_it_ended(ended.result())
@@ -205,46 +200,37 @@ class MasterGuard:
                 await master.end(at_once=True)
             self._own = None
             return reason
-        finally:
-            for task in (loading, looking, ended, silent):
-                task.cancel()
 
     async def _watch_other(self) -> str:
         """Wait for the end of a foreign master, and return the reason."""
-        watching = [asyncio.create_task(self._closed()), asyncio.create_task(self._silent())]
-        following = asyncio.create_task(self._follow())
-        told = False
-        try:
-            while True:
-                closed, silent = watching
-                unfinished = {closed, silent, *(() if following.done() else (following,))}
-                await asyncio.wait(unfinished, return_when=asyncio.FIRST_COMPLETED)
-                if closed.done():
-                    self._forget_other()
-                    return closed.result()
+        with _running(self._closed(), self._kill_silent(), self._follow()) as tasks:
+            closed, killed, following = tasks
+            while not closed.done():
+                await asyncio.wait(
+                    [task for task in tasks if not task.done()],
+                    return_when=asyncio.FIRST_COMPLETED,
+                )
                 if following.done():
                     following.result()
-                if not silent.done():
-                    continue
-                # Stopped, or too busy to be of use.
-                if self._signal_other(signal.SIGKILL):
-                    await closed
-                    self._forget_other()
-                    return silent.result()
-                if not told:
-                    self._events.event(
-                        "master_hangs",
-                        reason=f"{silent.result()}; it is none of this user's processes on this "
-                        "machine, so it is left alone",
-                    )
-                    told = True
-                watching[1] = asyncio.create_task(self._silent())
-        finally:
-            for task in (*watching, following):
-                task.cancel()
+            self._other_pid, self._is_inherited = None, False
+            reason: str = (killed if killed.done() else closed).result()
+            return reason
 
-    def _forget_other(self) -> None:
-        self._other_pid, self._is_inherited = None, False
+    async def _kill_silent(self) -> str:
+        """Kill a foreign master that is silent for too long, and return the reason."""
+        told = False
+        while True:
+            # Stopped, or too busy to be of use.
+            reason = await self._silent()
+            if self._signal_other(signal.SIGKILL):
+                return reason
+            if not told:
+                self._events.event(
+                    "master_hangs",
+                    reason=f"{reason}; it is none of this user's processes on this machine, so it "
+                    "is left alone",
+                )
+                told = True
 
     def _signal_other(self, number: signal.Signals) -> bool:
         """Signal a foreign master, if it is a process of this user on this machine."""
@@ -283,10 +269,9 @@ class MasterGuard:
 
     async def _silent(self) -> str:
         """Wait until the master has been silent for too long."""
-        connection = Connection(self._uri)
         probe_s = min(_PROBE_S, self._settings.silent_s)
         failed = 0.0
-        try:
+        with contextlib.closing(Connection(self._uri)) as connection:
             # Time actually waited counts, not the clock: the guard itself may have been stopped.
             while failed < self._settings.silent_s:
                 self._hold_journal()
@@ -300,14 +285,11 @@ class MasterGuard:
                 else:
                     failed = 0.0
                 await asyncio.sleep(_PROBE_EVERY_S if not failed else 0.01)
-            return f"it did not answer for {self._settings.silent_s:g} s"
-        finally:
-            connection.close()
+        return f"it did not answer for {self._settings.silent_s:g} s"
 
     async def _follow(self) -> None:
         """Journal the state of a master that keeps no journal itself."""
-        connection = Connection(self._uri)
-        try:
+        with contextlib.closing(Connection(self._uri)) as connection:
             while self._other_pid is None:
                 with contextlib.suppress(CallError):
                     await self._recognise(connection)
@@ -318,8 +300,6 @@ class MasterGuard:
                     await self._write_down(connection)
                 took = monotonic() - asked_at
                 await asyncio.sleep(max(_POLL_EVERY_S, took / _POLL_SHARE))
-        finally:
-            connection.close()
 
     async def _recognise(self, connection: Connection) -> None:
         """Identify a foreign master."""
@@ -397,30 +377,27 @@ class MasterGuard:
         """Return the last master's state."""
         if self._followed is not None:
             return self._followed
-        known, wrong = None, None
+        wrong: Exception = FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
         try:
             known = read_journal(self._journal)
+            if known is not None or self._held < 0:
+                return known or MasterState()
         except (OSError, ValueError) as error:
-            wrong = error
-        if known is None and self._held >= 0:
-            with contextlib.suppress(OSError, ValueError):
-                known = read_journal(self._held)
-            if known is not None and wrong is None:
-                wrong = FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
-        if wrong is not None:
-            reason = f"{self._journal}: {_words_of(wrong)}"
-            if known is not None:
-                reason += "; it was still open here, and nothing is lost"
-            else:
-                # The next master writes its own journal at this path.
-                aside = self._journal.with_name(f"{self._journal.name}.unread")
-                try:
-                    self._journal.replace(aside)
-                    reason += f"; it is kept as {aside}"
-                except OSError as error:
-                    reason += f"; it cannot be put aside: {_words_of(error)}"
-                reason += ", and the new master knows nothing of the last one"
-            self._events.event("journal_failed", reason=reason)
+            known, wrong = None, error
+        reason = f"{self._journal}: {_words_of(wrong)}"
+        try:
+            known = read_journal(self._held)
+            reason += "; it was still open here, and nothing is lost"
+        except (OSError, ValueError):
+            # The next master writes its own journal at this path.
+            aside = self._journal.with_name(f"{self._journal.name}.unread")
+            try:
+                self._journal.replace(aside)
+                reason += f"; it is kept as {aside}"
+            except OSError as error:
+                reason += f"; it cannot be put aside: {_words_of(error)}"
+            reason += ", and the new master knows nothing of the last one"
+        self._events.event("journal_failed", reason=reason)
         return known or MasterState()
 
     # -- replacing ---------------------------------------------------------------------------------
@@ -453,13 +430,7 @@ class MasterGuard:
         master = self._next_master()
         self._spare = None
         try:
-            await master.warm()
-            try:
-                master.hand_over(state)
-            except (OSError, TypeError, ValueError) as error:
-                # Then it reads the journal, which lists dead nodes, too.
-                self._events.event("note", reason=f"the new master's state: {_words_of(error)}")
-            await master.serve()
+            await master.serve(state)
         except BaseException:
             await master.end(at_once=True)
             raise
@@ -503,11 +474,8 @@ class MasterGuard:
         before = self._doubtful
         found = reconcile(before, *await ask_everyone(before))
         if calls := unregistrations(before, found.state):
-            connection = Connection(self._uri)
-            try:
+            with contextlib.closing(Connection(self._uri)) as connection:
                 await connection.calls(calls, within_s=_PROBE_S)
-            finally:
-                connection.close()
             self._events.event(
                 "nodes_gone",
                 gone=list(found.gone) or None,
@@ -562,10 +530,15 @@ class MasterGuard:
             self._listening.close()
 
 
-async def _keep_lock(lock: GuardLock) -> None:
-    while True:
-        lock.keep()
-        await asyncio.sleep(_LOCKED_EVERY_S)
+@contextlib.contextmanager
+def _running(*works: Coroutine[Any, Any, Any]) -> Iterator[list[asyncio.Task[Any]]]:
+    """Do works until the end of the block."""
+    tasks = [asyncio.create_task(work) for work in works]
+    try:
+        yield tasks
+    finally:
+        for task in tasks:
+            task.cancel()
 
 
 def _words_of(error: Exception) -> str:

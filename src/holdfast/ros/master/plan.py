@@ -63,16 +63,9 @@ NodeAnswer: TypeAlias = NodeReport | Literal["gone"] | None
 class Reconciled(NamedTuple):
     """A new master's state.
 
-    Attributes
-    ----------
-    gone : tuple of str
-        Nodes that have ended.
-    silent : tuple of str
-        Nodes that did not answer, which are kept.
-    lost_services : tuple of str
-        Services that no longer exist.
-    doubtful : MasterState
-        The part of the state that no answer has confirmed.
+    ``gone`` are the nodes that have ended, and ``lost_services`` the services that no longer exist.
+    The ``silent`` nodes did not answer and are kept. ``doubtful`` is the part of the state that no
+    answer has confirmed.
     """
 
     state: MasterState
@@ -134,28 +127,21 @@ def reconcile(
 ) -> Reconciled:
     """Merge the last master's state with the answers of nodes and services.
 
-    Parameters
-    ----------
-    known : MasterState
-        Not changed.
-    nodes : mapping
-        Answers by the URI of the node's XML-RPC server.
-    services : mapping
-        Whether each service is offered where it was; None if that is unknown.
+    ``nodes`` has the answers by the URI of the node's XML-RPC server, and ``services`` whether each
+    service is offered where it was; None if that is unknown.
     """
     uris = known.nodes()
     sharing = Counter(uris.values())
-    state = MasterState()
+    state, doubtful = MasterState(), MasterState()
     state.parameters = known.parameters
     state.types = dict(known.types)
     for table in _REGISTRATIONS:
-        kept = getattr(state, table)
         for key, registered in getattr(known, table).items():
-            staying = [
-                (node, uri) for node, uri in registered if _still(table, key, nodes.get(uri))
-            ]
-            if staying:
-                kept[key] = staying
+            staying = [each for each in registered if _still(table, key, nodes.get(each[1]))]
+            silent = [each for each in registered if nodes.get(each[1]) is None]
+            for kept, part in ((state, staying), (doubtful, silent)):
+                if part:
+                    getattr(kept, table)[key] = part
     for node, uri in uris.items():
         answer = nodes.get(uri)
         # Two names at one address: one node has died, and the topics are the other's.
@@ -164,44 +150,25 @@ def reconcile(
             _add(state, state.subscribers, node, uri, answer.subscriptions)
     for topic in state.publishers:
         state.types.setdefault(topic, _ANY_TYPE)
-    state.services = {
-        service: where
-        for service, where in known.services.items()
-        if services.get(service) is not False
-    }
+    for service, where in known.services.items():
+        if services.get(service) is not False:
+            state.services[service] = where
+        if services.get(service) is None:
+            doubtful.services[service] = where
     return Reconciled(
         state,
         gone=tuple(node for node, uri in uris.items() if nodes.get(uri) == "gone"),
         silent=tuple(node for node, uri in uris.items() if nodes.get(uri) is None),
         lost_services=tuple(known.services.keys() - state.services.keys()),
-        doubtful=_doubtful(known, nodes, services),
+        doubtful=doubtful,
     )
-
-
-def _doubtful(
-    known: MasterState, nodes: Mapping[str, NodeAnswer], services: Mapping[str, bool | None]
-) -> MasterState:
-    part = MasterState()
-    for table in _REGISTRATIONS:
-        for key, registered in getattr(known, table).items():
-            silent = [(node, uri) for node, uri in registered if nodes.get(uri) is None]
-            if silent:
-                getattr(part, table)[key] = silent
-    part.services = {
-        service: where for service, where in known.services.items() if services.get(service) is None
-    }
-    return part
 
 
 def unregistrations(before: MasterState, after: MasterState) -> list[tuple[str, tuple[str, ...]]]:
     """Return the calls to a master that remove what is in one state and not in another.
 
-    Each call names the address, too, so it does not affect a node restarted at another address.
-
-    Returns
-    -------
-    list of tuple
-        Methods and their arguments, the first of which is the node's name.
+    They are methods and their arguments, the first of which is the node's name. Each names the
+    address, too, so it does not affect a node restarted at another address.
     """
     calls: list[tuple[str, tuple[str, ...]]] = []
     for table, method in _REGISTRATIONS.items():

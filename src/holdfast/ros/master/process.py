@@ -14,8 +14,8 @@ and the journal from here.
 
 Started as ``process.py SOCKET CONTROL STATE JOURNAL`` (three descriptors and a path) it loads all
 that it needs, says ``warm`` on CONTROL, and waits. On ``go`` it reads what the guard has left in
-STATE, or the journal if nothing is there, takes the connections that come to SOCKET, and says
-``serving``. If CONTROL ends before, it ends; afterwards it needs nobody.
+STATE, takes the connections that come to SOCKET, and says ``serving``. If CONTROL ends before, it
+ends; afterwards it needs nobody.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ import struct
 import sys
 import threading
 import time
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Dict, List, NoReturn, Tuple  # noqa: UP035 (older Python)
 from zlib import crc32
@@ -55,36 +56,22 @@ _WORKERS = 8
 """Threads that tell nodes of changes. One that a stopped node blocks is lost to the others; stock
 masters have three."""
 
-_TABLES = ("parameters", "publishers", "subscribers", "services", "types", "parameter_subscribers")
 
-
+@dataclass
 class MasterState:
     """A master's state.
 
-    Attributes
-    ----------
-    parameters : dict
-        The tree; a namespace is a dict.
-    publishers, subscribers, parameter_subscribers : dict
-        Registrations by topic, or by parameter.
-    services : dict
-        Of each service the node's name, the URI of its XML-RPC server, and the service's own URI.
-    types : dict
-        Of each topic the type of its messages.
+    ``parameters`` is a tree, in which a namespace is a dict. Registrations are by topic, or by
+    parameter. ``services`` has the node's name, the URI of its XML-RPC server, and the service's
+    own URI; ``types`` has the type of each topic's messages.
     """
 
-    def __init__(self) -> None:
-        self.parameters: dict[str, Any] = {}
-        self.publishers: Registrations = {}
-        self.subscribers: Registrations = {}
-        self.services: dict[str, tuple[str, str, str]] = {}
-        self.types: dict[str, str] = {}
-        self.parameter_subscribers: Registrations = {}
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, MasterState) and vars(self) == vars(other)
-
-    __hash__ = None  # type: ignore[assignment]  # it changes
+    parameters: dict[str, Any] = field(default_factory=dict)
+    publishers: Registrations = field(default_factory=dict)
+    subscribers: Registrations = field(default_factory=dict)
+    services: dict[str, tuple[str, str, str]] = field(default_factory=dict)
+    types: dict[str, str] = field(default_factory=dict)
+    parameter_subscribers: Registrations = field(default_factory=dict)
 
     def apply(self, table: str, key: str | None, value: Any) -> None:
         """Set a key of a table, or with None all of it; the value None removes the key."""
@@ -122,6 +109,9 @@ class MasterState:
                 found.update(registered)
         found.update((node, uri) for node, uri, _ in self.services.values())
         return found
+
+
+_TABLES = [table.name for table in fields(MasterState)]
 
 
 def parameter_names(tree: dict[str, Any], space: str = "/") -> list[str]:
@@ -173,12 +163,7 @@ def read_journal(journal: Path | int) -> MasterState | None:
 
     A descriptor stays open; while it is, the file is readable even if it is removed.
 
-    Raises
-    ------
-    OSError
-        If there is one, and it cannot be read.
-    ValueError
-        If what is there is no journal.
+    Raises OSError if it cannot be read, and ValueError if what is there is no journal.
     """
     try:
         with open(journal, "rb", closefd=not isinstance(journal, int)) as file:
@@ -211,12 +196,8 @@ def _state_in(content: bytes) -> MasterState:
 def write_journal(path: Path, state: MasterState) -> int:
     """Write a journal anew, in one piece, and return its size in bytes.
 
-    Its directory is made if it is gone.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written; the one before is still there then.
+    Its directory is made if it is gone. If it cannot be written (OSError), the one before is still
+    there.
     """
     content = journal_of(state)
     new = path.with_name(f"{path.name}.new")
@@ -425,13 +406,10 @@ def _load() -> Any:
     class JournalledMaster(rosmaster.master_api.ROSMasterHandler):  # type: ignore[misc, name-defined, unused-ignore]
         """The stock master's calls, and one more."""
 
-        def __init__(self, path: Path, content: bytes = b"") -> None:
+        def __init__(self, path: Path, content: bytes) -> None:
             super().__init__(_WORKERS)
             # Twice, since what is written down shares nothing with what the master changes.
-            state, written = (
-                (_state_in(content) if content else read_journal(path)) or MasterState()
-                for _ in range(2)
-            )
+            state, written = _state_in(content), _state_in(content)
             manager = self.reg_manager = JournalledRegistrations(self.thread_pool)
             self.publishers = manager.publishers
             self.subscribers = manager.subscribers
@@ -447,17 +425,11 @@ def _load() -> Any:
             self.path = str(path)
 
         def restore(self, manager: Any, state: MasterState) -> None:
-            register = manager.register_again
-            for registrations, table in (
-                (self.publishers, state.publishers),
-                (self.subscribers, state.subscribers),
-                (self.param_subscribers, state.parameter_subscribers),
-            ):
-                for key, registered in table.items():
-                    for node, uri in registered:
-                        register(registrations, key, node, uri)
-            for service, (node, uri, own_uri) in state.services.items():
-                register(self.services, service, node, uri, own_uri)
+            for table, registrations in manager.tables().items():
+                for key, registered in getattr(state, table).items():
+                    # Of a service there is one, with its own URI.
+                    for each in [registered] if table == "services" else registered:
+                        manager.register_again(registrations, key, *each)
             self.param_server.parameters = state.parameters
 
         def tell_subscribers(self) -> None:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import socket
 import stat
+import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple, Self
 from urllib.parse import urlsplit
 
 from holdfast.errors import GuardError
-from holdfast.ros.master.process import touch
 
 __all__ = [
     "DEFAULT_PORT",
@@ -26,17 +25,12 @@ __all__ = [
 
 DEFAULT_PORT = 11311
 
+_PEER = struct.Struct("3i")
+"""A peer's process, user and group."""
+
 
 class MasterAddress(NamedTuple):
-    """A master's address.
-
-    Attributes
-    ----------
-    host : str
-        In the nodes' ``ROS_MASTER_URI``.
-    bind : str
-        The address of this machine at which it listens.
-    """
+    """A master's address: ``host`` is what ``ROS_MASTER_URI`` names, ``bind`` where it listens."""
 
     host: str
     port: int
@@ -55,19 +49,10 @@ class MasterAddress(NamedTuple):
 
     @classmethod
     def of(cls, environment: Mapping[str, str], port: int | None = None) -> Self:
-        """Read ROS's variables.
+        """Read ``ROS_MASTER_URI``, ``ROS_HOSTNAME``, ``ROS_IP`` and ``ROS_IPV6``.
 
-        Parameters
-        ----------
-        environment : mapping
-            ``ROS_MASTER_URI``, ``ROS_HOSTNAME``, ``ROS_IP`` and ``ROS_IPV6`` count.
-        port : int, optional
-            Instead of that of the URI.
-
-        Raises
-        ------
-        GuardError
-            If the URI is none, or names another machine.
+        ``port`` replaces that of the URI. Raises GuardError if the URI is none, or names another
+        machine.
         """
         text = environment.get("ROS_MASTER_URI") or f"http://localhost:{DEFAULT_PORT}"
         try:
@@ -108,19 +93,7 @@ def _is_here(host: str) -> bool:
 
 
 class GuardSettings(NamedTuple):
-    """How to guard a master.
-
-    Attributes
-    ----------
-    python : str
-        ROS's Python.
-    directory : Path or None
-        Of the journal; None for one of this user that is cleared when the machine restarts.
-    silent_s : float
-        A master that has been silent for this long is replaced.
-    rosout : bool
-        Whether ``/rosout`` is to run, too, as with ``roscore``.
-    """
+    """How to guard a master; the options of ``holdfast ros1-guard`` say what each means."""
 
     address: MasterAddress
     python: str = "/usr/bin/python3"
@@ -149,59 +122,37 @@ def own_directory() -> Path:
 class GuardLock:
     """Keeps a second guard of the same master away.
 
-    Raises
-    ------
-    GuardError
-        If there is one already.
+    It is a socket without a file, which the system removes with the process.
+
+    Raises GuardError if there is one already.
     """
 
-    def __init__(self, path: Path, port: int) -> None:
-        self._path = path
+    def __init__(self, port: int) -> None:
+        name = f"\0holdfast-ros1-guard-{port}"
+        self._socket = socket.socket(socket.AF_UNIX)
         try:
-            self._descriptor = self._open()
+            self._socket.bind(name)
+            self._socket.listen()
         except OSError as error:
-            raise GuardError(f"{path}: cannot be written: {error.strerror}") from error
-        if not self._take(self._descriptor):
-            who = os.pread(self._descriptor, 20, 0).decode(errors="replace").strip()
-            os.close(self._descriptor)
+            self._socket.close()
             raise GuardError(
-                f"the master at port {port} has a guard already: process {who or 'unknown'}"
-            )
-
-    def _open(self) -> int:
-        return os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-
-    def _take(self, descriptor: int) -> bool:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            return False
-        # The lock is on the file; its content is optional, as the disk may be full.
-        with contextlib.suppress(OSError):
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
-        return True
-
-    def keep(self) -> None:
-        """Keep the file young for cleaners of old files, and lock a new one if it is gone."""
-        try:
-            found = self._path.lstat()
-            if os.path.samestat(found, os.fstat(self._descriptor)):
-                touch(self._path, found)
-                return
-        except OSError:
-            pass
-        with contextlib.suppress(OSError):
-            descriptor = self._open()
-            if self._take(descriptor):
-                descriptor, self._descriptor = self._descriptor, descriptor
-            os.close(descriptor)
+                f"the master at port {port} has a guard already: process {_listener_of(name)}"
+            ) from error
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        os.close(self._descriptor)
+        self._socket.close()
+
+
+def _listener_of(name: str) -> int | str:
+    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
+        probe.connect(name)
+        peer = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
+        pid: int = _PEER.unpack(peer)[0]
+        return pid or "unknown"
+    return "unknown"
 
 
 def listens_at(pid: int, port: int) -> bool:

@@ -93,10 +93,7 @@ class MasterProcess:
 
     It inherits ``listening``, which need not be bound yet.
 
-    Raises
-    ------
-    GuardError
-        If it cannot be started.
+    Raises GuardError if it cannot be started.
     """
 
     def __init__(self, settings: GuardSettings, listening: socket.socket, journal: Path) -> None:
@@ -106,7 +103,7 @@ class MasterProcess:
         self._control.setblocking(False)
         script = str(Path(master_process.__file__).resolve())
         # In memory, because the disk may be full.
-        self._state = open(os.memfd_create("master-state"), "wb", buffering=0)  # noqa: PTH123, SIM115
+        self._state = open(os.memfd_create("master-state"), "wb")  # noqa: PTH123, SIM115
         descriptors = (listening.fileno(), its.fileno(), self._state.fileno())
         try:
             self.process = DetachedProcess(
@@ -126,10 +123,7 @@ class MasterProcess:
     async def warm(self) -> None:
         """Wait until it has loaded what it needs.
 
-        Raises
-        ------
-        GuardError
-            If it cannot.
+        Raises GuardError if it cannot.
         """
         if self._warm:
             return
@@ -142,31 +136,14 @@ class MasterProcess:
             )
         self._warm = True
 
-    def hand_over(self, state: MasterState) -> None:
-        """Hand it its state; without one it reads the journal.
+    async def serve(self, state: MasterState) -> None:
+        """Make it the master, with this state.
 
-        Raises
-        ------
-        OSError
-            If there is no room; it reads the journal then.
-        """
-        content = memoryview(master_process.journal_of(state))
-        try:
-            while content:
-                content = content[self._state.write(content) :]
-        except OSError:
-            self._state.truncate(0)
-            raise
-
-    async def serve(self) -> None:
-        """Make it the master, with the state that it was handed.
-
-        Raises
-        ------
-        GuardError
-            If it does not begin.
+        Raises GuardError if it does not begin. Raises OSError if there is no room for the state.
         """
         await self.warm()
+        self._state.write(master_process.journal_of(state))
+        self._state.flush()
         with contextlib.suppress(OSError):
             await asyncio.get_running_loop().sock_sendall(self._control, b"go")
         if (said := await self._hear()) != "serving":

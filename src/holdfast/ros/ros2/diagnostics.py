@@ -39,13 +39,7 @@ class RobotDiagnosis(NamedTuple):
 
 
 class Diagnostics:
-    """Follows the segments of one run.
-
-    Attributes
-    ----------
-    diverged : bool
-        Whether the filter has.
-    """
+    """Follows the segments of one run."""
 
     def __init__(self, recovery: RecoverySettings, clock: Callable[[], float] = monotonic) -> None:
         self._may_launch = recovery.launch != "never"

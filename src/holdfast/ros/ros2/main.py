@@ -42,10 +42,11 @@ particle_filter.num_particles): docs/settings.md. Topics, services and how a rob
 
 def usage() -> str:
     """Return what ``--help`` prints."""
-    from holdfast.ros.ros2.parameters import OWN
+    from holdfast.ros.ros2.parameters import OWN, OWN_DEFAULTS
 
     lines = []
-    for name, (default, text) in OWN.items():
+    for name, text in OWN.items():
+        default = OWN_DEFAULTS[name]
         shown = str(default).lower() if isinstance(default, bool) else default
         end = f" (default: {shown})" if shown not in ("", []) else ""
         indent = " " * 24

@@ -42,7 +42,7 @@ from holdfast.ros.poses import PoseLayout, pose_layout
 from holdfast.ros.ros2 import messages
 from holdfast.ros.ros2.diagnostics import Diagnostics
 from holdfast.ros.ros2.parameters import (
-    OWN,
+    OWN_DEFAULTS,
     NodeParameters,
     in_parameters,
     known_parameters,
@@ -50,6 +50,7 @@ from holdfast.ros.ros2.parameters import (
 )
 from holdfast.ros.ros2.run_segment import Ending, RunSegment, SegmentResult, make_world
 from holdfast.ros.ros2.telemetry import PublishedDecision, Telemetry
+from holdfast.ros.ros2_connections import Connections
 from holdfast.runtime.log_lines import fields_as_text
 
 __all__ = ["NUM_THREADS", "HoldfastNode"]
@@ -123,6 +124,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             automatically_declare_parameters_from_overrides=True,
         )
         self._declare()
+        self._robot = Connections(self)
         # Guards the fields below.
         self._changed = threading.RLock()
         self._parameters_read: NodeParameters | None = None
@@ -183,10 +185,9 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             if self.has_parameter(name):
                 self.set_descriptor(name, descriptor)
             else:
-                own = OWN.get(name)
                 # An empty list has no type in ROS.
-                default = None if own is None or own.default == [] else own.default
-                self.declare_parameter(name, default, descriptor)
+                default = OWN_DEFAULTS.get(name)
+                self.declare_parameter(name, None if default == [] else default, descriptor)
 
     def _judge_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         known = known_parameters()
@@ -229,7 +230,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             read = read_parameters(self._values())
             check_services(read.configuration)
             layout = pose_layout(read.configuration.problem)
-            make_world(self, read)
+            make_world(self._robot, read)
             # Whether a run can begin there, or go on.
             RunDirectory.resume_if_begun(read.run_directory, read.configuration).close()
         except Exception as error:  # noqa: BLE001 - rclpy would hide it
@@ -285,9 +286,9 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             segment, telemetry = self._segment, self._telemetry
             read = self._parameters_read
         if segment is not None and read is not None:
-            segment.pause(why, read.pause_timeout_s)
+            segment.pause(why, read.own.pause_timeout_s)
             # It ends itself within the time that it was given; the rest is for a slow disk.
-            if not segment.ended.wait(read.pause_timeout_s + 10.0):
+            if not segment.ended.wait(read.own.pause_timeout_s + 10.0):
                 self.get_logger().error("the run has not ended; its journal has everything")
         if telemetry is not None:
             telemetry.close()
@@ -323,14 +324,14 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         assert read is not None
         assert diagnostics is not None
         configuration = read.configuration
-        world = make_world(self, read)
+        world = make_world(self._robot, read)
         telemetry = Telemetry(
             configuration,
             self._show_order,
             self._show_belief,
             self._tell_diagnostics,
             self._tell_failure,
-            belief_rate_hz=read.belief_rate_hz,
+            belief_rate_hz=read.own.belief_rate_hz,
             wants_entropies=self._wants_entropies,
         )
 
@@ -341,7 +342,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             configuration,
             read.run_directory,
             world,
-            rate_hz=read.rate_hz,
+            rate_hz=read.own.rate_hz or None,
             sink=_Events(self, diagnostics, telemetry),
             on_order=on_order,
             on_timing=telemetry.time,
@@ -384,7 +385,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             segment = self._segment if goal == self._goal else None
             read = self._parameters_read
         if segment is not None and read is not None:
-            segment.pause("the goal was cancelled", read.pause_timeout_s)
+            segment.pause("the goal was cancelled", read.own.pause_timeout_s)
         return CancelResponse.ACCEPT
 
     def _execute(self, goal: Any) -> Any:
@@ -411,7 +412,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             return _Run.Result(code=_Run.Result.REFUSED, message=refusal or "")
         try:
             if goal.is_cancel_requested:
-                segment.pause("the goal was cancelled", read.pause_timeout_s)
+                segment.pause("the goal was cancelled", read.own.pause_timeout_s)
             segment.ended.wait()
             outcome = segment.outcome
             assert outcome is not None
@@ -463,7 +464,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             response.message = "" if last is None else last.message
             return response
         if request.done > _Decide.Request.FAILED:
-            reply = handover.call(DecideRequest(), read.decide_timeout_s)  # asks what is due
+            reply = handover.call(DecideRequest(), read.own.decide_timeout_s)  # asks what is due
             if reply.code in (DecideCode.OK, DecideCode.HOLDING):
                 message = f"done {request.done}: allowed are 0 to {_Decide.Request.FAILED}"
                 reply = reply._replace(code=DecideCode.BAD_REQUEST, message=message)
@@ -475,7 +476,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
                 request.reward if request.has_reward else None,
                 (False, True, "failed")[request.done],
             )
-            reply = handover.call(call, read.decide_timeout_s)
+            reply = handover.call(call, read.own.decide_timeout_s)
         response.code, response.message = reply.code, reply.message
         response.status = segment.status
         due = reply.due
@@ -496,9 +497,9 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         read = self._parameters_read
         if not self._active or read is None:
             return f"the node is not active: {self.how_to_activate()}"
-        if read.environment != "executive":
+        if read.own.environment != "executive":
             return (
-                f"environment.kind is {read.environment}: the node itself performs what it "
+                f"environment.kind is {read.own.environment}: the node itself performs what it "
                 "decides; it must be executive for calls of ~/decide"
             )
         return None
@@ -511,7 +512,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             return
         problem = read.configuration.problem
         now = self.get_clock().now().to_msg()
-        message = messages.decision_message(shown, problem, read.frame_id, now)
+        message = messages.decision_message(shown, problem, read.own.frame_id, now)
         self._decision_publisher.publish(message)
         if goal is not None:
             finished = 0 if segment is None else segment.num_finished
@@ -520,7 +521,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
     def _wants_entropies(self) -> bool:
         read = self._parameters_read
         heard = self._goal is not None or self._decision_publisher.get_subscription_count() > 0
-        return heard and read is not None and read.publish_entropies
+        return heard and read is not None and read.own.publish_entropies
 
     def _tell_failure(self, error: Exception) -> None:
         self.get_logger().warning(
@@ -533,10 +534,10 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             return
         now = self.get_clock().now().to_msg()
         if self._belief_publisher.get_subscription_count():
-            self._belief_publisher.publish(messages.belief_message(state, read.frame_id, now))
+            self._belief_publisher.publish(messages.belief_message(state, read.own.frame_id, now))
         if layout is not None and self._cloud_publisher.get_subscription_count():
             poses = layout.poses(state.belief.states)
-            self._cloud_publisher.publish(messages.pose_array(poses, read.frame_id, now))
+            self._cloud_publisher.publish(messages.pose_array(poses, read.own.frame_id, now))
 
     def _tell_diagnostics(self) -> None:
         with self._changed:

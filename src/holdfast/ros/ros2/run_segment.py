@@ -62,16 +62,10 @@ class Ending(enum.IntEnum):
 
 
 class SegmentResult(NamedTuple):
-    """The result of a segment.
+    """The result of a segment, the trials of earlier segments included.
 
-    Attributes
-    ----------
-    trials : tuple of TrialResult
-        The first :data:`MAX_TRIALS_TOLD` finished ones, those of earlier segments included.
-    status : str
-        At its end; empty if the robot had not started.
-    num_finished : int
-        Trials, those of earlier segments included.
+    ``trials`` are the first :data:`MAX_TRIALS_TOLD` finished ones; ``status`` is empty if the robot
+    had not started.
     """
 
     ending: Ending
@@ -84,15 +78,9 @@ class SegmentResult(NamedTuple):
 class World(NamedTuple):
     """What a segment acts on.
 
-    Attributes
-    ----------
-    interrupt : callable
-        Ends the environment's current call where possible; given the reason.
-    interrupt_at_once : bool
-        Whether a pause interrupts without waiting for the call to end by itself. It costs nothing
-        only if an interrupted call is repeated later.
-    handover : DecisionHandover or None
-        Where calls of ``~/decide`` meet the run; None where the node itself performs.
+    ``interrupt`` gets a reason and ends the environment's current call where possible. A pause does
+    so at once if an interrupted call is repeated later, so that it costs nothing. ``handover`` is
+    where calls of ``~/decide`` meet the run; None where the node itself performs.
     """
 
     maker: EnvironmentMaker
@@ -101,21 +89,18 @@ class World(NamedTuple):
     handover: DecisionHandover | None = None
 
 
-def make_world(node: Any, parameters: NodeParameters) -> World:
+def make_world(connections: Any, parameters: NodeParameters) -> World:
     """Make what the parameters name, for one segment of a run.
 
-    Raises
-    ------
-    HoldfastError
-        If that cannot be; the message names the parameter.
+    Raises HoldfastError if that cannot be; the message names the parameter.
     """
     configuration = parameters.configuration
-    if parameters.environment == "configuration":
+    if parameters.own.environment == "configuration":
         return World(load_environment(configuration), lambda _: None)
     # Other threads than the robot's use it.
     problem = Configuration.from_plain(configuration.plain()).problem
     timeout_ms = configuration.environment.timeout_ms
-    if parameters.environment == "executive":
+    if parameters.own.environment == "executive":
         handover = DecisionHandover(problem, configuration.planning.sensing_interval)
         return World(
             ExecutiveMaker(handover, configuration.problem, timeout_ms),
@@ -124,34 +109,21 @@ def make_world(node: Any, parameters: NodeParameters) -> World:
             handover=handover,
         )
     from holdfast.ros.robot_interface import RobotInterface
-    from holdfast.ros.ros2_environment import cancel_ros_environments, make_ros_environment
+    from holdfast.ros.ros2_environment import make_ros_environment
 
     # Invalid parameters are reported now, not when a trial begins.
     RobotInterface(parameters.mapping, problem.sensing_actions, problem.action_size)
-    make: Any = functools.partial(make_ros_environment, node, parameters.mapping)
+    make: Any = functools.partial(make_ros_environment, connections, parameters.mapping)
     maker = EnvironmentMaker("the robot", problem, configuration.simulator.seed, timeout_ms, make)
-
-    return World(maker, lambda _: cancel_ros_environments(node))
+    return World(maker, lambda _: connections.cancel())
 
 
 class RunSegment:
-    """Runs the remaining trials once :meth:`start` is called.
+    """Runs the remaining trials of the run in the directory ``path``, once it is started.
 
-    Parameters
-    ----------
-    path : Path
-        The run's directory.
-    on_order, on_timing : callable
-        As of :class:`~holdfast.recording.robot_run.RobotObserver`.
-    on_end : callable
-        Gets the result, on the segment's thread.
-
-    Attributes
-    ----------
-    outcome : SegmentResult or None
-        Once it has ended.
-    num_finished : int
-        Trials, those of earlier segments included.
+    ``on_order`` and ``on_timing`` are those of a
+    :class:`~holdfast.recording.robot_run.RobotObserver`; ``on_end`` gets the result, on the
+    segment's thread. ``outcome`` is there when ``ended`` is set.
     """
 
     def __init__(
@@ -207,11 +179,8 @@ class RunSegment:
     def pause(self, why: str, within_s: float) -> None:
         """End in order, from any thread: :attr:`ended` says when. Only the first call counts.
 
-        Parameters
-        ----------
-        within_s : float
-            Time for the environment to end its current call. Then the call is interrupted, and
-            abandoned if that does not help.
+        The environment has ``within_s`` to end its current call, which is then interrupted, and
+        abandoned if that does not help.
         """
         with self._changed:
             if self._why_paused is not None:

@@ -15,8 +15,8 @@ import os
 import threading
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from time import monotonic
-from typing import NamedTuple
 
 import numpy as np
 
@@ -46,7 +46,8 @@ _ENTROPIES = ("action_entropy", "path_entropy", "state_entropy", "action_covaria
 ``expected_return`` computes are returns, which the message has no field for.)"""
 
 
-class PublishedDecision(NamedTuple):
+@dataclass(slots=True)
+class PublishedDecision:
     """An order to the environment, for people.
 
     Attributes
@@ -59,6 +60,8 @@ class PublishedDecision(NamedTuple):
         Empty for a sensing action.
     state : PlanningState or None
         In which it was decided; None if there was no time for it.
+    noted_at : float
+        On the monotonic clock, in seconds.
     """
 
     trial: int
@@ -70,29 +73,14 @@ class PublishedDecision(NamedTuple):
     status: str
     decided_by: str
     state: PlanningState | None
-
-
-class _Note:
-    __slots__ = ("at", "shown")
-
-    def __init__(self, shown: PublishedDecision) -> None:
-        self.shown = shown
-        self.at = monotonic()
+    noted_at: float
 
 
 class Telemetry:
     """Publishes orders and beliefs, on its own thread.
 
-    Parameters
-    ----------
-    on_order, on_belief : callable
-        Show them.
-    on_notice : callable
-        Is called when there is something else that changed.
-    on_failure : callable
-        Gets the first error that any of this came to: to look on must not end a run.
-    belief_rate_hz : float
-        Beliefs shown a second, at most.
+    ``on_order`` and ``on_belief`` show them, ``on_notice`` shows what else has changed.
+    ``on_failure`` gets the first error of any of these: to look on must not end a run.
     """
 
     def __init__(
@@ -115,8 +103,7 @@ class Telemetry:
         self._belief_every_s = 1.0 / belief_rate_hz if belief_rate_hz > 0.0 else np.inf
         self._wants_entropies = wants_entropies
         self._changed = threading.Condition()
-        self._notes: deque[_Note] = deque()
-        self._with_state: deque[_Note] = deque()
+        self._notes: deque[PublishedDecision] = deque()
         self._notice = False
         self._closed = False
         self._decided_by = {"sensing": "", "task": ""}
@@ -146,8 +133,7 @@ class Telemetry:
 
     def order(self, state: PlanningState, order: Act | Sense, status: str) -> None:
         """Take note of an order; returns at once."""
-        sensing = isinstance(order, Sense)
-        shown = PublishedDecision(
+        note = PublishedDecision(
             state.trial,
             state.step,
             state.stage,
@@ -155,17 +141,15 @@ class Telemetry:
             np.empty(0),
             np.empty(0) if isinstance(order, Sense) else order.action,
             status,
-            self._decided_by["sensing" if sensing else "task"],
+            self._decided_by["sensing" if isinstance(order, Sense) else "task"],
             state,
+            monotonic(),
         )
-        note = _Note(shown)
         keep = max(_MIN_STATES, _MAX_STATE_BYTES // max(1, state.belief.states.nbytes))
         with self._changed:
             self._notes.append(note)
-            self._with_state.append(note)
-            if len(self._with_state) > min(keep, _MAX_NOTES):
-                old = self._with_state.popleft()
-                old.shown = old.shown._replace(state=None)
+            if len(self._notes) > keep:
+                self._notes[-keep - 1].state = None
             if len(self._notes) > _MAX_NOTES:
                 self._notes.popleft()
                 self.dropped_decisions += 1
@@ -197,14 +181,13 @@ class Telemetry:
                 note = self._notes.popleft() if self._notes else None
                 if note is None and not notice:
                     return
-                if note is not None and self._with_state and self._with_state[0] is note:
-                    self._with_state.popleft()
             try:
                 if notice:
                     self._on_notice()
                 if note is not None:
-                    is_late = monotonic() > note.at + _LATE_S
-                    self._show(note.shown._replace(state=None) if is_late else note.shown)
+                    if monotonic() > note.noted_at + _LATE_S:
+                        note.state = None
+                    self._show(note)
             except Exception as error:  # noqa: BLE001 - the problem is anybody's code
                 if not self.has_failed:
                     self.has_failed = True
@@ -220,5 +203,5 @@ class Telemetry:
             assert state is not None
             _, info = Planner(self._problem, self._settings).choose_sensing_action(state)
             if info.entropies is not None:
-                shown = shown._replace(entropies=info.entropies)
+                shown.entropies = info.entropies
         self._on_order(shown)
