@@ -160,7 +160,7 @@ async def _asked(
 
 def _turns(wanted: Exchange, settings: PlanningSettings, trial: int) -> Iterator[_Turn]:
     """Yield all questions that the robot of a trial would ask, with the answers."""
-    problem = problem_of(wanted.problem, {}, {})
+    problem = problem_of(wanted.problem)
     planner = Planner(problem, settings)
     state = planner.init(wanted.seed, trial)
     asked, sensing_action = state, -1
@@ -253,7 +253,7 @@ class _Asking:
 
 @contextlib.asynccontextmanager
 async def _in_process(wanted: Exchange) -> AsyncIterator[tuple[str, RobotTransport]]:
-    problem = problem_of(wanted.problem, {}, {})
+    problem = problem_of(wanted.problem)
     network = InProcessNetwork()
     shell = ServiceShell(
         Service(lambda _: problem, workers=1), network.service(_IN_PROCESS, "0"), workers=1
