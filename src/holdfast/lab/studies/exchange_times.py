@@ -70,16 +70,7 @@ _LEASE_MS = 30_000.0
 
 
 class Exchange(msgspec.Struct, frozen=True, kw_only=True):
-    """What is asked.
-
-    Attributes
-    ----------
-    problem : str
-        Its name.
-    way : {"tcp", "in_process"}
-    num_trials : int
-        All questions of so many trials.
-    """
+    """What is asked: all questions of some trials, by ``tcp`` or ``in_process``."""
 
     problem: str
     particles: int = 100
@@ -103,15 +94,8 @@ def measure_exchange(**exchange: Any) -> pd.DataFrame:
     """Put questions and time the answers; the function of tasks of the kind ``exchange_times``.
 
     It gets the fields of :class:`Exchange`, and returns a table with the columns of
-    :data:`COLUMNS`.
-
-    Raises
-    ------
-    TaskError
-        If the service does not start, does not answer, or answers something else than what the
-        same question comes to in this process.
-    HoldfastError
-        If the problem refuses it.
+    :data:`COLUMNS`. TaskError if the service does not start, does not answer, or answers something
+    else than what the same question comes to in this process.
     """
     wanted = msgspec.convert(exchange, Exchange)
     ways: dict[str, Callable[[Exchange], _Service]] = {

@@ -72,7 +72,6 @@ def _over_particles(panels: Iterable[Axes]) -> None:
         panel.set_xlabel("particles")
         panel.xaxis.set_major_locator(FixedLocator(list(PARTICLES)))
         panel.set_xlim(PARTICLES[0] - 60, PARTICLES[-1] + 60)
-        panel.grid(axis="y")
 
 
 def _medians(
@@ -248,6 +247,8 @@ def sensing_times(rows: pd.DataFrame) -> Figure:
         panels[2].set_title("Fig. 11: side by side, and with the way", loc="left")
         milliseconds(panels[0], "time for a sensing action (ms)")
         _over_particles(panels)
+        for panel in panels:
+            panel.grid(axis="y")
         legend_below(figure, panels[2], 3, fontsize=8.5)
     return figure
 
@@ -340,6 +341,7 @@ def successes(table: pd.DataFrame) -> Figure:
             )
         panel.set_ylim(0.0, 104.0)
         panel.set_ylabel("successes (%), with 95 % intervals (Wilson)")
+        panel.grid(axis="y")
         _over_particles([panel])
         panel.legend(loc="lower right")
     return figure
