@@ -81,7 +81,7 @@ def horizon(context: Context) -> Result:
     cases = [case for case in CASES if case.name in names]
     rows = []
     for done, case in enumerate(cases):
-        problem = problem_of(case.problem, case.model, {})
+        problem = problem_of(case.problem, case.model)
         for num_particles in (100, 500):
             near = settings_for(num_particles, 1)
             states = evenly_spread(recorded_trial(problem, near)[0], number)

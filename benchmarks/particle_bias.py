@@ -105,7 +105,7 @@ def entropies_of(
 def compare(case_name: str, seed: int) -> dict[Rival, list[Choice]]:
     """Return what every rival chooses for the beliefs of a case."""
     case = next(case for case in CASES if case.name == case_name)
-    problem = problem_of(case.problem, case.model, {})
+    problem = problem_of(case.problem, case.model)
     rng = np.random.default_rng(seed)
     choices: dict[Rival, list[Choice]] = {rival: [] for rival in RIVALS}
     for interval in INTERVALS:

@@ -77,14 +77,15 @@ from __future__ import annotations
 import functools
 import math
 
+import msgspec
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 
 from holdfast.arrays import FloatArray
-from holdfast.lab.studies.emulation_2017 import Emulation, drawn_particle, emulate, likelihoods
+from holdfast.lab.studies.emulation_2017 import drawn_particle, likelihoods, run_emulation
 from holdfast.lab.studies.published_2017 import PublishedRow, published_rows, series_of
-from holdfast.lab.studies.trial_batches import problem_of
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem
 
@@ -111,12 +112,9 @@ def label(row: PublishedRow) -> str:
 
 
 @functools.cache
-def emulated(row: PublishedRow, num_trials: int) -> Emulation:
+def emulated(row: PublishedRow, num_trials: int) -> pd.DataFrame:
     series = series_of(row, num_trials, SEED)
-    problem = problem_of(series.problem, series.model, series.state_space_planner)
-    return emulate(
-        problem, series.planning, max_steps=row.max_steps, num_trials=num_trials, seed=SEED
-    )
+    return run_emulation(0, **msgspec.to_builtins(series))
 
 
 def success_p_value(successes: int, num_trials: int, row: PublishedRow) -> float:
@@ -134,16 +132,16 @@ def reward_p_value(rewards: FloatArray, row: PublishedRow) -> float:
     return math.erfc(distance / deviation / math.sqrt(2.0))
 
 
-def check_successes(emulation: Emulation, row: PublishedRow, num_rows: int) -> None:
-    count, num_trials = int(emulation.successes.sum()), emulation.successes.size
+def check_successes(emulation: pd.DataFrame, row: PublishedRow, num_rows: int) -> None:
+    count, num_trials = int(emulation["success"].sum()), len(emulation)
     level = FAMILY_WISE_LEVEL / num_rows
     assert success_p_value(count, num_trials, row) >= level, (
         f"{count} of {num_trials} trials succeed, in 2017 {row.successes} of {row.num_trials}"
     )
 
 
-def check_rewards(emulation: Emulation, row: PublishedRow, num_rows: int) -> None:
-    rewards = emulation.rewards[emulation.successes]
+def check_rewards(emulation: pd.DataFrame, row: PublishedRow, num_rows: int) -> None:
+    rewards = emulation["reward"][emulation["success"]].to_numpy()
     level = FAMILY_WISE_LEVEL / num_rows
     assert reward_p_value(rewards, row) >= level, (
         f"mean reward {np.mean(rewards):.3f} of {rewards.size} successful trials, in 2017 "

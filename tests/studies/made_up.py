@@ -8,17 +8,17 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pandas as pd
 
-from holdfast.lab.studies.study import Results, Scale, Study
-from holdfast.lab.studies.tasks import Task, task_key
+from holdfast.lab.studies.study import Report, Scale, Study
+from holdfast.lab.studies.tasks import Task
 from holdfast.lab.studies.trial_batches import COLUMNS
 
 
-def results_of(
+def report_on(
     study: Study, scale: Scale, trial: Callable[[Task, int], tuple[bool, int, float]]
-) -> Results:
-    """Return results of tasks of trials, by success, steps and reward of each of them."""
-    tables = {}
-    for task in study.tasks(scale):
+) -> Report:
+    """Return the report on trials, by success, steps and reward of each of them."""
+
+    def result_of(task: Task) -> pd.DataFrame:
         first = task.parameters["first_trial"]
         rows = []
         for number in range(first, first + task.parameters["num_trials"]):
@@ -27,8 +27,9 @@ def results_of(
             limit = 10**6 if number < task.parameters["continued_trials"] else 10**5
             row = (number, success, steps, reward, steps // 2, 0.5, 0, "digest", limit, to_goal)
             rows.append(row)
-        tables[task_key(task)] = pd.DataFrame(rows, columns=list(COLUMNS))
-    return Results(tables, task_key)
+        return pd.DataFrame(rows, columns=list(COLUMNS))
+
+    return study.report(scale, result_of)
 
 
 def noise(task: Task, number: int, names: Sequence[str]) -> float:

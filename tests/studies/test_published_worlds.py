@@ -18,9 +18,9 @@ from holdfast.lab.studies.published_worlds import (
     published_planners,
     run_vdp_tag,
 )
-from holdfast.lab.studies.study import Report, Results, Scale
+from holdfast.lab.studies.study import TRIALS, Report, Scale
 from holdfast.lab.studies.tables import to_csv
-from holdfast.lab.studies.tasks import task_key
+from holdfast.lab.studies.tasks import Task
 
 SCALE = Scale(seed=8101)
 
@@ -28,21 +28,18 @@ SCALE = Scale(seed=8101)
 @pytest.fixture(scope="module")
 def made_up() -> Report:
     """Published heuristics earn what was published; all others alternate, priced looks most."""
-    published = published_planners()
-    study = PublishedWorlds()
-    tables = {}
-    for task in study.tasks(SCALE):
+    means = published_planners()["mean_discounted_reward"]
+
+    def result_of(task: Task) -> pd.DataFrame:
         way, first = task.parameters["way"], task.parameters["first_trial"]
-        if way in published:
-            mean = published[way].mean
-        else:
-            mean = 40.0 if way == BEST else 30.0
+        mean = means.get(way, 40.0 if way == BEST else 30.0)
         rows = [
             (trial, mean + 10.0 * (-1.0) ** trial, True, 10, 2, 7.0)
             for trial in range(first, first + task.parameters["num_trials"])
         ]
-        tables[task_key(task)] = pd.DataFrame(rows, columns=list(COLUMNS))
-    return study.report(SCALE, Results(tables, task_key))
+        return pd.DataFrame(rows, columns=list(COLUMNS))
+
+    return PublishedWorlds().report(SCALE, result_of)
 
 
 def test_it_is_registered() -> None:
@@ -52,13 +49,14 @@ def test_it_is_registered() -> None:
 
 def test_published_figures() -> None:
     planners = published_planners()
-    assert planners["pomcpow"] == (1000, 29.3428, 0.8249)
+    names = ["trials", "mean_discounted_reward", "standard_error"]
+    assert planners.loc["pomcpow", names].tolist() == [1000, 29.3428, 0.8249]
     assert len(planners) == 7
 
 
 def test_the_table_has_ours_and_theirs(made_up: Report) -> None:
     rows = {row["way"]: row for row in made_up.summary["vdp_tag"].to_dict("records")}
-    assert set(rows) == {*WAYS, *published_planners()}
+    assert set(rows) == {*WAYS, *published_planners().index}
     ours = rows[BEST]
     assert ours["mean_discounted_reward"] == pytest.approx(40.0, rel=1e-6)
     assert ours["standard_error"] == pytest.approx(10.0 / 1000**0.5, rel=1e-3)
@@ -87,7 +85,7 @@ def test_all_is_made_of_the_trials_that_are_kept(made_up: Report) -> None:
     trials = made_up.trials
     assert trials is not None
     assert len(trials) == sum(way.trials for way in WAYS.values())
-    again = PublishedWorlds().report_of(trials)
+    again = PublishedWorlds().report_of({TRIALS: trials})
     assert {name: to_csv(table) for name, table in again.tables.items()} == {
         name: to_csv(table) for name, table in made_up.tables.items()
     }
@@ -95,7 +93,7 @@ def test_all_is_made_of_the_trials_that_are_kept(made_up: Report) -> None:
 
 def test_other_trials_are_refused(made_up: Report) -> None:
     with pytest.raises(InvalidValueError, match="published_worlds: these are trials of something"):
-        PublishedWorlds().report_of(pd.DataFrame({"way": []}))
+        PublishedWorlds().report_of({TRIALS: pd.DataFrame({"way": []})})
 
 
 def test_the_figure_can_be_drawn(made_up: Report) -> None:

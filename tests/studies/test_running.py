@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
@@ -20,7 +20,7 @@ import holdfast
 from holdfast import _kernel
 from holdfast.errors import HoldfastError, InvalidValueError, OutputError
 from holdfast.lab.errors import TaskError
-from holdfast.lab.studies import executors, running, tasks
+from holdfast.lab.studies import executors, tasks
 from holdfast.lab.studies.command import studies_of
 from holdfast.lab.studies.executors import (
     LocalExecutor,
@@ -30,8 +30,7 @@ from holdfast.lab.studies.executors import (
 )
 from holdfast.lab.studies.running import ResultCache, Workload, compute, write_report
 from holdfast.lab.studies.statistics import Interval
-from holdfast.lab.studies.study import Number, Report, Results, Scale
-from holdfast.lab.studies.tables import Columns
+from holdfast.lab.studies.study import Number, Part, Report, Scale, Study
 from holdfast.lab.studies.tasks import Task, code_of, run_task, task_key
 from holdfast.lab.studies.trial_batches import TrialSeries, trial_tasks
 
@@ -223,14 +222,6 @@ class TestCache:
         assert loaded is not None
         assert loaded["a"].tolist() == [2]
 
-    def test_columns_that_do_not_fit_are_computed_again(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        cache, task = ResultCache(tmp_path), Task(kind="trials", parameters={})
-        monkeypatch.setattr(running, "columns_of", lambda _: Columns({"a": [1], "b": [1, 2]}))
-        cache.store(task, pd.DataFrame())
-        assert cache.load(task) is None
-
     def test_what_cannot_be_kept_says_where(self, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("")
         with pytest.raises(OutputError, match="file"):
@@ -302,21 +293,19 @@ class TestLocalExecutor:
             LocalExecutor(count)
 
 
-class OneSeries:
+class OneSeries(Study):
     """A study of seven trials."""
 
     name = "one_series"
     title = "Seven trials"
 
-    def tasks(self, scale: Scale) -> list[Task]:
-        return list(trial_tasks(series(seed=scale.seed), 3))
+    def parts(self, scale: Scale) -> list[Part]:
+        return [Part({"way": "ours"}, list(trial_tasks(series(seed=scale.seed), 3)), self.name)]
 
-    def report(self, scale: Scale, results: Results) -> Report:
-        table = results.of(self.tasks(scale))
-        mean = float(table["reward"].mean())
+    def report_of(self, tables: Mapping[str, pd.DataFrame]) -> Report:
+        mean = float(tables[self.name]["reward"].mean())
         return Report(
             summary={"means": pd.DataFrame({"reward": [mean]})},
-            raw={"one_series": table},
             numbers=[Number("mean reward", Interval(mean, mean, mean), n=7)],
         )
 
@@ -342,7 +331,9 @@ class TestWorkload:
         third = Workload([study, study], scale, tmp_path)
         assert third.pending == []
         assert third.units == 7, "what two studies need is computed once"
-        assert outcome([study.report(scale, third.results).raw["one_series"]]) == outcome(
+        rows = study.report(scale, third.result_of).raw["one_series"]
+        assert rows["way"].tolist() == ["ours"] * 7
+        assert outcome([rows.drop(columns="way")]) == outcome(
             [run_task(next(trial_tasks(series(), 100)))]
         )
 
@@ -350,7 +341,7 @@ class TestWorkload:
         study, scale = OneSeries(), Scale(seed=4)
         workload = Workload([study], scale, tmp_path)
         compute(workload, LocalExecutor(1), lambda _: None)
-        report = study.report(scale, workload.results)
+        report = study.report(scale, workload.result_of)
         names = write_report(study, scale, report, tmp_path / "one_series")
         assert names == ["means.csv", "numbers.csv", "one_series_trials.csv", "origin.json"]
         origin = msgspec.json.decode((tmp_path / "one_series" / "origin.json").read_bytes())
@@ -428,11 +419,12 @@ def test_exclusive_tasks_come_last_and_here(
                 on_result(task, pd.DataFrame({}))
 
     class Both(OneSeries):
-        def tasks(self, scale: Scale) -> list[Task]:
-            return [
+        def parts(self, scale: Scale) -> list[Part]:
+            tasks = [
                 Task(kind="trials", parameters={"a": number}, exclusive=number == 0)
                 for number in range(3)
             ]
+            return [Part({}, tasks)]
 
     def run_here(task: Task) -> pd.DataFrame:
         ran.append((int(task.parameters["a"]), "here"))

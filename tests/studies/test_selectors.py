@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 import pytest
-from tests.studies.made_up import noise, results_of
+from tests.studies.made_up import noise, report_on
 
 from holdfast.errors import InvalidValueError
 from holdfast.lab.errors import TrialFileError
@@ -19,7 +19,7 @@ from holdfast.lab.studies import parameters, selectors
 from holdfast.lab.studies.cases import CASES
 from holdfast.lab.studies.command import main
 from holdfast.lab.studies.running import write_report
-from holdfast.lab.studies.study import CHOICE, CLAIM, Report, Scale, Study
+from holdfast.lab.studies.study import CHOICE, CLAIM, TRIALS, Report, Scale, Study
 from holdfast.lab.studies.tables import to_csv
 from holdfast.lab.studies.tasks import Task, run_task
 from holdfast.lab.studies.trial_batches import TrialSeries, run_trials_of, trial_tasks
@@ -29,7 +29,7 @@ from holdfast.robot import trial as trial_runner
 from holdfast.robot.environment import SimulatedEnvironment
 
 SCALE = Scale(seed=5)
-TRIALS = {CHOICE: 20, CLAIM: 40}
+NUM_TRIALS = {CHOICE: 20, CLAIM: 40}
 PEG_IN_HOLE = "peg_in_hole_2d"
 PEG_IN_SPACE = "peg_in_hole_3d"
 THREE_PLATES = "multitier_peg_in_hole_2d"
@@ -68,8 +68,8 @@ def compared() -> Iterator[Report]:
 
     study = selectors.Selectors()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(selectors.Selectors, "num_trials", TRIALS)
-        yield study.report(SCALE, results_of(study, SCALE, trial))
+        patch.setattr(selectors.Selectors, "num_trials", NUM_TRIALS)
+        yield report_on(study, SCALE, trial)
 
 
 def test_every_cell_is_there(compared: Report) -> None:
@@ -178,10 +178,8 @@ def test_a_trial_that_begins_in_the_goal_says_nothing_of_steps(
         (selectors.Selectors(), ("selectors", "relative_steps", "rivals")),
         (parameters.Parameters(), ("parameters", "together")),
     ):
-        monkeypatch.setattr(type(study), "num_trials", TRIALS)
-        report, other = (
-            study.report(SCALE, results_of(study, SCALE, each)) for each in (trial, without_it)
-        )
+        monkeypatch.setattr(type(study), "num_trials", NUM_TRIALS)
+        report, other = (report_on(study, SCALE, each) for each in (trial, without_it))
         for name in names:
             both = (each.summary[name].to_dict("records") for each in (report, other))
             rows = zip(*both, strict=True)
@@ -203,7 +201,7 @@ def test_a_trial_that_begins_in_the_goal_says_nothing_of_steps(
 
 
 def test_what_a_parameter_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parameters.Parameters, "num_trials", TRIALS)
+    monkeypatch.setattr(parameters.Parameters, "num_trials", NUM_TRIALS)
 
     def trial(task: Task, number: int) -> tuple[bool, int, float]:
         world = math.exp(0.3 * noise(task, number, ["problem", "model"]))
@@ -222,7 +220,7 @@ def test_what_a_parameter_does(monkeypatch: pytest.MonkeyPatch) -> None:
         return True, round(10_000 * world * own * factor), 0.0
 
     study = parameters.Parameters()
-    report = study.report(SCALE, results_of(study, SCALE, trial))
+    report = report_on(study, SCALE, trial)
     for row in report.summary["parameters"].to_dict("records"):
         expected = 1.0
         if (row["parameter"], row["value"]) == ("horizon", "3"):
@@ -376,8 +374,8 @@ def decided() -> Iterator[Report]:
 
     study = selectors.Selectors()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(selectors.Selectors, "num_trials", TRIALS)
-        yield study.report(SCALE, results_of(study, SCALE, trial))
+        patch.setattr(selectors.Selectors, "num_trials", NUM_TRIALS)
+        yield report_on(study, SCALE, trial)
 
 
 def test_what_decides_about_the_default(decided: Report) -> None:
@@ -453,7 +451,7 @@ def test_all_follows_from_the_file_of_trials(
         chance = noise(task, number, ["problem", "model", "seed", "planning"])
         return chance < 1.5, round(10_000 * math.exp(0.3 * chance)), chance / 3.0
 
-    report = study.report(SCALE, results_of(study, SCALE, trial))
+    report = report_on(study, SCALE, trial)
     out = tmp_path / "first" / study.name
     report = msgspec.structs.replace(report, figures={})
     assert "trials.parquet" in write_report(study, SCALE, report, out)
@@ -461,16 +459,16 @@ def test_all_follows_from_the_file_of_trials(
     assert (kept.study, kept.scale) == (study.name, SCALE)
     assert report.trials is not None
     pd.testing.assert_frame_equal(kept.trials, report.trials)
-    again = study.report_of(kept.trials)
+    again = study.report_of({TRIALS: kept.trials})
     assert columns_of(again) == columns_of(report)
     # A trial that went otherwise is seen.
     kept.trials.loc[len(kept.trials) - 1, "steps"] += 1000
-    assert columns_of(study.report_of(kept.trials)) != columns_of(report)
+    assert columns_of(study.report_of({TRIALS: kept.trials})) != columns_of(report)
     short = kept.trials.iloc[:-6]
     with pytest.raises(InvalidValueError, match=f"{study.name}: there are no trials of claim, "):
-        study.report_of(short)
+        study.report_of({TRIALS: short})
     with pytest.raises(InvalidValueError, match="without the columns steps_to_goal"):
-        study.report_of(short.drop(columns="steps_to_goal"))
+        study.report_of({TRIALS: short.drop(columns="steps_to_goal")})
     other = "parameters" if study.name == "selectors" else "selectors"
     with pytest.raises(InvalidValueError, match=f"has the trials of {study.name}, not of {other}"):
         source = out / "trials.parquet"

@@ -30,7 +30,6 @@ def test_mean_interval_is_students() -> None:
     interval = mean_interval(values)
     low, high = stats.t.interval(0.95, 3, loc=3.0, scale=stats.sem([1.0, 2.0, 4.0, 5.0]))
     assert interval == pytest.approx((3.0, low, high))
-    assert str(interval) == "3 [0.0948, 5.91]"
 
 
 def test_mean_interval_of_few() -> None:

@@ -5,10 +5,8 @@ import io
 import math
 
 import pandas as pd
-import pytest
 
-from holdfast.errors import InvalidValueError
-from holdfast.lab.studies.tables import Columns, columns_of, frame_of, to_csv
+from holdfast.lab.studies.tables import columns_of, to_csv
 
 
 def table() -> pd.DataFrame:
@@ -17,8 +15,8 @@ def table() -> pd.DataFrame:
 
 
 def test_plain_data_gives_the_same_table_back() -> None:
-    pd.testing.assert_frame_equal(frame_of(columns_of(table())), table())
-    assert columns_of(table()).columns["steps"] == [3, 4, 5]
+    pd.testing.assert_frame_equal(pd.DataFrame(columns_of(table())), table())
+    assert columns_of(table())["steps"] == [3, 4, 5]
 
 
 def test_csv_gives_the_same_numbers_back() -> None:
@@ -27,8 +25,3 @@ def test_csv_gives_the_same_numbers_back() -> None:
     assert [row["success"] for row in rows] == ["1", "0", "1"]
     assert [float(row["reward"]) for row in rows[:2]] == [-0.1, 1e-300]
     assert rows[2]["reward"] == ""
-
-
-def test_columns_of_another_length_are_refused() -> None:
-    with pytest.raises(InvalidValueError, match="columns that make no table"):
-        frame_of(Columns({"a": [1], "b": [1, 2]}))

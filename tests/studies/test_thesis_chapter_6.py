@@ -13,7 +13,7 @@ from holdfast.config.loader import load
 from holdfast.lab.studies import cloud_trials, thesis_chapter_6
 from holdfast.lab.studies.cloud_trials import COLUMNS, CloudTrials, rows_of_run
 from holdfast.lab.studies.running import write_report
-from holdfast.lab.studies.study import Number, Report, Results, Scale
+from holdfast.lab.studies.study import Number, Report, Scale
 from holdfast.lab.studies.tasks import Task, run_task, task_key
 from holdfast.lab.studies.thesis_chapter_6 import ThesisChapter6, series_of
 from holdfast.lab.studies.thesis_measurements import (
@@ -88,17 +88,16 @@ def test_the_settings_are_the_thesis_s() -> None:
     """In process and with services."""
     thesis = load(THESIS)
     series = series_of(100, 10, seed=0)
-    cloud = CloudTrials(particles=100)
     assert series.problem == thesis.problem_name
     assert series.planning.particle_filter == thesis.planning.particle_filter
     assert series.planning.sensing_interval == thesis.planning.sensing_interval
     assert series.planning.selector == thesis.planning.selector
-    assert series.max_steps == thesis.simulator.max_steps == cloud.max_steps
-    for settings in (series.planning.active_sensing, cloud):
+    assert series.max_steps == thesis.simulator.max_steps == cloud_trials.MAX_STEPS
+    for settings in (series.planning.active_sensing, cloud_trials.SENSING):
         sensing = thesis.planning.active_sensing
         assert settings.num_observation_samples == sensing.num_observation_samples
         assert settings.num_nearest_neighbors == sensing.num_nearest_neighbors
-    assert cloud.sensing_interval == thesis.planning.sensing_interval
+    assert thesis.planning.sensing_interval == cloud_trials.SENSING_INTERVAL
 
 
 @pytest.mark.parametrize("quick", [True, False])
@@ -168,8 +167,7 @@ def number_of(report: Report, name: str) -> Number:
 def report() -> Any:
     scale = Scale(quick=True, seed=3)
     study = ThesisChapter6()
-    tables = {task_key(task): made_up(task) for task in study.tasks(scale)}
-    return study.report(scale, Results(tables, task_key))
+    return study.report(scale, made_up)
 
 
 class TestReport:
@@ -203,12 +201,14 @@ class TestReport:
         scale = Scale(quick=True, seed=3)
         study = ThesisChapter6()
         tasks = study.tasks(scale)
-        tables = {task_key(task): made_up(task) for task in tasks}
         changed = next(task for task in tasks if task.kind == "cloud_trials" and
                        not task.parameters["actions"])  # fmt: skip
-        table = tables[task_key(changed)]
-        table["identical"] = False
-        report = study.report(scale, Results(tables, task_key))
+
+        def result_of(task: Task) -> pd.DataFrame:
+            table = made_up(task)
+            return table.assign(identical=False) if task == changed else table
+
+        report = study.report(scale, result_of)
         runs = sum(task.parameters["runs"] for task in tasks if task.kind == "cloud_trials")
         number = number_of(report, "disturbed runs identical to their reference runs")
         assert number.n == runs
@@ -261,8 +261,7 @@ def test_really(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(thesis_chapter_6, "_QUICK_TRIALS", 2)
     study = ThesisChapter6()
     scale = Scale(quick=True, seed=5)
-    tables = {task_key(task): run_task(task) for task in study.tasks(scale)}
-    report = study.report(scale, Results(tables, task_key))
+    report = study.report(scale, run_task)
     same = number_of(report, "disturbed runs identical to their reference runs")
     assert (same.n, same.interval.value) == (3, 100.0)
     rows = report.raw["cloud"]

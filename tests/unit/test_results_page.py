@@ -14,7 +14,7 @@ from matplotlib.text import Text
 
 from holdfast.lab.studies import offload_break_even, plots, published_2017
 from holdfast.lab.studies.command import studies_of, study_names
-from holdfast.lab.studies.study import Report, TrialStudy
+from holdfast.lab.studies.study import TRIALS, Report, TrialStudy
 from holdfast.lab.studies.tables import to_csv
 from holdfast.lab.studies.trial_files import read_trials
 
@@ -188,7 +188,7 @@ def test_tables_follow_from_the_committed_trials(path: Path) -> None:
         pytest.skip("the trials are of a quick run")
     (study,) = studies_of([kept.study])
     assert isinstance(study, TrialStudy)
-    report = study.report_of(kept.trials)
+    report = study.report_of({TRIALS: kept.trials})
     committed = {table.stem for table in path.parent.glob("*.csv")}
     assert committed == set(report.tables)
     for name, table in report.tables.items():
@@ -217,7 +217,7 @@ def test_figures_are_legible_on_the_page(path: Path) -> None:
     """Where a figure is 900 pixels wide, its texts are at least 9 pixels high."""
     (study,) = studies_of([path.parent.name])
     assert isinstance(study, TrialStudy)
-    for draw in study.report_of(read_trials(path).trials).figures.values():
+    for draw in study.report_of({TRIALS: read_trials(path).trials}).figures.values():
         figure = draw()
         plots.make_legible(figure)
         figure.canvas.draw()

@@ -22,10 +22,6 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    name : str
-        In tables and figures.
-    problem : str
-        A registered name or ``module:Class``.
     model : dict
         Differences from the problem's defaults.
     share : float
@@ -54,16 +50,10 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
         particle_filter: ParticleFilterSettings | None = None,
         continued_trials: int = 0,
     ) -> TrialSeries:
-        """Return the trials of one way of sensing.
+        """Return the trials of one way of sensing, with this case's number of particles.
 
-        Parameters
-        ----------
-        num_trials : int
-            Of a problem whose share is 1.
-        active_sensing, particle_filter : optional
-            Default: the project's, on one core, with this case's number of particles.
-        continued_trials : int
-            The first ones, which are continued if they are cut off.
+        ``num_trials`` is that of a problem whose share is 1. Of these the first
+        ``continued_trials`` are continued if they are cut off.
         """
         if (
             self.state_resolution is not None

@@ -19,6 +19,7 @@ from typing import Any
 import msgspec
 import pandas as pd
 
+from holdfast.config.settings import ActiveSensingSettings
 from holdfast.files import write_atomically
 from holdfast.lab.errors import NoProgressError, ProcessEndedError, TaskError
 from holdfast.lab.studies.tables import Cell
@@ -36,7 +37,16 @@ from holdfast.lab.testbed.world import (
 from holdfast.recording.compare import compare_runs
 from holdfast.robot.links import RECOVERY_SERVICE
 
-__all__ = ["COLUMNS", "CloudTrials", "rows_of_run", "run_cloud_trials"]
+__all__ = [
+    "COLUMNS",
+    "MAX_STEPS",
+    "PROBLEM",
+    "SENSING",
+    "SENSING_INTERVAL",
+    "CloudTrials",
+    "rows_of_run",
+    "run_cloud_trials",
+]
 
 COLUMNS = (
     "run",
@@ -75,7 +85,12 @@ that were sent between robot and cloud from the start of the robot to its end, w
 seen.
 """
 
-_PROBLEM = "peg_in_hole_2d"
+PROBLEM = "peg_in_hole_2d"
+MAX_STEPS = 700
+SENSING_INTERVAL = 8
+SENSING = ActiveSensingSettings(num_observation_samples=10, num_nearest_neighbors=5, num_cores=8)
+"""The thesis's settings."""
+
 _USUAL_START_S = 1.0
 _MAX_SLOWNESS = 3.0
 
@@ -92,7 +107,6 @@ class CloudTrials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     Attributes
     ----------
-    transport : {"tcp", "tls", "udp"}
     round_trip_ms : float
         Of the emulated path; 0 is the machine's own loopback.
     loss : float
@@ -106,10 +120,6 @@ class CloudTrials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         or the run would be over before all has happened.
     local_decisions : int
         Sensing actions that the local service chooses before the cloud is started again.
-    max_steps, sensing_interval, num_observation_samples, num_nearest_neighbors : int
-        The thesis's.
-    num_cores : int
-        Threads of a decision, at most.
     packets : bool
         Whether the path may be one for packets; see :mod:`holdfast.lab.testbed.wide_area`.
     actions : bool
@@ -128,11 +138,6 @@ class CloudTrials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     min_steps: int = 400
     rate_hz: float = 100.0
     local_decisions: int = 8
-    max_steps: int = 700
-    sensing_interval: int = 8
-    num_observation_samples: int = 10
-    num_nearest_neighbors: int = 5
-    num_cores: int = 8
     packets: bool = True
     actions: bool = False
     kills: bool = True
@@ -142,14 +147,7 @@ def run_cloud_trials(**trials: Any) -> pd.DataFrame:
     """Run them; the function of tasks of the kind ``cloud_trials``.
 
     It gets the fields of :class:`CloudTrials`, and returns a table with the columns of
-    :data:`COLUMNS`.
-
-    Raises
-    ------
-    TaskError
-        If a process ends that should not, or nothing goes on any more.
-    HoldfastError
-        If a process or the path cannot be had.
+    :data:`COLUMNS`. TaskError if a process ends that should not, or nothing goes on any more.
     """
     wanted = msgspec.convert(trials, CloudTrials)
     seed = f"cloud trials {wanted.seed} {wanted.first_run}"
@@ -176,13 +174,8 @@ def rows_of_run(
     table: DecisionTable,
     fault: FaultTimes | None,
     killed_at: float | None,
-    *,
-    identical: bool,
-    emulated_by: str,
-    load: float | None = None,
-    rate_hz: float | None = None,
-    carried_bytes: int | None = None,
     performed: Iterable[Performance] = (),
+    **of_all: Cell,
 ) -> pd.DataFrame:
     """Return the rows of a run: its decisions, its kill, if there was one, and its actions.
 
@@ -190,24 +183,16 @@ def rows_of_run(
     ----------
     killed_at : float or None
         When the cloud was killed, in seconds since the epoch.
-    identical : bool
-        Whether all decisions and actions are those of the reference run.
     performed : iterable of Performance
         Task actions to be listed.
+    **of_all
+        Columns that are the same in all rows.
     """
     began = table.rows[0].at
-    ends: dict[str, Cell] = {
-        "identical": identical,
-        "emulated_by": emulated_by,
-        "load": load,
-        "rate_hz": rate_hz,
-        "carried_bytes": carried_bytes,
-    }
     rows: list[dict[str, Cell]] = [
         {
-            "run": run,
             "what": each.kind,
-            "at_s": round(each.at - began, 6),
+            "at_s": each.at - began,
             "trial": each.trial,
             "step": each.step,
             "service": "local" if each.service == RECOVERY_SERVICE else "cloud",
@@ -215,7 +200,6 @@ def rows_of_run(
             "waited_ms": each.waited_ms,
             "round_trip_ms": each.round_trip_ms,
             "computed_ms": each.computed_ms,
-            **ends,
         }
         for each in table.rows
     ]
@@ -225,30 +209,22 @@ def rows_of_run(
             decided_ms = round(max(0.0, fault.recovery_ms - fault.detection_ms), 3)
         rows.append(
             {
-                "run": run,
                 "what": "kill",
-                "at_s": round(killed_at - began, 6),
+                "at_s": killed_at - began,
                 "waited_ms": fault.longest_wait_ms,
                 "found_ms": fault.detection_ms,
                 "first_local_ms": decided_ms,
                 "launch_ms": fault.launch_ms,
                 "away_ms": fault.away_ms,
                 "failback_ms": fault.failback_ms,
-                **ends,
             }
         )
     rows += [
-        {
-            "run": run,
-            "what": "action",
-            "at_s": round(each.at - began, 6),
-            "trial": each.trial,
-            "step": each.step,
-            **ends,
-        }
+        {"what": "action", "at_s": each.at - began, "trial": each.trial, "step": each.step}
         for each in performed
     ]
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+    listed = pd.DataFrame(rows, columns=list(COLUMNS)).assign(run=run, **of_all)
+    return listed.assign(at_s=listed["at_s"].round(6))
 
 
 class _Series:
@@ -309,12 +285,12 @@ class _Series:
             robot.table,
             times[0] if times else None,
             testbed.faults[0].injected_at if times else None,
+            performed=list(performances(performed[_WITH_KILL])) if wanted.actions else (),
             identical=comparison.identical and difference is None,
             emulated_by=self._path.emulated_by,
             load=round(load, 2),
             rate_hz=round(rate_hz, 2),
             carried_bytes=self._carried_bytes(since=carried_before),
-            performed=list(performances(performed[_WITH_KILL])) if wanted.actions else (),
         )
         shutil.rmtree(directory)
         return rows
@@ -323,7 +299,7 @@ class _Series:
         """Kill the cloud; start it again once the local service has decided for a while."""
         testbed, cloud, robot = self._testbed, self._cloud, self._testbed.robot
         kill_step = int(chance.uniform(_EARLIEST_KILL, _LATEST_KILL) * robot.steps)
-        turn_s = (self._wanted.sensing_interval + 1) / robot.rate_hz
+        turn_s = (SENSING_INTERVAL + 1) / robot.rate_hz
         pause_s = chance.uniform(0.0, turn_s)
         yield (
             lambda: robot.steps_done >= kill_step and robot.decisions[-1].service == cloud.endpoint
@@ -355,18 +331,18 @@ class _Series:
         if self._keys is not None:
             offload["tls"] = str(self._keys / "robot")
         document = {
-            "problem": _PROBLEM,
+            "problem": PROBLEM,
             "particle_filter": {"num_particles": wanted.particles},
             "active_sensing": {
-                "num_observation_samples": wanted.num_observation_samples,
-                "num_nearest_neighbors": wanted.num_nearest_neighbors,
-                "num_cores": wanted.num_cores,
+                "num_observation_samples": SENSING.num_observation_samples,
+                "num_nearest_neighbors": SENSING.num_nearest_neighbors,
+                "num_cores": SENSING.num_cores,
             },
             "selector": {"estimator": "nearest_neighbor"},  # the thesis's
             "simulator": {
                 "num_trials": num_trials,
-                "max_steps": wanted.max_steps,
-                "sensing_intervals": wanted.sensing_interval,
+                "max_steps": MAX_STEPS,
+                "sensing_intervals": SENSING_INTERVAL,
                 "seed": wanted.seed + run,
             },
             "offload": offload,

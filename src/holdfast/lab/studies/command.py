@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from holdfast.cli.exit_codes import ended_by_signals, interrupted_by
 from holdfast.errors import HoldfastError, InvalidValueError, OptionError, RunError
 from holdfast.runtime.command_line import (
@@ -178,22 +180,21 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _make_anew(studies: list[Study], source: Path, directory: Path) -> None:
-    from holdfast.lab.studies.running import write_report
-    from holdfast.lab.studies.study import TrialStudy
+    from holdfast.lab.studies.study import TRIALS, TrialStudy
     from holdfast.lab.studies.trial_files import read_trials
 
     kept = read_trials(source)
-    if [study.name for study in studies] != [kept.study]:
+    names = [study.name for study in studies]
+    if names != [kept.study]:
         raise InvalidValueError(
-            f"--from {source}: has the trials of {kept.study}, not of "
-            f"{', '.join(study.name for study in studies)}"
+            f"--from {source}: has the trials of {kept.study}, not of {', '.join(names)}"
         )
-    study = studies[0]
+    (study,) = studies
     if not isinstance(study, TrialStudy):
         raise InvalidValueError(f"--from {source}: {study.name} makes nothing of trials in a file")
-    report = study.report_of(kept.trials)
-    place = directory / study.name
-    _show(study, report, write_report(study, kept.scale, report, place, kept.machine), place)
+    report = study.report_of({TRIALS: kept.trials})
+    report = msgspec.structs.replace(report, trials=kept.trials)
+    _show(study, kept.scale, report, directory / study.name, kept.machine)
 
 
 def _executor_of(place: str, jobs: int) -> Executor:
@@ -222,7 +223,8 @@ def _run(
         workload = Workload(studies, scale, directory)
         _compute(workload, directory, executor)
         for study in studies:
-            _report(study, scale, workload, directory / study.name)
+            report = study.report(scale, workload.result_of)
+            _show(study, scale, report, directory / study.name)
     except KeyboardInterrupt as interruption:
         how = interrupted_by(interruption)
         with contextlib.suppress(OSError):
@@ -253,14 +255,17 @@ def _compute(workload: Workload, directory: Path, executor: Executor) -> None:
             line.stop()
 
 
-def _report(study: Study, scale: Scale, workload: Workload, directory: Path) -> None:
+def _show(
+    study: Study,
+    scale: Scale,
+    report: Report,
+    directory: Path,
+    machine: dict[str, str] | None = None,
+) -> None:
+    """Write a report, and print its numbers and the names of its files."""
     from holdfast.lab.studies.running import write_report
 
-    report = study.report(scale, workload.results)
-    _show(study, report, write_report(study, scale, report, directory), directory)
-
-
-def _show(study: Study, report: Report, names: list[str], directory: Path) -> None:
+    names = write_report(study, scale, report, directory, machine)
     sys.stdout.write(f"\n{study.title}\n\n")
     for number in report.numbers[:_MOST_NUMBERS]:
         sys.stdout.write(f"- {number}\n")

@@ -13,9 +13,7 @@ measurement allows.
 Everything here is arithmetic on numbers that were measured elsewhere.
 
 Source: G. M. Amdahl, "Validity of the single processor approach to achieving large scale computing
-capabilities", 1967; D. C. Montgomery, E. A. Peck, G. G. Vining, "Introduction to Linear Regression
-Analysis" (the interval of a slope); H. A. David, H. N. Nagaraja, "Order Statistics" (the interval
-of a median).
+capabilities", 1967.
 """
 
 from __future__ import annotations
@@ -27,112 +25,38 @@ from typing import NamedTuple
 import numpy as np
 
 from holdfast.arrays import FloatArray
-from holdfast.errors import InvalidValueError
-from holdfast.lab.studies.statistics import Interval
 
-__all__ = [
-    "BreakEven",
-    "Curve",
-    "Scaling",
-    "break_even",
-    "busy_cores",
-    "parallel_share",
-    "power_law",
-]
-
-
-_LEVEL = 0.95
+__all__ = ["BreakEven", "Curve", "Scaling", "break_even", "busy_cores", "parallel_share"]
 
 
 def parallel_share(times: Mapping[int, float]) -> float:
-    """Return the share f of a time on one thread that is divided among threads.
+    """Return the share f of a time on one thread that is divided among threads, from 0 to 1.
 
     The least-squares fit of T(p) / T(1) = 1 - f (1 - 1 / p) to all numbers of threads p, which with
-    two of them is exact.
-
-    Parameters
-    ----------
-    times : mapping of int to float
-        By numbers of threads; 1 and at least one more.
-
-    Returns
-    -------
-    float
-        From 0 to 1; where threads made it slower, 0.
-
-    Raises
-    ------
-    InvalidValueError
-        If there are too few times, or one is not positive.
+    two of them is exact. Where threads made it slower it is 0.
     """
-    if 1 not in times or len(times) < 2 or min(times) < 1:
-        raise InvalidValueError(f"times of {sorted(times)} threads: 1 and one more are needed")
-    if not all(time > 0.0 for time in times.values()):
-        raise InvalidValueError(f"times {list(times.values())}: must be positive")
-    numbers = [number for number in times if number > 1]
-    gained = [1.0 - times[number] / times[1] for number in numbers]
-    possible = [1.0 - 1.0 / number for number in numbers]
-    share = sum(g * p for g, p in zip(gained, possible, strict=True))
-    share /= sum(p * p for p in possible)
-    return min(max(share, 0.0), 1.0)
+    more = [number for number in times if number > 1]
+    gained = np.array([1.0 - times[number] / times[1] for number in more])
+    possible = np.array([1.0 - 1.0 / number for number in more])
+    return float(np.clip(gained @ possible / (possible @ possible), 0.0, 1.0))
 
 
 def busy_cores(cores: int, pieces: int | None) -> float:
     """Return how many of some cores equal pieces of work keep busy on average.
 
     Nine pieces on eight cores take two turns, as sixteen would: 4.5 cores' worth.
-
-    Raises
-    ------
-    InvalidValueError
-        If one is below 1.
     """
-    if pieces is None and cores >= 1:
-        return float(cores)
-    if pieces is None or cores < 1 or pieces < 1:
-        raise InvalidValueError(f"{pieces} pieces on {cores} cores: both must be at least 1")
-    return pieces / math.ceil(pieces / cores)
-
-
-def power_law(sizes: FloatArray, times: FloatArray) -> tuple[float, Interval]:
-    """Fit ``times = a sizes^b``, by least squares of logarithms.
-
-    Returns
-    -------
-    a : float
-    b : Interval
-        Student's; without bounds for two points.
-
-    Raises
-    ------
-    InvalidValueError
-        If there are fewer than two different sizes, or a number is not positive.
-    """
-    from scipy import stats
-
-    if sizes.shape != times.shape or np.unique(sizes).size < 2:
-        raise InvalidValueError(f"a power law of {np.unique(sizes).size} sizes: 2 are needed")
-    if not (np.all(sizes > 0.0) and np.all(times > 0.0)):
-        raise InvalidValueError("a power law of sizes and times that are not all positive")
-    fit = stats.linregress(np.log(sizes), np.log(times))
-    slope = float(fit.slope)
-    half = math.inf
-    if sizes.size > 2:
-        half = float(stats.t.ppf(0.5 + 0.5 * _LEVEL, sizes.size - 2)) * float(fit.stderr)
-    return math.exp(float(fit.intercept)), Interval(slope, slope - half, slope + half)
+    return float(cores) if pieces is None else pieces / math.ceil(pieces / cores)
 
 
 class Curve(NamedTuple):
-    """A positive quantity over numbers of particles, straight between points in logarithms.
+    """A positive quantity over rising numbers of particles, straight between points in logarithms.
 
-    Attributes
-    ----------
-    particles : tuple of float
-        Rising.
+    Both of shape (n,).
     """
 
-    particles: tuple[float, ...]
-    values: tuple[float, ...]
+    particles: FloatArray
+    values: FloatArray
 
     def at(self, particles: FloatArray) -> FloatArray:
         """Return the values at some numbers of particles; NaN outside of what was measured."""
@@ -160,31 +84,29 @@ class Scaling(NamedTuple):
 
     Attributes
     ----------
-    particles : tuple of int
+    particles : array of shape (n,)
         Rising.
-    times : tuple of Interval
-        On one thread, in milliseconds.
-    shares : tuple of Interval
+    times : array of shape (3, n)
+        On one thread, in milliseconds; with the ends of their intervals, infinite where there is
+        none.
+    shares : array of shape (3, n)
         Of that, what is divided among threads, from 0 to 1.
     pieces : int or None
         Into which the divided part falls; None for as many as one likes.
     """
 
-    particles: tuple[int, ...]
-    times: tuple[Interval, ...]
-    shares: tuple[Interval, ...]
+    particles: FloatArray
+    times: FloatArray
+    shares: FloatArray
     pieces: int | None
 
     def on_cores(self, cores: int) -> Curve:
         """Return the time on some cores, as extrapolated from what was measured."""
-        busy = busy_cores(cores, self.pieces)
-        return Curve(
-            self.particles,
-            tuple(
-                time.value * (1.0 - share.value + share.value / busy)
-                for time, share in zip(self.times, self.shares, strict=True)
-            ),
-        )
+        return Curve(self.particles, self._times_on(cores, self.shares[0]))
+
+    def _times_on(self, cores: int, shares: FloatArray) -> FloatArray:
+        times: FloatArray = self.times[0] * (1.0 - shares + shares / busy_cores(cores, self.pieces))
+        return times
 
     def band(self, cores: int) -> tuple[Curve, Curve]:
         """Return what the time on some cores is at least, and at most.
@@ -192,14 +114,8 @@ class Scaling(NamedTuple):
         At least: all of the work divided evenly. At most: the least share that the measurement
         allows, in pieces that cannot be divided further. Both about the median on one core.
         """
-        busy = busy_cores(cores, self.pieces)
-        least = tuple(time.value / cores for time in self.times)
-        lows = [_bounded(share.low) for share in self.shares]
-        most = tuple(
-            time.value * (1.0 - low + low / busy)
-            for time, low in zip(self.times, lows, strict=True)
-        )
-        return Curve(self.particles, least), Curve(self.particles, most)
+        most = self._times_on(cores, self.shares[1].clip(0.0, 1.0))
+        return Curve(self.particles, self.times[0] / cores), Curve(self.particles, most)
 
     def bounds(self) -> tuple[Scaling, Scaling, Scaling]:
         """Return what is favourable to few cores, favourable to many, and divided evenly.
@@ -207,22 +123,19 @@ class Scaling(NamedTuple):
         The first has the low ends of both intervals, the second their high ends, and the third the
         medians with all of the work divided, in as many pieces as one likes.
         """
-        low = [Interval(*[max(time.low, 1e-9)] * 3) for time in self.times]
-        high = [
-            Interval(*[time.high if math.isfinite(time.high) else time.value] * 3)
-            for time in self.times
-        ]
-        least = [Interval(*[_bounded(share.low)] * 3) for share in self.shares]
-        most = [Interval(*[_bounded(share.high)] * 3) for share in self.shares]
-        even = [Interval(1.0, 1.0, 1.0)] * len(self.shares)
+        value, low, high = self.times
+        _, least, most = self.shares.clip(0.0, 1.0)
+        slow = np.where(np.isfinite(high), high, value)
         return (
-            self._replace(times=tuple(low), shares=tuple(least)),
-            self._replace(times=tuple(high), shares=tuple(most)),
-            self._replace(shares=tuple(even), pieces=None),
+            self._replace(times=_always(np.maximum(low, 1e-9)), shares=_always(least)),
+            self._replace(times=_always(slow), shares=_always(most)),
+            self._replace(shares=np.ones_like(self.shares), pieces=None),
         )
 
     def saved_ms(self, robot_cores: int, cores: int, ahead_ms: float = 0.0) -> Curve | None:
         """Return how much less a robot waits for some cores than for its own, but for the path.
+
+        From the number of particles on above which something is saved; None if nothing is.
 
         Parameters
         ----------
@@ -231,43 +144,31 @@ class Scaling(NamedTuple):
         ahead_ms : float
             How long before it is needed a decision is begun. Only what it takes longer is waited
             for, by whomever it is made.
-
-        Returns
-        -------
-        Curve or None
-            From the number of particles on above which something is saved; None if nothing is.
         """
-        own, elsewhere = self.on_cores(robot_cores), self.on_cores(cores)
-        first, last = math.log(self.particles[0]), math.log(self.particles[-1])
+        first, last = self.particles[0], self.particles[-1]
         # Both are straight between what was measured; the difference of the waits is not.
-        numbers = np.unique(
-            np.concatenate(
-                [np.array(self.particles, dtype=np.float64), np.exp(np.linspace(first, last, 400))]
-            )
-        ).clip(self.particles[0], self.particles[-1])
-        waits = [np.maximum(curve.at(numbers) - ahead_ms, 0.0) for curve in (own, elsewhere)]
-        saved = waits[0] - waits[1]
+        dense = np.exp(np.linspace(math.log(first), math.log(last), 400))
+        numbers = np.unique(np.concatenate([self.particles, dense])).clip(first, last)
+        own, elsewhere = (
+            np.maximum(self.on_cores(each).at(numbers) - ahead_ms, 0.0)
+            for each in (robot_cores, cores)
+        )
+        saved = own - elsewhere
         # Where nothing is saved a logarithm has no place; from there on up is what counts.
         nothing = np.flatnonzero(saved <= 0.0)
         start = int(nothing[-1]) + 1 if nothing.size else 0
-        if start >= numbers.size:
-            return None
-        return Curve(tuple(map(float, numbers[start:])), tuple(map(float, saved[start:])))
+        return Curve(numbers[start:], saved[start:]) if start < numbers.size else None
 
 
-def _bounded(share: float) -> float:
-    return min(max(share, 0.0), 1.0)
+def _always(values: FloatArray) -> FloatArray:
+    """Return values that are also the ends of their intervals."""
+    return np.tile(values, (3, 1))
 
 
 class BreakEven(NamedTuple):
-    """From how many particles on a service is faster.
+    """From how many particles on a service is faster; None if that is not within what was measured.
 
-    Attributes
-    ----------
-    particles : float or None
-        None if it was not within what was measured.
-    words : str
-        Where it is, for people.
+    With words for it.
     """
 
     particles: float | None
@@ -275,45 +176,30 @@ class BreakEven(NamedTuple):
 
 
 def break_even(saved_ms: Curve | None, cost_ms: float) -> BreakEven:
-    """Return from where on what is saved is more than what it costs.
+    """Return from where on what is saved (None: nothing) is more than what it costs.
 
     If the curve crosses the cost several times, the last time counts: beyond it the service stays
     faster as far as was measured.
-
-    Parameters
-    ----------
-    saved_ms : Curve or None
-        None saves nothing.
-    cost_ms : float
-        Of the path and of asking.
-
-    Raises
-    ------
-    InvalidValueError
-        If the cost is not positive.
     """
-    if not cost_ms > 0.0:
-        raise InvalidValueError(f"a cost of {cost_ms} ms: must be positive")
     if saved_ms is None:
         return BreakEven(None, "not within what was measured: nothing is saved there")
-    particles, values = saved_ms
+    particles, values = map(np.asarray, saved_ms)
     if values[-1] <= cost_ms:
         return BreakEven(
             None,
             f"not up to {particles[-1]:,.0f} particles, where {values[-1]:.3g} ms are saved "
             f"and {cost_ms:.3g} ms paid",
         )
-    if all(value > cost_ms for value in values):
+    too_little = np.flatnonzero(values <= cost_ms)
+    if too_little.size == 0:
         # The curve begins where it was measured first, or where the first time is saved.
-        return BreakEven(particles[0], f"at {_rounded(particles[0])} particles or fewer")
-    after = max(i for i, value in enumerate(values) if value <= cost_ms) + 1
-    low, high = math.log(values[after - 1]), math.log(values[after])
-    way = (math.log(cost_ms) - low) / (high - low)
-    first, second = math.log(particles[after - 1]), math.log(particles[after])
-    found = math.exp(first + way * (second - first))
-    return BreakEven(found, f"from {_rounded(found)} particles on")
+        first = float(particles[0])
+        return BreakEven(first, f"at {_rounded(first)} particles or fewer")
+    around = slice(too_little[-1], too_little[-1] + 2)
+    found = np.exp(np.interp(math.log(cost_ms), np.log(values[around]), np.log(particles[around])))
+    return BreakEven(float(found), f"from {_rounded(found)} particles on")
 
 
 def _rounded(particles: float) -> str:
     digits = max(0, math.floor(math.log10(particles)) - 1)
-    return f"{round(particles, -digits):,.0f}"
+    return f"{round(float(particles), -digits):,.0f}"

@@ -32,22 +32,20 @@ All trials run side by side as one batch; a trial leaves the batch when it is do
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
 import pandas as pd
 
-from holdfast.arrays import BoolArray, FloatArray, IntArray
+from holdfast.arrays import FloatArray, IntArray
 from holdfast.config.settings import PlanningSettings
 from holdfast.lab.studies.trial_batches import TrialSeries, problem_of
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
 
 __all__ = [
-    "Emulation",
     "drawn_particle",
-    "emulate",
     "entropy_of_neighborhoods",
     "least_of",
     "likelihoods",
@@ -61,50 +59,21 @@ _NEGLIGIBLE = 1e-16
 """Weight below which a neighbourhood was left out."""
 
 
-class Emulation(NamedTuple):
-    """What came of the trials, one entry each.
+def run_emulation(first_trial: int, **series: Any) -> pd.DataFrame:
+    """Run trials of a series as the implementation of 2017 did.
 
-    Attributes
-    ----------
-    successes : array of bool
-        Whether the goal was reached within the steps allowed.
-    rewards : array
-        Sum of the rewards until then.
-    steps : array of int
-        Task actions performed.
+    The function of tasks of the kind ``emulation_2017``: it gets the fields of
+    :class:`TrialSeries`, whose problem has the same observation variances in all states. All these
+    trials share one stream per step and purpose.
     """
-
-    successes: BoolArray
-    rewards: FloatArray
-    steps: IntArray
-
-
-def emulate(
-    problem: Problem,
-    planning: PlanningSettings,
-    *,
-    max_steps: int,
-    num_trials: int,
-    seed: int,
-    first_trial: int = 0,
-) -> Emulation:
-    """Run trials as the implementation of 2017 did.
-
-    Parameters
-    ----------
-    problem : Problem
-        Whose observation variances are the same in all states.
-    planning : PlanningSettings
-        Number of particles, sensing interval, and how sensing actions are chosen.
-    seed, first_trial : int
-        Name the streams; all these trials share one stream per step and purpose.
-    """
-    num_particles = planning.particle_filter.num_particles
+    wanted = msgspec.convert(series, TrialSeries)
+    problem, planning = problem_of(wanted.problem, wanted.model), wanted.planning
+    num_trials, num_particles = wanted.num_trials, planning.particle_filter.num_particles
     world = problem.initial_states(
-        stream(seed, first_trial, 0, Purpose.WORLD_INITIAL_STATE), num_trials
+        stream(wanted.seed, first_trial, 0, Purpose.WORLD_INITIAL_STATE), num_trials
     )
     particles = problem.initial_states(
-        stream(seed, first_trial, 0, Purpose.INITIAL_BELIEF), num_trials * num_particles
+        stream(wanted.seed, first_trial, 0, Purpose.INITIAL_BELIEF), num_trials * num_particles
     ).reshape(num_trials, num_particles, problem.state_size)
     stages = np.zeros(num_trials, dtype=np.int64)
     done = np.array(problem.is_goal(world))
@@ -112,10 +81,10 @@ def emulate(
     steps = np.zeros(num_trials, dtype=np.int64)
 
     # Whatever is drawn in step t is named by this, t and its purpose.
-    name = (seed, first_trial)
+    name = (wanted.seed, first_trial)
     running = np.flatnonzero(~done)
     world, particles, stages = world[running], particles[running], stages[running]
-    for step in range(max_steps):
+    for step in range(wanted.max_steps):
         if running.size == 0:
             break
         if step % (planning.sensing_interval + 1) == 0:
@@ -136,27 +105,12 @@ def emulate(
             going = ~arrived
             running, world = running[going], world[going]
             particles, stages = particles[going], stages[going]
-    return Emulation(done, rewards, steps)
-
-
-def run_emulation(first_trial: int, **series: Any) -> pd.DataFrame:
-    """Emulate some trials of a series; the function of tasks of the kind ``emulation_2017``."""
-    wanted = msgspec.convert(series, TrialSeries)
-    problem = problem_of(wanted.problem, wanted.model, wanted.state_space_planner)
-    emulation = emulate(
-        problem,
-        wanted.planning,
-        max_steps=wanted.max_steps,
-        num_trials=wanted.num_trials,
-        seed=wanted.seed,
-        first_trial=first_trial,
-    )
     return pd.DataFrame(
         {
-            "trial": list(range(first_trial, first_trial + wanted.num_trials)),
-            "success": emulation.successes,
-            "steps": emulation.steps,
-            "reward": emulation.rewards,
+            "trial": first_trial + np.arange(num_trials),
+            "success": done,
+            "steps": steps,
+            "reward": rewards,
         }
     )
 
@@ -196,9 +150,7 @@ def _entropies(
 ) -> FloatArray:
     """Return the entropy after each sensing action, summed over its hypothetical observations.
 
-    Returns
-    -------
-    array of shape (trials, sensing actions)
+    Shape (trials, sensing actions).
     """
     points = particles
     if planning.selector.method == "action_entropy":
@@ -231,13 +183,7 @@ def _entropies(
 
 
 def _squared_distances(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the squared distances of points, shape (trials, a, b).
-
-    Parameters
-    ----------
-    first : array of shape (trials, a, d)
-    second : array of shape (trials, b, d)
-    """
+    """Return the squared distances (trials, a, b) of points (trials, a, d) and (trials, b, d)."""
     squares = np.zeros((first.shape[0], first.shape[1], second.shape[1]))
     # One coordinate after the other: arrays with the few coordinates as last axis are slow.
     for coordinate in range(first.shape[2]):
@@ -250,15 +196,9 @@ def _squared_distances(first: FloatArray, second: FloatArray) -> FloatArray:
 def _neighborhoods(points: FloatArray, neighbors: int) -> tuple[IntArray, FloatArray]:
     """Return the nearest neighbours of each point, itself among them, and the log volume around it.
 
-    Parameters
-    ----------
-    points : array of shape (trials, num_particles, d)
-
-    Returns
-    -------
-    indices : array of shape (trials, num_particles, neighbors)
-    log_volumes : array of shape (trials, num_particles)
-        Minus infinity where all neighbours are the same point.
+    Of points of shape (trials, num_particles, d): indices of shape (trials, num_particles,
+    neighbors), and logarithms of shape (trials, num_particles); minus infinity where all neighbours
+    are the same point.
     """
     squares = _squared_distances(points, points)
     indices = np.argpartition(squares, neighbors - 1, axis=-1)[..., :neighbors]
@@ -272,7 +212,7 @@ def _neighborhoods(points: FloatArray, neighbors: int) -> tuple[IntArray, FloatA
 def entropy_of_neighborhoods(
     weights: FloatArray, indices: IntArray, log_volumes: FloatArray
 ) -> FloatArray:
-    """Return the entropies of weighted points as the implementation of 2017 estimated them.
+    """Return the entropies (trials, samples) that the implementation of 2017 estimated.
 
     Parameters
     ----------
@@ -282,10 +222,6 @@ def entropy_of_neighborhoods(
         The nearest points of each, itself among them.
     log_volumes : array of shape (trials, num_particles)
         Logarithm of the volume of the ball that holds them.
-
-    Returns
-    -------
-    array of shape (trials, samples)
     """
     neighbors = indices.shape[-1]
     trials, samples, count = weights.shape
@@ -297,12 +233,8 @@ def entropy_of_neighborhoods(
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = mass * (np.log(mass) - log_volumes[:, None, :]) / neighbors
     terms = np.where(mass <= _NEGLIGIBLE, 0.0, terms)
-    return np.asarray(math.log(neighbors) - digamma(neighbors) - terms.sum(axis=-1))
-
-
-def digamma(count: int) -> float:
-    """Return the digamma function of a whole number: a partial sum of the harmonic series."""
-    return -np.euler_gamma + sum(1.0 / number for number in range(1, count))
+    digamma = -np.euler_gamma + sum(1.0 / number for number in range(1, neighbors))
+    return np.asarray(math.log(neighbors) - digamma - terms.sum(axis=-1))
 
 
 def least_of(entropies: FloatArray, drawn: FloatArray) -> IntArray:
@@ -352,19 +284,9 @@ def likelihoods(
 ) -> FloatArray:
     """Return the densities of one observation per world in each of its particles.
 
-    Parameters
-    ----------
-    world : array of shape (trials, state_size)
-    particles : array of shape (trials, num_particles, state_size)
-    action : int
-        The sensing action.
-    noise : array of shape (trials, observation_size)
-        Standard normal numbers, from which the observations are made.
-
-    Returns
-    -------
-    array of shape (trials, num_particles)
-        Plain densities: far from the observation they underflow to zero, as they did in 2017.
+    Of shape (trials, num_particles). Plain densities: far from the observation they underflow to
+    zero, as they did in 2017. ``noise`` of shape (trials, observation_size) are standard normal
+    numbers, from which the observations are made.
     """
     variance = problem.observation_variance(world, action)
     observed = problem.observation_mean(world, action) + np.sqrt(variance) * noise

@@ -71,16 +71,7 @@ _LEASE_MS = 30_000.0
 
 
 class Exchange(msgspec.Struct, frozen=True, kw_only=True):
-    """What is asked.
-
-    Attributes
-    ----------
-    problem : str
-        Its name.
-    way : {"tcp", "in_process"}
-    num_trials : int
-        All questions of so many trials.
-    """
+    """What is asked: all questions of some trials, by ``tcp`` or ``in_process``."""
 
     problem: str
     particles: int = 100
@@ -104,15 +95,8 @@ def measure_exchange(**exchange: Any) -> pd.DataFrame:
     """Put questions and time the answers; the function of tasks of the kind ``exchange_times``.
 
     It gets the fields of :class:`Exchange`, and returns a table with the columns of
-    :data:`COLUMNS`.
-
-    Raises
-    ------
-    TaskError
-        If the service does not start, does not answer, or answers something else than what the
-        same question comes to in this process.
-    HoldfastError
-        If the problem refuses it.
+    :data:`COLUMNS`. TaskError if the service does not start, does not answer, or answers something
+    else than what the same question comes to in this process.
     """
     wanted = msgspec.convert(exchange, Exchange)
     ways: dict[str, Callable[[Exchange], _Service]] = {
@@ -161,7 +145,7 @@ async def _asked(
 
 def _turns(wanted: Exchange, settings: PlanningSettings, trial: int) -> Iterator[_Turn]:
     """Yield all questions that the robot of a trial would ask, with the answers."""
-    problem = problem_of(wanted.problem, {}, {})
+    problem = problem_of(wanted.problem)
     planner = Planner(problem, settings)
     state = planner.init(wanted.seed, trial)
     asked, sensing_action = state, -1
@@ -254,7 +238,7 @@ class _Asking:
 
 @contextlib.asynccontextmanager
 async def _in_process(wanted: Exchange) -> AsyncIterator[tuple[str, RobotTransport]]:
-    problem = problem_of(wanted.problem, {}, {})
+    problem = problem_of(wanted.problem)
     network = InProcessNetwork()
     shell = ServiceShell(
         Service(lambda _: problem, workers=1),

@@ -13,20 +13,18 @@ import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, wait
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import msgspec
+import pandas as pd
 
 from holdfast import __version__
 from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.lab.errors import TaskCrashError, TaskError
-from holdfast.lab.studies.tables import Columns, columns_of, frame_of
+from holdfast.lab.studies.tables import Columns, columns_of
 from holdfast.lab.studies.tasks import Task, code_of, run_task
 from holdfast.runtime.command_line import MAX_JOBS
 from holdfast.runtime.workers import WorkerProcess, end_workers
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 __all__ = [
     "MOST_ATTEMPTS",
@@ -36,7 +34,6 @@ __all__ = [
     "encode_task",
     "table_of",
 ]
-
 
 MOST_ATTEMPTS = 3
 """A task that is lost with its process this often is given up."""
@@ -53,16 +50,8 @@ class Executor(Protocol):
     def run(self, tasks: Sequence[Task], on_result: Callable[[Task, pd.DataFrame], None]) -> None:
         """Compute tasks, begun in this order; pass each with its result, in any order.
 
-        Raises
-        ------
-        TaskError
-            If a task cannot be computed, or was lost with its process several times.
-        HoldfastError
-            If the function of a task refuses its parameters, or nothing can be computed there.
-        TaskCrashError
-            If anything else went wrong in another process.
-        KeyboardInterrupt
-            After everything that it started has been ended.
+        However it ends, everything that it started has been ended. TaskError if a task cannot be
+        computed, or was lost with its process several times.
         """
         ...
 
@@ -164,18 +153,13 @@ class _Computed(msgspec.Struct, tag="computed"):
     table: Columns
 
 
-class _Refused(msgspec.Struct, tag="refused"):
+class _Failed(msgspec.Struct, tag="failed"):
     reason: str
-
-
-class _Crashed(msgspec.Struct, tag="crashed"):
-    account: str
+    crashed: bool
 
 
 _REQUEST_DECODER = msgspec.msgpack.Decoder(_Request)
-_Answer = _Computed | _Refused | _Crashed
-
-_ANSWER_DECODER = msgspec.msgpack.Decoder(_Answer)
+_ANSWER_DECODER = msgspec.msgpack.Decoder(_Computed | _Failed)
 
 
 def encode_task(task: Task, code: str) -> bytes:
@@ -188,7 +172,7 @@ def compute_encoded(request: bytes) -> bytes:
 
     It always answers, also when it fails, so that an error is the same wherever it happens.
     """
-    answer: _Answer
+    answer: _Computed | _Failed
     try:
         asked = _REQUEST_DECODER.decode(request)
         _check_code(asked)
@@ -197,21 +181,20 @@ def compute_encoded(request: bytes) -> bytes:
         _check_code(asked)
         answer = _Computed(columns_of(table))
     except HoldfastError as error:
-        answer = _Refused(str(error))
+        answer = _Failed(str(error), crashed=False)
     except Exception:  # noqa: BLE001 - raised again where it was asked for
-        answer = _Crashed(traceback.format_exc())
+        answer = _Failed(traceback.format_exc(), crashed=True)
     return msgspec.msgpack.encode(answer)
 
 
 def _check_code(asked: _Request) -> None:
-    kind = asked.task.kind
     own = code_of(asked.task)
     if own != asked.code:
         raise TaskError(
-            f"a process on {socket.gethostname()} has other code for tasks of the kind {kind!r} "
-            f"(digest {own}, of holdfast {__version__}) than the one that asks (digest "
-            f"{asked.code}), so the results would not belong together: install the same holdfast "
-            "on every node, and edit nothing meanwhile"
+            f"a process on {socket.gethostname()} has other code for tasks of the kind "
+            f"{asked.task.kind!r} (digest {own}, of holdfast {__version__}) than the one that asks "
+            f"(digest {asked.code}), so the results would not belong together: install the same "
+            "holdfast on every node, and edit nothing meanwhile"
         )
 
 
@@ -225,9 +208,9 @@ def table_of(answer: bytes) -> pd.DataFrame:
     TaskCrashError
         If anything else went wrong there.
     """
-    found: _Answer = _ANSWER_DECODER.decode(answer)
-    if isinstance(found, _Refused):
-        raise TaskError(found.reason)
-    if isinstance(found, _Crashed):
-        raise TaskCrashError(f"in another process:\n{found.account}")
-    return frame_of(found.table)
+    found = _ANSWER_DECODER.decode(answer)
+    if isinstance(found, _Computed):
+        return pd.DataFrame(found.table)
+    if found.crashed:
+        raise TaskCrashError(f"in another process:\n{found.reason}")
+    raise TaskError(found.reason)

@@ -6,21 +6,21 @@ compared pair by pair.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import pandas as pd
 
 from holdfast.arrays import FloatArray
+from holdfast.errors import InvalidValueError
 from holdfast.lab.studies import statistics
-from holdfast.lab.studies.statistics import cells_of
-from holdfast.lab.studies.study import CHOICE, CLAIM, Report, Results, Scale
+from holdfast.lab.studies.statistics import Interval, cells_of
+from holdfast.lab.studies.study import CHOICE, CLAIM, Part, Scale, TrialStudy
 from holdfast.lab.studies.tables import Cell
-from holdfast.lab.studies.tasks import Task
 from holdfast.lab.studies.trial_batches import TrialSeries, trial_tasks
-from holdfast.lab.studies.trial_files import kept_trials
+from holdfast.lab.studies.trial_files import rounded
 
 __all__ = [
     "MEASURES",
@@ -29,10 +29,22 @@ __all__ = [
     "compared",
     "outcome_cells",
     "over_problems",
+    "shown_as",
     "steps_and_success",
 ]
 
 _TRIALS_IN_EACH = 20
+
+_PURPOSE = ("purpose", "seed")
+_KEPT = (
+    "trial",
+    "success",
+    "steps",
+    "reward",
+    "sensing_decisions",
+    "step_limit",
+    "steps_to_goal",
+)
 
 MEASURES = ("steps_ratio", "success_gain")
 """What is compared: the ratio of steps (geometric mean; a failure counts as the limit), and the
@@ -42,11 +54,11 @@ Trials: TypeAlias = tuple[FloatArray, FloatArray]
 """The logarithm of steps and the success of each trial."""
 
 
-class JudgedStudy(ABC):
-    """Tasks and trials of such a study; :meth:`report_of` makes the rest."""
+class JudgedStudy(TrialStudy):
+    """A study whose trials are those of cells."""
 
-    name: ClassVar[str]
-    title: ClassVar[str]
+    columns: ClassVar[tuple[str, ...]]
+    """Those that name a cell."""
     num_trials: ClassVar[Mapping[str, int]]
     quick_trials: ClassVar[Mapping[str, int]] = {CHOICE: 2, CLAIM: 4}
 
@@ -55,45 +67,68 @@ class JudgedStudy(ABC):
         """Return all cells, in the order of the tables."""
 
     @abstractmethod
-    def names(self, cell: Any) -> dict[str, Cell]:
-        """Return the columns that name a cell."""
+    def names(self, cell: Any) -> tuple[Cell, ...]:
+        """Return a cell's values of the columns."""
 
     @abstractmethod
     def series(self, cell: Any, purpose: str, scale: Scale, num_trials: int) -> TrialSeries:
         """Return the trials of a cell for a purpose."""
 
-    @abstractmethod
-    def report_of(self, trials: pd.DataFrame) -> Report:
-        """Return the report on all trials; InvalidValueError if they are not of this study."""
+    def parts(self, scale: Scale) -> Iterator[Part]:
+        """Yield the trials of each cell, by purpose."""
+        for purpose, number in (self.quick_trials if scale.quick else self.num_trials).items():
+            for cell in self.cells(scale):
+                names = (purpose, scale.seed_of(purpose), *self.names(cell))
+                series = self.series(cell, purpose, scale, number)
+                yield Part(
+                    dict(zip((*_PURPOSE, *self.columns), names, strict=True)),
+                    list(trial_tasks(series, _TRIALS_IN_EACH)),
+                )
 
-    def tasks(self, scale: Scale) -> list[Task]:
-        """Return all tasks, in the order in which to begin."""
-        return [
-            task
-            for purpose in self.num_trials
-            for cell in self.cells(scale)
-            for task in self._tasks(cell, purpose, scale)
-        ]
-
-    def report(self, scale: Scale, results: Results) -> Report:
-        """Return the report on the results of all tasks."""
-        cells = [(purpose, cell) for purpose in self.num_trials for cell in self.cells(scale)]
-        tables = [results.of(self._tasks(cell, purpose, scale)) for purpose, cell in cells]
-        names = pd.DataFrame(
-            {"purpose": purpose, "seed": scale.seed_of(purpose), **self.names(cell)}
-            for purpose, cell in cells
+    def kept(self, trials: pd.DataFrame) -> pd.DataFrame:
+        """Return what is kept; of times, which differ from run to run, the median of each cell."""
+        names = [*_PURPOSE, *self.columns]
+        times = trials["mean_sensing_ms"].where(trials["sensing_decisions"] > 0)
+        medians = times.groupby([trials[name] for name in names]).transform("median")
+        return trials[[*names, *_KEPT]].assign(
+            reward=rounded(trials["reward"]),
+            steps_to_goal=trials["steps_to_goal"].astype(np.float64),
+            median_sensing_ms=rounded(medians),
         )
-        number = np.repeat(np.arange(len(cells)), [len(table) for table in tables])
-        trials = kept_trials(pd.concat(tables, ignore_index=True), number)
-        named = names.iloc[number].reset_index(drop=True)
-        return self.report_of(pd.concat([named, trials], axis=1))
 
-    def _tasks(self, cell: Any, purpose: str, scale: Scale) -> list[Task]:
-        number = (self.quick_trials if scale.quick else self.num_trials)[purpose]
-        return list(trial_tasks(self.series(cell, purpose, scale, number), _TRIALS_IN_EACH))
+    def by_cell(self, trials: pd.DataFrame) -> dict[str, dict[Any, pd.DataFrame]]:
+        """Return the trials of each cell, by purpose; a quick run may have fewer cells.
+
+        InvalidValueError if they are not those of this study.
+        """
+        names = ("purpose", *self.columns)
+        missing = [name for name in (*names, *_KEPT) if name not in trials.columns]
+        if missing:
+            raise InvalidValueError(f"trials without the columns {', '.join(missing)}")
+        found = {
+            key: table.drop(columns=list(names)).reset_index(drop=True)
+            for key, table in trials.groupby(list(names), sort=False)
+        }
+        whole, few = (
+            {
+                (purpose, *self.names(cell)): (purpose, cell)
+                for purpose in (CHOICE, CLAIM)
+                for cell in self.cells(Scale(quick=quick))
+            }
+            for quick in (False, True)
+        )
+        expected = few if few.keys() == found.keys() else whole
+        for key in [*expected, *found]:
+            if (key in expected) != (key in found):
+                what = "there are no trials" if key in expected else "knows nothing"
+                raise InvalidValueError(f"{self.name}: {what} of {', '.join(map(str, key))}")
+        tables: dict[str, dict[Any, pd.DataFrame]] = {CHOICE: {}, CLAIM: {}}
+        for key, (purpose, cell) in expected.items():
+            tables[purpose][cell] = found[key]
+        return tables
 
 
-def steps_and_success(tables: Sequence[pd.DataFrame]) -> Trials:
+def steps_and_success(*tables: pd.DataFrame) -> Trials:
     """Return the logarithm of steps, and success, of each trial: the mean over several tables.
 
     The tables have the same worlds; where they have different numbers of trials, the first ones
@@ -105,6 +140,11 @@ def steps_and_success(tables: Sequence[pd.DataFrame]) -> Trials:
     if len(tables) == 1:
         return logs[0], successes[0]
     return np.mean(logs, axis=0), np.mean(successes, axis=0)
+
+
+def shown_as(measure: str, difference: Interval) -> Interval:
+    """Return a difference as tables show it: of steps, the ratio."""
+    return statistics.ratio_of(difference) if measure == "steps_ratio" else difference
 
 
 def compared(own: Trials, other: Trials) -> dict[str, Cell]:
@@ -130,6 +170,9 @@ def over_problems(
 ) -> pd.DataFrame:
     """Return how ways differ over these problems, and over all problems like them.
 
+    Columns: ``mean``, over these problems, of the trials that all have; ``expected``, over all such
+    problems; ``new_problem``, in one more; ``deviation_between_problems`` as a difference.
+
     Parameters
     ----------
     pairs : sequence of (dict, sequence)
@@ -139,11 +182,30 @@ def over_problems(
     """
     rows: list[dict[str, Cell]] = []
     for part, (measure, least) in enumerate(zip(MEASURES, (0.01, least_success), strict=True)):
-        shown = {"shown": statistics.ratio_of} if measure == "steps_ratio" else {}
         for names, trials in pairs:
             both = [(own[part].astype(float), other[part].astype(float)) for own, other in trials]
-            cells = statistics.cells_across_problems(both, least, **shown)
-            rows.append({"measure": measure, **names, **cells})
+            fewest = min(own.size for own, _ in both)
+            own, other = (
+                np.mean([pair[which][:fewest] for pair in both], axis=0) for which in (0, 1)
+            )
+            mean, p_value = statistics.paired_difference(own, other)
+            found = statistics.across_problems(both, least)
+            _, new_low, new_high = shown_as(measure, found.new_problem)
+            rows.append(
+                {
+                    "measure": measure,
+                    **names,
+                    "trials": fewest,
+                    **cells_of("mean", shown_as(measure, mean)),
+                    "mean_p_value": p_value,
+                    "problems": len(both),
+                    **cells_of("expected", shown_as(measure, found.mean)),
+                    "expected_p_value": found.p_value,
+                    "deviation_between_problems": found.deviation,
+                    "new_problem_low": new_low,
+                    "new_problem_high": new_high,
+                }
+            )
     table = pd.DataFrame(rows)
     statistics.add_adjusted(table, "mean_p_value", "expected_p_value")
     return table

@@ -18,27 +18,30 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 import pandas as pd
 
+from holdfast.arrays import FloatArray
 from holdfast.config.settings import PlanningSettings
-from holdfast.lab.studies.cost_model import BreakEven, Scaling, break_even, power_law
+from holdfast.lab.studies.cost_model import BreakEven, Scaling, break_even
 from holdfast.lab.studies.exchange_times import Exchange
 from holdfast.lab.studies.sensing_times import Measurement
-from holdfast.lab.studies.statistics import Interval, cells_of, interval_in, median_interval
-from holdfast.lab.studies.study import Number, Report, Results, Scale
+from holdfast.lab.studies.statistics import (
+    Interval,
+    cells_of,
+    exactly,
+    interval_in,
+    median_interval,
+)
+from holdfast.lab.studies.study import Number, Part, Report, Scale, Study, drawn
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.tasks import Task
 from holdfast.lab.studies.trial_batches import problem_of
 from holdfast.robot.trials import available_cores
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = [
     "PATHS_MS",
@@ -50,7 +53,6 @@ __all__ = [
     "OffloadBreakEven",
     "ahead_ms_of",
     "break_even_table",
-    "drawings",
     "exchange_ms_of",
     "kind_of",
     "line_of",
@@ -71,7 +73,6 @@ SAMPLES_DRAWN = (10, 100)
 _PARTICLES_AHEAD = (100, 300, 1000, 2000, 4000)
 
 _QUICK_PARTICLES = (100, 1000, 2000, 5000, 10_000, 20_000)
-_QUICK_SAMPLES = (10, 100)
 
 TIMES_THE_CORES = (8, 36)
 _ROBOT_CORES = (1, 4)
@@ -85,17 +86,7 @@ _STEADY_FROM = 1000
 
 
 class Kind(NamedTuple):
-    """A kind of decision.
-
-    Attributes
-    ----------
-    sensing_actions : int
-        J.
-    samples : int
-        M.
-    horizon : int
-        H.
-    """
+    """A kind of decision: J sensing actions, M hypothetical observations, horizon H."""
 
     problem: str
     sensing_actions: int
@@ -107,79 +98,59 @@ class Kind(NamedTuple):
     def label(self) -> str:
         """As figures name it."""
         parts = [self.problem, f"M = {self.samples}"]
-        parts += [f"J = {self.sensing_actions}"] if self.sensing_actions != _all(self) else []
+        if self.sensing_actions != _actions_of(self.problem):
+            parts.append(f"J = {self.sensing_actions}")
         parts += [f"H = {self.horizon}"] if self.horizon > 1 else []
         parts += ["mixture"] if self.estimator != _ESTIMATORS[0] else []
         return ", ".join(parts)
 
 
-def _all(kind: Kind) -> int:
-    return _actions_of(kind.problem)
-
-
 @functools.cache
 def _actions_of(problem: str) -> int:
-    return len(problem_of(problem, {}, {}).sensing_actions)
+    return len(problem_of(problem).sensing_actions)
 
 
 SHOWN = Kind(_PROBLEMS[0], 3)
 """The problem and the settings that the thesis reports on."""
 
 
-class OffloadBreakEven:
+class OffloadBreakEven(Study):
     """The study ``offload_break_even``."""
 
     name = "offload_break_even"
     title = "When is asking a service worth it? Sensing time, cores and the path to them"
 
-    def tasks(self, scale: Scale) -> list[Task]:
-        """Return all tasks, in the order in which to begin."""
-        return [
-            *(task for _, task in _exchanges(scale)),
-            *(_measured(kind, scale) for kind in _kinds(scale)),
-        ]
+    def parts(self, scale: Scale) -> Iterator[Part]:
+        """Yield exchanges, and decisions of each kind."""
+        for way in ("tcp", "in_process"):
+            for particles in _EXCHANGE_PARTICLES:
+                names: dict[str, Cell] = {"way": way, "particles": particles}
+                yield Part(names, [_exchange_task(way, particles, scale)], "exchange")
+        for kind in _kinds(scale):
+            yield Part(kind._asdict(), [_sensing_task(kind, scale)], "sensing_times")
 
-    def report(self, scale: Scale, results: Results) -> Report:
-        """Return the report on the results of all tasks."""
-        of_beliefs = {kind: results.of([_measured(kind, scale)]) for kind in _kinds(scale)}
-        asked = {key: results.of([task]) for key, task in _exchanges(scale)}
-        times, exchange = times_table(of_beliefs), _exchange_table(asked)
+    def report_of(self, tables: Mapping[str, pd.DataFrame]) -> Report:
+        """Return the report on the rows of all parts."""
+        measured = tables["sensing_times"]
+        times, exchange = times_table(measured), _exchange_table(tables["exchange"])
         scalings, exchange_ms = scalings_of(times), exchange_ms_of(exchange)
         lines = break_even_table(scalings, exchange_ms)
-        raw = [table.assign(**kind._asdict()) for kind, table in of_beliefs.items()]
         return Report(
-            raw={"sensing_times": pd.concat(raw, ignore_index=True)},
             summary={
                 "sensing_times": times,
                 "exchange": exchange,
-                "growth": _growth_table(of_beliefs),
+                "growth": _growth_table(measured),
                 "break_even": lines,
                 "break_even_ahead": _ahead_table(scalings, exchange_ms),
             },
-            figures=drawings(times, exchange, lines),
+            figures={
+                "sensing_time": drawn("offload_figures:sensing_time", scalings, exchange_ms),
+                "break_even_map": drawn("offload_figures:break_even_map", scalings, exchange_ms),
+                "break_even": drawn("offload_figures:break_even_lines", lines),
+                "waiting": drawn("offload_figures:waiting", scalings, exchange_ms),
+            },
             numbers=numbers_of(times, exchange, lines),
         )
-
-
-def drawings(
-    times: pd.DataFrame, exchange: pd.DataFrame, lines: pd.DataFrame
-) -> dict[str, partial[Figure]]:
-    """Return what draws the figures, from the tables of the summary."""
-    scalings, exchange_ms = scalings_of(times), exchange_ms_of(exchange)
-    return {
-        "sensing_time": partial(_draw, "sensing_time", scalings, exchange_ms),
-        "break_even_map": partial(_draw, "break_even_map", scalings, exchange_ms),
-        "break_even": partial(_draw, "break_even_lines", lines),
-        "waiting": partial(_draw, "waiting", scalings, exchange_ms),
-    }
-
-
-def _draw(drawing: str, *of: Any) -> Figure:
-    # Imports matplotlib, so only when a figure is wanted.
-    from holdfast.lab.studies import offload_figures
-
-    figure: Figure = getattr(offload_figures, drawing)(*of)
-    return figure
 
 
 # -- what is measured --------------------------------------------------------------------------
@@ -187,40 +158,44 @@ def _draw(drawing: str, *of: Any) -> Figure:
 
 def _kinds(scale: Scale) -> list[Kind]:
     """Return all that is measured, what is shown first."""
-    kinds: list[Kind] = []
-    for problem in _PROBLEMS:
-        actions = _actions_of(problem)
-        for estimator in _ESTIMATORS:
-            samples: Sequence[int] = _SAMPLES
-            if scale.quick:
-                shown = problem == SHOWN.problem
-                samples = _QUICK_SAMPLES if shown and estimator == _ESTIMATORS[0] else (10,)
-                if estimator != _ESTIMATORS[0] and not shown:
-                    continue
-            kinds += [Kind(problem, actions, estimator, each) for each in samples]
-    whole = Kind("peg_in_hole_3d", _actions_of("peg_in_hole_3d"))
-    for actions in (3,) if scale.quick else (1, 2, 3):
-        kinds.append(whole._replace(sensing_actions=actions))
-    for problem in (SHOWN.problem,) if scale.quick else _PROBLEMS:
-        for horizon in (2,) if scale.quick else (2, 4):
-            for samples_ahead in (10, 30) if horizon == 2 and not scale.quick else (10,):
-                kinds.append(
-                    Kind(problem, _actions_of(problem), samples=samples_ahead, horizon=horizon)
-                )
-    return kinds
+    plane, space, _ = _PROBLEMS
+    whole = {problem: Kind(problem, _actions_of(problem)) for problem in _PROBLEMS}
+    kinds = [
+        *(
+            kind._replace(estimator=estimator, samples=samples)
+            for kind in whole.values()
+            for estimator in _ESTIMATORS
+            for samples in _SAMPLES
+        ),
+        *(whole[space]._replace(sensing_actions=actions) for actions in (1, 2, 3)),
+        *(
+            kind._replace(horizon=horizon, samples=samples)
+            for kind in whole.values()
+            for horizon, samples in ((2, 10), (2, 30), (4, 10))
+        ),
+    ]
+    if not scale.quick:
+        return kinds
+    few = {
+        *whole.values(),
+        whole[plane]._replace(samples=100),
+        whole[plane]._replace(estimator=_ESTIMATORS[1]),
+        whole[space]._replace(sensing_actions=3),
+        whole[plane]._replace(horizon=2),
+    }
+    return [kind for kind in kinds if kind in few]
 
 
-def _measured(kind: Kind, scale: Scale) -> Task:
+def _sensing_task(kind: Kind, scale: Scale) -> Task:
     whole = _QUICK_PARTICLES if scale.quick else _PARTICLES
     ahead = _QUICK_PARTICLES[:2] if scale.quick else _PARTICLES_AHEAD
-    particles = ahead if kind.horizon > 1 else whole
     measurement = Measurement(
         problem=kind.problem,
         num_sensing_actions=kind.sensing_actions,
         estimator=kind.estimator,
         num_observation_samples=kind.samples,
         horizon=kind.horizon,
-        particles=particles,
+        particles=ahead if kind.horizon > 1 else whole,
         threads=_threads(),
         num_trials=9,
         seed=scale.seed,
@@ -228,12 +203,7 @@ def _measured(kind: Kind, scale: Scale) -> Task:
         least_repetitions=1 if scale.quick else 3,
         limit_s=2.0 if scale.quick else 8.0,
     )
-    return Task(
-        kind="sensing_times",
-        parameters=msgspec.to_builtins(measurement),
-        units=len(particles),
-        exclusive=True,
-    )
+    return _task_of("sensing_times", measurement, len(measurement.particles))
 
 
 def _threads() -> tuple[int, ...]:
@@ -242,49 +212,41 @@ def _threads() -> tuple[int, ...]:
     return tuple(2**power for power in range(most.bit_length()) if 2**power <= most)
 
 
-def _exchanges(scale: Scale) -> Iterator[tuple[tuple[str, int], Task]]:
-    for way in ("tcp", "in_process"):
-        for particles in _EXCHANGE_PARTICLES:
-            exchange = Exchange(
-                problem=SHOWN.problem,
-                particles=particles,
-                way=way,
-                num_trials=1 if scale.quick else 3,
-                seed=scale.seed,
-            )
-            task = Task(
-                kind="exchange_times",
-                parameters=msgspec.to_builtins(exchange),
-                units=exchange.num_trials,
-                exclusive=True,
-            )
-            yield (way, particles), task
+def _exchange_task(way: str, particles: int, scale: Scale) -> Task:
+    trials = 1 if scale.quick else 3
+    exchange = Exchange(
+        problem=SHOWN.problem, particles=particles, way=way, num_trials=trials, seed=scale.seed
+    )
+    return _task_of("exchange_times", exchange, trials)
+
+
+def _task_of(kind: str, measured: Measurement | Exchange, units: int) -> Task:
+    parameters = msgspec.to_builtins(measured)
+    return Task(kind=kind, parameters=parameters, units=units, exclusive=True)
 
 
 # -- tables ------------------------------------------------------------------------------------
 
 
-def times_table(of_beliefs: Mapping[Kind, pd.DataFrame]) -> pd.DataFrame:
+def times_table(measured: pd.DataFrame) -> pd.DataFrame:
     """Return median times over the beliefs by kind, particles and threads, and divided shares."""
     rows: list[dict[str, Cell]] = []
-    for kind, table in of_beliefs.items():
-        for particles, here in table.groupby("particles"):
-            one = here[here["threads"] == 1]
-            share = cells_of("divided_share", median_interval(one["share"].to_numpy(float)))
-            rows += [
-                {
-                    **kind._asdict(),
-                    "particles": particles,
-                    "threads": threads,
-                    "beliefs": len(those),
-                    "repetitions": int(those["repetitions"].iloc[0]),
-                    **cells_of("ms", median_interval(those["median_ms"].to_numpy(float))),
-                    **share,
-                    "mapping_share": float((those["mapping_ms"] / those["median_ms"]).median()),
-                    "others_cores": float(those["others_cores"].iloc[0]),
-                }
-                for threads, those in here.groupby("threads")
-            ]
+    names = [*Kind._fields, "particles"]
+    for key, here in measured.groupby(names, sort=False):
+        share = median_interval(here["share"][here["threads"] == 1])
+        rows += [
+            {
+                **dict(zip(names, key, strict=True)),
+                "threads": threads,
+                "beliefs": len(those),
+                "repetitions": int(those["repetitions"].iloc[0]),
+                **cells_of("ms", median_interval(those["median_ms"])),
+                **cells_of("divided_share", share),
+                "mapping_share": float((those["mapping_ms"] / those["median_ms"]).median()),
+                "others_cores": float(those["others_cores"].iloc[0]),
+            }
+            for threads, those in here.groupby("threads")
+        ]
     return pd.DataFrame(rows)
 
 
@@ -293,45 +255,41 @@ def scalings_of(times: pd.DataFrame) -> dict[Kind, Scaling]:
     found: dict[Kind, Scaling] = {}
     one = times[times["threads"] == 1]
     for _, rows in one.groupby(list(Kind._fields), sort=False):
-        records = rows.to_dict("records")
-        kind = kind_of(records[0])
+        kind = kind_of(rows.iloc[0])
         found[kind] = Scaling(
-            tuple(row["particles"] for row in records),
-            tuple(_unbounded(interval_in(row, "ms")) for row in records),
-            tuple(_unbounded(interval_in(row, "divided_share")) for row in records),
+            rows["particles"].to_numpy(float),
+            _intervals(rows, "ms"),
+            _intervals(rows, "divided_share"),
             kind.sensing_actions * kind.samples,
         )
     return found
 
 
-def kind_of(row: Mapping[Any, Any]) -> Kind:
+def kind_of(row: Mapping[Any, Any] | pd.Series) -> Kind:
     """Return the kind of decision that a row of a table is about."""
-    return Kind(**{name: row[name] for name in Kind._fields})
+    return Kind(*(row[name] for name in Kind._fields))
 
 
-def _unbounded(interval: Interval) -> Interval:
-    """Return an interval whose missing bounds are infinite."""
-    value, low, high = interval
-    return Interval(
-        value, -math.inf if math.isnan(low) else low, math.inf if math.isnan(high) else high
-    )
+def _intervals(rows: pd.DataFrame, name: str) -> FloatArray:
+    """Return a column and its intervals, shape (3, n); missing bounds are infinite."""
+    ends = {name: math.nan, f"{name}_low": -math.inf, f"{name}_high": math.inf}
+    return np.asarray(rows[list(ends)].fillna(ends).to_numpy(float).T)
 
 
-def _exchange_table(asked: Mapping[tuple[str, int], pd.DataFrame]) -> pd.DataFrame:
+def _exchange_table(asked: pd.DataFrame) -> pd.DataFrame:
     """Return the time of an exchange beside the computation and the path."""
     rows: list[dict[str, Cell]] = []
-    for (way, particles), table in asked.items():
+    for (way, particles), table in asked.groupby(["way", "particles"], sort=False):
         task = table["task_ms"] - table["task_computed_ms"]
         both = table["sensing_ms"] - table["computed_ms"]
-        computed = table["task_computed_ms"]
         rows.append(
             {
                 "way": way,
                 "particles": particles,
                 "questions": len(table),
-                **cells_of("task_exchange_ms", median_interval(task.to_numpy(float))),
-                **cells_of("sensing_exchange_ms", median_interval(both.to_numpy(float))),
-                **cells_of("task_computed_ms", median_interval(computed.to_numpy(float))),
+                **cells_of("task_exchange_ms", median_interval(task)),
+                **cells_of("sensing_exchange_ms", median_interval(both)),
+                **cells_of("task_computed_ms", median_interval(table["task_computed_ms"])),
             }
         )
     return pd.DataFrame(rows)
@@ -345,11 +303,9 @@ def exchange_ms_of(exchange: pd.DataFrame) -> float:
     return float(exchange.loc[exchange["way"] == "tcp", "sensing_exchange_ms"].max())
 
 
-def _growth_table(of_beliefs: Mapping[Kind, pd.DataFrame]) -> pd.DataFrame:
+def _growth_table(measured: pd.DataFrame) -> pd.DataFrame:
     """Return the exponents of the time on one thread, in particles, M, J and H."""
-    tables = [table.assign(**kind._asdict()) for kind, table in of_beliefs.items()]
-    every = pd.concat(tables, ignore_index=True)
-    one = every[every["threads"] == 1]
+    one = measured[measured["threads"] == 1]
     cells: list[dict[str, Cell]] = []
     for _, rows in one.groupby(list(Kind._fields), sort=False):
         for start in (100, _STEADY_FROM):
@@ -369,12 +325,15 @@ def _growth_table(of_beliefs: Mapping[Kind, pd.DataFrame]) -> pd.DataFrame:
 
 def _exponents(what: str, rows: pd.DataFrame, where: str) -> list[dict[str, Cell]]:
     """Return a row with the median exponent over the beliefs, each fitted alone; none if few."""
+    from scipy import stats
+
     beliefs = [(own[what].to_numpy(float), own["median_ms"]) for _, own in rows.groupby("belief")]
     most = max((sizes.size for sizes, _ in beliefs), default=0)
     if most < 2:
         return []
-    whole = [(sizes, times.to_numpy()) for sizes, times in beliefs if sizes.size == most]
-    slopes = [power_law(sizes, times)[1].value for sizes, times in whole]
+    # Power laws, by least squares of logarithms.
+    whole = [(sizes, times) for sizes, times in beliefs if sizes.size == most]
+    slopes = [stats.linregress(np.log(sizes), np.log(times)).slope for sizes, times in whole]
     smallest, largest = int(whole[0][0].min()), int(whole[0][0].max())
     names = rows[list(Kind._fields)].iloc[0].to_dict()
     if what != "particles":
@@ -387,7 +346,7 @@ def _exponents(what: str, rows: pd.DataFrame, where: str) -> list[dict[str, Cell
             "smallest": smallest,
             "largest": largest,
             "beliefs": len(slopes),
-            **cells_of("exponent", median_interval(np.array(slopes))),
+            **cells_of("exponent", median_interval(slopes)),
             "n_log_n": _exponent_of_n_log_n(smallest, largest) if what == "particles" else math.nan,
         }
     ]
@@ -436,7 +395,7 @@ def _line_cells(
         "particles_high": _whole(line.last),
         "particles_if_divided_evenly": _whole(line.even),
         "words": line.value.words,
-        "measured_to": scaling.particles[-1],
+        "measured_to": int(scaling.particles[-1]),
     }
 
 
@@ -509,4 +468,4 @@ def numbers_of(times: pd.DataFrame, exchange: pd.DataFrame, lines: pd.DataFrame)
     ]
     # Where others kept a quarter of a core busy, the shares are lower bounds.
     others = times["others_cores"].median()
-    return [*numbers, Number("cores that other processes kept busy", Interval(*[others] * 3))]
+    return [*numbers, Number("cores that other processes kept busy", exactly(others))]

@@ -74,11 +74,8 @@ _LINES = ((8, "--", "o"), (36, "-.", "D"))
 
 def _draw_lines(panel: Axes, scaling: Scaling, path_ms: float, exchange_ms: float) -> None:
     cost_ms = path_ms + exchange_ms
-    numbers = np.array(scaling.particles, dtype=float)
+    numbers, (value, low, high) = scaling.particles, scaling.times
     dense = np.geomspace(numbers[0], numbers[-1], 300).clip(numbers[0], numbers[-1])
-    value = np.array([time.value for time in scaling.times])
-    low = np.array([time.low for time in scaling.times])
-    high = np.array([time.high for time in scaling.times])
     finite = np.isfinite(low) & np.isfinite(high)
     panel.errorbar(
         numbers,

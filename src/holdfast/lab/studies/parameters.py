@@ -7,9 +7,9 @@ with random sensing with as many particles.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -26,10 +26,9 @@ from holdfast.lab.studies.judged_study import (
     steps_and_success,
 )
 from holdfast.lab.studies.statistics import interval_in
-from holdfast.lab.studies.study import CHOICE, CLAIM, Number, Report, Scale
+from holdfast.lab.studies.study import CHOICE, CLAIM, TRIALS, Number, Report, Scale
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.trial_batches import TrialSeries, problem_of
-from holdfast.lab.studies.trial_files import cells_of_trials, require_cells
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,7 +37,7 @@ if TYPE_CHECKING:
 __all__ = ["Parameters", "Variant", "variants"]
 
 _MOST_QUICK_PARTICLES = 3.0
-"""In a quick run, as a multiple of a problem's."""
+"""In a quick run, as a multiple of a problem's: ten times would take as long as all the rest."""
 
 _INTERVALS: Mapping[str, int] = {
     "tight hole": 8,
@@ -49,9 +48,6 @@ _INTERVALS: Mapping[str, int] = {
 }
 """Steps between two sensing actions, in the problems whose outcome depends on sensing."""
 
-METHOD: Literal["action_entropy"] = "action_entropy"
-"""The method whose parameters are changed."""
-
 _CASES = {case.name: case for case in CASES if case.name in _INTERVALS}
 
 _TOGETHER = "all five problems (mean)"
@@ -59,9 +55,9 @@ _TOGETHER = "all five problems (mean)"
 Way = Literal["neighbours", "path, prior neighbours", "mixture", "random"]
 
 _WAYS: Mapping[Way, SelectorSettings] = {
-    "neighbours": SelectorSettings(method=METHOD, estimator="nearest_neighbor"),
+    "neighbours": SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
     "path, prior neighbours": SelectorSettings(method="path_entropy", estimator="prior_neighbors"),
-    "mixture": SelectorSettings(method=METHOD, estimator="gaussian_mixture_upper"),
+    "mixture": SelectorSettings(method="action_entropy", estimator="gaussian_mixture_upper"),
     "random": SelectorSettings(method="random"),
 }
 """Ways of estimating an entropy (of actions, if not of paths), and one that estimates nothing."""
@@ -77,7 +73,6 @@ class Variant(NamedTuple):
     ----------
     parameter, value : str
         What differs, and how; empty for the reference itself.
-    way : {"neighbours", "path, prior neighbours", "mixture", "random"}
     resolution : float, optional
         In units of the problem's own; None for that, and for a mixture the motion noise.
     times_the_particles : float
@@ -99,61 +94,64 @@ class Variant(NamedTuple):
 
 def variants() -> list[Variant]:
     """Return each way's reference, followed by all that differ from it."""
-    found = [Variant(), *_numbers_of_particles("neighbours")]
-    for samples in (1, 3, 30, 100):
-        sensing = ActiveSensingSettings(num_observation_samples=samples)
-        found.append(Variant("M", str(samples), active_sensing=sensing))
-    for horizon in (2, 3):
-        sensing = ActiveSensingSettings(horizon=horizon)
-        found.append(Variant("horizon", str(horizon), active_sensing=sensing))
-    found += [
-        Variant("resampling", f"below {threshold:g} N", particle_filter=filtering)
-        for threshold in (0.25, 0.5)
-        for filtering in [ParticleFilterSettings(resampling_threshold=threshold)]
+    path: Way = "path, prior neighbours"
+    return [
+        Variant(),
+        *_particles(_FIRST, 0.5, 3.0, 10.0),
+        *_sensing("M", "num_observation_samples", 1, 3, 30, 100),
+        *_sensing("horizon", "horizon", 2, 3),
+        _filter("resampling", "below 0.25 N", resampling_threshold=0.25),
+        _filter("resampling", "below 0.5 N", resampling_threshold=0.5),
+        _filter(
+            "estimate",
+            "most likely, resampling below 0.5 N",
+            estimate="most_likely",
+            resampling_threshold=0.5,
+        ),
+        _filter("estimate", "most likely", estimate="most_likely", resampling_threshold=1.0),
+        *_sensing("k", "num_nearest_neighbors", 1, 3, 10, 20),
+        *_resolutions(_FIRST, 0.1, 0.3, 3.0, 10.0),
+        Variant(way=path),
+        *_particles(path, 0.5, 3.0),
+        *_sensing("M", "num_observation_samples", 3, 30, way=path),
+        *_sensing("k", "num_nearest_neighbors", 3, 10, way=path),
+        Variant(way="mixture"),
+        *_particles("mixture", 0.5, 3.0, 10.0),
+        # The same in all directions, as the motion noise itself need not be: so 1 is another, too.
+        *_resolutions("mixture", 0.1, 0.3, 1.0, 3.0, 10.0),
+        Variant(way=_RANDOM),
+        *_particles(_RANDOM, 0.5, 3.0, 10.0),
     ]
-    found += [
-        Variant("estimate", value, particle_filter=filtering)
-        for threshold, value in (
-            (0.5, "most likely, resampling below 0.5 N"),
-            (1.0, "most likely"),
-        )
-        for filtering in [
-            ParticleFilterSettings(estimate="most_likely", resampling_threshold=threshold)
-        ]
-    ]
-    for neighbors in (1, 3, 10, 20):
-        sensing = ActiveSensingSettings(num_nearest_neighbors=neighbors)
-        found.append(Variant("k", str(neighbors), active_sensing=sensing))
-    found += _resolutions("neighbours", (0.1, 0.3, 3.0, 10.0))
-    found += _of_paths("path, prior neighbours")
-    found += [Variant(way="mixture"), *_numbers_of_particles("mixture")]
-    # The same in all directions, as the motion noise itself need not be: so 1 is another, too.
-    found += _resolutions("mixture", (0.1, 0.3, 1.0, 3.0, 10.0))
-    return [*found, Variant(way=_RANDOM), *_numbers_of_particles(_RANDOM)]
 
 
-def _numbers_of_particles(way: Way) -> list[Variant]:
+def _particles(way: Way, *factors: float) -> list[Variant]:
     return [
         Variant("particles", f"x {times:g}", way=way, times_the_particles=times)
-        for times in (0.5, 3.0, 10.0)
+        for times in factors
     ]
 
 
-def _of_paths(way: Way) -> list[Variant]:
-    found = [Variant(way=way), *_numbers_of_particles(way)[:2]]
-    for samples in (3, 30):
-        sensing = ActiveSensingSettings(num_observation_samples=samples)
-        found.append(Variant("M", str(samples), way=way, active_sensing=sensing))
-    for neighbors in (3, 10):
-        sensing = ActiveSensingSettings(num_nearest_neighbors=neighbors)
-        found.append(Variant("k", str(neighbors), way=way, active_sensing=sensing))
-    return found
+def _sensing(parameter: str, key: str, *values: int, way: Way = _FIRST) -> list[Variant]:
+    return [
+        Variant(parameter, str(value), way, ActiveSensingSettings(**{key: value}))
+        for value in values
+    ]
 
 
-def _resolutions(way: Way, factors: Sequence[float]) -> list[Variant]:
+def _filter(parameter: str, value: str, **settings: Any) -> Variant:
+    return Variant(parameter, value, particle_filter=ParticleFilterSettings(**settings))
+
+
+def _resolutions(way: Way, *factors: float) -> list[Variant]:
     return [
         Variant("resolution", f"x {factor:g}", way=way, resolution=factor) for factor in factors
     ]
+
+
+_Cell = tuple[str, Variant]
+"""The name of a case, and a variant."""
+
+_Tables = Mapping[_Cell, pd.DataFrame]
 
 
 class Parameters(JudgedStudy):
@@ -161,24 +159,22 @@ class Parameters(JudgedStudy):
 
     name = "parameters"
     title = "What the parameters do: particles, M, k, resolution, horizon, estimate, resampling"
+    columns = ("problem", "sensing_interval", "way", "parameter", "value")
     num_trials: ClassVar = {CHOICE: 10, CLAIM: 60}
 
-    def cells(self, scale: Scale) -> Iterator[tuple[str, Variant]]:
+    def cells(self, scale: Scale) -> Iterator[_Cell]:
         """Return all cells, in the order of the tables."""
         for case in _CASES:
             for variant in variants():
-                # Ten times the particles alone would take as long as all the rest.
                 if not scale.quick or variant.times_the_particles <= _MOST_QUICK_PARTICLES:
                     yield case, variant
 
-    def names(self, cell: tuple[str, Variant]) -> dict[str, Cell]:
-        """Return the columns that name a cell."""
+    def names(self, cell: _Cell) -> tuple[Cell, ...]:
+        """Return a cell's values of the columns."""
         case, variant = cell
-        return {"problem": case, "sensing_interval": _INTERVALS[case], **variant.names()}
+        return case, _INTERVALS[case], *variant.names().values()
 
-    def series(
-        self, cell: tuple[str, Variant], purpose: str, scale: Scale, num_trials: int
-    ) -> TrialSeries:
+    def series(self, cell: _Cell, purpose: str, scale: Scale, num_trials: int) -> TrialSeries:
         """Return the trials of a cell for a purpose."""
         name, variant = cell
         case = _CASES[name]
@@ -187,7 +183,7 @@ class Parameters(JudgedStudy):
         )
         selector = _WAYS[variant.way]
         if variant.resolution is not None:
-            own = problem_of(case.problem, case.model, {}).resolution
+            own = problem_of(case.problem, case.model).resolution
             resolution = np.multiply(variant.resolution, own).tolist()
             if isinstance(resolution, list):
                 resolution = tuple(resolution)
@@ -201,26 +197,11 @@ class Parameters(JudgedStudy):
             particle_filter=variant.particle_filter,
         )
 
-    def report_of(self, trials: pd.DataFrame) -> Report:
+    def report_of(self, tables: Mapping[str, pd.DataFrame]) -> Report:
         """Return the report on all trials; InvalidValueError if they are not of this study."""
-        found = cells_of_trials(trials, ("purpose", "problem", "way", "parameter", "value"))
-        # A quick run leaves some out.
-        tried = {cell[2:] for cell in found}
-        known = [each for each in variants() if tuple(each.names().values()) in tried]
-        expected = {
-            (purpose, case, *variant.names().values()): (purpose, case, variant)
-            for purpose in (CHOICE, CLAIM)
-            for case in _CASES
-            for variant in known
-        }
-        require_cells(self.name, found, expected)
-        choosing: dict[tuple[str, Variant], pd.DataFrame] = {}
-        claim: dict[tuple[str, Variant], pd.DataFrame] = {}
-        for cell, (purpose, case, variant) in expected.items():
-            (claim if purpose == CLAIM else choosing)[case, variant] = found[cell]
+        choosing, claim = self.by_cell(tables[TRIALS]).values()
         summary, together = _alone(claim), _together(claim)
         return Report(
-            trials=trials,
             summary={
                 "parameters": summary,
                 "together": together,
@@ -233,12 +214,12 @@ class Parameters(JudgedStudy):
         )
 
 
-_Tables = Mapping[tuple[str, Variant], pd.DataFrame]
-
 _P_VALUES = ("success_p_value", "steps_p_value")
 
 _OVER_RANDOM = "_over_random"
 """Ends the names of columns of a comparison with random."""
+
+_AS_IT_IS = "as it is"
 
 
 def _varied(tables: _Tables) -> list[Variant]:
@@ -253,7 +234,7 @@ def _random_rival(variant: Variant) -> Variant:
 
 def _paired(table: pd.DataFrame, reference: pd.DataFrame) -> dict[str, Cell]:
     """Return how the trials of one problem differ from those of a reference."""
-    return compared(steps_and_success([table]), steps_and_success([reference]))
+    return compared(steps_and_success(table), steps_and_success(reference))
 
 
 def _paired_together(tables: _Tables, variant: Variant, reference: Variant) -> dict[str, Cell]:
@@ -261,17 +242,12 @@ def _paired_together(tables: _Tables, variant: Variant, reference: Variant) -> d
 
     The number of a trial is the mean over the problems, of the trials that all have.
     """
-    own, other = (
-        steps_and_success([tables[case, each] for case in _CASES]) for each in (variant, reference)
-    )
     fewest = min(map(len, tables.values()))
-    return {
-        "trials": fewest,
-        **compared(
-            (own[0][:fewest], own[1][:fewest]),
-            (other[0][:fewest], other[1][:fewest]),
-        ),
-    }
+    own, other = (
+        steps_and_success(*(tables[case, each][:fewest] for case in _CASES))
+        for each in (variant, reference)
+    )
+    return {"trials": fewest, **compared(own, other)}
 
 
 def _alone(tables: _Tables) -> pd.DataFrame:
@@ -327,7 +303,7 @@ def _together(tables: _Tables) -> pd.DataFrame:
 
 def _over_problems(tables: _Tables) -> pd.DataFrame:
     """Return how variants differ over these problems, and over all problems like them."""
-    trials = {cell: steps_and_success([table]) for cell, table in tables.items()}
+    trials = {cell: steps_and_success(table) for cell, table in tables.items()}
     return over_problems(
         [
             (
@@ -371,9 +347,6 @@ def _chosen_values(choosing: _Tables, tables: _Tables) -> pd.DataFrame:
     changed = (table["chosen"] != _AS_IT_IS) | (table["reference"] != table["way"])
     statistics.add_adjusted(table, *_P_VALUES, compared=changed)
     return table
-
-
-_AS_IT_IS = "as it is"
 
 
 def _more_particles(tables: _Tables) -> pd.DataFrame:

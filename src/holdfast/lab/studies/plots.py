@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import matplotlib as mpl
+import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -73,10 +74,8 @@ class Dots(NamedTuple):
     @property
     def errors(self) -> list[list[float]]:
         """How far the intervals reach below and above the values."""
-        return [
-            [value - low for value, low in zip(self.values, self.lows, strict=True)],
-            [high - value for value, high in zip(self.values, self.highs, strict=True)],
-        ]
+        value, low, high = map(np.asarray, (self.values, self.lows, self.highs))
+        return [(value - low).tolist(), (high - value).tolist()]
 
 
 def dots_of(label: str, rows: pd.DataFrame, name: str, factor: float = 1.0) -> Dots:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from importlib import resources
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -26,9 +26,8 @@ from holdfast.config.settings import (
 )
 from holdfast.lab.studies import statistics
 from holdfast.lab.studies.statistics import Interval, cells_of, interval_in
-from holdfast.lab.studies.study import Number, Report, Results, Scale
+from holdfast.lab.studies.study import Number, Part, Report, Scale, Study
 from holdfast.lab.studies.tables import Cell
-from holdfast.lab.studies.tasks import Task
 from holdfast.lab.studies.trial_batches import TrialSeries, trial_tasks
 
 if TYPE_CHECKING:
@@ -56,8 +55,11 @@ _WIDER_TOLERANCES: Mapping[str, tuple[float, float, float]] = {
 
 _CENTERS = ((4.0, 6.0), (-4.0, 0.0), (0.0, -6.0))
 _QUICK_TRIALS = 12
-_TRIALS_IN_EACH = 50
-_EMULATED_IN_EACH = 250  # side by side
+_TRIALS_IN_EACH: Mapping[str, int] = {"emulation_2017": 250, "trials": 50}
+"""By kind of task: those of the emulation run side by side."""
+
+_WAYS: Mapping[str, str] = {"emulated": "emulation_2017", "sound": "trials"}
+"""The two ways in which each row is run, with their kinds of tasks."""
 
 
 class PublishedRow(NamedTuple):
@@ -87,6 +89,10 @@ def published_rows() -> list[PublishedRow]:
     file = resources.files("holdfast.lab.studies") / "data" / "results_2017.csv"
     rows = csv.DictReader(file.read_text(encoding="utf-8").splitlines())
     return [msgspec.convert(list(row.values()), PublishedRow, strict=False) for row in rows]
+
+
+def _covered() -> list[PublishedRow]:
+    return [row for row in published_rows() if row.covered]
 
 
 def series_of(row: PublishedRow, num_trials: int, seed: int) -> TrialSeries:
@@ -122,57 +128,36 @@ def series_of(row: PublishedRow, num_trials: int, seed: int) -> TrialSeries:
     )
 
 
-class Published2017:
+class Published2017(Study):
     """The study ``published_2017``."""
 
     name = "published_2017"
     title = "The results of 2017: as logged, with that implementation's defects, and without"
 
-    def tasks(self, scale: Scale) -> list[Task]:
-        """Return all that is to be computed, in the order in which to begin."""
-        return [
-            task
-            for row in published_rows()
-            if row.covered
-            for task in (*_emulated(row, scale), *_sound(row, scale))
-        ]
+    def parts(self, scale: Scale) -> Iterator[Part]:
+        """Yield each row of 2017 that our problems cover, in both ways."""
+        for number, row in enumerate(_covered()):
+            series = series_of(row, _QUICK_TRIALS if scale.quick else row.num_trials, scale.seed)
+            for way, kind in _WAYS.items():
+                tasks = list(trial_tasks(series, _TRIALS_IN_EACH[kind], kind))
+                yield Part({"row": number, **_names(row), "way": way}, tasks, self.name)
 
-    def report(self, scale: Scale, results: Results) -> Report:
-        """Return the report on the results of all tasks."""
-        raw, cells = [], []
-        for row in published_rows():
-            if not row.covered:
-                continue
-            tables = {"emulated": _emulated(row, scale), "sound": _sound(row, scale)}
-            found = {way: results.of(tasks) for way, tasks in tables.items()}
-            for way, table in found.items():
-                raw.append(table[list(_KEPT)].assign(**_names(row), way=way))
-            cells.append({**_names(row), **_compared(row, **found)})
-        summary = pd.DataFrame(cells)
-        _adjust(summary)
+    def report_of(self, tables: Mapping[str, pd.DataFrame]) -> Report:
+        """Return the report on the rows of all parts."""
+        summary = pd.DataFrame(
+            {**_names(row), **_compared(row, trials)}
+            for row, (_, trials) in zip(_covered(), tables[self.name].groupby("row"), strict=True)
+        )
+        for name in ("successes", "reward"):
+            # Adjusted for the number of rows of each problem.
+            known = summary[summary[f"{name}_p_value"].notna()]
+            adjusted = known.groupby("problem")[f"{name}_p_value"].transform(statistics.holm)
+            summary[f"{name}_adjusted_p_value"] = adjusted
         return Report(
             summary={"published_2017": summary},
-            raw={"published_2017": pd.concat(raw, ignore_index=True)},
             figures={"published_2017": partial(_draw, summary)},
             numbers=numbers_of(summary),
         )
-
-
-_KEPT = ("trial", "success", "steps", "reward")
-
-
-def _emulated(row: PublishedRow, scale: Scale) -> list[Task]:
-    series = series_of(row, _num_trials(row, scale), scale.seed)
-    return list(trial_tasks(series, _EMULATED_IN_EACH, "emulation_2017"))
-
-
-def _sound(row: PublishedRow, scale: Scale) -> list[Task]:
-    series = series_of(row, _num_trials(row, scale), scale.seed)
-    return list(trial_tasks(series, _TRIALS_IN_EACH))
-
-
-def _num_trials(row: PublishedRow, scale: Scale) -> int:
-    return _QUICK_TRIALS if scale.quick else row.num_trials
 
 
 def _names(row: PublishedRow) -> dict[str, Cell]:
@@ -185,42 +170,29 @@ def _names(row: PublishedRow) -> dict[str, Cell]:
     }
 
 
-def _compared(row: PublishedRow, emulated: pd.DataFrame, sound: pd.DataFrame) -> dict[str, Cell]:
-    cells: dict[str, Cell] = {
-        "trials_logged": row.num_trials,
-        "trials": len(emulated),
-        **_rate("logged", row.successes, row.num_trials),
-    }
-    ways = {"emulated": emulated, "sound": sound}
-    for way, table in ways.items():
-        cells |= _rate(way, int(table["success"].sum()), len(table))
-    cells["successes_p_value"] = statistics.agreement_of_rates(
-        int(emulated["success"].sum()), len(emulated), row.successes, row.num_trials
-    )
+def _compared(row: PublishedRow, trials: pd.DataFrame) -> dict[str, Cell]:
+    """Return the cells of a row, with our trials of both ways."""
+    ways = {way: trials[trials["way"] == way] for way in _WAYS}
+    emulated, sound = ways.values()
+    successes = {way: (int(own["success"].sum()), len(own)) for way, own in ways.items()}
+    logged = (row.successes, row.num_trials)
+    cells: dict[str, Cell] = {"trials_logged": row.num_trials, "trials": len(emulated)}
+    for way, counts in {"logged": logged, **successes}.items():
+        cells |= cells_of(f"success_{way}", statistics.rate_interval(*counts))
+    cells["successes_p_value"] = statistics.agreement_of_rates(*successes["emulated"], *logged)
     cells["reward_of_successes_logged"] = row.mean_reward_of_successes
-    for way, table in ways.items():
-        earned = table["reward"][table["success"]].to_numpy()
-        cells |= cells_of(f"reward_of_successes_{way}", statistics.mean_interval(earned))
-        if way == "emulated":
-            cells["reward_p_value"] = statistics.agreement_of_means(
-                earned, row.mean_reward_of_successes, row.successes
-            )
-    cells |= cells_of("mean_reward_sound", statistics.mean_interval(sound["reward"].to_numpy()))
-    cells["mean_sensing_ms_logged"] = 1e3 * row.mean_sensing_seconds
-    cells["mean_sensing_ms_sound"] = float(sound["mean_sensing_ms"].mean())
-    return cells
-
-
-def _rate(way: str, successes: int, trials: int) -> dict[str, Cell]:
-    return cells_of(f"success_{way}", statistics.rate_interval(successes, trials))
-
-
-def _adjust(summary: pd.DataFrame) -> None:
-    """Add p-values that are adjusted for the number of rows of each problem."""
-    for name in ("successes", "reward"):
-        known = summary[summary[f"{name}_p_value"].notna()]
-        adjusted = known.groupby("problem")[f"{name}_p_value"].transform(statistics.holm)
-        summary[f"{name}_adjusted_p_value"] = adjusted
+    earned = {way: own["reward"][own["success"]].to_numpy() for way, own in ways.items()}
+    rewards = {way: statistics.mean_interval(own) for way, own in earned.items()}
+    return cells | {
+        **cells_of("reward_of_successes_emulated", rewards["emulated"]),
+        "reward_p_value": statistics.agreement_of_means(
+            earned["emulated"], row.mean_reward_of_successes, row.successes
+        ),
+        **cells_of("reward_of_successes_sound", rewards["sound"]),
+        **cells_of("mean_reward_sound", statistics.mean_interval(sound["reward"].to_numpy())),
+        "mean_sensing_ms_logged": 1e3 * row.mean_sensing_seconds,
+        "mean_sensing_ms_sound": float(sound["mean_sensing_ms"].mean()),
+    }
 
 
 def numbers_of(summary: pd.DataFrame) -> list[Number]:
@@ -229,13 +201,14 @@ def numbers_of(summary: pd.DataFrame) -> list[Number]:
     That no difference was found says little without how large one may be.
     """
     numbers = []
+    apart: dict[str, tuple[str, Callable[[Mapping[Any, Any]], Interval]]] = {
+        "successes": ("points", _successes_apart),
+        "mean rewards of successful trials": ("of reward", _rewards_apart),
+    }
     for problem, rows in summary.groupby("problem", sort=False):
-        records = rows.to_dict("records")
-        for what, unit, apart in (
-            ("successes", "points", _successes_apart),
-            ("mean rewards of successful trials", "of reward", _rewards_apart),
-        ):
-            known = [each for each in map(apart, records) if all(map(math.isfinite, each))]
+        for what, (unit, difference) in apart.items():
+            found = map(difference, rows.to_dict("records"))
+            known = [each for each in found if all(map(math.isfinite, each))]
             if known:
                 largest = max(known, key=lambda each: abs(each.value))
                 name = f"{problem}, {what}, emulated less logged: the largest difference"
@@ -256,7 +229,7 @@ def _rewards_apart(row: Mapping[Any, Any]) -> Interval:
     ours = row["success_emulated"] * row["trials"]
     others = row["success_logged"] * row["trials_logged"]
     if not (ours and others):
-        return Interval(math.nan, math.nan, math.nan)
+        return statistics.exactly(math.nan)
     half = math.sqrt(ours / others) * (emulated.high - emulated.value)
     value = row["reward_of_successes_logged"]
     return statistics.independent_difference(emulated, Interval(value, value - half, value + half))
@@ -274,10 +247,8 @@ def _draw(summary: pd.DataFrame) -> Figure:
     ways = {"logged": "as logged", "emulated": "emulated", "sound": "true filter"}
     for number, (panel, (problem, rows)) in enumerate(zip(panels, groups, strict=True)):
         labels = [
-            f"{logged}, every {_steps(interval)}, {selector}"
-            for logged, interval, selector in zip(
-                rows["logged"], rows["sensing_interval"], rows["selector"], strict=True
-            )
+            f"{row['logged']}, every {_steps(row['sensing_interval'])}, {row['selector']}"
+            for row in rows.to_dict("records")
         ]
         dots = [plots.dots_of(label, rows, f"success_{way}", 100.0) for way, label in ways.items()]
         plots.dot_rows(panel, labels, dots, legend=number == 0)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from importlib import resources
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -36,7 +36,7 @@ from holdfast.errors import InvalidValueError
 from holdfast.lab.errors import TaskError
 from holdfast.lab.studies import statistics
 from holdfast.lab.studies.statistics import Interval, cells_of, interval_in
-from holdfast.lab.studies.study import Number, Report, Results, Scale
+from holdfast.lab.studies.study import TRIALS, Number, Part, Report, Scale, TrialStudy
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.tasks import Task
 from holdfast.lab.studies.trial_files import rounded
@@ -74,16 +74,9 @@ _PARTICLES = 1000
 
 
 class Way(NamedTuple):
-    """A policy with its settings.
+    """A policy with its settings, and as many trials as its standard error needs.
 
-    Attributes
-    ----------
-    trials : int
-        As many as its standard error needs.
-    published : bool
-        Whether it is a published heuristic, with the particle filter of its figures.
-    known_state : bool
-        Whether it is told the true state.
+    A published heuristic has the particle filter of its figures.
     """
 
     policy: VdpTagPolicy
@@ -122,38 +115,41 @@ look if that takes so many nats of entropy: the best of two or three thresholds,
 the share of random looks."""
 
 
-class PublishedWorlds:
+class PublishedWorlds(TrialStudy):
     """The study ``published_worlds``."""
 
     name = "published_worlds"
     title = "Worlds of others: Van der Pol tag, beside the planners published for it"
 
-    def tasks(self, scale: Scale) -> list[Task]:
-        """Return all that is to be computed, in the order in which to begin."""
-        return [task for way in WAYS for task in _tasks(way, scale)]
+    def parts(self, scale: Scale) -> Iterator[Part]:
+        """Yield the trials of each way."""
+        for name, way in WAYS.items():
+            trials = _QUICK_TRIALS if scale.quick else way.trials
+            yield Part({"way": name}, list(_tasks(name, trials, scale.seed)))
 
-    def report(self, scale: Scale, results: Results) -> Report:
-        """Return what it comes to, from the results of all its tasks."""
-        tables = []
-        for way in WAYS:
-            table = results.of(_tasks(way, scale))
-            table = table.assign(**{name: rounded(table[name]) for name in _FRACTIONS})
-            table.insert(0, "way", way)
-            tables.append(table)
-        return self.report_of(pd.concat(tables, ignore_index=True))
+    def kept(self, trials: pd.DataFrame) -> pd.DataFrame:
+        """Return all trials, as a file has them."""
+        fractions = {name: rounded(trials[name]) for name in _FRACTIONS}
+        return trials[["way", *COLUMNS]].assign(**fractions)
 
-    def report_of(self, trials: pd.DataFrame) -> Report:
+    def report_of(self, tables: Mapping[str, pd.DataFrame]) -> Report:
         """Return the report on all trials; InvalidValueError if they are not of this study."""
+        trials = tables[TRIALS]
         if list(trials.columns) != ["way", *COLUMNS] or set(trials["way"]) != set(WAYS):
             raise InvalidValueError(f"{self.name}: these are trials of something else")
-        tables = {way: trials[trials["way"] == way] for way in WAYS}
-        summary, rivals = _summary(tables), _rivals(tables)
+        summary, rivals = _summary(trials), _rivals(trials)
         return Report(
-            trials=trials,
             summary={"vdp_tag": summary, "looks": rivals},
             figures={"vdp_tag": partial(_draw, summary)},
             numbers=_numbers(summary, rivals),
         )
+
+
+def _tasks(way: str, trials: int, seed: int) -> Iterator[Task]:
+    for first in range(0, trials, _TRIALS_IN_EACH):
+        count = min(_TRIALS_IN_EACH, trials - first)
+        parameters = {"way": way, "seed": seed, "first_trial": first, "num_trials": count}
+        yield Task(kind="vdp_tag", parameters=parameters, units=count)
 
 
 def run_vdp_tag(way: str, seed: int, first_trial: int, num_trials: int) -> pd.DataFrame:
@@ -165,110 +161,73 @@ def run_vdp_tag(way: str, seed: int, first_trial: int, num_trials: int) -> pd.Da
     if way not in WAYS:
         raise TaskError(f"way {way!r}: there are {', '.join(WAYS)}")
     chosen = WAYS[way]
-    policy = _Timed(chosen.policy)
+    seconds, decisions = 0.0, 0
+
+    def timed(beliefs: FloatArray, draws: Sequence[Stream]) -> tuple[FloatArray, IntArray]:
+        nonlocal seconds, decisions
+        began = time.process_time()
+        decided = chosen.policy(beliefs, draws)
+        seconds += time.process_time() - began
+        decisions += len(draws)
+        return decided
+
     trials = run_vdp_tag_trials(
-        policy,
+        timed,
         seed,
         range(first_trial, first_trial + num_trials),
         chosen.num_particles,
         misses_at_once=not chosen.published,
         known_state=chosen.known_state,
     )
-    milliseconds = 1e3 * policy.seconds / max(1, policy.decisions)
+    numbers = range(first_trial, first_trial + num_trials)
     rows = [
-        (first_trial + index, each.discounted_reward, each.tagged, each.steps, each.looks)
-        for index, each in enumerate(trials)
+        (number, *trial, 1e3 * seconds / max(1, decisions))
+        for number, trial in zip(numbers, trials, strict=True)
     ]
-    return pd.DataFrame([(*row, milliseconds) for row in rows], columns=list(COLUMNS))
+    return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
-class _Timed:
-    """A policy, and how much of the processor's time its decisions take."""
-
-    def __init__(self, policy: VdpTagPolicy) -> None:
-        self._policy = policy
-        self.seconds = 0.0
-        self.decisions = 0
-
-    def __call__(self, beliefs: FloatArray, draws: Sequence[Stream]) -> tuple[FloatArray, IntArray]:
-        began = time.process_time()
-        decided = self._policy(beliefs, draws)
-        self.seconds += time.process_time() - began
-        self.decisions += len(draws)
-        return decided
-
-
-class PublishedPlanner(NamedTuple):
-    """A row of the published figures."""
-
-    trials: int
-    mean: float
-    standard_error: float
-
-
-def published_planners() -> dict[str, PublishedPlanner]:
-    """Return the published figures, by the planners' names."""
+def published_planners() -> pd.DataFrame:
+    """Return the published figures, a row for each planner."""
     file = resources.files("holdfast.lab.studies") / "data" / "vdp_tag_2018.csv"
     with file.open() as lines:
-        rows = pd.read_csv(lines)[["planner", "trials", "mean_discounted_reward", "standard_error"]]
-    return {
-        planner: PublishedPlanner(*figures)
-        for planner, *figures in rows.itertuples(index=False, name=None)
-    }
+        return pd.read_csv(lines, index_col="planner")
 
 
-def _tasks(way: str, scale: Scale) -> list[Task]:
-    trials = _QUICK_TRIALS if scale.quick else WAYS[way].trials
-    each = min(_TRIALS_IN_EACH, trials)
-    return [
-        Task(
-            kind="vdp_tag",
-            parameters={
-                "way": way,
-                "seed": scale.seed,
-                "first_trial": first,
-                "num_trials": min(each, trials - first),
-            },
-            units=min(each, trials - first),
-        )
-        for first in range(0, trials, each)
-    ]
-
-
-def _summary(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+def _summary(trials: pd.DataFrame) -> pd.DataFrame:
     """Return a row for each way and each published planner."""
+    of_ways = trials.groupby("way")
+    rewards = of_ways["discounted_reward"]
+    own = pd.DataFrame(
+        {
+            "trials": of_ways.size(),
+            "mean_discounted_reward": rewards.mean(),
+            "standard_error": rewards.sem(),
+            **{name: of_ways[name].mean() for name in ("tagged", "steps", "looks")},
+            "decision_ms": of_ways["mean_decision_ms"].mean(),
+        }
+    )
     published = published_planners()
-    rows: list[dict[str, Cell]] = []
-    for way in dict.fromkeys([*tables, *published]):
-        row: dict[str, Cell] = {"way": way}
-        if way in tables:
-            own = tables[way]
-            row |= {
-                "trials": len(own),
-                "mean_discounted_reward": own["discounted_reward"].mean(),
-                "standard_error": own["discounted_reward"].sem(),
-                **{name: own[name].mean() for name in ("tagged", "steps", "looks")},
-                "decision_ms": own["mean_decision_ms"].mean(),
-            }
-        if way in published:
-            row["published_mean"] = published[way].mean
-            row["published_standard_error"] = published[way].standard_error
-        rows.append(row)
-    table = pd.DataFrame(rows)
+    table = own.reindex(list(dict.fromkeys([*WAYS, *published.index]))).assign(
+        published_mean=published["mean_discounted_reward"],
+        published_standard_error=published["standard_error"],
+    )
     table["standard_errors_apart"] = (
         table["mean_discounted_reward"] - table["published_mean"]
     ) / np.hypot(table["standard_error"], table["published_standard_error"])
-    return table
+    return table.rename_axis("way").reset_index()
 
 
-def _rivals(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+def _rivals(trials: pd.DataFrame) -> pd.DataFrame:
     """Return how much more priced looks earn than other rules, trial by trial."""
+    rewards = {
+        way: trials["discounted_reward"][trials["way"] == way].to_numpy()
+        for way in WAYS
+        if not WAYS[way].published
+    }
+    best = rewards.pop(BEST)
     rows: list[dict[str, Cell]] = []
-    best = tables[BEST]["discounted_reward"].to_numpy()
-    for way, table in tables.items():
-        if way == BEST or WAYS[way].published:
-            continue
-        own = table["discounted_reward"].to_numpy()
+    for way, own in rewards.items():
         count = min(own.size, best.size)
         gain, p_value = statistics.paired_difference(best[:count], own[:count])
         rows.append(
@@ -288,22 +247,20 @@ def _rivals(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
 def _numbers(summary: pd.DataFrame, rivals: pd.DataFrame) -> list[Number]:
     """Return how the heuristics repeat, and how priced looks compare."""
     rows = {row["way"]: row for row in summary.to_dict("records")}
-    ours, strongest = rows[BEST], rows[STRONGEST]
     unit = "of discounted reward"
-    numbers = [
-        Number(
-            f"{way}, here less published",
-            _apart(rows[way], rows[way]),
-            unit,
-            rows[way]["trials"],
-        )
-        for way in WAYS
-        if WAYS[way].published
-    ]
-    numbers.append(Number(f"{BEST} less {STRONGEST}, as published", _apart(ours, strongest), unit))
-    return numbers + [
-        Number(f"{BEST} less {row['rival']}", interval_in(row, "reward_gain"), unit, row["trials"])
-        for row in rivals.to_dict("records")
+    repeated = [rows[name] for name, way in WAYS.items() if way.published]
+    return [
+        *(
+            Number(f"{row['way']}, here less published", _apart(row, row), unit, row["trials"])
+            for row in repeated
+        ),
+        Number(f"{BEST} less {STRONGEST}, as published", _apart(rows[BEST], rows[STRONGEST]), unit),
+        *(
+            Number(
+                f"{BEST} less {row['rival']}", interval_in(row, "reward_gain"), unit, row["trials"]
+            )
+            for row in rivals.to_dict("records")
+        ),
     ]
 
 

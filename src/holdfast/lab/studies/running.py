@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import tempfile
 import zlib
 from collections.abc import Callable, Sequence
@@ -12,12 +11,12 @@ import msgspec
 import pandas as pd
 
 from holdfast import __version__
-from holdfast.errors import InvalidValueError, OutputError
+from holdfast.errors import OutputError
 from holdfast.files import remove_unfinished, write_atomically
 from holdfast.lab.errors import TaskError
 from holdfast.lab.studies.executors import Executor, LocalExecutor
-from holdfast.lab.studies.study import Report, Results, Scale, Study
-from holdfast.lab.studies.tables import Columns, columns_of, frame_of, to_csv
+from holdfast.lab.studies.study import Report, Scale, Study
+from holdfast.lab.studies.tables import Columns, columns_of, to_csv
 from holdfast.lab.studies.tasks import Task, task_key
 from holdfast.lab.studies.trial_files import TRIALS_NAME, TrialFile
 from holdfast.recording.machine import describe
@@ -54,37 +53,40 @@ class ResultCache:
             return None
         except OSError as error:
             raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
-        payload, checksum = content[:-_CHECKSUM_BYTES], content[-_CHECKSUM_BYTES:]
-        if zlib.crc32(payload).to_bytes(_CHECKSUM_BYTES, "little") != checksum:
+        payload = content[:-_CHECKSUM_BYTES]
+        if content != payload + _checksum(payload):
             return None
         try:
             kept = self._decoder.decode(payload)
         except msgspec.DecodeError:
             return None
-        if _plain(kept.task) != _plain(task):
-            return None
-        with contextlib.suppress(InvalidValueError):
-            return frame_of(kept.table)
-        return None
+        return pd.DataFrame(kept.table) if _plain(kept.task) == _plain(task) else None
 
     def store(self, task: Task, table: pd.DataFrame) -> None:
         """Keep a task's result."""
         path = self._path_of(task)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"{path.parent}: cannot be made: {error.strerror}") from error
+        _make(path.parent)
         payload = msgspec.msgpack.encode(_Kept(task, columns_of(table)))
-        checksum = zlib.crc32(payload).to_bytes(_CHECKSUM_BYTES, "little")
-        write_atomically(path, payload + checksum)
+        write_atomically(path, payload + _checksum(payload))
 
     def _path_of(self, task: Task) -> Path:
         key = task_key(task)
         return self._directory / task.kind / key[:2] / f"{key}.table"
 
 
+def _checksum(payload: bytes) -> bytes:
+    return zlib.crc32(payload).to_bytes(_CHECKSUM_BYTES, "little")
+
+
 def _plain(task: Task) -> bytes:
     return msgspec.json.encode(task, order="sorted")
+
+
+def _make(directory: Path) -> None:
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{directory}: cannot be made: {error.strerror}") from error
 
 
 class Workload:
@@ -102,21 +104,16 @@ class Workload:
 
     def __init__(self, studies: Sequence[Study], scale: Scale, directory: Path) -> None:
         self._cache = ResultCache(directory / _CACHE)
-        self._tables: dict[str, pd.DataFrame] = {}
         # Only where this program alone writes: the directory itself may have other files.
         remove_unfinished(directory / _CACHE, below=True)
         for study in studies:
             remove_unfinished(directory / study.name)
         tasks = {task_key(task): task for study in studies for task in study.tasks(scale)}
-        self.tasks = list(tasks.values())
+        loaded = {key: self._cache.load(task) for key, task in tasks.items()}
+        self._tables = {key: table for key, table in loaded.items() if table is not None}
         self._keys = frozenset(tasks)
-        self.pending: list[Task] = []
-        for key, task in tasks.items():
-            table = self._cache.load(task)
-            if table is None:
-                self.pending.append(task)
-            else:
-                self._tables[key] = table
+        self.tasks = list(tasks.values())
+        self.pending = [task for key, task in tasks.items() if key not in self._tables]
         self.units = sum(task.units for task in self.tasks)
         self.finished_units = self.units - sum(task.units for task in self.pending)
         if self.pending:
@@ -143,10 +140,9 @@ class Workload:
         self._tables[key] = table
         self.finished_units += task.units
 
-    @property
-    def results(self) -> Results:
-        """The results of all tasks, once none is pending."""
-        return Results(self._tables, task_key)
+    def result_of(self, task: Task) -> pd.DataFrame:
+        """Return the result of a task that is not pending."""
+        return self._tables[task_key(task)]
 
 
 def compute(workload: Workload, executor: Executor, on_progress: Callable[[int], None]) -> None:
@@ -183,43 +179,26 @@ def write_report(
     directory: Path,
     machine: dict[str, str] | None = None,
 ) -> list[str]:
-    """Write a study's tables and figures.
+    """Write a study's tables and figures into its directory; return the names of the files.
 
-    ``origin.json`` comes last: where it is not there, the rest may be of two runs.
-
-    Parameters
-    ----------
-    directory : Path
-        Of this study; made if it is not there.
-    machine : dict, optional
-        On which its trials were run; this one by default.
-
-    Returns
-    -------
-    list of str
-        The names of the files.
+    ``machine`` is the one on which its trials were run; this one by default. ``origin.json`` comes
+    last: where it is not there, the rest may be of two runs.
     """
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{directory}: cannot be made: {error.strerror}") from error
+    _make(directory)
     origin_path = directory / "origin.json"
     try:
         origin_path.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{origin_path}: cannot be replaced: {error.strerror}") from error
     machine = describe() if machine is None else machine
-    names = []
-    for name, table in report.tables.items():
-        write_atomically(directory / f"{name}.csv", to_csv(table).encode())
-        names.append(f"{name}.csv")
-    for name, table in report.raw.items():
-        write_atomically(directory / f"{name}_trials.csv", to_csv(table).encode())
-        names.append(f"{name}_trials.csv")
+    raw = {f"{name}_trials": table for name, table in report.raw.items()}
+    files = {f"{name}.csv": to_csv(table).encode() for name, table in (report.tables | raw).items()}
     if report.trials is not None:
         kept = TrialFile(study=study.name, scale=scale, machine=machine, trials=report.trials)
-        write_atomically(directory / TRIALS_NAME, kept.encoded())
-        names.append(TRIALS_NAME)
+        files[TRIALS_NAME] = kept.encoded()
+    for name, content in files.items():
+        write_atomically(directory / name, content)
+    names = list(files)
     if report.figures:
         from holdfast.lab.studies import plots
     for name, draw in report.figures.items():
@@ -237,8 +216,7 @@ def write_report(
     )
     text = msgspec.json.format(msgspec.json.encode(origin), indent=2)
     write_atomically(origin_path, text + b"\n")
-    names.append("origin.json")
-    return names
+    return [*names, "origin.json"]
 
 
 def _check_room(directory: Path) -> None:

@@ -15,14 +15,13 @@ sample of all problems (a random effect).
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from functools import partial
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import pandas as pd
 
 from holdfast.arrays import BoolArray, FloatArray
-from holdfast.config.settings import SelectorSettings
+from holdfast.config.settings import Estimator, Method, SelectorSettings
 from holdfast.lab.studies import statistics
 from holdfast.lab.studies.cases import CASES, Case
 from holdfast.lab.studies.judged_study import (
@@ -32,16 +31,13 @@ from holdfast.lab.studies.judged_study import (
     compared,
     outcome_cells,
     over_problems,
+    shown_as,
     steps_and_success,
 )
 from holdfast.lab.studies.statistics import Interval, cells_of, interval_in
-from holdfast.lab.studies.study import CHOICE, CLAIM, Number, Report, Scale
+from holdfast.lab.studies.study import CHOICE, CLAIM, TRIALS, Number, Report, Scale, drawn
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.trial_batches import TrialSeries, problem_of
-from holdfast.lab.studies.trial_files import cells_of_trials, require_cells
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["COSTS", "GROUPS", "INTERVALS", "SHOWN", "WAYS", "Selectors"]
 
@@ -54,37 +50,28 @@ LEVEL = 0.01
 LEVEL_OF_VERDICT = 0.05
 """Of the tests whether a candidate is beaten: less strict, to the candidate's disadvantage."""
 
+
+def _by(method: Method, estimator: Estimator | None = None) -> SelectorSettings:
+    return SelectorSettings(method=method, estimator=estimator)
+
+
 WAYS: Mapping[str, SelectorSettings] = {
-    "random": SelectorSettings(method="random"),
-    "fixed": SelectorSettings(method="fixed"),
-    "state entropy, neighbours": SelectorSettings(
-        method="state_entropy", estimator="nearest_neighbor"
-    ),
-    "state entropy, mixture": SelectorSettings(
-        method="state_entropy", estimator="gaussian_mixture_upper"
-    ),
-    "action entropy, neighbours": SelectorSettings(
-        method="action_entropy", estimator="nearest_neighbor"
-    ),
+    "random": _by("random"),
+    "fixed": _by("fixed"),
+    "state entropy, neighbours": _by("state_entropy", "nearest_neighbor"),
+    "state entropy, mixture": _by("state_entropy", "gaussian_mixture_upper"),
+    "action entropy, neighbours": _by("action_entropy", "nearest_neighbor"),
     "action entropy, neighbours, executed": SelectorSettings(
         method="action_entropy", estimator="nearest_neighbor", actions="executed"
     ),
-    "action entropy, mixture": SelectorSettings(
-        method="action_entropy", estimator="gaussian_mixture_upper"
-    ),
+    "action entropy, mixture": _by("action_entropy", "gaussian_mixture_upper"),
     "action entropy, mixture, executed": SelectorSettings(
         method="action_entropy", estimator="gaussian_mixture_upper", actions="executed"
     ),
-    "action covariance": SelectorSettings(method="action_covariance"),
-    "path entropy, neighbours": SelectorSettings(
-        method="path_entropy", estimator="nearest_neighbor"
-    ),
-    "action entropy, prior neighbours": SelectorSettings(
-        method="action_entropy", estimator="prior_neighbors"
-    ),
-    "path entropy, prior neighbours": SelectorSettings(
-        method="path_entropy", estimator="prior_neighbors"
-    ),
+    "action covariance": _by("action_covariance"),
+    "path entropy, neighbours": _by("path_entropy", "nearest_neighbor"),
+    "action entropy, prior neighbours": _by("action_entropy", "prior_neighbors"),
+    "path entropy, prior neighbours": _by("path_entropy", "prior_neighbors"),
 }
 """By their names in tables and figures. Actions are the commanded ones, unless named executed."""
 
@@ -130,15 +117,19 @@ _CONTINUED_TRIALS = 60
 COSTS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Of a sensing action, in units of reward (the length of the way, in most problems)."""
 
-_MEAN = "mean"
-"""In place of an interval: the mean over all of them."""
-
 _CASES: Mapping[str, Case] = {case.name: case for case in CASES}
 
-_Cell = tuple[str, int, str]
-"""Names of a case, an interval and a way."""
+_EACH_AND_ALL: tuple[tuple[Cell, tuple[int, ...]], ...] = (
+    *((interval, (interval,)) for interval in INTERVALS),
+    ("mean", INTERVALS),
+)
+"""Each interval alone, and all of them together, with their names."""
 
-_Cells = Mapping[_Cell, pd.DataFrame]
+_Cells = Mapping[tuple[str, int, str], pd.DataFrame]
+"""Trials by case, interval and way."""
+
+_Places = Mapping[tuple[str, str], Trials]
+"""Trials by place and way. A place is a problem, or a group of problems."""
 
 
 class Selectors(JudgedStudy):
@@ -146,18 +137,21 @@ class Selectors(JudgedStudy):
 
     name = "selectors"
     title = "What is really best: choosing what to sense, on eight problems"
+    columns = ("problem", "sensing_interval", "way")
     num_trials: ClassVar = {CHOICE: 20, CLAIM: 120}
 
-    def cells(self, scale: Scale | None = None) -> Iterator[_Cell]:
+    def cells(self, scale: Scale) -> Iterator[tuple[str, int, str]]:
         """Return all cells, in the order of the tables."""
         del scale
         return ((case, interval, way) for case in _CASES for interval in INTERVALS for way in WAYS)
 
-    def names(self, cell: _Cell) -> dict[str, Cell]:
-        """Return the columns that name a cell."""
-        return dict(zip(("problem", "sensing_interval", "way"), cell, strict=True))
+    def names(self, cell: tuple[str, int, str]) -> tuple[Cell, ...]:
+        """Return a cell's values of the columns."""
+        return cell
 
-    def series(self, cell: _Cell, purpose: str, scale: Scale, num_trials: int) -> TrialSeries:
+    def series(
+        self, cell: tuple[str, int, str], purpose: str, scale: Scale, num_trials: int
+    ) -> TrialSeries:
         """Return the trials of a cell for a purpose."""
         case, interval, way = cell
         return _CASES[case].series(
@@ -168,55 +162,44 @@ class Selectors(JudgedStudy):
             continued_trials=_CONTINUED_TRIALS if purpose == CLAIM and way in _CONTINUED else 0,
         )
 
-    def report_of(self, trials: pd.DataFrame) -> Report:
+    def report_of(self, tables: Mapping[str, pd.DataFrame]) -> Report:
         """Return the report on all trials; InvalidValueError if they are not of this study."""
-        found = cells_of_trials(trials, ("purpose", "problem", "sensing_interval", "way"))
-        every = list(self.cells())
-        require_cells(
-            self.name, found, {(purpose, *cell) for purpose in _PURPOSES for cell in every}
+        choosing, cells = self.by_cell(tables[TRIALS]).values()
+        chosen_by, places = _over_intervals(choosing), _over_intervals(cells)
+        summary, costs = _summary(cells), _costs(choosing, cells)
+        rivals = {measure: _rivals(places, measure, _pairs()) for measure in MEASURES}
+        relative_steps = _rivals(
+            places, "steps_ratio", [(way, BASELINE) for way in WAYS if way != BASELINE]
+        ).drop(columns="rival")
+        return Report(
+            summary={
+                "cases": _cases_table(cells, choosing),
+                "selectors": summary,
+                "relative_steps": relative_steps,
+                "rivals": rivals["steps_ratio"],
+                "rivals_in_success": rivals["success_gain"],
+                "over_problems": _over_problems(places),
+                "chosen_ways": _chosen_ways(chosen_by, places),
+                "default_candidates": _default_candidates(chosen_by, cells),
+                "stuck": _stuck(cells),
+                "costs_of_looks": costs,
+            },
+            figures={
+                "choice_of_sensing": drawn("selectors_figures:choice_of_sensing", summary),
+                "selectors": drawn("selectors_figures:selectors", relative_steps),
+                "costs_of_looks": drawn("selectors_figures:costs_of_looks", costs),
+            },
+            numbers=_numbers(rivals),
         )
-        choosing, cells = ({cell: found[each, *cell] for cell in every} for each in _PURPOSES)
-        of_choosing, of_claim = _over_intervals(choosing), _over_intervals(cells)
-        summary = _summary(cells)
-        relative_steps, costs = _relative_steps(of_claim), _costs(choosing, cells)
-        rivals = {measure: _rivals(of_claim, measure) for measure in MEASURES}
-        report = Report(trials=trials)
-        report.summary = {
-            "cases": _cases_table(cells, choosing),
-            "selectors": summary,
-            "relative_steps": relative_steps,
-            "rivals": rivals["steps_ratio"],
-            "rivals_in_success": rivals["success_gain"],
-            "over_problems": _over_problems(of_claim),
-            "chosen_ways": _chosen_ways(of_choosing, of_claim),
-            "default_candidates": _default_candidates(of_choosing, cells),
-            "stuck": _stuck(cells),
-            "costs_of_looks": costs,
-        }
-        drawn = {"choice_of_sensing": summary, "selectors": relative_steps, "costs_of_looks": costs}
-        report.figures = {name: partial(_draw, name, table) for name, table in drawn.items()}
-        report.numbers = _numbers(rivals)
-        return report
 
 
-def _draw(name: str, table: pd.DataFrame) -> Figure:
-    # Imports matplotlib, so only when a figure is wanted.
-    from holdfast.lab.studies import selectors_figures
+def _over_intervals(cells: _Cells) -> _Places:
+    """Return steps and success: the mean over the intervals, trial by trial.
 
-    figure: Figure = getattr(selectors_figures, name)(table)
-    return figure
-
-
-_PURPOSES = (CHOICE, CLAIM)
-
-
-def _over_intervals(cells: _Cells) -> dict[tuple[str, str], Trials]:
-    """Return steps and success by place and way: the mean over the intervals, trial by trial.
-
-    A place is a problem, or a group of problems: their mean over the trials that all have.
+    Of a group of problems: their mean over the trials that all have.
     """
     found = {
-        (case, way): steps_and_success([cells[case, interval, way] for interval in INTERVALS])
+        (case, way): steps_and_success(*(cells[case, interval, way] for interval in INTERVALS))
         for case in _CASES
         for way in WAYS
     }
@@ -235,15 +218,15 @@ def _cases_table(cells: _Cells, choosing: _Cells) -> pd.DataFrame:
     """Return how each problem is posed, so that others can pose it."""
     rows: list[dict[str, Cell]] = []
     for name, case in _CASES.items():
-        series = case.series(WAYS[DEFAULT], INTERVALS[0], seed=0, num_trials=2)
-        sensing = series.planning.active_sensing
+        planning = case.series(WAYS[DEFAULT], INTERVALS[0], seed=0, num_trials=2).planning
+        sensing = planning.active_sensing
         rows.append(
             {
                 "problem": name,
                 "class": case.problem,
                 "model": ", ".join(f"{key} {value}" for key, value in case.model.items()),
-                "particles": series.planning.particle_filter.num_particles,
-                "resampling_threshold": series.planning.particle_filter.resampling_threshold,
+                "particles": planning.particle_filter.num_particles,
+                "resampling_threshold": planning.particle_filter.resampling_threshold,
                 "M": sensing.num_observation_samples,
                 "k": sensing.num_nearest_neighbors,
                 "horizon": sensing.horizon,
@@ -258,7 +241,7 @@ def _cases_table(cells: _Cells, choosing: _Cells) -> pd.DataFrame:
 
 def _resolution(case: Case) -> Cell:
     """Return a problem's resolution, or as a text those of all coordinates."""
-    own = problem_of(case.problem, case.model, {}).resolution
+    own = problem_of(case.problem, case.model).resolution
     rounded = [f"{each:.4g}" for each in np.atleast_1d(own)]
     return float(rounded[0]) if isinstance(own, (int, float)) else ", ".join(rounded)
 
@@ -277,7 +260,7 @@ def _summary(cells: _Cells) -> pd.DataFrame:
                 "sensing_interval": interval,
                 "way": way,
                 **outcome_cells(table),
-                **compared(steps_and_success([table]), steps_and_success([baseline])),
+                **compared(steps_and_success(table), steps_and_success(baseline)),
                 **cells_of("reward_gain", reward),
                 "reward_p_value": p_value,
             }
@@ -298,48 +281,36 @@ def _pairs() -> list[tuple[str, str]]:
     ]
 
 
-def _relative_steps(trials: Mapping[tuple[str, str], Trials]) -> pd.DataFrame:
-    """Return the steps of each way relative to the baseline."""
-    table = pd.DataFrame(
-        {"problem": case, "way": way, **_difference("steps_ratio", own, trials[case, BASELINE])}
-        for (case, way), own in trials.items()
-        if way != BASELINE
-    )
-    statistics.add_adjusted(table, "p_value")
-    return table
-
-
-def _rivals(trials: Mapping[tuple[str, str], Trials], measure: str) -> pd.DataFrame:
+def _rivals(places: _Places, measure: str, pairs: Iterable[tuple[str, str]]) -> pd.DataFrame:
     """Return how the first way of each pair differs from the second, everywhere."""
-    table = pd.DataFrame(
-        {
-            "problem": place,
-            "way": way,
-            "rival": rival,
-            **_difference(measure, trials[place, way], trials[place, rival]),
-        }
-        for place in (*_CASES, *GROUPS)
-        for way, rival in _pairs()
-    )
+    part = MEASURES.index(measure)
+    rows: list[dict[str, Cell]] = []
+    for place in (*_CASES, *GROUPS):
+        for way, rival in pairs:
+            own, other = places[place, way][part], places[place, rival][part]
+            difference, p_value = statistics.paired_difference(own, other)
+            rows.append(
+                {
+                    "problem": place,
+                    "way": way,
+                    "rival": rival,
+                    "trials": int(np.count_nonzero(~np.isnan(own))),
+                    **cells_of(measure, shown_as(measure, difference)),
+                    "p_value": p_value,
+                }
+            )
+    table = pd.DataFrame(rows)
     statistics.add_adjusted(table, "p_value")
     return table
 
 
-def _difference(measure: str, own: Trials, other: Trials) -> dict[str, Cell]:
-    part = MEASURES.index(measure)
-    difference, p_value = statistics.paired_difference(own[part], other[part])
-    shown = statistics.ratio_of(difference) if measure == "steps_ratio" else difference
-    count = int(np.count_nonzero(~np.isnan(own[part])))
-    return {"trials": count, **cells_of(measure, shown), "p_value": p_value}
-
-
-def _over_problems(trials: Mapping[tuple[str, str], Trials]) -> pd.DataFrame:
+def _over_problems(places: _Places) -> pd.DataFrame:
     """Return how ways differ over these problems, and over all problems like them."""
     return over_problems(
         [
             (
                 {"way": way, "rival": rival},
-                [(trials[case, way], trials[case, rival]) for case in _CASES],
+                [(places[case, way], places[case, rival]) for case in _CASES],
             )
             for way, rival in _pairs()
         ],
@@ -347,36 +318,31 @@ def _over_problems(trials: Mapping[tuple[str, str], Trials]) -> pd.DataFrame:
     )
 
 
-def _fewest_steps(
-    choosing: Mapping[tuple[str, str], Trials], place: str, ways: Iterable[str]
-) -> str:
+def _fewest_steps(chosen_by: _Places, place: str, ways: Iterable[str]) -> str:
     """Return the way with the fewest steps on the trials for choosing."""
-    return min(ways, key=lambda way: float(np.nanmean(choosing[place, way][0])))
+    return min(ways, key=lambda way: float(np.nanmean(chosen_by[place, way][0])))
 
 
-def _chosen_ways(
-    choosing: Mapping[tuple[str, str], Trials], trials: Mapping[tuple[str, str], Trials]
-) -> pd.DataFrame:
+def _chosen_ways(chosen_by: _Places, places: _Places) -> pd.DataFrame:
     """Return the way that the trials for choosing choose, compared on the others.
 
     For each problem and group, against the baseline and the default.
     """
     rows: list[dict[str, Cell]] = []
     for place in (*_CASES, *GROUPS):
-        way = _fewest_steps(choosing, place, WAYS)
-        rows += [
-            {
-                "problem": place,
-                "chosen": way,
-                "rival": rival,
-                "steps_ratio_when_chosen": compared(choosing[place, way], choosing[place, rival])[
-                    "steps_ratio"
-                ],
-                "trials": trials[place, way][0].size,
-                **compared(trials[place, way], trials[place, rival]),
-            }
-            for rival in (BASELINE, DEFAULT)
-        ]
+        way = _fewest_steps(chosen_by, place, WAYS)
+        for rival in (BASELINE, DEFAULT):
+            when_chosen = compared(chosen_by[place, way], chosen_by[place, rival])
+            rows.append(
+                {
+                    "problem": place,
+                    "chosen": way,
+                    "rival": rival,
+                    "steps_ratio_when_chosen": when_chosen["steps_ratio"],
+                    "trials": places[place, way][0].size,
+                    **compared(places[place, way], places[place, rival]),
+                }
+            )
     table = pd.DataFrame(rows)
     statistics.add_adjusted(
         table, "steps_p_value", "success_p_value", compared=table["chosen"] != table["rival"]
@@ -384,13 +350,13 @@ def _chosen_ways(
     return table
 
 
-def _default_candidates(choosing: Mapping[tuple[str, str], Trials], cells: _Cells) -> pd.DataFrame:
+def _default_candidates(chosen_by: _Places, cells: _Cells) -> pd.DataFrame:
     """Return the comparisons that decide whether a candidate becomes the default.
 
     It does not if the baseline or the default before beats it beyond noise, in steps or success, in
     any row. The p-values of a candidate are adjusted for all its comparisons of both measures.
     """
-    chosen = _fewest_steps(choosing, next(iter(GROUPS)), _CANDIDATES)
+    chosen = _fewest_steps(chosen_by, next(iter(GROUPS)), _CANDIDATES)
     return pd.concat(
         [_candidate(way, cells).assign(chosen=way == chosen) for way in _CANDIDATES],
         ignore_index=True,
@@ -407,13 +373,13 @@ def _candidate(candidate: str, cells: _Cells) -> pd.DataFrame:
             "trials": len(cells[case, INTERVALS[0], candidate]),
             **compared(
                 *(
-                    steps_and_success([cells[case, each, way] for each in intervals])
+                    steps_and_success(*(cells[case, each, way] for each in intervals))
                     for way in (candidate, rival)
                 )
             ),
         }
         for case in _CASES
-        for name, intervals in _intervals()
+        for name, intervals in _EACH_AND_ALL
         for rival in (BASELINE, BEFORE)
     )
     levels = statistics.holm(np.concatenate([table["steps_p_value"], table["success_p_value"]]))
@@ -427,45 +393,40 @@ def _candidate(candidate: str, cells: _Cells) -> pd.DataFrame:
     return table
 
 
-def _intervals() -> list[tuple[Cell, tuple[int, ...]]]:
-    """Return each interval alone, and all of them together, with their names."""
-    return [*((interval, (interval,)) for interval in INTERVALS), (_MEAN, INTERVALS)]
-
-
 def _stuck(cells: _Cells) -> pd.DataFrame:
     """Return how many trials were cut off, and how many of these never reached the goal."""
     rows: list[dict[str, Cell]] = []
     for name, case in _CASES.items():
-        continued = {
-            (interval, way): _continued(cells[name, interval, way])
-            for interval in INTERVALS
-            for way in _CONTINUED
-        }
-        for label, intervals in _intervals():
-            others = np.array([_is_stuck(continued[each, BASELINE]) for each in intervals])
-            for way in _CONTINUED:
-                found = [continued[each, way] for each in intervals]
-                cut = np.array([~table["success"].to_numpy(bool) for table in found])
-                stuck = np.array([_is_stuck(table) for table in found])
+        for label, intervals in _EACH_AND_ALL:
+            found = {
+                way: [_continued(cells[name, each, way]) for each in intervals]
+                for way in _CONTINUED
+            }
+            stuck = {
+                way: np.array([table["steps_to_goal"].isna() for table in tables])
+                for way, tables in found.items()
+            }
+            for way, own in stuck.items():
+                cut = np.array([~table["success"].to_numpy(bool) for table in found[way]])
                 if len(intervals) == 1:
-                    difference, p_value = statistics.paired_rates(stuck[0], others[0])
+                    beyond, p_value = statistics.paired_rates(own[0], stuck[BASELINE][0])
                 else:
-                    difference, p_value = statistics.paired_difference(
-                        stuck.mean(axis=0), others.mean(axis=0)
+                    beyond, p_value = statistics.paired_difference(
+                        own.mean(axis=0), stuck[BASELINE].mean(axis=0)
                     )
                 rows.append(
                     {
                         "problem": name,
                         "sensing_interval": label,
                         "way": way,
-                        "trials": stuck.size,
+                        "trials": own.size,
                         "max_steps": case.max_steps,
                         "cut_off": int(cut.sum()),
-                        "continued_to": int(found[0]["step_limit"].iloc[0]),
-                        "stuck": int(stuck.sum()),
+                        "continued_to": int(found[way][0]["step_limit"].iloc[0]),
+                        "stuck": int(own.sum()),
                         **cells_of("cut_off_share", _share(cut)),
-                        **cells_of("stuck_share", _share(stuck)),
-                        **cells_of("stuck_beyond_random", difference),
+                        **cells_of("stuck_share", _share(own)),
+                        **cells_of("stuck_beyond_random", beyond),
                         "p_value": p_value,
                     }
                 )
@@ -492,10 +453,6 @@ def _continued(table: pd.DataFrame) -> pd.DataFrame:
     return table[table["step_limit"] == table["step_limit"].max()]
 
 
-def _is_stuck(table: pd.DataFrame) -> BoolArray:
-    return np.asarray(table["steps_to_goal"].isna())
-
-
 def _costs(choosing: _Cells, cells: _Cells) -> pd.DataFrame:
     """Return the net reward where sensing has a price, at the interval that is best then.
 
@@ -504,22 +461,18 @@ def _costs(choosing: _Cells, cells: _Cells) -> pd.DataFrame:
     rows: list[dict[str, Cell]] = []
     for case in _CASES:
         for cost in COSTS:
-            best = {
-                way: max(
-                    INTERVALS,
-                    key=lambda interval: float(_net(choosing[case, interval, way], cost).mean()),
-                )
-                for way in SHOWN
-            }
-            nets = {way: _net(cells[case, best[way], way], cost) for way in SHOWN}
-            for way, net in nets.items():
+            nets: dict[str, FloatArray] = {}
+            for way in SHOWN:
+                chosen_by = {each: _net(choosing[case, each, way], cost) for each in INTERVALS}
+                best = max(chosen_by, key=lambda each: float(chosen_by[each].mean()))
+                net = nets[way] = _net(cells[case, best, way], cost)
                 gain, p_value = statistics.paired_difference(net, nets[BASELINE])
                 rows.append(
                     {
                         "problem": case,
                         "way": way,
                         "cost_of_a_look": cost,
-                        "best_interval": best[way],
+                        "best_interval": best,
                         "trials": net.size,
                         **cells_of("net_reward", statistics.mean_interval(net)),
                         **cells_of("gain", gain),

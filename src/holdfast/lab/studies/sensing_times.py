@@ -35,7 +35,6 @@ from holdfast.config.settings import (
 )
 from holdfast.errors import InvalidValueError
 from holdfast.lab.studies.cost_model import parallel_share
-from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.trial_batches import problem_of
 from holdfast.planning import Planner, PlanningState
 from holdfast.problems.problem import Problem
@@ -68,18 +67,14 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    problem : str
-        Its name.
-    num_sensing_actions : int or None
-        J: the first so many of its sensing actions; None for all.
-    num_observation_samples : int
-        M.
-    horizon : int
-        H.
+    num_sensing_actions : int
+        J: the first so many of the problem's sensing actions.
+    num_observation_samples, horizon : int
+        M and H.
     particles : tuple of int
         Rising. It ends earlier if a number would take too long.
     threads : tuple of int
-        Numbers of threads, 1 among them.
+        Numbers of threads, 1 and at least one more.
     num_trials : int
         From each comes one belief.
     repeat_s : float
@@ -92,7 +87,7 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     problem: str
-    num_sensing_actions: int | None = None
+    num_sensing_actions: int
     estimator: str = "nearest_neighbor"
     num_observation_samples: int = 10
     horizon: int = 1
@@ -115,10 +110,7 @@ class Sensed(NamedTuple):
 def measure_sensing(**measurement: Any) -> pd.DataFrame:
     """Time decisions; the function of tasks of the kind ``sensing_times``.
 
-    Parameters
-    ----------
-    **measurement
-        The fields of :class:`Measurement`.
+    It gets the fields of :class:`Measurement`.
 
     Returns
     -------
@@ -129,25 +121,10 @@ def measure_sensing(**measurement: Any) -> pd.DataFrame:
         delays several threads sooner than one. ``mapping_ms`` is what the policy and the predicted
         observations of all particles take, which one thread does, and ``others_cores`` how many
         cores other processes kept busy meanwhile.
-
-    Raises
-    ------
-    InvalidValueError
-        If the measurement cannot be made so.
-    HoldfastError
-        If the problem refuses it.
     """
     wanted = msgspec.convert(measurement, Measurement)
-    _check(wanted)
-    problem = problem_of(wanted.problem, {}, {})
-    if wanted.num_sensing_actions is not None:
-        there_are = len(problem.sensing_actions)
-        if not 1 <= wanted.num_sensing_actions <= there_are:
-            raise InvalidValueError(
-                f"num_sensing_actions {wanted.num_sensing_actions}: {wanted.problem} has "
-                f"{there_are}"
-            )
-        problem.sensing_actions = problem.sensing_actions[: wanted.num_sensing_actions]
+    problem = problem_of(wanted.problem)
+    problem.sensing_actions = problem.sensing_actions[: wanted.num_sensing_actions]
     histories = [
         history_of(problem, _settings(wanted, _HISTORY_PARTICLES, 0), wanted.seed, trial)
         for trial in range(wanted.num_trials)
@@ -159,16 +136,16 @@ def measure_sensing(**measurement: Any) -> pd.DataFrame:
         expected_s = _FEWER * wanted.least_repetitions * _expected_s(taken, particles)
         if expected_s > wanted.limit_s:
             break
-        settings = _settings(wanted, particles, 1)
+        deciding = _Deciding(problem, wanted, particles)
         states = [
-            state_in(problem, settings, wanted.seed, trial, history)
+            state_in(problem, deciding.settings[1], wanted.seed, trial, history)
             for trial, history in enumerate(histories)
         ]
         load = _Load()
-        states = _few_enough(wanted, problem, settings, states)
+        states = deciding.few_enough(states)
         if not states:
             break
-        timed, round_s = _timed(wanted, problem, settings, states)
+        timed, round_s = deciding.timed(states)
         tables.append(timed.assign(particles=particles, others_cores=load.of_others()))
         taken.append((particles, round_s))
     if not taken:
@@ -227,29 +204,6 @@ def state_in(
     return state
 
 
-_COLUMNS = (
-    "belief",
-    "step",
-    "threads",
-    "median_ms",
-    "fastest_ms",
-    "repetitions",
-    "share",
-    "mapping_ms",
-)
-
-
-def _check(wanted: Measurement) -> None:
-    if 1 not in wanted.threads or len(set(wanted.threads)) < 2 or min(wanted.threads) < 1:
-        raise InvalidValueError(f"threads {wanted.threads}: 1 and at least one more are needed")
-    if not wanted.particles or list(wanted.particles) != sorted(set(wanted.particles)):
-        raise InvalidValueError(f"particles {wanted.particles}: must be at least one, and rise")
-    if wanted.num_trials < 1:
-        raise InvalidValueError(f"num_trials {wanted.num_trials}: must be at least 1")
-    if wanted.least_repetitions < 1:
-        raise InvalidValueError(f"least_repetitions {wanted.least_repetitions}: must be at least 1")
-
-
 def _settings(wanted: Measurement, particles: int, threads: int) -> PlanningSettings:
     return PlanningSettings(
         particle_filter=ParticleFilterSettings(num_particles=particles),
@@ -261,13 +215,6 @@ def _settings(wanted: Measurement, particles: int, threads: int) -> PlanningSett
         selector=msgspec.convert(
             {"method": "action_entropy", "estimator": wanted.estimator}, SelectorSettings
         ),
-    )
-
-
-def _on(settings: PlanningSettings, threads: int) -> PlanningSettings:
-    return msgspec.structs.replace(
-        settings,
-        active_sensing=msgspec.structs.replace(settings.active_sensing, num_cores=threads),
     )
 
 
@@ -283,79 +230,76 @@ def _expected_s(taken: Sequence[tuple[int, float]], particles: int) -> float:
     return float(seconds * (particles / last) ** exponent)
 
 
-def _few_enough(
-    wanted: Measurement,
-    problem: Problem,
-    settings: PlanningSettings,
-    states: list[PlanningState],
-) -> list[PlanningState]:
-    """Return as many of the beliefs as there is time for: all, fewer, or none."""
-    one_s = sum(
-        _decision_s(problem, _on(settings, threads), states[len(states) // 2])
-        for threads in wanted.threads
-    )
-    fewer = states[: round(_FEWER * len(states))]
-    for some in (states, fewer):
-        if wanted.least_repetitions * one_s * len(some) <= wanted.limit_s:
-            return some
-    return []
+class _Deciding:
+    """Decisions with one number of particles, on each number of threads."""
 
+    def __init__(self, problem: Problem, wanted: Measurement, particles: int) -> None:
+        self._problem = problem
+        self._wanted = wanted
+        self.settings = {
+            threads: _settings(wanted, particles, threads) for threads in wanted.threads
+        }
 
-def _timed(
-    wanted: Measurement,
-    problem: Problem,
-    settings: PlanningSettings,
-    states: Sequence[PlanningState],
-) -> tuple[pd.DataFrame, float]:
-    """Return the rows of some beliefs, and what a round of all of them takes in seconds."""
-    of_threads = {threads: _on(settings, threads) for threads in wanted.threads}
-    taken: list[dict[int, list[float]]] = [{p: [] for p in wanted.threads} for _ in states]
-    round_s = 0.0
-    repetitions = 1
-    repetition = 0
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        while repetition < repetitions:
-            order = wanted.threads if repetition % 2 == 0 else wanted.threads[::-1]
-            for state, times in zip(states, taken, strict=True):
-                for threads in order:
-                    times[threads].append(_decision_s(problem, of_threads[threads], state))
-            repetition += 1
-            if repetition == 1:
-                round_s = sum(seconds for times in taken for (seconds,) in times.values())
-                affordable = min(int(wanted.repeat_s / round_s), _MOST_REPETITIONS)
-                repetitions = max(affordable, wanted.least_repetitions)
-    finally:
-        if collects:
-            gc.enable()
-    rows: list[tuple[Cell, ...]] = []
-    for belief, (state, times) in enumerate(zip(states, taken, strict=True)):
-        share = parallel_share({threads: min(seconds) for threads, seconds in times.items()})
-        mapping_ms = 1e3 * _mapping_s(problem, state)
-        rows += [
-            (
-                belief,
-                state.step,
-                threads,
-                1e3 * float(np.median(seconds)),
-                1e3 * min(seconds),
-                repetitions,
-                share,
-                mapping_ms,
-            )
+    def few_enough(self, states: list[PlanningState]) -> list[PlanningState]:
+        """Return as many of the beliefs as there is time for: all, fewer, or none."""
+        middle = states[len(states) // 2]
+        one_s = sum(self._decision_s(threads, middle) for threads in self.settings)
+        for some in (states, states[: round(_FEWER * len(states))]):
+            if self._wanted.least_repetitions * one_s * len(some) <= self._wanted.limit_s:
+                return some
+        return []
+
+    def timed(self, states: Sequence[PlanningState]) -> tuple[pd.DataFrame, float]:
+        """Return the rows of some beliefs, and what a round of all of them takes in seconds."""
+        taken: list[dict[int, list[float]]] = [{p: [] for p in self.settings} for _ in states]
+        round_s = 0.0
+        repetitions = 1
+        repetition = 0
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            while repetition < repetitions:
+                order = list(self.settings)[:: 1 if repetition % 2 == 0 else -1]
+                for state, times in zip(states, taken, strict=True):
+                    for threads in order:
+                        times[threads].append(self._decision_s(threads, state))
+                repetition += 1
+                if repetition == 1:
+                    round_s = sum(seconds for times in taken for (seconds,) in times.values())
+                    affordable = min(int(self._wanted.repeat_s / round_s), _MOST_REPETITIONS)
+                    repetitions = max(affordable, self._wanted.least_repetitions)
+        finally:
+            if collects:
+                gc.enable()
+        rows = [
+            {
+                "belief": belief,
+                "step": state.step,
+                "threads": threads,
+                "median_ms": 1e3 * float(np.median(seconds)),
+                "fastest_ms": 1e3 * min(seconds),
+                "repetitions": repetitions,
+            }
+            for belief, (state, times) in enumerate(zip(states, taken, strict=True))
             for threads, seconds in times.items()
         ]
-    return pd.DataFrame(rows, columns=list(_COLUMNS)), round_s
+        of_beliefs = [
+            {
+                "belief": belief,
+                "share": parallel_share({each: min(seconds) for each, seconds in times.items()}),
+                "mapping_ms": 1e3 * _mapping_s(self._problem, state),
+            }
+            for belief, (state, times) in enumerate(zip(states, taken, strict=True))
+        ]
+        return pd.DataFrame(rows).merge(pd.DataFrame(of_beliefs), on="belief"), round_s
 
-
-def _decision_s(problem: Problem, settings: PlanningSettings, state: PlanningState) -> float:
-    """Return what a decision takes, less what its thread waited for a core that others had."""
-    delayed_ns = _delayed_ns()
-    start = time.perf_counter()
-    Planner(problem, settings).choose_sensing_action(state)
-    elapsed_s = time.perf_counter() - start
-    return max(elapsed_s - 1e-9 * (_delayed_ns() - delayed_ns), 1e-9)
+    def _decision_s(self, threads: int, state: PlanningState) -> float:
+        """Return what a decision takes, less what its thread waited for a core others had."""
+        delayed_ns = _delayed_ns()
+        start = time.perf_counter()
+        Planner(self._problem, self.settings[threads]).choose_sensing_action(state)
+        elapsed_s = time.perf_counter() - start
+        return max(elapsed_s - 1e-9 * (_delayed_ns() - delayed_ns), 1e-9)
 
 
 def _delayed_ns() -> int:

@@ -13,7 +13,7 @@ SciPy takes a second to import, so each function imports what it needs.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -35,9 +35,9 @@ __all__ = [
     "add_adjusted",
     "agreement_of_means",
     "agreement_of_rates",
-    "cells_across_problems",
     "cells_of",
     "clustered_median_interval",
+    "exactly",
     "holm",
     "independent_difference",
     "interval_in",
@@ -66,53 +66,43 @@ class Interval(NamedTuple):
     low: float
     high: float
 
-    def __str__(self) -> str:
-        return f"{self.value:.3g} [{self.low:.3g}, {self.high:.3g}]"
+
+def exactly(value: float) -> Interval:
+    """Return a number that is no estimate, or whose interval is not known."""
+    return Interval(value, value, value)
+
+
+def _students(mean: float, error: float, freedom: int) -> Interval:
+    from scipy import stats
+
+    half = float(stats.t.ppf(0.5 + 0.5 * _LEVEL, freedom)) * error
+    return Interval(mean, mean - half, mean + half)
 
 
 def mean_interval(values: FloatArray) -> Interval:
-    """Return the mean of independent values with Student's interval.
+    """Return the mean of independent values with Student's interval; NaN is left out.
 
-    Parameters
-    ----------
-    values : array
-        NaN for none, which is left out.
-
-    Returns
-    -------
-    Interval
-        NaN where there are no values; without bounds for a single one.
+    NaN where there are no values; without bounds for a single one.
     """
-    from scipy import stats
-
     values = values[~np.isnan(values)]
     if values.size == 0:
-        return Interval(math.nan, math.nan, math.nan)
+        return exactly(math.nan)
     mean = float(values.mean())
     if values.size == 1:
         return Interval(mean, -math.inf, math.inf)
-    error = float(values.std(ddof=1)) / math.sqrt(values.size)
-    half = float(stats.t.ppf(0.5 + 0.5 * _LEVEL, values.size - 1)) * error
-    return Interval(mean, mean - half, mean + half)
+    return _students(mean, _standard_error(values), values.size - 1)
+
+
+def _standard_error(values: FloatArray) -> float:
+    return float(values.std(ddof=1)) / math.sqrt(values.size)
 
 
 def log_steps(steps: FloatArray) -> FloatArray:
     """Return the logarithms of numbers of steps, whose paired differences are ratios.
 
-    A trial that begins in the goal takes no step, whatever would have been sensed. So it takes none
-    in any run of the same worlds: it has no ratio, and says nothing about how runs differ. It is
-    left out, here as NaN. A constant added to all numbers would keep it, but would draw the ratios
-    of all other trials towards 1.
-
-    Parameters
-    ----------
-    steps : array
-        Not negative.
-
-    Returns
-    -------
-    array
-        NaN where there is no step.
+    A trial that begins in the goal takes no step in any run of the same worlds. It has no ratio,
+    and says nothing about how runs differ: here it is NaN, and is left out. A constant added to all
+    numbers would keep it, but would draw the ratios of all other trials towards 1.
     """
     return np.log(np.where(steps == 0.0, math.nan, steps))
 
@@ -150,14 +140,12 @@ def paired_difference(first: FloatArray, second: FloatArray) -> tuple[Interval, 
             "worlds"
         )
     difference = (first - second)[~np.isnan(first)]
-    if difference.size == 0:
-        return mean_interval(difference), math.nan
-    if not np.any(difference):
-        return Interval(0.0, 0.0, 0.0), 1.0
+    if difference.size and not np.any(difference):
+        return exactly(0.0), 1.0
     interval = mean_interval(difference)
-    if difference.size == 1:
+    if difference.size < 2:
         return interval, math.nan
-    error = float(difference.std(ddof=1)) / math.sqrt(difference.size)
+    error = _standard_error(difference)
     if error == 0.0:
         return interval, 2.0 * 0.5**difference.size
     return interval, float(2.0 * stats.t.sf(abs(interval.value) / error, difference.size - 1))
@@ -166,13 +154,9 @@ def paired_difference(first: FloatArray, second: FloatArray) -> tuple[Interval, 
 def paired_rates(first: BoolArray, second: BoolArray) -> tuple[Interval, float]:
     """Return the difference of two rates over the same trials, and how likely it is by chance.
 
-    Returns
-    -------
-    Interval
-        By Student's interval of the differences of single trials.
-    p_value : float
-        Of McNemar's exact test: of the trials in which one alone succeeded, each is as likely to be
-        the first's as the second's.
+    The interval is Student's, of the differences of single trials. The p-value is that of McNemar's
+    exact test: of the trials in which one alone succeeded, each is as likely to be the first's as
+    the second's.
     """
     from scipy import stats
 
@@ -185,7 +169,7 @@ def paired_rates(first: BoolArray, second: BoolArray) -> tuple[Interval, float]:
 
 
 def rate_interval(successes: int, trials: int, factor: float = 1.0) -> Interval:
-    """Return a rate, times a factor, with Wilson's interval."""
+    """Return a rate with Wilson's interval, times a factor."""
     ends = (successes / trials, *wilson_interval(successes, trials))
     return Interval(*(factor * end for end in ends))
 
@@ -277,14 +261,8 @@ def random_effects(effects: FloatArray, errors: FloatArray) -> RandomEffects:
 
     Parameters
     ----------
-    effects : array of shape (problems,)
-    errors : array of shape (problems,)
-        Their standard errors, above zero.
-
-    Raises
-    ------
-    InvalidValueError
-        For fewer than three problems, or an error that is not above zero.
+    effects, errors : array of shape (problems,)
+        At least three effects with their standard errors, above zero; else InvalidValueError.
     """
     from scipy import optimize, stats
 
@@ -298,11 +276,8 @@ def random_effects(effects: FloatArray, errors: FloatArray) -> RandomEffects:
         """Return the mean, its variance, and how much too far the effects scatter."""
         weights = 1.0 / (errors * errors + variance)
         mean = float(weights @ effects / weights.sum())
-        return (
-            mean,
-            1.0 / float(weights.sum()),
-            float(weights @ (effects - mean) ** 2) - (count - 1),
-        )
+        excess = float(weights @ (effects - mean) ** 2) - (count - 1)
+        return mean, 1.0 / float(weights.sum()), excess
 
     between, high = 0.0, float(np.var(effects, ddof=1) + np.max(errors) ** 2)
     if weighted(0.0)[2] > 0.0:
@@ -310,13 +285,11 @@ def random_effects(effects: FloatArray, errors: FloatArray) -> RandomEffects:
             high *= 2.0
         between = float(optimize.brentq(lambda variance: weighted(variance)[2], 0.0, high))
     mean, variance, _ = weighted(between)
-    half = float(stats.t.ppf(0.5 + 0.5 * _LEVEL, count - 1)) * math.sqrt(variance)
-    wide = float(stats.t.ppf(0.5 + 0.5 * _LEVEL, count - 2)) * math.sqrt(between + variance)
     return RandomEffects(
-        Interval(mean, mean - half, mean + half),
+        _students(mean, math.sqrt(variance), count - 1),
         float(2.0 * stats.t.sf(abs(mean) / math.sqrt(variance), count - 1)),
         math.sqrt(between),
-        Interval(mean, mean - wide, mean + wide),
+        _students(mean, math.sqrt(between + variance), count - 2),
     )
 
 
@@ -335,47 +308,12 @@ def across_problems(
         Min's estimate ("Simple improved confidence intervals for comparing matched proportions",
         2005), which adds half a pair that differs in either direction; no error is below that.
     """
-    effects, errors = [], []
-    for first, second in pairs:
-        difference = (first - second)[~np.isnan(first)]
-        least = least_difference / (difference.size + 2)
-        scatter = float(difference.std(ddof=1)) if difference.size > 1 else 0.0
-        effects.append(float(difference.mean()))
-        errors.append(max(least, scatter / math.sqrt(difference.size)))
-    return random_effects(np.array(effects), np.array(errors))
-
-
-def cells_across_problems(
-    pairs: Sequence[tuple[FloatArray, FloatArray]],
-    least_difference: float,
-    shown: Callable[[Interval], Interval] = lambda difference: difference,
-) -> dict[str, Cell]:
-    """Return the cells of how two ways differ over these problems, and over all such problems.
-
-    The arguments are those of :func:`across_problems`, and what is shown of a difference.
-
-    Returns
-    -------
-    dict
-        ``mean``: over these problems, of the trials that all have; ``expected``: over all such
-        problems; ``new_problem``: in one more; ``deviation_between_problems`` as a difference.
-    """
-    fewest = min(own.size for own, _ in pairs)
-    own, other = (np.mean([pair[which][:fewest] for pair in pairs], axis=0) for which in (0, 1))
-    mean, p_value = paired_difference(own, other)
-    found = across_problems(pairs, least_difference)
-    new_low, new_high = shown(found.new_problem)[1:]
-    return {
-        "trials": fewest,
-        **cells_of("mean", shown(mean)),
-        "mean_p_value": p_value,
-        "problems": len(pairs),
-        **cells_of("expected", shown(found.mean)),
-        "expected_p_value": found.p_value,
-        "deviation_between_problems": found.deviation,
-        "new_problem_low": new_low,
-        "new_problem_high": new_high,
-    }
+    differences = [(first - second)[~np.isnan(first)] for first, second in pairs]
+    errors = [
+        max(least_difference / (each.size + 2), _standard_error(each) if each.size > 1 else 0.0)
+        for each in differences
+    ]
+    return random_effects(np.array([each.mean() for each in differences]), np.array(errors))
 
 
 def cells_of(name: str, interval: Interval) -> dict[str, Cell]:
@@ -389,8 +327,7 @@ def cells_of(name: str, interval: Interval) -> dict[str, Cell]:
 
 def interval_in(row: Mapping[str, Any], name: str, factor: float = 1.0) -> Interval:
     """Return the interval that :func:`cells_of` wrote into a row, times a factor."""
-    ends = (row[f"{name}{end}"] for end in ("", "_low", "_high"))
-    return Interval(*(factor * float(end) for end in ends))
+    return Interval(*(factor * float(row[f"{name}{end}"]) for end in ("", "_low", "_high")))
 
 
 def holm(p_values: npt.ArrayLike) -> FloatArray:
@@ -426,31 +363,24 @@ def add_adjusted(table: pd.DataFrame, *columns: str, compared: Any = None) -> No
         table[column.replace("p_value", "adjusted_p_value")] = adjusted
 
 
-def median_interval(values: FloatArray) -> Interval:
+def median_interval(values: npt.ArrayLike) -> Interval:
     """Return the median of independent values with the interval between two order statistics.
 
     The number of values below the true median is binomial, so two of the ordered values enclose it
-    with a known probability.
-
-    Parameters
-    ----------
-    values : array
-        NaN is left out.
-
-    Returns
-    -------
-    Interval
-        NaN without values; without bounds for fewer than six, of which no two enclose the median
-        with a probability of 95 %.
+    with a known probability. NaN is left out. NaN without values; without bounds for fewer than
+    six, of which no two enclose the median with a probability of 95 %.
     """
     from scipy import stats
 
-    values = values[~np.isnan(values)]
-    if values.size == 0:
-        return Interval(math.nan, math.nan, math.nan)
-    bounds = stats.quantile_test(values, q=np.median(values)).confidence_interval(_LEVEL)
-    low, high = (-math.inf, math.inf) if math.isnan(bounds.low) else bounds
-    return Interval(float(np.median(values)), float(low), float(high))
+    known = np.asarray(values, dtype=np.float64)
+    known = known[~np.isnan(known)]
+    if known.size == 0:
+        return exactly(math.nan)
+    median = float(np.median(known))
+    low, high = stats.quantile_test(known, q=median).confidence_interval(_LEVEL)
+    if math.isnan(low):
+        return Interval(median, -math.inf, math.inf)
+    return Interval(median, float(low), float(high))
 
 
 def clustered_median_interval(values: FloatArray, clusters: FloatArray) -> Interval:
@@ -471,20 +401,13 @@ def clustered_median_interval(values: FloatArray, clusters: FloatArray) -> Inter
     -------
     Interval
         NaN without values; without bounds for fewer than ten clusters.
-
-    Raises
-    ------
-    InvalidValueError
-        If the arrays differ in length.
     """
     from scipy import stats
 
-    if values.shape != clusters.shape:
-        raise InvalidValueError(f"{values.size} values and {clusters.size} clusters")
     known = ~np.isnan(values)
     values, clusters = values[known], clusters[known]
     if values.size == 0:
-        return Interval(math.nan, math.nan, math.nan)
+        return exactly(math.nan)
     middle = float(np.median(values))
     names, numbers = np.unique(clusters, return_inverse=True)
     if names.size < _FEWEST_CLUSTERS:

@@ -6,13 +6,16 @@ chooses something therefore chooses by the trials of one seed and judges by thos
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
+import importlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import msgspec
 import pandas as pd
 
 from holdfast.lab.studies.statistics import Interval
+from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.tasks import Task
 
 if TYPE_CHECKING:
@@ -21,17 +24,21 @@ if TYPE_CHECKING:
 __all__ = [
     "CHOICE",
     "CLAIM",
+    "TRIALS",
     "Number",
+    "Part",
     "Report",
-    "Results",
     "Scale",
     "Study",
     "TrialStudy",
+    "drawn",
 ]
 
 CHOICE = "choice"
 CLAIM = "claim"
 """What trials are for."""
+
+TRIALS = "trials"
 
 
 class Scale(msgspec.Struct, frozen=True, kw_only=True):
@@ -58,16 +65,18 @@ class Scale(msgspec.Struct, frozen=True, kw_only=True):
         return self.claim_seed if purpose == CLAIM else self.seed
 
 
-class Results:
-    """The tables that tasks returned, by the tasks' keys."""
+class Part(NamedTuple):
+    """Tasks whose rows belong together, and the columns that tell them from others.
 
-    def __init__(self, tables: Mapping[str, pd.DataFrame], key_of: Callable[[Task], str]) -> None:
-        self._tables = tables
-        self._key_of = key_of
+    Attributes
+    ----------
+    table : str
+        Which table they are part of.
+    """
 
-    def of(self, tasks: Sequence[Task]) -> pd.DataFrame:
-        """Return the rows of some tasks, one after another."""
-        return pd.concat([self._tables[self._key_of(task)] for task in tasks], ignore_index=True)
+    names: Mapping[str, Cell]
+    tasks: Iterable[Task]
+    table: str = TRIALS
 
 
 class Number(NamedTuple):
@@ -93,7 +102,7 @@ class Report(msgspec.Struct, kw_only=True):
     summary : dict of str to DataFrame
         Small tables by name, to be committed and shown.
     raw : dict of str to DataFrame
-        Every trial, by name; not to be committed.
+        Every row that was computed, by table; not to be committed.
     trials : DataFrame, optional
         Every trial, from which all else can be made again; small enough to be committed.
     figures : dict of str to callable
@@ -119,32 +128,64 @@ class Report(msgspec.Struct, kw_only=True):
         return {**self.summary, "numbers": numbers}
 
 
-class Study(Protocol):
+def drawn(place: str, *of: Any) -> Callable[[], Figure]:
+    """Return what draws a figure: a function of a module here that is imported only then.
+
+    Such modules import matplotlib. ``place`` is ``module:function``.
+    """
+    module, _, function = place.partition(":")
+
+    def draw() -> Figure:
+        imported = importlib.import_module(f"holdfast.lab.studies.{module}")
+        figure: Figure = getattr(imported, function)(*of)
+        return figure
+
+    return draw
+
+
+class Study(ABC):
     """A question to be answered by running something."""
 
-    @property
-    def name(self) -> str:
-        """Its name on the command line."""
-        ...
+    name: ClassVar[str]
+    """On the command line."""
+    title: ClassVar[str]
+    """Its subject, in one line."""
 
-    @property
-    def title(self) -> str:
-        """Its subject, in one line."""
-        ...
+    @abstractmethod
+    def parts(self, scale: Scale) -> Iterable[Part]:
+        """Return all that is computed, in the order in which to begin."""
+
+    @abstractmethod
+    def report_of(self, tables: Mapping[str, pd.DataFrame]) -> Report:
+        """Return the report on the rows of all parts, by table."""
 
     def tasks(self, scale: Scale) -> list[Task]:
         """Return all tasks, in the order in which to begin."""
-        ...
+        return [task for part in self.parts(scale) for task in part.tasks]
 
-    def report(self, scale: Scale, results: Results) -> Report:
+    def report(self, scale: Scale, result_of: Callable[[Task], pd.DataFrame]) -> Report:
         """Return the report on the results of all tasks."""
-        ...
+        tables = self._tables(scale, result_of)
+        return msgspec.structs.replace(self.report_of(tables), raw=tables)
+
+    def _tables(
+        self, scale: Scale, result_of: Callable[[Task], pd.DataFrame]
+    ) -> dict[str, pd.DataFrame]:
+        found: dict[str, list[pd.DataFrame]] = {}
+        for part in self.parts(scale):
+            rows = pd.concat([result_of(task) for task in part.tasks], ignore_index=True)
+            found.setdefault(part.table, []).append(rows.assign(**part.names))
+        return {table: pd.concat(rows, ignore_index=True) for table, rows in found.items()}
 
 
-@runtime_checkable
-class TrialStudy(Study, Protocol):
-    """A study whose report follows from a table of its trials, which is kept."""
+class TrialStudy(Study):
+    """A study whose report follows from one table of trials, which is kept."""
 
-    def report_of(self, trials: pd.DataFrame) -> Report:
-        """Return the report on all trials; InvalidValueError if they are not of this study."""
-        ...
+    @abstractmethod
+    def kept(self, trials: pd.DataFrame) -> pd.DataFrame:
+        """Return of all trials what is kept, as a file has it."""
+
+    def report(self, scale: Scale, result_of: Callable[[Task], pd.DataFrame]) -> Report:
+        """Return the report on the results of all tasks."""
+        trials = self.kept(self._tables(scale, result_of)[TRIALS])
+        return msgspec.structs.replace(self.report_of({TRIALS: trials}), trials=trials)

@@ -1,41 +1,22 @@
-"""Tables as plain data: how a data frame travels between processes and into files."""
+"""Tables as plain data, as which they travel and are kept, and as CSV."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
-
-import msgspec
-
-from holdfast.errors import InvalidValueError
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["Cell", "Columns", "columns_of", "frame_of", "to_csv"]
+__all__ = ["Cell", "Columns", "columns_of", "to_csv"]
 
 Cell = bool | int | float | str | None
 
-
-class Columns(msgspec.Struct):
-    """A data frame as plain data: named columns of the same length."""
-
-    columns: dict[str, list[Cell]]
+Columns = dict[str, list[Cell]]
 
 
 def columns_of(table: pd.DataFrame) -> Columns:
-    """Return a data frame as plain data."""
-    return Columns({str(name): table[name].tolist() for name in table.columns})
-
-
-def frame_of(plain: Columns | Mapping[str, Any]) -> pd.DataFrame:
-    """Return plain data as a data frame; InvalidValueError if the columns differ in length."""
-    import pandas as pd
-
-    try:
-        return pd.DataFrame(plain.columns if isinstance(plain, Columns) else plain)
-    except ValueError as error:
-        raise InvalidValueError(f"columns that make no table: {error}") from error
+    """Return the cells of each column, as Python's own numbers."""
+    return {str(name): table[name].tolist() for name in table.columns}
 
 
 def to_csv(table: pd.DataFrame) -> str:

@@ -50,14 +50,10 @@ _OF_THE_DAY = ("date", "holdfast")
 
 
 class Task(msgspec.Struct, frozen=True, kw_only=True):
-    """A piece of work.
+    """A piece of work: a kind of function, and its arguments as JSON has them.
 
     Attributes
     ----------
-    kind : str
-        Names the function.
-    parameters : dict
-        Its arguments: plain data, as JSON has it.
     units : int
         How much work it is, in trials: for progress and for the time left.
     exclusive : bool
@@ -72,13 +68,10 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def task_key(task: Task) -> str:
-    """Return the digest of all that a task's result depends on, in hexadecimal.
-
-    Times depend on the machine as well.
-    """
+    """Return the digest of all that a task's result depends on, in hexadecimal."""
     content: list[Any] = [task.kind, task.parameters, code_of(task)]
     if task.exclusive:
-        content.append(_machine())
+        content.append(_machine())  # times depend on it as well
     plain = msgspec.json.encode(content, order="sorted")
     return hashlib.blake2b(plain, digest_size=_KEY_SIZE).hexdigest()
 
@@ -89,19 +82,13 @@ def _machine() -> dict[str, str]:
 
 
 def code_of(task: Task) -> str:
-    """Return the digest of the code that computes a task, in hexadecimal.
+    """Return the digest of the code that computes a task, as it is on the disk now, in hexadecimal.
 
-    The version of holdfast alone would not tell what a developer has changed since: what is hashed
-    are the sources of the function's module, of the problems that the parameters name by their
-    place, and of all modules that these import, directly or not, and the compiled kernel; if the
-    function starts processes, all that these may be made of. It is what is on the disk now.
-
-    Raises
-    ------
-    TaskError
-        If there is no such kind, or a source cannot be read.
+    The version of holdfast alone would not tell what a developer has changed since. Hashed are the
+    sources of the function's module, of the problems that the parameters name by their place, and
+    of all modules that these import, and the compiled kernel; if the function starts processes, all
+    that these may be made of. TaskError if there is no such kind, or a source cannot be read.
     """
-    # A list of digests would do; one is easier to compare and to show.
     digests = [_digest_behind(_place_of(task.kind), task.kind in _OF_PROCESSES)]
     digests += [_digest_behind(place) for place in _places_in(task.parameters)]
     return hashlib.blake2b("".join(digests).encode(), digest_size=_KEY_SIZE).hexdigest()
@@ -147,15 +134,7 @@ def _stats_of(files: Iterable[Path]) -> tuple[tuple[int, int], ...]:
 
 
 def run_task(task: Task) -> pd.DataFrame:
-    """Compute a task in this process.
-
-    Raises
-    ------
-    TaskError
-        If there is no such kind.
-    HoldfastError
-        If its function refuses the parameters.
-    """
+    """Compute a task in this process; HoldfastError if its function refuses the parameters."""
     module, _, name = _place_of(task.kind).partition(":")
     function = getattr(importlib.import_module(module), name)
     return function(**task.parameters)

@@ -14,23 +14,29 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable
-from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import msgspec
 import numpy as np
 import pandas as pd
 
-from holdfast.config.settings import (
-    ActiveSensingSettings,
-    ParticleFilterSettings,
-    PlanningSettings,
-    SelectorSettings,
+from holdfast.config.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
+from holdfast.lab.studies.cloud_trials import (
+    MAX_STEPS,
+    PROBLEM,
+    SENSING,
+    SENSING_INTERVAL,
+    CloudTrials,
 )
-from holdfast.lab.studies.cloud_trials import CloudTrials
-from holdfast.lab.studies.statistics import Interval, cells_of, median_interval, rate_interval
-from holdfast.lab.studies.study import Number, Report, Results, Scale
+from holdfast.lab.studies.statistics import (
+    Interval,
+    cells_of,
+    exactly,
+    median_interval,
+    rate_interval,
+)
+from holdfast.lab.studies.study import Number, Part, Report, Scale, Study, drawn
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.tasks import Task
 from holdfast.lab.studies.thesis_measurements import (
@@ -52,12 +58,8 @@ from holdfast.lab.studies.thesis_measurements import (
 )
 from holdfast.lab.studies.trial_batches import TrialSeries, trial_tasks
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 __all__ = ["ThesisChapter6", "series_of"]
 
-_MAX_STEPS = 700
 _TRIALS = 200
 _QUICK_TRIALS = 20
 _TRIALS_IN_EACH = 20
@@ -89,72 +91,70 @@ _QUICK: dict[NetworkPath, tuple[int, ...]] = {
 def series_of(particles: int, num_trials: int, seed: int) -> TrialSeries:
     """Return the thesis's trials."""
     return TrialSeries(
-        problem="peg_in_hole_2d",
+        problem=PROBLEM,
         planning=PlanningSettings(
             particle_filter=ParticleFilterSettings(num_particles=particles),
-            active_sensing=ActiveSensingSettings(
-                num_observation_samples=10, num_nearest_neighbors=5, num_cores=1
-            ),
+            active_sensing=msgspec.structs.replace(SENSING, num_cores=1),
             selector=SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
-            sensing_interval=8,
+            sensing_interval=SENSING_INTERVAL,
         ),
-        max_steps=_MAX_STEPS,
+        max_steps=MAX_STEPS,
         seed=seed,
         num_trials=num_trials,
     )
 
 
-class _Condition(NamedTuple):
-    """Runs with the same settings."""
-
-    path: NetworkPath
-    particles: int
-    runs: int
-
-
-class ThesisChapter6:
+class ThesisChapter6(Study):
     """The study ``thesis_chapter_6``."""
 
     name = "thesis_chapter_6"
     title = "The thesis's chapter 6: sensing and recovery times, 100 to 500 particles"
 
-    def tasks(self, scale: Scale) -> list[Task]:
-        """Return all that is to be computed, in the order in which to begin."""
-        tasks = [_picture_task(scale)]
-        tasks += [task for each in _conditions(scale) for task in _cloud_tasks(each, scale)]
-        tasks += [task for count in PARTICLES for task in _trial_tasks(count, scale)]
-        return tasks
+    def parts(self, scale: Scale) -> Iterator[Part]:
+        """Yield the run of the picture, the runs of each condition, and trials in process."""
+        picture = CloudTrials(
+            particles=300,
+            transport=FAR.transport,
+            round_trip_ms=FAR.round_trip_ms,
+            seed=scale.seed,
+            min_steps=200,
+            rate_hz=_PICTURE_RATE_HZ,
+            local_decisions=5,
+            actions=True,
+        )
+        yield Part({}, [_task_of(picture)], "cloud_dies")
+        for number, (path, particles, runs) in enumerate(_conditions(scale)):
+            names = {
+                "condition": number,
+                "particles": particles,
+                "transport": path.transport,
+                "path_round_trip_ms": path.round_trip_ms,
+                "loss": path.loss,
+            }
+            yield Part(names, list(_cloud_tasks(path, particles, runs, scale)), "cloud")
+        for count in PARTICLES:
+            series = series_of(count, _QUICK_TRIALS if scale.quick else _TRIALS, scale.seed)
+            yield Part(
+                {"particles": count}, list(trial_tasks(series, _TRIALS_IN_EACH)), "in_process"
+            )
 
-    def report(self, scale: Scale, results: Results) -> Report:
-        """Return what it comes to, from the results of all its tasks."""
-        rows = pd.concat(
-            [
-                results.of(_cloud_tasks(each, scale)).assign(
-                    condition=number,
-                    particles=each.particles,
-                    transport=each.path.transport,
-                    path_round_trip_ms=each.path.round_trip_ms,
-                    loss=each.path.loss,
-                )
-                for number, each in enumerate(_conditions(scale))
-            ],
-            ignore_index=True,
-        )
-        trials = pd.concat(
-            [results.of(_trial_tasks(count, scale)).assign(particles=count) for count in PARTICLES]
-        )
-        picture = results.of([_picture_task(scale)])
-        known, successes = measured(rows), _successes(trials)
+    def report_of(self, tables: Mapping[str, pd.DataFrame]) -> Report:
+        """Return the report on the rows of all parts."""
+        picture, known = tables["cloud_dies"], measured(tables["cloud"])
+        successes = _successes(tables["in_process"])
         return Report(
             summary={
                 "decisions": _decisions(known),
                 "faults": _faults(known),
                 "successes": successes,
             },
-            raw={"cloud": rows, "in_process": trials, "cloud_dies": picture},
             figures={
-                name: partial(_draw, drawing, known, successes, picture)
-                for name, drawing in _DRAWINGS.items()
+                "fig09_10_11_sensing_time": drawn("thesis_figures:sensing_times", known),
+                "fig12_round_trip": drawn("thesis_figures:round_trips", known),
+                "fig13_successes": drawn("thesis_figures:successes", successes),
+                "fig14_launch": drawn("thesis_figures:launches", known),
+                "fig15_failback": drawn("thesis_figures:failbacks", known),
+                "cloud_dies": drawn("thesis_picture:cloud_dies", picture),
             },
             numbers=_numbers(known, picture),
         )
@@ -163,10 +163,11 @@ class ThesisChapter6:
 # -- what is run -----------------------------------------------------------------------------------
 
 
-def _conditions(scale: Scale) -> list[_Condition]:
+def _conditions(scale: Scale) -> list[tuple[NetworkPath, int, int]]:
+    """Return paths, numbers of particles, and of runs with these."""
     if scale.quick:
-        return [_Condition(path, count, 1) for path, counts in _QUICK.items() for count in counts]
-    return [_Condition(path, count, _runs_over(path)) for path in PATHS for count in PARTICLES]
+        return [(path, count, 1) for path, counts in _QUICK.items() for count in counts]
+    return [(path, count, _runs_over(path)) for path in PATHS for count in PARTICLES]
 
 
 def _runs_over(path: NetworkPath) -> int:
@@ -175,48 +176,24 @@ def _runs_over(path: NetworkPath) -> int:
     return 1 if path.loss else 6  # the fewest of which a median has an interval
 
 
-def _cloud_tasks(condition: _Condition, scale: Scale) -> list[Task]:
-    path = condition.path
-    tasks = []
-    for first in range(0, condition.runs, _RUNS_IN_EACH):
-        trials = CloudTrials(
-            particles=condition.particles,
-            transport=path.transport,
-            round_trip_ms=path.round_trip_ms,
-            loss=path.loss,
-            first_run=first,
-            runs=min(_RUNS_IN_EACH, condition.runs - first),
-            seed=_seed_of(condition, scale),
-            min_steps=_QUICK_STEPS if scale.quick else _STEPS,
-            rate_hz=_RATE_HZ,
-            local_decisions=_QUICK_LOCAL_DECISIONS if scale.quick else _LOCAL_DECISIONS,
-            max_steps=_MAX_STEPS,
+def _cloud_tasks(path: NetworkPath, particles: int, runs: int, scale: Scale) -> Iterator[Task]:
+    # A seed of each condition's own: what is pooled over conditions must be independent.
+    name = f"{path.transport} {path.round_trip_ms} {path.loss} {particles}"
+    for first in range(0, runs, _RUNS_IN_EACH):
+        yield _task_of(
+            CloudTrials(
+                particles=particles,
+                transport=path.transport,
+                round_trip_ms=path.round_trip_ms,
+                loss=path.loss,
+                first_run=first,
+                runs=min(_RUNS_IN_EACH, runs - first),
+                seed=scale.seed + zlib.crc32(name.encode()),
+                min_steps=_QUICK_STEPS if scale.quick else _STEPS,
+                rate_hz=_RATE_HZ,
+                local_decisions=_QUICK_LOCAL_DECISIONS if scale.quick else _LOCAL_DECISIONS,
+            )
         )
-        tasks.append(_task_of(trials))
-    return tasks
-
-
-def _seed_of(condition: _Condition, scale: Scale) -> int:
-    """Return a seed of each condition's own: what is pooled over conditions must be independent."""
-    path = condition.path
-    name = f"{path.transport} {path.round_trip_ms} {path.loss} {condition.particles}"
-    return scale.seed + zlib.crc32(name.encode())
-
-
-def _picture_task(scale: Scale) -> Task:
-    return _task_of(
-        CloudTrials(
-            particles=300,
-            transport=FAR.transport,
-            round_trip_ms=FAR.round_trip_ms,
-            seed=scale.seed,
-            min_steps=200,
-            rate_hz=_PICTURE_RATE_HZ,
-            local_decisions=5,
-            max_steps=_MAX_STEPS,
-            actions=True,
-        )
-    )
 
 
 def _task_of(trials: CloudTrials) -> Task:
@@ -228,45 +205,14 @@ def _task_of(trials: CloudTrials) -> Task:
     )
 
 
-def _trial_tasks(particles: int, scale: Scale) -> list[Task]:
-    num_trials = _QUICK_TRIALS if scale.quick else _TRIALS
-    return list(trial_tasks(series_of(particles, num_trials, scale.seed), _TRIALS_IN_EACH))
-
-
-_DRAWINGS = {
-    "fig09_10_11_sensing_time": "sensing_times",
-    "fig12_round_trip": "round_trips",
-    "fig13_successes": "successes",
-    "fig14_launch": "launches",
-    "fig15_failback": "failbacks",
-    "cloud_dies": "cloud_dies",
-}
-"""Figures, and the functions that draw them."""
-
-
-def _draw(
-    drawing: str, known: pd.DataFrame, successes: pd.DataFrame, picture: pd.DataFrame
-) -> Figure:
-    # Matplotlib is imported there, so only when a figure is wanted.
-    from holdfast.lab.studies import thesis_figures, thesis_picture
-
-    if drawing == "successes":
-        return thesis_figures.successes(successes)
-    if drawing == "cloud_dies":
-        return thesis_picture.cloud_dies(picture)
-    draw: Callable[[pd.DataFrame], Figure] = getattr(thesis_figures, drawing)
-    return draw(known)
-
-
 # -- what comes of it ------------------------------------------------------------------------------
 
 
 def _decisions(rows: pd.DataFrame) -> pd.DataFrame:
     """Return a row for each path, number of particles and service that decided."""
     cells: list[dict[str, Cell]] = []
-    for (_, particles, service), here in rows.groupby(
-        ["path", "particles", "service"], observed=True
-    ):
+    groups = rows.groupby(["path", "particles", "service"], observed=True)
+    for (_, particles, service), here in groups:
         sensing = select(here, what="sensing")
         if sensing.empty:
             continue
@@ -303,19 +249,15 @@ def _faults(rows: pd.DataFrame) -> pd.DataFrame:
                 "runs": runs,
                 "runs_as_their_references": runs - _diverged(here),
                 "kills": len(kills),
-                **_median_cells("found_ms", kills["found_ms"]),
+                **cells_of("found_ms", median_interval(kills["found_ms"])),
                 "launches": len(cold),
-                **_median_cells("launch_ms", cold["launch_ms"]),
-                **_median_cells("first_local_ms", cold["first_local_ms"]),
-                **_median_cells("failback_ms", kills["failback_ms"]),
-                **_median_cells("longest_wait_ms", kills["waited_ms"]),
+                **cells_of("launch_ms", median_interval(cold["launch_ms"])),
+                **cells_of("first_local_ms", median_interval(cold["first_local_ms"])),
+                **cells_of("failback_ms", median_interval(kills["failback_ms"])),
+                **cells_of("longest_wait_ms", median_interval(kills["waited_ms"])),
             }
         )
     return pd.DataFrame(cells)
-
-
-def _median_cells(name: str, times: pd.Series) -> dict[str, Cell]:
-    return cells_of(name, median_interval(times.to_numpy(float)))
 
 
 def _diverged(rows: pd.DataFrame) -> int:
@@ -345,14 +287,10 @@ def _successes(trials: pd.DataFrame) -> pd.DataFrame:
                     "trials": int(part.size),
                     "successes": found,
                     **cells_of("success", rate_interval(found, part.size)),
-                    "success_thesis": _success_of_thesis(count),
+                    "success_thesis": THESIS_SUCCESS_ABOVE_300 if count > 300 else THESIS_SUCCESS,
                 }
             )
     return pd.DataFrame(cells)
-
-
-def _success_of_thesis(particles: int) -> float:
-    return THESIS_SUCCESS_ABOVE_300 if particles > 300 else THESIS_SUCCESS
 
 
 def _numbers(rows: pd.DataFrame, picture: pd.DataFrame) -> list[Number]:
@@ -370,8 +308,8 @@ def _numbers(rows: pd.DataFrame, picture: pd.DataFrame) -> list[Number]:
             "%",
             runs,
         ),
-        Number("kills of the cloud service", Interval(*[kills] * 3)),
-        Number("sensing decisions", Interval(*[sensing] * 3)),
+        Number("kills of the cloud service", exactly(kills)),
+        Number("sensing decisions", exactly(sensing)),
         *_numbers_of_times(rows),
         *_numbers_of_faults(rows),
         *_numbers_of_loss(rows),
@@ -379,53 +317,44 @@ def _numbers(rows: pd.DataFrame, picture: pd.DataFrame) -> list[Number]:
     ]
 
 
-def _numbers_of_times(rows: pd.DataFrame) -> list[Number]:
-    """Return medians of what was asked, by service."""
-    wanted: list[tuple[str, str, dict[str, object]]] = [
-        (
-            f"computing a sensing action, {service}, {count} particles",
-            "computed_ms",
-            {"what": "sensing", "service": service, "particles": count},
-        )
-        for service in ("cloud", "local")
-        for count in (PARTICLES[0], PARTICLES[-1])
-    ]
+def _numbers_of_times(rows: pd.DataFrame) -> Iterator[Number]:
+    """Yield medians of what was asked, by service."""
+
+    def median(name: str, column: str, **cells: Any) -> Iterator[Number]:
+        here = select(rows, **cells)
+        if len(here):
+            yield Number(name, clustered_median(here, column), "ms", len(here))
+
+    for service in ("cloud", "local"):
+        for count in (PARTICLES[0], PARTICLES[-1]):
+            name = f"computing a sensing action, {service}, {count} particles"
+            yield from median(name, "computed_ms", what="sensing", service=service, particles=count)
     name = "round trip without computation"
-    wanted.append((f"{name}, local", "trip_ms", {"service": "local", "what": "task"}))
-    wanted += [
-        (
-            f"{name}, cloud, {path.label}",
-            "trip_ms",
-            {"path": path, "service": "cloud", "what": "task"},
-        )
-        for path in paths_of(rows)
-        if path.loss == 0.0
-    ]
+    yield from median(f"{name}, local", "trip_ms", what="task", service="local")
+    for path in _clean_paths(rows):
+        where = f"cloud, {path.label}"
+        yield from median(f"{name}, {where}", "trip_ms", what="task", service="cloud", path=path)
     places: dict[str, dict[str, object]] = {
         f"cloud, {FAR.label}": {"service": "cloud", "path": FAR},
         "local": {"service": "local"},
     }
-    wanted += [
-        (f"waiting for {asked}, {place}", "waited_ms", {"what": what, **cells})
-        for place, cells in places.items()
-        for what, asked in (("sensing", "a sensing action"), ("task", "task actions"))
-    ]
-    found = [(name, column, select(rows, **cells)) for name, column, cells in wanted]
-    return [
-        Number(name, clustered_median(here, column), "ms", len(here))
-        for name, column, here in found
-        if len(here)
-    ]
+    for place, cells in places.items():
+        for what, asked in (("sensing", "a sensing action"), ("task", "task actions")):
+            yield from median(f"waiting for {asked}, {place}", "waited_ms", what=what, **cells)
+
+
+def _clean_paths(rows: pd.DataFrame) -> list[NetworkPath]:
+    return [path for path in paths_of(rows) if path.loss == 0.0]
 
 
 def _numbers_of_faults(rows: pd.DataFrame) -> list[Number]:
     """Return the times from kill to local recovery and back, and how many beat the thesis's."""
     kills = select(rows, what="kill")
-    clean = {path.label: select(kills, path=path) for path in paths_of(rows) if path.loss == 0.0}
+    clean = {path.label: select(kills, path=path) for path in _clean_paths(rows)}
     numbers = [
         Number(
             f"from the kill until the robot detects it, {label}",
-            median_interval(here["found_ms"].to_numpy(float)),
+            median_interval(here["found_ms"]),
             "ms",
             len(here),
         )
@@ -448,10 +377,10 @@ def _numbers_of_faults(rows: pd.DataFrame) -> list[Number]:
 
 def _times_and_share(name: str, times: pd.Series, limit_ms: float) -> list[Number]:
     """Return the median of times, and the share below a limit; NaN, of a run that ended, is not."""
-    known = times.dropna().to_numpy(float)
-    if not known.size:
+    known = times.dropna()
+    if known.empty:
         return []
-    below = rate_interval(int(np.count_nonzero(known < limit_ms)), times.size, 100)
+    below = rate_interval(int((known < limit_ms).sum()), times.size, 100)
     return [
         Number(name, median_interval(known), "ms", known.size),
         Number(f"{name}, share below the thesis's {limit_ms:g} ms", below, "%", times.size),
@@ -470,19 +399,12 @@ def _numbers_of_loss(rows: pd.DataFrame) -> list[Number]:
         if path.loss == 0.0 or p95_ms is None:
             continue
         asked = select(before, path=path)
-        local = len(select(asked, service="local"))
+        local = rate_interval(len(select(asked, service="local")), len(asked), 100)
+        label = path.label
         numbers += [
+            Number(f"95th percentile of round trips, {label}", exactly(p95_ms), "ms", len(far)),
             Number(
-                f"95th percentile of round trips, {path.label}",
-                Interval(*[p95_ms] * 3),
-                "ms",
-                len(far),
-            ),
-            Number(
-                f"answers of the local service before the kill, {path.label}",
-                rate_interval(local, len(asked), 100),
-                "%",
-                len(asked),
+                f"answers of the local service before the kill, {label}", local, "%", len(asked)
             ),
         ]
     return numbers
@@ -495,5 +417,5 @@ def _numbers_of_load(rows: pd.DataFrame) -> list[Number]:
     load = Interval(loads.median(), loads.min(), loads.max())
     return [
         Number("processes that wanted a core (median, least and most)", load, "", len(runs)),
-        Number("rate of the slowest robot", Interval(*[float(runs["rate_hz"].min())] * 3), "Hz"),
+        Number("rate of the slowest robot", exactly(float(runs["rate_hz"].min())), "Hz"),
     ]

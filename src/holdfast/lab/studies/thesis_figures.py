@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -38,11 +38,12 @@ from holdfast.recording.figure import STYLE
 __all__ = ["failbacks", "launches", "round_trips", "sensing_times", "successes"]
 
 _THESIS = "#B5342B"
+_DASHED = (0, (5, 2))
 _MOST_DOTS = 250
 
 
 class _Series(NamedTuple):
-    """A value with its interval at each place, and single values behind it."""
+    """The looks of a value with its interval at each place."""
 
     label: str
     color: str
@@ -51,17 +52,13 @@ class _Series(NamedTuple):
     offset: float = 0.0
 
 
-def _panels(width: float, height: float, title: str, count: int, **options: object) -> list[Axes]:
+def _panels(
+    width: float, height: float, title: str, count: int, **options: Any
+) -> tuple[Figure, list[Axes]]:
     figure = figure_of(width, height, title)
     with mpl.rc_context(STYLE):
-        made = figure.subplots(1, count, squeeze=False, **options)  # type: ignore[call-overload]
-    return list(made[0])
-
-
-def _figure(panels: Sequence[Axes]) -> Figure:
-    figure = panels[0].figure
-    assert isinstance(figure, Figure)
-    return figure
+        panels = figure.subplots(1, count, squeeze=False, **options)
+    return figure, list(panels[0])
 
 
 def _widen(panel: Axes) -> None:
@@ -70,27 +67,40 @@ def _widen(panel: Axes) -> None:
     panel.set_ylim(low / 1.3, high * 1.3)
 
 
-def _over_particles(panel: Axes) -> None:
-    panel.set_xlabel("particles")
-    panel.xaxis.set_major_locator(FixedLocator(list(PARTICLES)))
-    panel.set_xlim(PARTICLES[0] - 60, PARTICLES[-1] + 60)
+def _over_particles(panels: Iterable[Axes]) -> None:
+    for panel in panels:
+        panel.set_xlabel("particles")
+        panel.xaxis.set_major_locator(FixedLocator(list(PARTICLES)))
+        panel.set_xlim(PARTICLES[0] - 60, PARTICLES[-1] + 60)
 
 
 def _medians(
-    panel: Axes, places: Sequence[float], intervals: Sequence[Interval], series: _Series
+    panel: Axes,
+    places: Sequence[float],
+    intervals: Sequence[Interval],
+    series: _Series,
+    *,
+    upright: bool = True,
 ) -> None:
     """Draw medians with their intervals, joined by a thin line where there are several."""
-    known = [number for number, each in enumerate(intervals) if math.isfinite(each.value)]
+    known = [
+        (place + series.offset, interval)
+        for place, interval in zip(places, intervals, strict=True)
+        if math.isfinite(interval.value)
+    ]
     if not known:
         return
-    values = [intervals[number].value for number in known]
-    at = [places[number] + series.offset for number in known]
-    below = [_length(value - intervals[n].low) for value, n in zip(values, known, strict=True)]
-    above = [_length(intervals[n].high - value) for value, n in zip(values, known, strict=True)]
+    at = [place for place, _ in known]
+    values = [interval.value for _, interval in known]
+    errors = [
+        [_length(interval.value - interval.low) for _, interval in known],
+        [_length(interval.high - interval.value) for _, interval in known],
+    ]
     panel.errorbar(
-        at,
-        values,
-        yerr=[below, above],
+        at if upright else values,
+        values if upright else at,
+        yerr=errors if upright else None,
+        xerr=None if upright else errors,
         fmt=series.marker,
         color=series.color,
         markerfacecolor=series.color if series.filled else "white",
@@ -102,7 +112,8 @@ def _medians(
         zorder=4,
         label=series.label,
     )
-    panel.plot(at, values, color=series.color, linewidth=0.7, alpha=0.6, zorder=3)
+    if upright:
+        panel.plot(at, values, color=series.color, linewidth=0.7, alpha=0.6, zorder=3)
 
 
 def _length(value: float) -> float:
@@ -111,23 +122,17 @@ def _length(value: float) -> float:
 
 
 def _dots(
-    panel: Axes,
-    place: float,
-    values: FloatArray,
-    color: str,
-    spread: float,
-    *,
-    upright: bool = True,
+    panel: Axes, place: float, values: pd.Series, color: str, spread: float, *, upright: bool = True
 ) -> None:
     """Draw single values beside each other; of very many, some."""
     chance = np.random.default_rng(0)
-    values = values[~np.isnan(values) & (values > 0.0)]
-    if values.size > _MOST_DOTS:
-        values = chance.choice(values, _MOST_DOTS, replace=False)
-    places = place + spread * (chance.random(values.size) - 0.5)
+    some = values[values > 0.0].to_numpy(float)
+    if some.size > _MOST_DOTS:
+        some = chance.choice(some, _MOST_DOTS, replace=False)
+    places = place + spread * (chance.random(some.size) - 0.5)
     panel.scatter(
-        places if upright else values,
-        values if upright else places,
+        places if upright else some,
+        some if upright else places,
         s=7.0,
         color=color,
         alpha=0.3,
@@ -138,7 +143,7 @@ def _dots(
 
 
 def _thesis_line(panel: Axes, height: float, text: str, *, above: bool = True) -> None:
-    panel.axhline(height, color=_THESIS, linewidth=1.1, linestyle=(0, (5, 2)), zorder=1.5)
+    panel.axhline(height, color=_THESIS, linewidth=1.1, linestyle=_DASHED, zorder=1.5)
     panel.annotate(
         text,
         (0.99, height),
@@ -152,59 +157,19 @@ def _thesis_line(panel: Axes, height: float, text: str, *, above: bool = True) -
     )
 
 
-# -- figures 9, 10 and 11 --------------------------------------------------------------------------
-
-
-def sensing_times(rows: pd.DataFrame) -> Figure:
-    """Draw how long it takes to choose a sensing action: in the cloud, locally, side by side."""
-    panels = _panels(
-        11.0, 4.3, "How long it takes to choose what to sense (Figures 9 to 11)", 3, sharey=True
+def _upright_thesis_line(panel: Axes, place: float, text: str) -> None:
+    panel.axvline(place, color=_THESIS, linewidth=1.1, linestyle=_DASHED, zorder=1.5)
+    panel.annotate(
+        text,
+        (place, 1.0),
+        xycoords=("data", "axes fraction"),
+        xytext=(-3, -2),
+        textcoords="offset points",
+        ha="right",
+        va="top",
+        color=_THESIS,
+        fontsize=8.0,
     )
-    in_cloud = select(rows, what="sensing", service="cloud")
-    locally = select(rows, what="sensing", service="local")
-    cloud = _Series("computing in the cloud service", COLORS[0], MARKERS[0])
-    local = _Series("computing in the local service", COLORS[1], MARKERS[1])
-    with mpl.rc_context(STYLE):
-        for panel, chosen, series, title in (
-            (panels[0], in_cloud, cloud, "Fig. 9: in the cloud service"),
-            (panels[1], locally, local, "Fig. 10: in local recovery"),
-        ):
-            _of_particles(panel, chosen, "computed_ms", series, dots=True)
-            panel.set_title(_with_count(title, len(chosen)), loc="left")
-        for series, name, chosen in (
-            (cloud._replace(offset=-6), "computed_ms", in_cloud),
-            (local._replace(offset=6), "computed_ms", locally),
-            (
-                _Series("local, from question to answer", COLORS[1], MARKERS[1], False, 6),
-                "round_trip_ms",
-                locally,
-            ),
-            *(
-                (
-                    look._replace(
-                        label=f"cloud, from question to answer: {path.label}",
-                        filled=False,
-                        offset=-6,
-                    ),
-                    "round_trip_ms",
-                    select(in_cloud, path=path),
-                )
-                for path, look in _stream_looks(rows).items()
-            ),
-        ):
-            _of_particles(panels[2], chosen, name, series)
-        panels[2].set_title("Fig. 11: side by side, and with the way", loc="left")
-        milliseconds(panels[0], "time for a sensing action (ms)")
-        for panel in panels:
-            _over_particles(panel)
-            panel.grid(axis="y")
-        legend_below(_figure(panels), panels[2], 3, fontsize=8.5)
-    return _figure(panels)
-
-
-def _stream_looks(rows: pd.DataFrame) -> dict[NetworkPath, _Series]:
-    """Return how the paths without loss over streams look."""
-    return {path: look for path, look in _path_looks(rows).items() if path.transport != "udp"}
 
 
 def _of_particles(
@@ -221,16 +186,71 @@ def _of_particles(
         here = select(rows, particles=count)
         intervals.append(median(here, name))
         if dots:
-            _dots(panel, count + series.offset, here[name].to_numpy(float), series.color, 30.0)
+            _dots(panel, count + series.offset, here[name], series.color, 30.0)
     _medians(panel, PARTICLES, intervals, series)
 
 
 def _median(rows: pd.DataFrame, name: str) -> Interval:
-    return median_interval(rows[name].to_numpy(float))
+    return median_interval(rows[name])
 
 
-def _with_count(title: str, count: int) -> str:
-    return f"{title} (n = {count:,})"
+def _title(panel: Axes, title: str, rows: pd.DataFrame) -> None:
+    panel.set_title(f"{title} (n = {len(rows):,})", loc="left")
+
+
+def _path_looks(rows: pd.DataFrame) -> dict[NetworkPath, _Series]:
+    """Return how the cloud's paths without loss look."""
+    looks = {}
+    for path in paths_of(rows):
+        if path.loss == 0.0:
+            label = f"cloud, {path.label}"
+            if path.round_trip_ms == 0.0:
+                looks[path] = _Series(label, COLORS[0], "s", offset=9.0)
+                continue
+            datagrams = path.transport == "udp"
+            color = COLORS[3 if path.round_trip_ms < THESIS_CLOUD_ROUND_TRIP_MS else 4]
+            marker, offset = ("v", 7.0) if datagrams else ("^", -7.0)
+            looks[path] = _Series(f"{label} set", color, marker, not datagrams, offset)
+    return looks
+
+
+def _stream_looks(rows: pd.DataFrame) -> dict[NetworkPath, _Series]:
+    """Return how the paths without loss over streams look."""
+    return {path: look for path, look in _path_looks(rows).items() if path.transport != "udp"}
+
+
+# -- figures 9, 10 and 11 --------------------------------------------------------------------------
+
+
+def sensing_times(rows: pd.DataFrame) -> Figure:
+    """Draw how long it takes to choose a sensing action: in the cloud, locally, side by side."""
+    figure, panels = _panels(
+        11.0, 4.3, "How long it takes to choose what to sense (Figures 9 to 11)", 3, sharey=True
+    )
+    in_cloud = select(rows, what="sensing", service="cloud")
+    locally = select(rows, what="sensing", service="local")
+    cloud = _Series("computing in the cloud service", COLORS[0], MARKERS[0])
+    local = _Series("computing in the local service", COLORS[1], MARKERS[1])
+    answered = _Series("local, from question to answer", COLORS[1], MARKERS[1], False, 6)
+    with mpl.rc_context(STYLE):
+        _of_particles(panels[0], in_cloud, "computed_ms", cloud, dots=True)
+        _title(panels[0], "Fig. 9: in the cloud service", in_cloud)
+        _of_particles(panels[1], locally, "computed_ms", local, dots=True)
+        _title(panels[1], "Fig. 10: in local recovery", locally)
+        _of_particles(panels[2], in_cloud, "computed_ms", cloud._replace(offset=-6))
+        _of_particles(panels[2], locally, "computed_ms", local._replace(offset=6))
+        _of_particles(panels[2], locally, "round_trip_ms", answered)
+        for path, look in _stream_looks(rows).items():
+            label = f"cloud, from question to answer: {path.label}"
+            look = look._replace(label=label, filled=False, offset=-6)
+            _of_particles(panels[2], select(in_cloud, path=path), "round_trip_ms", look)
+        panels[2].set_title("Fig. 11: side by side, and with the way", loc="left")
+        milliseconds(panels[0], "time for a sensing action (ms)")
+        _over_particles(panels)
+        for panel in panels:
+            panel.grid(axis="y")
+        legend_below(figure, panels[2], 3, fontsize=8.5)
+    return figure
 
 
 # -- figure 12 -------------------------------------------------------------------------------------
@@ -238,7 +258,7 @@ def _with_count(title: str, count: int) -> str:
 
 def round_trips(rows: pd.DataFrame) -> Figure:
     """Draw round trips without the computation: over particles, and over loss."""
-    panels = _panels(
+    figure, (panel, over_loss) = _panels(
         10.5,
         4.6,
         "Round trip with the computation taken out; 20 and 87 ms are set, not measured (Figure 12)",
@@ -247,50 +267,21 @@ def round_trips(rows: pd.DataFrame) -> Figure:
         width_ratios=(1.25, 1.0),
     )
     with mpl.rc_context(STYLE):
-        _of_particles(
-            panels[0],
-            select(rows, service="local"),
-            "trip_ms",
-            _Series("local service", COLORS[1], MARKERS[1], offset=-9.0),
-            dots=True,
-        )
+        local = _Series("local service", COLORS[1], MARKERS[1], offset=-9.0)
+        _of_particles(panel, select(rows, service="local"), "trip_ms", local, dots=True)
         looks = _path_looks(rows)
         for path, series in looks.items():
             chosen = select(rows, service="cloud", path=path)
-            _of_particles(panels[0], chosen, "trip_ms", series, dots=path.round_trip_ms == 0.0)
-        _thesis_line(
-            panels[0],
-            THESIS_CLOUD_ROUND_TRIP_MS,
-            f"thesis: at least {THESIS_CLOUD_ROUND_TRIP_MS:g} ms to the cloud",
-            above=False,
-        )
-        _thesis_line(
-            panels[0],
-            THESIS_LOCAL_ROUND_TRIP_MS,
-            f"thesis: local, under {THESIS_LOCAL_ROUND_TRIP_MS:g} ms",
-        )
-        milliseconds(panels[0], "round trip without computing (ms)")
-        _over_particles(panels[0])
-        panels[0].set_title("Nothing lost: medians with 95 % intervals", loc="left")
-        _draw_loss(panels[1], rows, looks)
-        legend_below(_figure(panels), panels[0], 3, fontsize=8.5)
-    return _figure(panels)
-
-
-def _path_looks(rows: pd.DataFrame) -> dict[NetworkPath, _Series]:
-    """Return how the cloud's paths without loss look."""
-    looks = {}
-    for path in paths_of(rows):
-        if path.loss:
-            continue
-        far = path.round_trip_ms > 0.0
-        color = 0 if not far else 3 if path.round_trip_ms < THESIS_CLOUD_ROUND_TRIP_MS else 4
-        marker = "s" if not far else "^" if path.transport != "udp" else "v"
-        offset = 9.0 if not far else -7.0 if path.transport != "udp" else 7.0
-        filled = path.transport != "udp"
-        label = f"cloud, {path.label}" + (" set" if far else "")
-        looks[path] = _Series(label, COLORS[color], marker, filled, offset)
-    return looks
+            _of_particles(panel, chosen, "trip_ms", series, dots=path.round_trip_ms == 0.0)
+        far, near = THESIS_CLOUD_ROUND_TRIP_MS, THESIS_LOCAL_ROUND_TRIP_MS
+        _thesis_line(panel, far, f"thesis: at least {far:g} ms to the cloud", above=False)
+        _thesis_line(panel, near, f"thesis: local, under {near:g} ms")
+        milliseconds(panel, "round trip without computing (ms)")
+        _over_particles([panel])
+        panel.set_title("Nothing lost: medians with 95 % intervals", loc="left")
+        _draw_loss(over_loss, rows, looks)
+        legend_below(figure, panel, 3, fontsize=8.5)
+    return figure
 
 
 def _draw_loss(panel: Axes, rows: pd.DataFrame, looks: dict[NetworkPath, _Series]) -> None:
@@ -308,9 +299,8 @@ def _draw_loss(panel: Axes, rows: pd.DataFrame, looks: dict[NetworkPath, _Series
                 tails.append(float(np.percentile(chosen["trip_ms"], 95.0)))
         shifted = series._replace(offset=series.offset / 90.0)
         _medians(panel, places, medians, shifted)
-        at = [place + shifted.offset for place in places]
         panel.plot(
-            at,
+            [place + shifted.offset for place in places],
             tails,
             linestyle=(0, (1, 1.5)),
             color=series.color,
@@ -330,38 +320,31 @@ def _draw_loss(panel: Axes, rows: pd.DataFrame, looks: dict[NetworkPath, _Series
 
 def successes(table: pd.DataFrame) -> Figure:
     """Draw how many trials reach the goal."""
-    (panel,) = _panels(6.6, 4.2, "Trials in which the peg is inserted (Figure 13)", 1)
+    figure, (panel,) = _panels(6.6, 4.2, "Trials in which the peg is inserted (Figure 13)", 1)
+    few = _Series("holdfast, the first {} trials", COLORS[1], MARKERS[1], False, -8.0)
+    every = _Series("holdfast, {} trials", COLORS[0], MARKERS[0], True, 8.0)
     with mpl.rc_context(STYLE):
-        per_count = len(table) // len(PARTICLES)
-        for part in range(per_count):
-            rows = table.iloc[part::per_count].to_dict("records")
-            trials = rows[0]["trials"]
+        for part, series in enumerate((few, every)):
+            rows = table.iloc[part::2].to_dict("records")
+            label = series.label.format(rows[0]["trials"])
             intervals = [interval_in(row, "success", 100.0) for row in rows]
-            few = part == 0
-            series = _Series(
-                f"holdfast, {'the first ' if few else ''}{trials} trials",
-                COLORS[1 if few else 0],
-                MARKERS[1 if few else 0],
-                filled=not few,
-                offset=-8.0 if few else 8.0,
-            )
-            _medians(panel, PARTICLES, intervals, series)
-        thesis = 100.0 * table["success_thesis"].to_numpy()[::per_count]
+            _medians(panel, PARTICLES, intervals, series._replace(label=label))
+        thesis = 100.0 * table["success_thesis"].to_numpy()[::2]
         for first, last in _levels(thesis):
             panel.plot(
                 [PARTICLES[first] - 35, PARTICLES[last] + 35],
                 [thesis[first], thesis[first]],
                 color=_THESIS,
-                linestyle=(0, (5, 2)),
+                linestyle=_DASHED,
                 linewidth=1.4,
                 label=f"thesis, {THESIS_TRIALS} trials, as its text has it" if first == 0 else None,
             )
         panel.set_ylim(0.0, 104.0)
         panel.set_ylabel("successes (%), with 95 % intervals (Wilson)")
         panel.grid(axis="y")
-        _over_particles(panel)
+        _over_particles([panel])
         panel.legend(loc="lower right")
-    return _figure([panel])
+    return figure
 
 
 def _levels(heights: FloatArray) -> list[tuple[int, int]]:
@@ -375,117 +358,67 @@ def _levels(heights: FloatArray) -> list[tuple[int, int]]:
 
 def launches(rows: pd.DataFrame) -> Figure:
     """Draw how soon a loss is found, and how soon the local service decides then."""
-    panels = _panels(
+    figure, (panel, by_path) = _panels(
         10.5, 4.6, "From the cloud's death to local recovery (Figure 14)", 2, width_ratios=(1, 1.3)
     )
     kills = select(rows, what="kill")
     cold = kills[kills["launch_ms"].notna()]
+    seen = _Series("local service: from its start until seen", COLORS[0], "s", False, -8.0)
+    label = "from the cloud found dead until the local service decides"
+    decides = _Series(label, COLORS[1], "o", True, 8.0)
     with mpl.rc_context(STYLE):
-        for name, series in (
-            (
-                "launch_ms",
-                _Series("local service: from its start until seen", COLORS[0], "s", False, -8.0),
-            ),
-            (
-                "first_local_ms",
-                _Series(
-                    "from the cloud found dead until the local service decides",
-                    COLORS[1],
-                    "o",
-                    True,
-                    8.0,
-                ),
-            ),
-        ):
-            _of_particles(panels[0], cold, name, series, dots=True, median=_median)
-        _thesis_line(
-            panels[0], THESIS_LAUNCH_MS, f"thesis: under {THESIS_LAUNCH_MS:g} ms after its timeout"
-        )
-        milliseconds(panels[0], "time (ms)")
-        _widen(panels[0])
-        _over_particles(panels[0])
-        panels[0].set_title(_with_count("The local service is launched", len(cold)), loc="left")
-        legend_below(_figure(panels), panels[0], 2, fontsize=8.5)
-        _over_paths(panels[1], kills, "found_ms")
-        milliseconds(panels[1], "time from the kill until found (ms)", upright=False)
-        _thesis_upright(
-            panels[1], THESIS_TIMEOUT_MS, f"thesis: a timeout of {THESIS_TIMEOUT_MS / 1e3:g} s"
-        )
-        panels[1].set_xlim(right=1.8 * THESIS_TIMEOUT_MS)
-        panels[1].set_title(_with_count("The cloud is found dead, by path", len(kills)), loc="left")
-    return _figure(panels)
+        _of_particles(panel, cold, "launch_ms", seen, dots=True, median=_median)
+        _of_particles(panel, cold, "first_local_ms", decides, dots=True, median=_median)
+        limit_ms = THESIS_LAUNCH_MS
+        _thesis_line(panel, limit_ms, f"thesis: under {limit_ms:g} ms after its timeout")
+        milliseconds(panel, "time (ms)")
+        _widen(panel)
+        _over_particles([panel])
+        _title(panel, "The local service is launched", cold)
+        legend_below(figure, panel, 2, fontsize=8.5)
+        _over_paths(by_path, kills, "found_ms")
+        milliseconds(by_path, "time from the kill until found (ms)", upright=False)
+        timeout_ms = THESIS_TIMEOUT_MS
+        _upright_thesis_line(by_path, timeout_ms, f"thesis: a timeout of {timeout_ms / 1e3:g} s")
+        by_path.set_xlim(right=1.8 * timeout_ms)
+        _title(by_path, "The cloud is found dead, by path", kills)
+    return figure
 
 
 def failbacks(rows: pd.DataFrame) -> Figure:
     """Draw how soon a cloud that was started again is used."""
-    panels = _panels(
+    figure, (panel, by_path) = _panels(
         10.5, 4.6, "Back to the relaunched cloud (Figure 15)", 2, width_ratios=(1, 1.3)
     )
     kills = select(rows, what="kill").dropna(subset="failback_ms")
+    what = "from its ready line until it decides (ms)"
     with mpl.rc_context(STYLE):
         for path, look in _stream_looks(rows).items():
-            _of_particles(
-                panels[0],
-                select(kills, path=path),
-                "failback_ms",
-                look._replace(label=path.label, offset=0.0),
-                dots=True,
-                median=_median,
-            )
-        _over_particles(panels[0])
-        panels[0].set_title("By particles, over streams without loss", loc="left")
-        legend_below(_figure(panels), panels[0], 3, fontsize=8.5)
-        _over_paths(panels[1], kills, "failback_ms")
-        panels[1].set_title(_with_count("By path", len(kills)), loc="left")
-        what = "from its ready line until it decides (ms)"
-        _thesis_line(panels[0], THESIS_FAILBACK_MS, "thesis: under 1 s")
-        _thesis_upright(panels[1], THESIS_FAILBACK_MS, "thesis: under 1 s")
-        milliseconds(panels[0], what)
-        _widen(panels[0])
-        milliseconds(panels[1], what, upright=False)
-    return _figure(panels)
+            look = look._replace(label=path.label, offset=0.0)
+            chosen = select(kills, path=path)
+            _of_particles(panel, chosen, "failback_ms", look, dots=True, median=_median)
+        _over_particles([panel])
+        panel.set_title("By particles, over streams without loss", loc="left")
+        legend_below(figure, panel, 3, fontsize=8.5)
+        _thesis_line(panel, THESIS_FAILBACK_MS, "thesis: under 1 s")
+        milliseconds(panel, what)
+        _widen(panel)
+        _over_paths(by_path, kills, "failback_ms")
+        _title(by_path, "By path", kills)
+        _upright_thesis_line(by_path, THESIS_FAILBACK_MS, "thesis: under 1 s")
+        milliseconds(by_path, what, upright=False)
+    return figure
 
 
 def _over_paths(panel: Axes, rows: pd.DataFrame, name: str) -> None:
     """Draw a row for each path: dots, median and interval."""
     paths = paths_of(rows)
     for number, path in enumerate(paths):
-        here = select(rows, path=path)[name].to_numpy(float)
-        datagrams = path.transport == "udp"
-        color = COLORS[4] if datagrams else COLORS[0]
+        here = select(rows, path=path)[name]
+        color, marker = (COLORS[4], "v") if path.transport == "udp" else (COLORS[0], "s")
         _dots(panel, number, here, color, 0.5, upright=False)
-        interval = median_interval(here)
-        panel.errorbar(
-            [interval.value],
-            [number],
-            xerr=[
-                [_length(interval.value - interval.low)],
-                [_length(interval.high - interval.value)],
-            ],
-            fmt="v" if datagrams else "s",
-            color=color,
-            markeredgecolor="white",
-            markeredgewidth=0.7,
-            markersize=6.0,
-            elinewidth=1.4,
-            capsize=2.5,
-            zorder=4,
-        )
+        series = _Series(path.label, color, marker)
+        _medians(panel, [number], [median_interval(here)], series, upright=False)
     panel.set_yticks(range(len(paths)), [path.label for path in paths])
     panel.set_ylim(len(paths) - 0.4, -1.3)
     panel.tick_params(axis="y", length=0)
-
-
-def _thesis_upright(panel: Axes, place: float, text: str) -> None:
-    panel.axvline(place, color=_THESIS, linewidth=1.1, linestyle=(0, (5, 2)), zorder=1.5)
-    panel.annotate(
-        text,
-        (place, 1.0),
-        xycoords=("data", "axes fraction"),
-        xytext=(-3, -2),
-        textcoords="offset points",
-        ha="right",
-        va="top",
-        color=_THESIS,
-        fontsize=8.0,
-    )

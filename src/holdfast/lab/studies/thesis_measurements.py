@@ -45,14 +45,7 @@ after the timeout; less than a second; 8 of 10 trials, rising to 9 of 10 above 3
 
 
 class NetworkPath(NamedTuple):
-    """A path between the robot and the cloud.
-
-    Attributes
-    ----------
-    transport : {"tcp", "tls", "udp"}
-    loss : float
-        Share of packets, each way.
-    """
+    """A path between the robot and the cloud; ``loss`` is the share of packets, each way."""
 
     transport: Transport
     round_trip_ms: float

@@ -29,7 +29,7 @@ _STATUS_LOOKS = {
 _KILLED, _STARTED = "#B5342B", "#1E8A4C"
 
 _Kill: TypeAlias = Mapping[str, float]
-"""The times of the kill, without those that are not known."""
+"""The times of the kill, without those that are not known; none if nothing was killed."""
 
 
 def cloud_dies(table: pd.DataFrame) -> Figure:
@@ -41,10 +41,9 @@ def cloud_dies(table: pd.DataFrame) -> Figure:
         Of the task kind ``cloud_trials``, of one run, with its actions.
     """
     kill = _kill_of(table)
-    what = table["what"].to_numpy(object)
-    at_s = table["at_s"].to_numpy(float)
     bands = _status_bands(table, kill)
-    figure = figure_of(9.6, 5.6, _title(table))
+    verdict = "and no decision changes" if table["identical"].all() else "BUT DECISIONS CHANGE"
+    figure = figure_of(9.6, 5.6, f"The cloud dies, the robot goes on, {verdict}")
     with mpl.rc_context(STYLE):
         motion, answers = figure.subplots(2, 1, sharex=True, height_ratios=(1.0, 1.15))
         for panel in (motion, answers):
@@ -62,32 +61,21 @@ def cloud_dies(table: pd.DataFrame) -> Figure:
                     va="bottom",
                     fontsize=8.5,
                 )
-        _draw_motion(motion, at_s[what == "action"])
+        _draw_motion(motion, table["at_s"][table["what"] == "action"].to_numpy(float))
         _draw_answers(answers, table)
         _draw_moments((motion, answers), kill)
         answers.set_xlabel("time since the robot's first decision (s)")
         answers.set_xlim(bands[0][0], bands[-1][1])
         figure.align_ylabels()
-        figure.supxlabel(_verdict(table, kill), x=0.012, ha="left", fontsize=9.5)
     return figure
 
 
-def _kill_of(table: pd.DataFrame) -> _Kill | None:
-    rows = table[table["what"] == "kill"]
-    if rows.empty:
-        return None
-    times = rows.iloc[0][["at_s", "found_ms", "away_ms", "waited_ms"]]
-    return {str(name): float(time) for name, time in times.dropna().items()}
+def _kill_of(table: pd.DataFrame) -> _Kill:
+    rows = table.loc[table["what"] == "kill", ["at_s", "found_ms", "away_ms"]]
+    return {} if rows.empty else rows.iloc[0].dropna().astype(float).to_dict()
 
 
-def _title(table: pd.DataFrame) -> str:
-    same = table["identical"].all()
-    return "The cloud dies, the robot goes on, " + (
-        "and no decision changes" if same else "BUT DECISIONS CHANGE"
-    )
-
-
-def _status_bands(table: pd.DataFrame, kill: _Kill | None) -> list[tuple[float, float, str]]:
+def _status_bands(table: pd.DataFrame, kill: _Kill) -> list[tuple[float, float, str]]:
     """Return from when until when the robot had which status.
 
     A decision says which it had then; local recovery begins when the robot says that it has lost
@@ -95,7 +83,7 @@ def _status_bands(table: pd.DataFrame, kill: _Kill | None) -> list[tuple[float, 
     """
     known = table[table["status"].notna()]
     statuses = list(zip(known["at_s"], known["status"], strict=True))
-    if kill is not None and "found_ms" in kill:
+    if "found_ms" in kill:
         statuses.append((kill["at_s"] + 1e-3 * kill["found_ms"], "local_recovery"))
     end_s = float(np.nanmax(table["at_s"].to_numpy(float)))
     bands: list[tuple[float, float, str]] = []
@@ -177,9 +165,9 @@ def _draw_answers(panel: Axes, table: pd.DataFrame) -> None:
     panel.legend(handles=handles, loc="lower right", markerscale=0.7, fontsize=8.5)
 
 
-def _draw_moments(panels: Sequence[Axes], kill: _Kill | None) -> None:
+def _draw_moments(panels: Sequence[Axes], kill: _Kill) -> None:
     """Mark when the cloud is killed, and when it listens again."""
-    if kill is None:
+    if not kill:
         return
     killed_s = kill["at_s"]
     moments = [(killed_s, "the cloud's process\nis killed (SIGKILL)", _KILLED, "X", "left")]
@@ -211,15 +199,3 @@ def _draw_moments(panels: Sequence[Axes], kill: _Kill | None) -> None:
             color=color,
             fontsize=8.5,
         )
-
-
-def _verdict(table: pd.DataFrame, kill: _Kill | None) -> str:
-    what = table["what"].tolist()
-    counted = f"{what.count('sensing')} sensing actions and {what.count('action')} task actions"
-    if table["identical"].all():
-        text = f"All {counted} are, bit for bit, those of the run in which nothing dies."
-    else:
-        text = f"NOT all {counted} are those of the run in which nothing dies."
-    if kill is not None and "waited_ms" in kill:
-        text += f" Longest wait for a decision: {kill['waited_ms']:.0f} ms."
-    return text

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from holdfast.config.problem_builder import build_problem
-from holdfast.config.settings import PlanningSettings, SimulatorSettings
+from holdfast.config.settings import PlanningSettings
 from holdfast.errors import HoldfastError
 from holdfast.lab.errors import TaskError
 from holdfast.lab.studies.tasks import Task
@@ -52,8 +52,8 @@ class TrialSeries(msgspec.Struct, frozen=True, kw_only=True):
     ----------
     problem : str
         Its name.
-    model, state_space_planner : dict
-        Its two sections; what is left out has its default.
+    model : dict
+        Its section; what is left out has its default.
     continued_trials : int
         The first ones, which are continued where they are cut off at ``max_steps``, to see whether
         they are slow or stuck. Nothing but ``steps_to_goal`` depends on it.
@@ -63,7 +63,6 @@ class TrialSeries(msgspec.Struct, frozen=True, kw_only=True):
 
     problem: str
     model: dict[str, Any] = msgspec.field(default_factory=dict)
-    state_space_planner: dict[str, Any] = msgspec.field(default_factory=dict)
     planning: PlanningSettings = msgspec.field(default_factory=PlanningSettings)
     max_steps: int = 500
     seed: int = 0
@@ -100,40 +99,26 @@ def run_trials_of(first_trial: int, **series: Any) -> pd.DataFrame:
     import pandas as pd  # here, so that problems and cases can be had without it
 
     wanted = msgspec.convert(series, TrialSeries)
-    problem = problem_of(wanted.problem, wanted.model, wanted.state_space_planner)
-    simulator = SimulatorSettings(
-        num_trials=first_trial + wanted.num_trials,
-        max_steps=wanted.max_steps,
-        sensing_intervals=wanted.planning.sensing_interval,
-        seed=wanted.seed,
-    )
-    longer = msgspec.structs.replace(
-        simulator, max_steps=max(wanted.continued_to, wanted.max_steps)
-    )
-    rows = []
-    for trial in range(first_trial, first_trial + wanted.num_trials):
+    problem = problem_of(wanted.problem, wanted.model)
+    longest = max(wanted.continued_to, wanted.max_steps)
+
+    def run(trial: int, max_steps: int) -> TrialResult:
         try:
-            result = run_trial(
-                Planner(problem, wanted.planning),
-                simulator.seed,
-                trial,
-                max_steps=simulator.max_steps,
-            )
-            whole = result
-            continued = trial < wanted.continued_trials
-            if continued and _is_cut_off(result):
-                # From its beginning: every random draw is named by its step, so the trial goes
-                # through the same states as before.
-                whole = run_trial(
-                    Planner(problem, wanted.planning),
-                    longer.seed,
-                    trial,
-                    max_steps=longer.max_steps,
-                )
+            planner = Planner(problem, wanted.planning)
+            return run_trial(planner, wanted.seed, trial, max_steps=max_steps)
         except HoldfastError as error:
             raise TaskError(
                 f"trial {trial} (seed {wanted.seed}) of {wanted.problem}: {error}"
             ) from error
+
+    rows = []
+    for trial in range(first_trial, first_trial + wanted.num_trials):
+        result = whole = run(trial, wanted.max_steps)
+        continued = trial < wanted.continued_trials
+        if continued and not result.success and not result.failed:
+            # From its beginning: every random draw is named by its step, so the trial goes through
+            # the same states as before.
+            whole = run(trial, longest)
         rows.append(
             (
                 trial,
@@ -144,27 +129,13 @@ def run_trials_of(first_trial: int, **series: Any) -> pd.DataFrame:
                 result.mean_sensing_ms,
                 result.unexplained_observations,
                 result.digest[:_DIGEST_CHARACTERS],
-                longer.max_steps if continued else wanted.max_steps,
+                longest if continued else wanted.max_steps,
                 whole.steps if whole.success else None,
             )
         )
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
-def _is_cut_off(result: TrialResult) -> bool:
-    return not result.success and not result.failed
-
-
-def problem_of(
-    name: str, model: Mapping[str, Any], state_space_planner: Mapping[str, Any]
-) -> Problem:
-    """Build a problem from plain data.
-
-    Raises
-    ------
-    UnknownProblemError
-        If it is neither registered nor importable.
-    ConfigurationError
-        If the data does not fit it.
-    """
-    return build_problem(name, problem_class(name), model, state_space_planner)
+def problem_of(name: str, model: Mapping[str, Any] | None = None) -> Problem:
+    """Build a problem from plain data; HoldfastError if there is none, or the data does not fit."""
+    return build_problem(name, problem_class(name), model or {}, {})

@@ -25,8 +25,8 @@ from holdfast.arrays import FloatArray, IntArray
 from holdfast.belief import Belief
 from holdfast.config.settings import PlanningSettings
 from holdfast.lab.studies.vdp_tag import (
-    BARRIER_START,
     DISCOUNT,
+    INSIDE_TIPS,
     LOOK_COST,
     STEP,
     TAG_RADIUS,
@@ -328,7 +328,7 @@ class _Decision:
             [-second[:, 1], second[:, 0]], axis=-1
         )
         ahead = 0.5 * second
-        every = [self._by._compass, first, ahead + aside, ahead - aside, _TIPS - self._agent]
+        every = [self._by._compass, first, ahead + aside, ahead - aside, INSIDE_TIPS - self._agent]
         return toward(np.concatenate(every))
 
 
@@ -337,7 +337,6 @@ _OUT_OF_REACH = 0.05
 """Share of a chance that is left where a plan is not worth a thought."""
 _DIRECT = 10
 """Particles to which directions lead."""
-_TIPS = 0.9 * BARRIER_START * np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
 
 
 def _compass(count: int) -> FloatArray:

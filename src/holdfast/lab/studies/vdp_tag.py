@@ -14,6 +14,8 @@ authors, which made its figures (folder ``icaps_2018``).
 
 from __future__ import annotations
 
+import itertools
+import operator
 from collections.abc import Sequence
 
 import numpy as np
@@ -64,27 +66,17 @@ _BEAM_DEVIATION = 5.0
 _EMPTY_BEAM = 1.0
 """Mean reading of a beam that does not hold the target."""
 _LONGEST_PURSUIT = 30
-_INSIDE_TIPS = 0.9 * BARRIER_START * np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
+INSIDE_TIPS = 0.9 * BARRIER_START * np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
 """Places by which a way leads past the inner ends."""
 _EPSILON = float(np.finfo(np.float64).eps)
 
-_POWERS = [1.0]
-for _ in range(MAX_STEPS):
-    _POWERS.append(_POWERS[-1] * DISCOUNT)
+_POWERS = np.array([*itertools.accumulate([1.0, *[DISCOUNT] * MAX_STEPS], operator.mul)])
 
 
 def target_flow(targets: FloatArray, steps: int = 1) -> FloatArray:
-    """Return where targets are some steps later, without noise.
+    """Return where targets, shape (..., 2), are some steps of the agent later, without noise.
 
-    Parameters
-    ----------
-    targets : array of shape (..., 2)
-    steps : int
-        Steps of the agent; each is five steps of the classical Runge-Kutta method of order 4.
-
-    Returns
-    -------
-    array of shape (..., 2)
+    Each is five steps of the classical Runge-Kutta method of order 4.
     """
     x, y = targets[..., 0], targets[..., 1]
     half, whole = 0.5 * _TIME_STEP, _TIME_STEP
@@ -106,16 +98,8 @@ def stop_at_barriers(places: FloatArray, moves: FloatArray) -> FloatArray:
     """Return where straight moves lead, which end at the first barrier that they meet.
 
     A move along a barrier is free. A stopped move keeps two machine epsilons of its length away
-    from the barrier, so that the next one begins on the side from which it came.
-
-    Parameters
-    ----------
-    places, moves : arrays of shape (..., 2)
-        Broadcast against each other.
-
-    Returns
-    -------
-    array of shape (..., 2)
+    from the barrier, so that the next one begins on the side from which it came. Places and moves
+    of shape (..., 2) are broadcast against each other.
     """
     share = np.full(np.broadcast_shapes(places.shape, moves.shape)[:-1], 1.0 + 2.0 * _EPSILON)
     for across, along in ((1, 0), (0, 1)):
@@ -131,10 +115,7 @@ def stop_at_barriers(places: FloatArray, moves: FloatArray) -> FloatArray:
 def active_beam(offsets: FloatArray) -> IntArray:
     """Return which beam holds the target, from 0: beam i the angles (45 i, 45 (i + 1)] degrees.
 
-    Parameters
-    ----------
-    offsets : array of shape (..., 2)
-        From the agent to the target. No offset counts as one straight along x: beam 7.
+    Of offsets from the agent to the target, shape (..., 2). None counts as one along x: beam 7.
     """
     x, y = offsets[..., 0], offsets[..., 1]
     upper = np.where(x > 0.0, np.where(y <= x, 0, 1), np.where(y >= -x, 2, 3))
@@ -148,7 +129,7 @@ def active_beam(offsets: FloatArray) -> IntArray:
 
 def toward(offsets: FloatArray) -> FloatArray:
     """Return vectors scaled to the length of a step; zero becomes a step along x."""
-    length = np.sqrt(offsets[..., 0] * offsets[..., 0] + offsets[..., 1] * offsets[..., 1])
+    length = _norm(offsets[..., 0], offsets[..., 1])
     # The square of a tiny offset is zero.
     usable = length > 0.0
     scale = STEP / np.where(usable, length, 1.0)
@@ -161,20 +142,11 @@ def way_length(starts: FloatArray, ends: FloatArray) -> FloatArray:
 
     A straight one, if no barrier is in its way; else past the inner end of the barrier that is, or
     the longer of two such ways where two barriers are. The outer ends are further off than any
-    target ever is.
-
-    Parameters
-    ----------
-    starts, ends : arrays of shape (..., 2)
-        Broadcast against each other.
-
-    Returns
-    -------
-    array of shape (...)
+    target ever is. Starts and ends of shape (..., 2) are broadcast against each other.
     """
     ax, ay, bx, by = starts[..., 0], starts[..., 1], ends[..., 0], ends[..., 1]
     dx, dy = bx - ax, by - ay
-    straight = np.sqrt(dx * dx + dy * dy)
+    straight = _norm(dx, dy)
     # Zero only where the way crosses no axis.
     at_x = ax - ay * dx / np.where(dy == 0.0, 1.0, dy)
     at_y = ay - ax * dy / np.where(dx == 0.0, 1.0, dx)
@@ -197,17 +169,10 @@ def _norm(x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def missing_length(lengths: FloatArray, steps: npt.ArrayLike) -> FloatArray:
-    """Return how far from the end of a way some steps of the agent must end.
+    """Return how far from the end of a way some steps of the agent, at least 1, must end.
 
     Two steps or more end anywhere within their reach, as they need not lead straight on; a single
     one ends on a circle.
-
-    Parameters
-    ----------
-    lengths : array
-        Of the ways.
-    steps : array of int
-        At least 1; broadcast against the lengths.
     """
     beyond = lengths - STEP * np.asarray(steps)
     return np.where(np.equal(steps, 1), np.abs(beyond), np.maximum(beyond, 0.0))
@@ -223,19 +188,11 @@ def chance_of_tag(steps: int) -> float:
 
 
 def value_of_plan(steps: npt.ArrayLike, chance: npt.ArrayLike, after: float = 0.0) -> FloatArray:
-    """Return the discounted return of steps of which the last one may tag.
+    """Return the discounted return of steps, at least 1, of which the last one may tag.
 
-    Parameters
-    ----------
-    steps : array of int
-        At least 1.
-    chance : array
-        That the last one tags.
-    after : float
-        Value of being there if it does not.
+    ``chance`` is that it tags, ``after`` the value of being there if it does not.
     """
-    powers = np.array(_POWERS)
-    before = powers[np.asarray(steps) - 1]
+    before = _POWERS[np.asarray(steps) - 1]
     chance = np.asarray(chance)
     last = TAG_REWARD * chance + (1.0 - chance) * (DISCOUNT * after - 1.0)
     return np.asarray(before * last - (1.0 - before) / (1.0 - DISCOUNT))
@@ -244,14 +201,7 @@ def value_of_plan(steps: npt.ArrayLike, chance: npt.ArrayLike, after: float = 0.
 def interception(agents: FloatArray, targets: FloatArray) -> tuple[FloatArray, IntArray]:
     """Return the steps that lead to where known targets can be met first, and how many it takes.
 
-    Parameters
-    ----------
-    agents, targets : arrays of shape (n, 2)
-
-    Returns
-    -------
-    steps : array of shape (n, 2)
-    numbers : array of shape (n,)
+    Agents, targets and steps have the shape (n, 2).
     """
     count = agents.shape[0]
     numbers = np.zeros(count, dtype=np.int64)
@@ -281,9 +231,9 @@ def _first_steps(agents: FloatArray, places: FloatArray, numbers: IntArray) -> F
     chosen = np.where(((numbers == 2) & (length < 2.0 * STEP))[:, np.newaxis], bend, direct)
     # Round a barrier: past the inner end that makes the way short.
     blocked = way_length(agents, places) > length + 1e-9
-    tips = _INSIDE_TIPS - agents[:, np.newaxis]
-    ways = way_length(agents[:, np.newaxis], _INSIDE_TIPS) + way_length(
-        _INSIDE_TIPS, places[:, np.newaxis]
+    tips = INSIDE_TIPS - agents[:, np.newaxis]
+    ways = way_length(agents[:, np.newaxis], INSIDE_TIPS) + way_length(
+        INSIDE_TIPS, places[:, np.newaxis]
     )
     best = tips[np.arange(agents.shape[0]), ways.argmin(axis=1)]
     # At the end itself, go on.
@@ -321,7 +271,7 @@ class VdpTag(ProblemBase):
         """Return the distance for the beam that holds the target, one for the others."""
         del sensing_action
         offsets = states[..., 2:] - states[..., :2]
-        distance = np.sqrt(offsets[..., 0] * offsets[..., 0] + offsets[..., 1] * offsets[..., 1])
+        distance = _norm(offsets[..., 0], offsets[..., 1])
         return np.where(_is_active(offsets), distance[..., np.newaxis], _EMPTY_BEAM)
 
     def observation_variance(self, states: FloatArray, sensing_action: int) -> FloatArray:
@@ -353,9 +303,8 @@ class VdpTag(ProblemBase):
 
     def is_goal(self, states: FloatArray) -> BoolArray:
         """Tell where the target is tagged."""
-        x = states[..., 2] - states[..., 0]
-        y = states[..., 3] - states[..., 1]
-        return np.asarray(np.sqrt(x * x + y * y) < TAG_RADIUS)
+        offsets = states[..., 2:] - states[..., :2]
+        return _norm(offsets[..., 0], offsets[..., 1]) < TAG_RADIUS
 
     def scene(self) -> Scene:
         """Return the plane of agent and target with the barriers."""
@@ -368,11 +317,7 @@ class VdpTag(ProblemBase):
 def moved(states: FloatArray, actions: FloatArray, noise: FloatArray) -> FloatArray:
     """Return where states are after a step: agents at barriers, targets by their flow with noise.
 
-    Parameters
-    ----------
-    states : array of shape (..., 4)
-    actions, noise : arrays of shape (..., 2)
-        Noise is standard normal.
+    Noise, of shape (..., 2) as actions are, is standard normal.
     """
     agents = stop_at_barriers(states[..., :2], actions)
     targets = target_flow(states[..., 2:]) + TARGET_DEVIATION * noise
@@ -390,18 +335,10 @@ def reading_log_likelihood(
 
     Beams that do not hold the target say nothing of it, so that one beam of each state counts: how
     likely its reading is there, compared with how likely it would be if the beam held nothing.
-
-    Parameters
-    ----------
-    states : array of shape (n, 4)
-    look : int
-        The sensing action.
-    reading : array of shape (8,)
-    beams : array of shape (n,), optional
-        Which one holds the target, where that is known already.
+    ``beams`` are those that hold the target, where that is known already.
     """
     offsets = states[:, 2:] - states[:, :2]
-    distance = np.sqrt(offsets[:, 0] * offsets[:, 0] + offsets[:, 1] * offsets[:, 1])
+    distance = _norm(offsets[:, 0], offsets[:, 1])
     own = reading[active_beam(offsets) if beams is None else beams]
     held = (own - distance) / (_LOOK_DEVIATION if look else _BEAM_DEVIATION)
     empty = (own - _EMPTY_BEAM) / _BEAM_DEVIATION

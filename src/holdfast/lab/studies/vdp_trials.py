@@ -111,8 +111,6 @@ def run_vdp_tag_trials(
 
     Parameters
     ----------
-    trials : sequence of int
-        Seed and trial name the random numbers: a trial comes to the same in any company.
     num_particles : int
         Of the particle filter, which resamples after each reading.
     misses_at_once : bool
@@ -120,11 +118,6 @@ def run_vdp_tag_trials(
         decision. That of the published figures drops it one step later.
     known_state : bool
         Whether the policy is told the true state instead: what no filter can give, for a bound.
-
-    Returns
-    -------
-    list of VdpTagTrial
-        In the order of ``trials``.
     """
     runs = [_Run(seed, trial, num_particles) for trial in trials]
     if known_state:
@@ -186,12 +179,7 @@ class _Run:
         self.tagged = tagged
 
     def observe(
-        self,
-        step: int,
-        look: int,
-        states: FloatArray,
-        impossible: BoolArray,
-        beams: IntArray,
+        self, step: int, look: int, states: FloatArray, impossible: BoolArray, beams: IntArray
     ) -> None:
         """Read the beams, and weigh and resample the belief that was states to there."""
         noise = stream(self.seed, self.trial, step, Purpose.WORLD_OBSERVATION).normal(NUM_BEAMS)
