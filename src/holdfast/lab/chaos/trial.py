@@ -231,30 +231,23 @@ def _make_reference_run(
     if schedule.decision_deadline_ms is not None:
         offload["decision_deadline_ms"] = schedule.decision_deadline_ms
 
-    def write_configuration(num_trials: int) -> Path:
-        document = {
-            "problem": "peg_in_hole_2d",
-            "particle_filter": {"num_particles": schedule.num_particles},
-            "active_sensing": {"num_cores": 1},
-            "simulator": {
-                "num_trials": num_trials,
-                "max_steps": _MAX_STEPS,
-                "sensing_intervals": _SENSING_INTERVALS,
-                "seed": schedule.world_seed,
-            },
-            "offload": offload,
-            "recovery": {"launch": schedule.launch},
-            "environment": witnessed_by(directory / _PERFORMED_NAME.format(_RUN_NAME)),
-        }
-        path = directory / _CONFIGURATION_NAME
-        # JSON is YAML as well.
-        text = msgspec.json.format(msgspec.json.encode(document), indent=2)
-        write_atomically(path, text + b"\n")
-        return path
-
+    document = {
+        "problem": "peg_in_hole_2d",
+        "particle_filter": {"num_particles": schedule.num_particles},
+        "active_sensing": {"num_cores": 1},
+        "simulator": {
+            "max_steps": _MAX_STEPS,
+            "sensing_intervals": _SENSING_INTERVALS,
+            "seed": schedule.world_seed,
+        },
+        "offload": offload,
+        "recovery": {"launch": schedule.launch},
+        "environment": witnessed_by(directory / _PERFORMED_NAME.format(_RUN_NAME)),
+    }
     return make_reference_run(
         directory / _REFERENCE_NAME,
-        write_configuration,
+        directory / _CONFIGURATION_NAME,
+        document,
         min_steps,
         directory / _PERFORMED_NAME.format(_REFERENCE_NAME),
     )

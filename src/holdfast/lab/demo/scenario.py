@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
@@ -41,12 +40,9 @@ FINDINGS_NAME = "findings.json"
 KILLED_RUN_NAME = "killed"
 REFERENCE_RUN_NAME = "undisturbed"
 
-_CONFIGURATION = """\
+_COMMENT = """\
 # What holdfast demo has run. The same without services, without kills and as fast as it goes:
-#   holdfast run {path}
-problem: peg_in_hole_2d
-particle_filter: {{num_particles: 100}}
-simulator: {{num_trials: {num_trials}, max_steps: {max_steps}, seed: {seed}}}
+#   holdfast run {}
 """
 _MAX_STEPS = 250
 
@@ -215,17 +211,18 @@ class Demo:
 
     def _make_reference_run(self) -> ReferenceRun:
         directory = self._testbed.directory
-
-        def write_configuration(num_trials: int) -> Path:
-            path = directory / CONFIGURATION_NAME
-            text = _CONFIGURATION.format(
-                path=path, num_trials=num_trials, max_steps=_MAX_STEPS, seed=self._seed
-            )
-            write_atomically(path, text.encode())
-            return path
-
+        path = directory / CONFIGURATION_NAME
+        document = {
+            "problem": "peg_in_hole_2d",
+            "particle_filter": {"num_particles": 100},
+            "simulator": {"max_steps": _MAX_STEPS, "seed": self._seed},
+        }
         reference = make_reference_run(
-            directory / REFERENCE_RUN_NAME, write_configuration, self._plan.min_steps
+            directory / REFERENCE_RUN_NAME,
+            path,
+            document,
+            self._plan.min_steps,
+            comment=_COMMENT.format(path),
         )
         self._state.title = (
             f"{reference.configuration.problem_name}, seed {self._seed}: "
