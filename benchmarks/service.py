@@ -22,7 +22,6 @@ from benchmarks.common import Context
 from benchmarks.echo import ECHO_BYTES, EchoClient
 from benchmarks.measure import without_collection
 from benchmarks.processes import (
-    CountingProxy,
     EchoProcess,
     ServiceProcess,
     pipe_round_trip_s,
@@ -31,6 +30,8 @@ from benchmarks.processes import (
 from benchmarks.report import Bar, Result, Table, milliseconds, paragraph
 from benchmarks.robots import Notebook, configuration_for, run_robot
 from benchmarks.turns import Asker, decided_in_process, recorded_turns
+from holdfast.lab.testbed.processes import free_port
+from holdfast.lab.testbed.proxy import Proxy, endpoint_at
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner, digest, encode_checkpoint
 from holdfast.protocol.messages import DIGEST_SIZE, encode_floats
@@ -432,7 +433,7 @@ def wire(context: Context) -> Result:
         for done, num_particles in enumerate(sizes):
             own = Path(directory) / str(num_particles)
             own.mkdir()
-            with CountingProxy(service.endpoint) as proxy:
+            with Proxy(free_port(), service.port, "wire") as proxy:
                 counted, up, seconds = _bytes_per_turn(own, num_particles, proxy)
             median, rare = _quantiles(counted)
             rows.append(
@@ -456,14 +457,16 @@ def wire(context: Context) -> Result:
                 )
             )
             context.progress((done + 1) / (len(sizes) + 1))
-        with CountingProxy(service.endpoint) as proxy:
+        with Proxy(free_port(), service.port, "wire") as proxy:
             configuration = configuration_for(Path(directory), num_trials=1)
             with Asker(
-                proxy.endpoint, session_configuration_of(configuration), b"only looks on..."
+                endpoint_at("tcp", proxy.place),
+                session_configuration_of(configuration),
+                b"only looks on...",
             ) as asker:
-                before = proxy.total
+                before = sum(proxy.carried.values())
                 asker.pause(idle_s)
-                keep_alive = (proxy.total - before) / idle_s
+                keep_alive = (sum(proxy.carried.values()) - before) / idle_s
     return Result(
         [
             paragraph(
@@ -491,19 +494,19 @@ def wire(context: Context) -> Result:
 
 
 def _bytes_per_turn(
-    directory: Path, num_particles: int, proxy: CountingProxy
+    directory: Path, num_particles: int, proxy: Proxy
 ) -> tuple[list[float], list[float], list[float]]:
     """Return the bytes of each sensing step both ways and upwards, and the seconds of each."""
     configuration = configuration_for(
         directory,
         num_trials=4 if num_particles < 10_000 else 2,
-        services=(proxy.endpoint,),
+        services=(endpoint_at("tcp", proxy.place),),
         num_particles=num_particles,
     )
     notebook = Notebook()
     cuts: list[tuple[int, int, float]] = []
     notebook.on_decided = lambda timing: (
-        cuts.append((proxy.total, proxy.to_service, time.monotonic()))
+        cuts.append((sum(proxy.carried.values()), proxy.carried["to_service"], time.monotonic()))
         if timing.kind == "sensing"
         else None
     )

@@ -53,7 +53,7 @@ class ServiceCommand:
         self,
         start: Callable[[], Process],
         endpoint: str,
-        port: int | None = None,
+        port: int = 0,
         proxy: Proxy | None = None,
         namespace: NetworkNamespace | None = None,
     ) -> None:
@@ -242,7 +242,7 @@ class Testbed:
         service = ServiceCommand(
             lambda: self._start(arguments, log_name, prefix),
             endpoint or listen,
-            int(port) if port.isdigit() else None,
+            int(port) if port.isdigit() else 0,
             proxy,
             namespace,
         )

@@ -165,7 +165,7 @@ def _impair_line(testbed: Testbed, fault: Fault) -> Script:
 def _drop_packets(testbed: Testbed, fault: Fault) -> Script:
     cloud = testbed.services[fault.cloud]
     namespace, port = cloud.namespace, cloud.port
-    assert namespace is not None and port is not None
+    assert namespace is not None
     share = fault.loss if fault.kind is FaultKind.PACKETS_LOST else 1.0
     return _until_healed(testbed, fault, lambda: namespace.drop(port, fault.direction, share))
 

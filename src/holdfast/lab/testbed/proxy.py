@@ -29,7 +29,7 @@ from typing import Any, Literal, Self, TypeAlias
 
 from holdfast.lab.errors import CannotStartError
 
-__all__ = ["Direction", "Impairment", "Place", "Proxy"]
+__all__ = ["Direction", "Impairment", "Place", "Proxy", "endpoint_at"]
 
 Direction: TypeAlias = Literal["both", "to_service", "to_robot"]
 
@@ -46,6 +46,11 @@ _RESET_ON_CLOSE = struct.pack("ii", 1, 0)
 _BACKLOG = 16
 _LARGEST_DATAGRAM = 65_536
 _MOST_CLIENTS = 64
+
+
+def endpoint_at(transport: str, place: Place) -> str:
+    """Return the endpoint of a service at a place of this machine."""
+    return f"{transport}/{place}" if isinstance(place, Path) else f"{transport}/127.0.0.1:{place}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +86,11 @@ class Proxy:
     datagrams : bool
         Whether it carries datagrams between the same ports, too.
 
+    Attributes
+    ----------
+    carried : dict of str to int
+        Bytes that were carried in each direction, without the headers of TCP or UDP and below.
+
     Raises
     ------
     CannotStartError
@@ -88,11 +98,10 @@ class Proxy:
     """
 
     def __init__(self, place: Place, target: Place, seed: str, *, datagrams: bool = False) -> None:
-        self._place = place
+        self.place = place
         self._target = target
         self._chance = random.Random(seed)
-        self._impairments: dict[int, Impairment] = {}
-        self._numbers = 0
+        self._impairments: dict[object, Impairment] = {}
         self._listener: socket.socket | None = None
         self._datagrams: socket.socket | None = None
         self._carries_datagrams = datagrams
@@ -103,6 +112,7 @@ class Proxy:
         self._changed = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name=f"proxy-{place}", daemon=True)
         self._thread.start()
+        self.carried: dict[Direction, int] = {"to_service": 0, "to_robot": 0}
         try:
             self._call(self._listen())
         except OSError as error:
@@ -120,10 +130,9 @@ class Proxy:
 
     def impair(self, impairment: Impairment) -> Callable[[], None]:
         """Put an impairment on the line; return what takes it away, which may be repeated."""
-        number = self._numbers
-        self._numbers += 1
-        self._call(self._add(number, impairment))
-        return lambda: self._call(self._remove(number))
+        key = object()
+        self._call(self._change(key, impairment))
+        return lambda: self._call(self._change(key, None))
 
     def close(self) -> None:
         """Reset all connections, and listen no more; may be repeated."""
@@ -148,16 +157,18 @@ class Proxy:
         future.result(_START_TIMEOUT_S)
 
     async def _listen(self) -> None:
-        self._listener = self._bound()
-        self._open(self._listener)
-        self._open_datagrams()
-
-    def _open(self, listener: socket.socket) -> None:
-        listener.listen(_BACKLOG)
-        self._loop.add_reader(listener, self._accept, listener)
+        """Listen on streams and, if wanted, for datagrams."""
+        if self._listener is None:
+            self._listener = self._bound()
+        self._listener.listen(_BACKLOG)
+        self._loop.add_reader(self._listener, self._accept, self._listener)
+        self._close_datagrams()
+        if self._carries_datagrams:
+            self._datagrams = self._bound(socket.SOCK_DGRAM)
+            self._loop.add_reader(self._datagrams, self._questions_come, self._datagrams)
 
     def _bound(self, kind: socket.SocketKind = socket.SOCK_STREAM) -> socket.socket:
-        place = self._place
+        place = self.place
         if isinstance(place, Path):
             place.unlink(missing_ok=True)
         bound = socket.socket(_family(place), kind)
@@ -171,28 +182,24 @@ class Proxy:
             raise
         return bound
 
-    async def _add(self, number: int, impairment: Impairment) -> None:
+    async def _change(self, key: object, impairment: Impairment | None) -> None:
+        """Put an impairment on the line, or take it away."""
         was_cut = self._is_cut()
-        self._impairments[number] = impairment
+        if impairment is None:
+            self._impairments.pop(key, None)
+        else:
+            self._impairments[key] = impairment
         self._tell()
-        if impairment.cut and not was_cut:
+        if was_cut and not self._is_cut():
+            await self._listen()
+        elif not was_cut and self._is_cut():
             await self._hang_up()
             # A port that is bound but not listened on refuses connections, and stays reserved.
             self._listener = self._bound()
             if self._carries_datagrams:
                 # Connected to itself, it refuses all other senders.
                 self._datagrams = self._bound(socket.SOCK_DGRAM)
-                self._datagrams.connect(_address(self._place))
-
-    async def _remove(self, number: int) -> None:
-        was_cut = self._is_cut()
-        self._impairments.pop(number, None)
-        self._tell()
-        if was_cut and not self._is_cut():
-            assert self._listener is not None
-            self._open(self._listener)
-            self._close_datagrams()
-            self._open_datagrams()
+                self._datagrams.connect(_address(self.place))
 
     async def _end(self) -> None:
         self._impairments.clear()
@@ -237,10 +244,6 @@ class Proxy:
                 delay_s += each.latency_s + each.jitter_s * self._chance.random()
                 losses += each.loss > 0.0 and self._chance.random() < each.loss
         return delay_s, losses
-
-    def _delay_s(self, direction: Direction) -> float:
-        delay_s, losses = self._fate(direction)
-        return delay_s + losses * _RETRANSMISSION_S
 
     async def _until_heard(self, direction: Direction) -> None:
         while self._is_silent(direction):
@@ -296,6 +299,7 @@ class Proxy:
                 if not piece:
                     break
                 await self._loop.sock_sendall(sink, piece)
+                self.carried[direction] += len(piece)
             with contextlib.suppress(OSError):
                 sink.shutdown(socket.SHUT_WR)
         finally:
@@ -315,18 +319,14 @@ class Proxy:
                 piece = await self._loop.sock_recv(source, _PIECE_BYTES)
             except OSError:
                 piece = b""
+            delay_s, losses = self._fate(direction)
             # No piece overtakes another.
-            due = max(due, self._loop.time() + self._delay_s(direction))
+            due = max(due, self._loop.time() + delay_s + losses * _RETRANSMISSION_S)
             await pieces.put((due, piece))
             if not piece:
                 return
 
     # -- datagrams -------------------------------------------------------------------------------
-
-    def _open_datagrams(self) -> None:
-        if self._carries_datagrams:
-            self._datagrams = self._bound(socket.SOCK_DGRAM)
-            self._loop.add_reader(self._datagrams, self._questions_come, self._datagrams)
 
     def _close_datagrams(self) -> None:
         for each in (*self._clients.values(), *([self._datagrams] if self._datagrams else [])):
@@ -367,6 +367,7 @@ class Proxy:
     ) -> None:
         delay_s, losses = self._fate(direction)
         if not losses and not self._is_silent(direction):
+            self.carried[direction] += len(content)
             self._loop.call_later(delay_s, self._send_datagram, content, sender, address)
 
     @staticmethod
