@@ -9,24 +9,23 @@ from __future__ import annotations
 import contextlib
 import os
 import random
+import secrets
 import signal
 import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from holdfast.lab.errors import CannotStartError, NoProgressError, ProcessEndedError
 from holdfast.lab.testbed.records import LogEvent, log_event_of
 
 __all__ = [
     "HOLDFAST",
-    "Ended",
     "Process",
-    "end_marked_processes",
+    "ProcessGroup",
     "free_port",
     "local_services_of",
     "marked_processes",
@@ -34,6 +33,7 @@ __all__ = [
 
 HOLDFAST = (sys.executable, "-m", "holdfast")
 
+_MARK = "HOLDFAST_TESTBED"
 _SHOWN_CHARACTERS = 300
 _POLL_S = 0.008
 _READER_S = 30.0
@@ -42,12 +42,6 @@ _LOWEST_PORT = 20_000
 _OUTGOING_PORTS = Path("/proc/sys/net/ipv4/ip_local_port_range")
 _USUAL_FIRST_OUTGOING_PORT = 32_768
 _PORT_ATTEMPTS = 1000
-
-
-class Ended(NamedTuple):
-    """A process has ended and all its events are delivered; the code is negative after a signal."""
-
-    code: int
 
 
 class Process:
@@ -60,8 +54,8 @@ class Process:
     ----------
     log_path : Path or None
         Its output is appended to this file.
-    deliver : callable or None
-        Gets each event and the end; called from a thread.
+    changed : threading.Condition or None
+        Notified of each line and of the end; several processes may share it.
     own_session : bool
         Whether it leads a session, so that it may have a terminal of its own.
 
@@ -71,6 +65,8 @@ class Process:
         In seconds since the epoch.
     killed_at : float or None
         When :meth:`kill` was called.
+    exit_code : int or None
+        Negative after a signal; None until it has ended and all its events are here.
 
     Raises
     ------
@@ -85,16 +81,15 @@ class Process:
         *,
         directory: Path | None = None,
         log_path: Path | None = None,
-        deliver: Callable[[Process, LogEvent | Ended], None] | None = None,
+        changed: threading.Condition | None = None,
         own_session: bool = False,
     ) -> None:
         self.log_path = log_path
-        self._deliver = deliver
-        self._changed = threading.Condition()
-        self._has_ended = False
+        self._changed = changed or threading.Condition()
         self.lines: list[str] = []
         self.events: list[LogEvent] = []
         self.killed_at: float | None = None
+        self.exit_code: int | None = None
         self.spawned_at = time.time()
         try:
             self.process = subprocess.Popen(
@@ -179,7 +174,7 @@ class Process:
         with self._changed:
             while len(found := self.matching(name, **fields)) < count:
                 awaited = f"event {name} {fields or ''} (number {count})"
-                if self._has_ended:
+                if self.exit_code is not None:
                     raise ProcessEndedError(f"no {awaited}: {self.account()}")
                 left = deadline - time.monotonic()
                 if left <= 0.0:
@@ -210,10 +205,8 @@ class Process:
                 self._take(line.decode(errors="replace"))
         code = self.process.wait()
         with self._changed:
-            self._has_ended = True
+            self.exit_code = code
             self._changed.notify_all()
-        if self._deliver is not None:
-            self._deliver(self, Ended(code))
 
     def _take(self, line: str) -> None:
         event = log_event_of(line)
@@ -223,8 +216,58 @@ class Process:
             if event is not None:
                 self.events.append(event)
             self._changed.notify_all()
-        if event is not None and self._deliver is not None:
-            self._deliver(self, event)
+
+
+class ProcessGroup:
+    """Processes, and all that they start: a variable, which children inherit, marks them.
+
+    Attributes
+    ----------
+    changed : threading.Condition
+        Notified when one of them writes a line, or has ended.
+    """
+
+    def __init__(self) -> None:
+        self._mark = secrets.token_hex(16)
+        self.processes: list[Process] = []
+        self.changed = threading.Condition()
+
+    def environment(self, variables: Mapping[str, str]) -> dict[str, str]:
+        """Return the environment of a process of this group."""
+        return {**os.environ, _MARK: self._mark, **variables}
+
+    def living(self) -> list[int]:
+        """Return all of them that have not ended, whoever started them."""
+        return marked_processes(_MARK, self._mark)
+
+    def close(self, patience_s: float, orderly_end_s: float = 0.0) -> list[int]:
+        """End all of them, and return those that had to be killed although nobody knew them.
+
+        Parameters
+        ----------
+        patience_s : float
+            How long what they have started has to end by itself, after them.
+        orderly_end_s : float
+            How long they have after SIGTERM; at 0, or by an exception, they are killed at once.
+        """
+        try:
+            if orderly_end_s > 0.0:
+                for process in self.processes:
+                    process.process.terminate()
+                for process in self.processes:
+                    process.close(orderly_end_s)
+        finally:
+            for process in self.processes:
+                process.process.kill()
+            for process in self.processes:
+                process.close(0.0)
+            deadline = time.monotonic() + patience_s
+            while (left := self.living()) and time.monotonic() <= deadline:
+                time.sleep(_POLL_S)
+            for pid in left:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+        return left
 
 
 def free_port() -> int:
@@ -286,16 +329,3 @@ def _state_and_parent(folder: Path) -> tuple[str, int]:
     # The name, in parentheses, may hold anything.
     fields = (folder / "stat").read_text().rpartition(")")[2].split()
     return fields[0], int(fields[1])
-
-
-def end_marked_processes(name: str, value: str, patience_s: float) -> list[int]:
-    """Wait until all :func:`marked_processes` have ended; kill the rest and return them."""
-    deadline = time.monotonic() + patience_s
-    while left := marked_processes(name, value):
-        if time.monotonic() > deadline:
-            for pid in left:
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(pid, signal.SIGKILL)
-            break
-        time.sleep(_POLL_S)
-    return left
