@@ -96,13 +96,8 @@ class Proxy:
         Where the service listens. If nothing does, connections are closed at once.
     datagrams : bool
         Whether it carries datagrams between the same ports, too.
-
-    Attributes
-    ----------
-    carried : dict of str to int
-        Bytes that were carried in each direction, without the headers of TCP or UDP and below.
-    num_datagrams : int
-        Of those that were carried.
+    overhear : callable
+        Gets what is carried, a piece of a stream or a datagram, and which way; in another thread.
 
     Raises
     ------
@@ -110,8 +105,17 @@ class Proxy:
         If it cannot listen.
     """
 
-    def __init__(self, place: Place, target: Place, seed: str, *, datagrams: bool = False) -> None:
+    def __init__(
+        self,
+        place: Place,
+        target: Place,
+        seed: str,
+        *,
+        datagrams: bool = False,
+        overhear: Callable[[Carrier, Direction, bytes], object] = lambda *_: None,
+    ) -> None:
         self.place = place
+        self._overhear = overhear
         self._target = target
         self._chance = random.Random(seed)
         self._impairments: dict[object, Impairment] = {}
@@ -126,8 +130,6 @@ class Proxy:
         self._changed = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name=f"proxy-{place}", daemon=True)
         self._thread.start()
-        self.carried: dict[Direction, int] = {"to_service": 0, "to_robot": 0}
-        self.num_datagrams = 0
         try:
             self._call(self._open())
         except OSError as error:
@@ -331,8 +333,8 @@ class Proxy:
                 await self._until_heard(direction)
                 if not piece:
                     break
+                self._overhear("streams", direction, piece)
                 await self._loop.sock_sendall(sink, piece)
-                self.carried[direction] += len(piece)
             with contextlib.suppress(OSError):
                 sink.shutdown(socket.SHUT_WR)
         finally:
@@ -415,8 +417,7 @@ class Proxy:
         delay_s, losses = self._fate("datagrams", direction)
         if losses or self._is_silent("datagrams", direction):
             return
-        self.carried[direction] += len(content)
-        self.num_datagrams += 1
+        self._overhear("datagrams", direction, content)
         for _ in range(1 + any(each.doubled for each in self._active("datagrams", direction))):
             self._loop.call_later(delay_s, self._send_datagram, content, sender, address)
 
