@@ -7,6 +7,7 @@ a caller may wait for an event, or hand in a function that gets each event and t
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import random
 import secrets
@@ -17,6 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 
 from holdfast.lab.errors import CannotStartError, NoProgressError, ProcessEndedError
@@ -24,6 +26,7 @@ from holdfast.lab.testbed.records import LogEvent, log_event_of
 
 __all__ = [
     "HOLDFAST",
+    "Ports",
     "Process",
     "ProcessGroup",
     "free_port",
@@ -41,7 +44,6 @@ _READER_S = 30.0
 _LOWEST_PORT = 20_000
 _OUTGOING_PORTS = Path("/proc/sys/net/ipv4/ip_local_port_range")
 _USUAL_FIRST_OUTGOING_PORT = 32_768
-_PORT_ATTEMPTS = 1000
 
 
 class Process:
@@ -270,33 +272,51 @@ class ProcessGroup:
         return left
 
 
-def free_port() -> int:
-    """Return a port of this machine that is free for streams and datagrams.
+class Ports:
+    """A range of ports, taken one after another from a random one on: none is taken again soon."""
 
-    It is outside the range from which the system takes ports for outgoing connections: otherwise a
-    connection attempt to a service that is away could get the service's own port and connect to
-    itself.
+    def __init__(self, first: int, end: int) -> None:
+        self._first = first
+        self._size = end - first
+        # A run that begins when another one has just ended begins elsewhere.
+        self._numbers = itertools.count(random.SystemRandom().randrange(self._size))
 
-    Raises
-    ------
-    CannotStartError
-        If there is none.
+    def free(self, host: str = "127.0.0.1") -> int:
+        """Return a port that is free for streams and datagrams.
+
+        Raises
+        ------
+        CannotStartError
+            If there is none.
+        """
+        for number in itertools.islice(self._numbers, self._size):
+            port = self._first + number % self._size
+            with contextlib.suppress(OSError):
+                for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
+                    with socket.socket(type=kind) as probe:
+                        probe.bind((host, port))
+                return port
+        end = self._first + self._size - 1
+        raise CannotStartError(f"no port of {host} from {self._first} to {end} is free")
+
+
+@cache
+def _own_ports() -> Ports:
+    """Return those below the range from which the system takes ports for outgoing connections.
+
+    From within it a connection attempt to a service that is away could get the service's own port
+    and connect to itself.
     """
     try:
         end = int(_OUTGOING_PORTS.read_text().split()[0])
     except (OSError, ValueError, IndexError):
         end = _USUAL_FIRST_OUTGOING_PORT
-    if end <= _LOWEST_PORT:
-        end = _USUAL_FIRST_OUTGOING_PORT
-    chance = random.SystemRandom()
-    for _ in range(_PORT_ATTEMPTS):
-        port = chance.randrange(_LOWEST_PORT, end)
-        with contextlib.suppress(OSError):
-            for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
-                with socket.socket(type=kind) as probe:
-                    probe.bind(("127.0.0.1", port))
-            return port
-    raise CannotStartError(f"no port of 127.0.0.1 from {_LOWEST_PORT} to {end - 1} is free")
+    return Ports(_LOWEST_PORT, end if end > _LOWEST_PORT else _USUAL_FIRST_OUTGOING_PORT)
+
+
+def free_port() -> int:
+    """Return a port of this machine that is free for streams and datagrams."""
+    return _own_ports().free()
 
 
 def local_services_of(robot: int) -> list[int]:
