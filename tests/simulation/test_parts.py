@@ -220,7 +220,8 @@ class TestWireChecker:
         checker = WireChecker()
         for call, epoch in ((1, 1), (2, 2)):
             checker.requested(call, request(epoch))
-            checker.arrived("cloud-1", 1, call, request(epoch))
+            checker.arrived("cloud-1", 1, call)
+            checker.taken("cloud-1", 1, call, request(epoch))
         checker.replied("cloud-1", 1, 2, reply(1))
         checker.replied("cloud-1", 1, 1, reply(6))  # to refuse it is right
         with pytest.raises(Violation, match="of epoch 1, after one of epoch 2"):
@@ -229,7 +230,8 @@ class TestWireChecker:
     def test_a_damaged_request_is_not_answered(self) -> None:
         checker = WireChecker()
         checker.requested(1, request(1))
-        checker.arrived("cloud-1", 1, 1, request(3))
+        checker.arrived("cloud-1", 1, 1)
+        checker.taken("cloud-1", 1, 1, request(3))
         checker.replied("cloud-1", 1, 1, reply(6))
         with pytest.raises(Violation, match="which was damaged"):
             checker.replied("cloud-1", 1, 1, reply(2))
@@ -237,7 +239,8 @@ class TestWireChecker:
     def test_an_end_is_the_end(self) -> None:
         checker = WireChecker()
         checker.requested(1, request(1))
-        checker.arrived("cloud-1", 1, 1, request(1))
+        checker.arrived("cloud-1", 1, 1)
+        checker.taken("cloud-1", 1, 1, request(1))
         checker.ended("cloud-1", 1)
         with pytest.raises(Violation, match="after its end"):
             checker.replied("cloud-1", 1, 1, reply(1))
@@ -252,14 +255,16 @@ class TestWireChecker:
         with pytest.raises(Violation, match="that it has not ended"):
             for call in range(1000):
                 checker.requested(call, request(1))
-                checker.arrived("cloud-1", 1, call, request(1))
+                checker.arrived("cloud-1", 1, call)
+                checker.taken("cloud-1", 1, call, request(1))
 
     def test_other_robots_have_epochs_of_their_own(self) -> None:
         checker = WireChecker()
         other = bytes(msgspec.msgpack.encode([2, b"t", 1, 1])) + b"sum!"
         for call, payload in ((1, request(7)), (2, other)):
             checker.requested(call, payload)
-            checker.arrived("cloud-1", 1, call, payload)
+            checker.arrived("cloud-1", 1, call)
+            checker.taken("cloud-1", 1, call, payload)
             checker.replied("cloud-1", 1, call, reply(1))
 
 

@@ -347,7 +347,7 @@ class Network:
             self.messages += 1
             original, key = key, self.messages if call is None else self._key(call)
             self._checker.copied(original, key)
-        self._checker.arrived(service.name, incarnation, key, payload)
+        self._checker.arrived(service.name, incarnation, key)
         service.receive(incarnation, key, payload, owner)
 
     def _reply_arrives(self, payload: bytes, key: int) -> None:

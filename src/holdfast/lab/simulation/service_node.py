@@ -114,6 +114,7 @@ class ServiceNode:
             return
         if not self._is_later(self.receive, incarnation, call, payload, owner):
             assert self.machine is not None
+            self._world.checker.taken(self.name, incarnation, call, payload)
             self._carry_out(self.machine.receive(call, payload, self._clock.now(), owner))
 
     def _carry_out(self, effects: list[ServiceEffect]) -> None:
