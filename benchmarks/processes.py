@@ -1,16 +1,12 @@
-"""Services as processes of their own, what they use of the machine, and what crosses their wire."""
+"""Services as processes of their own, and what they use of the machine."""
 
 from __future__ import annotations
 
-import contextlib
 import os
-import socket
 import statistics
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +14,6 @@ from holdfast.lab.testbed.driver import ServiceCommand
 from holdfast.lab.testbed.processes import HOLDFAST, Process, free_port
 
 __all__ = [
-    "CountingProxy",
     "EchoProcess",
     "ServiceProcess",
     "Usage",
@@ -108,7 +103,8 @@ class ServiceProcess(ServiceCommand):
 
     def __init__(self, *options: str, protocol: str = "tcp") -> None:
         self._options = options
-        super().__init__(self._started, f"{protocol}/127.0.0.1:{free_port()}")
+        port = free_port()
+        super().__init__(self._started, f"{protocol}/127.0.0.1:{port}", port)
 
     @property
     def process_ids(self) -> list[int]:
@@ -163,75 +159,3 @@ class EchoProcess:
     def __exit__(self, *_: object) -> None:
         self._process.kill()
         self._process.communicate()
-
-
-class CountingProxy:
-    """Passes a TCP connection on, and counts its bytes.
-
-    Parameters
-    ----------
-    endpoint : str
-        To which connections are passed on.
-
-    Attributes
-    ----------
-    port : int
-        Where it listens itself.
-    to_service, to_robot : int
-        Bytes so far: what TCP carries, without the headers of TCP and below.
-    """
-
-    def __init__(self, endpoint: str) -> None:
-        self._target = int(endpoint.rpartition(":")[2])
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self.port = int(self._listener.getsockname()[1])
-        self.to_service = self.to_robot = 0
-        self._sockets: list[socket.socket] = [self._listener]
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    @property
-    def endpoint(self) -> str:
-        """Where robots find it."""
-        return f"tcp/127.0.0.1:{self.port}"
-
-    @property
-    def total(self) -> int:
-        """Bytes both ways."""
-        return self.to_service + self.to_robot
-
-    def __enter__(self) -> CountingProxy:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for each in self._sockets:
-            # The pumps are in a call of these sockets; this lets them go.
-            with contextlib.suppress(OSError):
-                each.shutdown(socket.SHUT_RDWR)
-            each.close()
-
-    def _accept(self) -> None:
-        with contextlib.suppress(OSError):
-            while True:
-                robot, _ = self._listener.accept()
-                service = socket.create_connection(("127.0.0.1", self._target))
-                for each in (robot, service):
-                    each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                    self._sockets.append(each)
-                for ends in ((robot, service, True), (service, robot, False)):
-                    threading.Thread(target=self._pump, args=ends, daemon=True).start()
-
-    def _pump(self, source: socket.socket, sink: socket.socket, upwards: bool) -> None:
-        with contextlib.suppress(OSError):
-            for data in _pieces(source):
-                if upwards:
-                    self.to_service += len(data)
-                else:
-                    self.to_robot += len(data)
-                sink.sendall(data)
-        with contextlib.suppress(OSError):
-            sink.shutdown(socket.SHUT_RDWR)
-
-
-def _pieces(source: socket.socket) -> Iterator[bytes]:
-    while data := source.recv(65536):
-        yield data

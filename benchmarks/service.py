@@ -6,12 +6,14 @@ Everything is on loopback, and what is compared runs in turns. The robots are th
 
 from __future__ import annotations
 
+import contextlib
 import json
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +24,6 @@ from benchmarks.common import Context
 from benchmarks.echo import ECHO_BYTES, EchoClient
 from benchmarks.measure import without_collection
 from benchmarks.processes import (
-    CountingProxy,
     EchoProcess,
     ServiceProcess,
     pipe_round_trip_s,
@@ -31,6 +32,8 @@ from benchmarks.processes import (
 from benchmarks.report import Bar, Result, Table, milliseconds, paragraph
 from benchmarks.robots import Notebook, configuration_for, run_robot
 from benchmarks.turns import Asker, decided_in_process, recorded_turns
+from holdfast.lab.testbed.processes import free_port
+from holdfast.lab.testbed.proxy import Proxy
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner, digest, encode_checkpoint
 from holdfast.protocol.messages import DIGEST_SIZE, encode_floats
@@ -432,8 +435,8 @@ def wire(context: Context) -> Result:
         for done, num_particles in enumerate(sizes):
             own = Path(directory) / str(num_particles)
             own.mkdir()
-            with CountingProxy(service.endpoint) as proxy:
-                counted, up, seconds = _bytes_per_turn(own, num_particles, proxy)
+            with _counting_proxy(service) as (endpoint, carried):
+                counted, up, seconds = _bytes_per_turn(own, num_particles, endpoint, carried)
             median, rare = _quantiles(counted)
             rows.append(
                 [
@@ -456,14 +459,16 @@ def wire(context: Context) -> Result:
                 )
             )
             context.progress((done + 1) / (len(sizes) + 1))
-        with CountingProxy(service.endpoint) as proxy:
+        with _counting_proxy(service) as (endpoint, carried):
             configuration = configuration_for(Path(directory), num_trials=1)
             with Asker(
-                proxy.endpoint, session_configuration_of(configuration), b"only looks on..."
+                endpoint,
+                session_configuration_of(configuration),
+                b"only looks on...",
             ) as asker:
-                before = proxy.total
+                before = carried.total()
                 asker.pause(idle_s)
-                keep_alive = (proxy.total - before) / idle_s
+                keep_alive = (carried.total() - before) / idle_s
     return Result(
         [
             paragraph(
@@ -490,20 +495,34 @@ def wire(context: Context) -> Result:
     )
 
 
+@contextlib.contextmanager
+def _counting_proxy(service: ServiceProcess) -> Iterator[tuple[str, Counter[str]]]:
+    """Yield the endpoint of a proxy before a service, and the bytes that it carries each way."""
+    carried: Counter[str] = Counter()
+    proxy = Proxy(
+        free_port(),
+        service.port,
+        "wire",
+        overhear=lambda _, way, piece: carried.update({way: len(piece)}),
+    )
+    with proxy:
+        yield f"tcp/127.0.0.1:{proxy.place}", carried
+
+
 def _bytes_per_turn(
-    directory: Path, num_particles: int, proxy: CountingProxy
+    directory: Path, num_particles: int, endpoint: str, carried: Counter[str]
 ) -> tuple[list[float], list[float], list[float]]:
     """Return the bytes of each sensing step both ways and upwards, and the seconds of each."""
     configuration = configuration_for(
         directory,
         num_trials=4 if num_particles < 10_000 else 2,
-        services=(proxy.endpoint,),
+        services=(endpoint,),
         num_particles=num_particles,
     )
     notebook = Notebook()
     cuts: list[tuple[int, int, float]] = []
     notebook.on_decided = lambda timing: (
-        cuts.append((proxy.total, proxy.to_service, time.monotonic()))
+        cuts.append((carried.total(), carried["to_service"], time.monotonic()))
         if timing.kind == "sensing"
         else None
     )

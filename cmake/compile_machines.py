@@ -28,7 +28,6 @@ INTERPRETED = {
     "protocol/events.py",
     "protocol/status.py",
     "protocol/verification.py",
-    "lab/simulation/shrinking.py",
     "lab/simulation/story.py",
 }
 

@@ -8,10 +8,9 @@ chooses from, each worker of pytest-xdist its own, one after another.
 
 from __future__ import annotations
 
-import itertools
 import os
-import random
-import socket
+
+from holdfast.lab.testbed.processes import Ports
 
 FIRST, END = 10_000, 20_000
 """Linux chooses from 32768 on, unless it is told otherwise; chaos trials from 20000 on."""
@@ -19,21 +18,7 @@ FIRST, END = 10_000, 20_000
 WORKERS = 4
 """So many of them share no port."""
 
-_size = (END - FIRST) // WORKERS
-_block = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")) % WORKERS
-# A run that begins when another one has just ended begins elsewhere.
-_numbers = itertools.count(random.SystemRandom().randrange(_size))
+_SIZE = (END - FIRST) // WORKERS
+_BLOCK = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")) % WORKERS
 
-
-def free_port(host: str = "127.0.0.1") -> int:
-    """Return a port at which nobody listens, for streams or datagrams, nor soon will."""
-    for number in itertools.islice(_numbers, _size):
-        port = FIRST + _block * _size + number % _size
-        try:
-            for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
-                with socket.socket(type=kind) as probe:
-                    probe.bind((host, port))
-        except OSError:
-            continue
-        return port
-    raise RuntimeError(f"no port of {host} is free in this worker's block")
+free_port = Ports(FIRST + _BLOCK * _SIZE, FIRST + (_BLOCK + 1) * _SIZE).free

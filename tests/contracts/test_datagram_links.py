@@ -16,10 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.contracts.wires import LEASE_MS, Inbox, Received, StreamWire, echo, until
 from tests.ports import free_port
-from tests.relay import Relay, relay
 
 from holdfast.errors import TransportError
-from holdfast.lab.testbed.proxy import Direction, Impairment, Proxy
+from holdfast.lab.testbed.proxy import Carrier, Direction, Impairment, Proxy
 from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared, ServiceVanished
 from holdfast.transport import datagram_cipher
 from holdfast.transport import datagram_links as datagram_links
@@ -349,13 +348,16 @@ class TestStrangers:
         asyncio.run(run())
 
 
+STREAM: tuple[Carrier, ...] = ("streams",)
+DATAGRAMS: tuple[Carrier, ...] = ("datagrams",)
+
+
 class Line(NamedTuple):
     """A robot and its service, and what carries the stream and the datagrams between them."""
 
     robot: StreamRobotTransport
     inbox: Inbox
-    stream: Proxy
-    datagrams: Relay
+    proxy: Proxy
 
 
 @contextlib.asynccontextmanager
@@ -367,11 +369,11 @@ async def on_a_line(
     _, target = place_of(wire)
     entry = free_port()
     wire._endpoints["cloud"] = f"udp/127.0.0.1:{entry}"
-    with Proxy(entry, target, "seed") as stream, relay(entry, target) as datagrams:
+    with Proxy(entry, target, "seed", datagrams=True) as proxy:
         robot, inbox = wire.robot("cloud"), Inbox()
         robot.start(inbox)
         await until(lambda: robot.sends_datagrams("cloud"))
-        yield Line(robot, inbox, stream, datagrams)
+        yield Line(robot, inbox, proxy)
         await robot.close()
 
 
@@ -388,11 +390,11 @@ class TestEnds:
         self, udp: StreamWire
     ) -> None:
         calls = Received()
-        async with on_a_line(udp, calls) as (robot, inbox, stream, _):
+        async with on_a_line(udp, calls) as (robot, inbox, proxy):
             link = link_of(robot)
             robot.call("cloud", 1, b"in the middle")
             first = await calls.next()
-            heal = await asyncio.to_thread(stream.impair, Impairment(cut=True))
+            heal = await asyncio.to_thread(proxy.impair, Impairment(cut=True, carriers=STREAM))
             await until(lambda: link.without_stream)
             robot.call("cloud", 2, b"without a stream")
             second = await calls.next()
@@ -416,10 +418,10 @@ class TestEnds:
     ) -> None:
         """For several leases neither end hears the other one on the stream, and nobody asks."""
         udp.lease_ms = 500.0
-        async with on_a_line(udp) as (robot, inbox, stream, _):
+        async with on_a_line(udp) as (robot, inbox, proxy):
             link = link_of(robot)
-            silent = Impairment(direction=direction, silent=True)
-            heal = await asyncio.to_thread(stream.impair, silent)
+            silent = Impairment(direction=direction, silent=True, carriers=STREAM)
+            heal = await asyncio.to_thread(proxy.impair, silent)
             await asyncio.sleep(1.5)
             await answers(robot, inbox, 1)
             await asyncio.to_thread(heal)
@@ -453,12 +455,12 @@ class TestEnds:
 
     async def test_adrift_it_is_lost_when_nothing_comes(self, udp: StreamWire) -> None:
         udp.lease_ms = LEASE_MS
-        async with on_a_line(udp) as (robot, inbox, stream, datagrams):
+        async with on_a_line(udp) as (robot, inbox, proxy):
             link = link_of(robot)
-            await asyncio.to_thread(stream.impair, Impairment(cut=True))
+            await asyncio.to_thread(proxy.impair, Impairment(cut=True, carriers=STREAM))
             await until(lambda: link.without_stream)
             await answers(robot, inbox, 1)
-            datagrams.close()
+            await asyncio.to_thread(proxy.impair, Impairment(cut=True, carriers=DATAGRAMS))
             await inbox.wait_for(ServiceVanished("cloud", "b1"))
             robot.call("cloud", 2, b"nobody is there")
             assert await inbox.of_call(2) == [CallEnded(2)]
@@ -466,10 +468,11 @@ class TestEnds:
     async def test_a_port_that_is_closed_is_a_service_that_is_gone(self, udp: StreamWire) -> None:
         """Although its stream, held open by a line that has fallen silent, says nothing."""
         udp.lease_ms = 3.6e6
-        async with on_a_line(udp) as (robot, inbox, stream, datagrams):
+        async with on_a_line(udp) as (robot, inbox, proxy):
             await at_rest(link_of(robot))
-            await asyncio.to_thread(stream.impair, Impairment(silent=True))
-            await asyncio.to_thread(datagrams.close)  # from now on the system answers
+            await asyncio.to_thread(proxy.impair, Impairment(silent=True, carriers=STREAM))
+            # From now on the system answers.
+            await asyncio.to_thread(proxy.impair, Impairment(cut=True, carriers=DATAGRAMS))
             cipher = link_of(robot)._cipher
             assert cipher is not None
             before = cipher._counter
@@ -484,8 +487,7 @@ class TestEnds:
         await udp.service("cloud", "b1").start(echo)
         _, target = place_of(udp)
         entry = free_port()
-        with Proxy(entry, target, "seed"), contextlib.ExitStack() as lines:
-            line = lines.enter_context(relay(entry, target))
+        with Proxy(entry, target, "seed", datagrams=True) as proxy:
             robot = StreamRobotTransport(
                 {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")}, tls=robot_tls, lease_ms=3.6e6
             )
@@ -499,12 +501,13 @@ class TestEnds:
             await at_rest(link)
             ours = link._socket
             assert ours is not None
-            await asyncio.to_thread(line.close)
+            closed = Impairment(cut=True, carriers=DATAGRAMS)
+            heal = await asyncio.to_thread(proxy.impair, closed)
             header = link._sent[-1][:8]
             for unlike in (b"", header, header + bytes(24), bytes(1200)):
                 ours.send(unlike)  # the system's answer quotes it
                 await until(lambda: not select.select([ours], [], [], 0.0)[0])
-            lines.enter_context(relay(entry, target))
+            await asyncio.to_thread(heal)
             await answers(robot, inbox, 2)
             assert link_of(robot) is link
             assert ServiceVanished("cloud", "b1") not in inbox

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import secrets
 import select
 import signal
 import sys
@@ -61,8 +60,6 @@ COMMAND = (
     "-c",
     "import sys; sys.modules['matplotlib'] = None; from holdfast.cli import main; main()",
 )
-
-_MARK = "HOLDFAST_TEST_SITE"
 
 
 def in_order(*hooks: Hook) -> Hook:
@@ -215,8 +212,7 @@ class Site:
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
-        self._mark = secrets.token_hex(16)
-        self._processes: list[Process] = []
+        self._group = lab.ProcessGroup()
         self._open: list[World | Gate] = []
         self.robot: Robot | None = None
 
@@ -224,23 +220,17 @@ class Site:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        failures: list[BaseException] = []
         try:
-            for process in self._processes:
-                if process.process.poll() is None:
-                    process.process.kill()
-            for process in self._processes:
-                process.wait()
             # What a robot that was killed has started ends by itself.
-            self.wait_for_nobody()
+            left = self._group.close(PATIENCE_S)
         finally:
-            for pid in self.left_behind():
-                os.kill(pid, signal.SIGKILL)
-            failures = []
             for each in self._open:
                 try:
                     each.close()
                 except BaseException as error:  # noqa: BLE001 - all of them are closed first
                     failures.append(error)
+        assert left == []
         if failures:
             raise failures[0]
 
@@ -248,11 +238,11 @@ class Site:
 
     def environment(self, variables: Mapping[str, str] | None = None) -> dict[str, str]:
         """Return the environment variables of the test's processes."""
-        return {**os.environ, _MARK: self._mark, **(variables or {})}
+        return self._group.environment(variables or {})
 
     def process(self, *command: str, variables: Mapping[str, str] | None = None) -> Process:
         started = Process(command, self.environment(variables), self.directory)
-        self._processes.append(started)
+        self._group.processes.append(started)
         return started
 
     def holdfast(self, *arguments: str | Path) -> Process:
@@ -263,7 +253,7 @@ class Site:
 
     def left_behind(self) -> list[int]:
         """Return all processes that were started here, by whomever, and have not ended."""
-        return lab.marked_processes(_MARK, self._mark)
+        return self._group.living()
 
     def wait_for_nobody(self, *but: Service) -> None:
         """Wait until no process is left but these."""
@@ -302,7 +292,7 @@ class Site:
             words.append("--resume")
         robot = Robot([*command, *words], self.environment(variables), self.directory)
         robot.out = self.directory / out
-        self._processes.append(robot)
+        self._group.processes.append(robot)
         self.robot = robot
         return robot
 

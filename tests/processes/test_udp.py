@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,6 @@ from tests.processes.faults import (
     document_of,
     sensing_steps,
 )
-from tests.relay import relay
 
 from holdfast.lab.testbed.proxy import Impairment, Proxy
 from holdfast.protocol.events import CallEnded, ServiceVanished
@@ -65,12 +65,19 @@ def test_datagrams_that_come_twice_and_again_later(
     entry = free_port()
     document = document_of(PEG)
     story = Story(site, references, document)
-    with Proxy(entry, port_of(cloud), "twice"), relay(entry, port_of(cloud)) as between:
-        between.repeat = True
+    carried: Counter[str] = Counter()
+    with Proxy(
+        entry,
+        port_of(cloud),
+        "twice",
+        datagrams=True,
+        overhear=lambda carrier, way, _: carried.update((f"{carrier} {way}",)),
+    ) as between:
+        between.impair(Impairment(doubled=True))
         for step in sensing_steps(document)[2:]:
             story.at("perform", step, between.replay)
         robot = story.run(f"udp/127.0.0.1:{entry}", options=credentials)
-        assert between.carried["to_service"] > len(sensing_steps(document))
+        assert carried["datagrams to_service"] > len(sensing_steps(document))
     assert robot.statuses() == []
     assert len(cloud.process.matching("session_opened")) == 1
 
@@ -83,25 +90,29 @@ def test_a_robot_whose_address_changes(
     document = document_of(PEG)
     steps = sensing_steps(document)
     story = Story(site, references, document)
-    with (
-        Proxy(entry, port_of(cloud), "address") as stream,
-        relay(entry, port_of(cloud)) as datagrams,
-    ):
-        healed = []
+    carried: Counter[str] = Counter()
+    with Proxy(
+        entry,
+        port_of(cloud),
+        "address",
+        datagrams=True,
+        overhear=lambda carrier, *_: carried.update((carrier,)),
+    ) as line:
+        healed, moves = [], []
 
         def move() -> None:
-            healed.append(stream.impair(Impairment(cut=True)))
-            datagrams.change_address()
+            healed.append(line.impair(Impairment(cut=True, carriers=("streams",))))
+            line.change_address()
+            moves.append(carried["datagrams"])
 
         story.at("perform", steps[1] + 1, move)
-        before = datagrams.carried
-        story.at("perform", steps[3] + 1, lambda: before.update(datagrams.carried))
         story.at("perform", steps[4] + 1, lambda: healed.pop()())
         story.at("perform", steps[5] + 1, lambda: cloud.process.wait_for("robot_connected", 2))
         # Two answers later the robot has the keys of the new link, too.
         story.at("perform", steps[7] + 1, move)
         robot = story.run(f"udp/127.0.0.1:{entry}", options=credentials)
-        assert datagrams.addresses == 3
+        first, second = moves
+        assert first < second < carried["datagrams"]
     assert robot.statuses() == []
     assert len(robot.matching("service_appeared")) == 1
     assert robot.matching("service_lost") == []

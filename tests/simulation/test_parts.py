@@ -10,15 +10,16 @@ from holdfast.config.settings import PlanningSettings
 from holdfast.lab.errors import Violation
 from holdfast.lab.simulation.checkers import StatusChecker, WireChecker, check_size
 from holdfast.lab.simulation.disk import Disk
-from holdfast.lab.simulation.environment_model import EnvironmentModel
-from holdfast.lab.simulation.event_queue import Clock, EventQueue
-from holdfast.lab.simulation.memo_cache import MemoizingPlanner
-from holdfast.lab.simulation.reference_runs import (
+from holdfast.lab.simulation.environment_model import (
+    EnvironmentModel,
     ReferenceRun,
     ReferenceRuns,
     ReferenceStep,
     Repeats,
 )
+from holdfast.lab.simulation.event_queue import Clock, EventQueue
+from holdfast.lab.simulation.exploration import shrink
+from holdfast.lab.simulation.memo_cache import MemoizingPlanner
 from holdfast.lab.simulation.schedule import (
     Crash,
     MessageFault,
@@ -27,33 +28,32 @@ from holdfast.lab.simulation.schedule import (
     Stop,
 )
 from holdfast.lab.simulation.schedule_draws import draw_schedule
-from holdfast.lab.simulation.shrinking import shrink
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner, PlanningState
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.records import ActingRecord, PerformedRecord, TrialHistory
 
 
-class TestAgenda:
+class TestEventQueue:
     def test_order(self) -> None:
-        agenda = EventQueue()
+        queue = EventQueue()
         seen: list[str] = []
-        agenda.after(2.0, seen.append, "c")
-        agenda.after(1.0, seen.append, "a")
-        agenda.at(1.0, seen.append, "b")
-        agenda.at(-5.0, seen.append, "first")
-        while agenda.step():
+        queue.after(2.0, seen.append, "c")
+        queue.after(1.0, seen.append, "a")
+        queue.at(1.0, seen.append, "b")
+        queue.at(-5.0, seen.append, "first")
+        while queue.step():
             pass
         assert seen == ["first", "a", "b", "c"]
-        assert agenda.now == 2.0
+        assert queue.now == 2.0
 
     def test_clocks(self) -> None:
-        agenda = EventQueue()
-        clock = Clock(agenda, 1e6, 0.97)
+        queue = EventQueue()
+        clock = Clock(queue, 1e6, 0.97)
         assert clock.now() == 1e6
         due = clock.now() + 0.25
-        agenda.after(clock.until(due), lambda: None)
-        agenda.step()
+        queue.after(clock.until(due), lambda: None)
+        queue.step()
         assert clock.now() == pytest.approx(due, abs=1e-9)
         assert clock.reached(due) >= due
         assert clock.now() >= due, "a clock does not go back"
@@ -220,7 +220,8 @@ class TestWireChecker:
         checker = WireChecker()
         for call, epoch in ((1, 1), (2, 2)):
             checker.requested(call, request(epoch))
-            checker.arrived("cloud-1", 1, call, request(epoch))
+            checker.arrived("cloud-1", 1, call)
+            checker.taken("cloud-1", 1, call, request(epoch))
         checker.replied("cloud-1", 1, 2, reply(1))
         checker.replied("cloud-1", 1, 1, reply(6))  # to refuse it is right
         with pytest.raises(Violation, match="of epoch 1, after one of epoch 2"):
@@ -229,7 +230,8 @@ class TestWireChecker:
     def test_a_damaged_request_is_not_answered(self) -> None:
         checker = WireChecker()
         checker.requested(1, request(1))
-        checker.arrived("cloud-1", 1, 1, request(3))
+        checker.arrived("cloud-1", 1, 1)
+        checker.taken("cloud-1", 1, 1, request(3))
         checker.replied("cloud-1", 1, 1, reply(6))
         with pytest.raises(Violation, match="which was damaged"):
             checker.replied("cloud-1", 1, 1, reply(2))
@@ -237,7 +239,8 @@ class TestWireChecker:
     def test_an_end_is_the_end(self) -> None:
         checker = WireChecker()
         checker.requested(1, request(1))
-        checker.arrived("cloud-1", 1, 1, request(1))
+        checker.arrived("cloud-1", 1, 1)
+        checker.taken("cloud-1", 1, 1, request(1))
         checker.ended("cloud-1", 1)
         with pytest.raises(Violation, match="after its end"):
             checker.replied("cloud-1", 1, 1, reply(1))
@@ -252,14 +255,16 @@ class TestWireChecker:
         with pytest.raises(Violation, match="that it has not ended"):
             for call in range(1000):
                 checker.requested(call, request(1))
-                checker.arrived("cloud-1", 1, call, request(1))
+                checker.arrived("cloud-1", 1, call)
+                checker.taken("cloud-1", 1, call, request(1))
 
     def test_other_robots_have_epochs_of_their_own(self) -> None:
         checker = WireChecker()
         other = bytes(msgspec.msgpack.encode([2, b"t", 1, 1])) + b"sum!"
         for call, payload in ((1, request(7)), (2, other)):
             checker.requested(call, payload)
-            checker.arrived("cloud-1", 1, call, payload)
+            checker.arrived("cloud-1", 1, call)
+            checker.taken("cloud-1", 1, call, payload)
             checker.replied("cloud-1", 1, call, reply(1))
 
 

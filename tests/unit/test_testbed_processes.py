@@ -9,21 +9,18 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from queue import SimpleQueue
 
 import pytest
 
 from holdfast.lab.errors import CannotStartError, NoProgressError, ProcessEndedError
 from holdfast.lab.testbed.processes import (
     HOLDFAST,
-    Ended,
     Process,
-    end_marked_processes,
+    ProcessGroup,
     free_port,
     local_services_of,
     marked_processes,
 )
-from holdfast.lab.testbed.records import LogEvent
 
 PATIENCE_S = 30.0
 
@@ -38,12 +35,11 @@ def test_ports_are_free_and_not_given_to_connections() -> None:
 
 
 def test_output_and_end(tmp_path: Path) -> None:
-    happened: SimpleQueue[LogEvent | Ended] = SimpleQueue()
     command = ("env", "-u", "HOLDFAST_SIMD", *HOLDFAST, "--version")
     log_path = tmp_path / "log"
-    process = Process(command, log_path=log_path, deliver=lambda _, each: happened.put(each))
-    assert happened.get(timeout=PATIENCE_S) == Ended(0)
+    process = Process(command, log_path=log_path)
     assert process.close(PATIENCE_S) == 0
+    assert process.exit_code == 0
     assert process.last_line().startswith("holdfast ")
     assert log_path.read_text() == f"{process.last_line()}\n"
     with pytest.raises(CannotStartError, match="absent cannot be started: No such file"):
@@ -168,11 +164,12 @@ class TestFound:
         assert marked.returncode == -signal.SIGKILL
 
     def test_and_ended(self) -> None:
-        name = "HOLDFAST_TEST_MARK"
-        assert end_marked_processes(name, "nobody", 0.0) == []
-        marked = self.start(**{name: "def"})
-        other = self.start(**{name: "other"})
-        assert end_marked_processes(name, "def", 0.0) == [marked.pid]
+        group, others = ProcessGroup(), ProcessGroup()
+        assert group.close(0.0) == []
+        marked = self.start(**group.environment({}))
+        other = self.start(**others.environment({}))
+        assert group.living() == [marked.pid]
+        assert group.close(0.0) == [marked.pid]
         self.end(marked)
         self.end(other)
         assert marked.returncode == -signal.SIGKILL

@@ -378,6 +378,57 @@ class TestDatagrams:
             client.send(b"two")
             assert client.recv(100) == b"two"
 
+    def test_streams_and_datagrams_are_cut_apart(self, datagram_echo: DatagramEcho) -> None:
+        port = free_port()
+        heard: list[tuple[str, str, bytes]] = []
+        proxy = Proxy(
+            port,
+            datagram_echo.port,
+            "seed",
+            datagrams=True,
+            overhear=lambda *each: heard.append(each),
+        )
+        with proxy, client_of(port) as client:
+            proxy.impair(Impairment(cut=True, carriers=("streams",)))
+            with pytest.raises(ConnectionRefusedError):
+                socket.create_connection(("127.0.0.1", port))
+            client.send(b"heard")
+            assert client.recv(100) == b"heard"
+            proxy.impair(Impairment(cut=True, carriers=("datagrams",)))
+            client.send(b"lost")
+            with pytest.raises(ConnectionRefusedError):
+                client.recv(100)
+        assert heard == [("datagrams", way, b"heard") for way in ("to_service", "to_robot")]
+
+    def test_they_come_twice_again_and_from_elsewhere(self) -> None:
+        port = free_port()
+        with (
+            socket.socket(type=socket.SOCK_DGRAM) as service,
+            datagram_line(port, bound_port(service), 0.0, 0.0) as proxy,
+            client_of(port) as client,
+        ):
+            heal = proxy.impair(Impairment(doubled=True))
+            client.send(b"one")
+            one, again = service.recvfrom(100), service.recvfrom(100)
+            assert one == again
+            heal()
+            proxy.replay()
+            content, stranger = service.recvfrom(100)
+            assert content == b"one"
+            proxy.change_address()
+            client.send(b"two")
+            content, moved = service.recvfrom(100)
+            assert content == b"two"
+            assert len({one[1], stranger, moved}) == 3
+            service.sendto(b"answer", moved)
+            assert client.recv(100) == b"answer"
+
+
+def bound_port(service: socket.socket) -> int:
+    service.settimeout(PATIENCE_S)
+    service.bind(("127.0.0.1", 0))
+    return int(service.getsockname()[1])
+
 
 def test_a_local_socket_has_such_a_line_as_well(tmp_path: Path) -> None:
     place, target = tmp_path / "line", tmp_path / "service"

@@ -1,16 +1,15 @@
 """The faults of a trial, drawn from the seed and the number of the trial.
 
-A schedule is data: which faults, when, how strong, how long, and in which robot's run. The same
-seed, trial, kind and wire give the same schedule on every machine. The time of a fault is in steps
-of the robot, so it is the same on a slow machine; its duration is in seconds, like the robot's
-timeouts.
+The same seed, trial, kind and wire give the same schedule on every machine. The time of a fault is
+in steps of the robot, so it is the same on a slow machine; its duration is in seconds, like the
+robot's timeouts.
 """
 
 from __future__ import annotations
 
 import random
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import msgspec
 
@@ -29,8 +28,11 @@ __all__ = [
 Wire: TypeAlias = Literal["tcp", "tls", "unix", "udp"]
 """The transport between robot and services."""
 
-WIRES: tuple[Wire, ...] = ("tcp", "tls", "unix", "udp")
+WIRES: tuple[Wire, ...] = get_args(Wire)
 """All of them, in the order in which trials use them."""
+
+Launch: TypeAlias = Literal["on_failure", "at_start", "never"]
+"""When the robot launches its local service."""
 
 
 class Schedule(msgspec.Struct, frozen=True, kw_only=True):
@@ -40,8 +42,6 @@ class Schedule(msgspec.Struct, frozen=True, kw_only=True):
     ----------
     world_seed : int
         Of the robot's run.
-    launch : {"on_failure", "at_start", "never"}
-        When the robot launches its local service.
     decision_deadline_ms : float or None
         After which the robot asks its local service as well.
     faults : tuple of Fault
@@ -55,7 +55,7 @@ class Schedule(msgspec.Struct, frozen=True, kw_only=True):
     world_seed: int
     num_particles: int
     num_clouds: int
-    launch: Literal["on_failure", "at_start", "never"]
+    launch: Launch
     decision_deadline_ms: float | None
     faults: tuple[Fault, ...]
 
@@ -77,35 +77,33 @@ class _Times(NamedTuple):
     duration_s: tuple[float, float]
 
 
-_EARLY, _LATE = (0.06, 0.16), (0.46, 0.56)
-
-_TWICE = _Times((_EARLY, _LATE), (0.3, 0.55))
+_TWO = (0.06, 0.16), (0.46, 0.56)
+_TWICE = _Times(_TWO, (0.3, 0.55))
+_TWICE_FOR_LONG = _Times(_TWO, (0.5, 0.8))
 _ONCE = _Times(((0.08, 0.3),), (0.4, 0.8))
 """For lines that need a while to be used again."""
 
 _TIMES = {
     FaultKind.CLOUD_KILLED: _TWICE,
     # Some of them are shorter than the robot's timeout.
-    FaultKind.CLOUD_STOPPED: _Times((_EARLY, _LATE), (0.1, 0.7)),
+    FaultKind.CLOUD_STOPPED: _Times(_TWO, (0.1, 0.7)),
     FaultKind.LOCAL_KILLED: _Times(((0.06, 0.2),), (0.9, 1.2)),
     FaultKind.ROBOT_KILLED: _Times(((0.05, 0.3), (0.4, 0.6), (0.7, 0.9)), (0.0, 0.1)),
-    FaultKind.ROBOT_STOPPED: _Times((_EARLY, _LATE), (0.1, 0.8)),
+    FaultKind.ROBOT_STOPPED: _Times(_TWO, (0.1, 0.8)),
     FaultKind.REPLICAS_KILLED: _Times(((0.06, 0.12), (0.15, 0.4), (0.55, 0.65)), (0.3, 0.55)),
-    FaultKind.LINK_DELAYED: _Times((_EARLY, _LATE), (0.5, 0.8)),
-    FaultKind.LINK_LOSSY: _Times((_EARLY, _LATE), (0.5, 0.8)),
+    FaultKind.LINK_DELAYED: _TWICE_FOR_LONG,
+    FaultKind.LINK_LOSSY: _TWICE_FOR_LONG,
     FaultKind.LINK_SILENT: _ONCE,
     FaultKind.LINK_SILENT_ONE_WAY: _ONCE,
     FaultKind.LINK_CUT: _TWICE,
-    FaultKind.PACKETS_LOST: _Times((_EARLY, _LATE), (0.5, 0.8)),
+    FaultKind.PACKETS_LOST: _TWICE_FOR_LONG,
     FaultKind.PACKETS_DROPPED: _ONCE,
     FaultKind.PACKETS_DROPPED_ONE_WAY: _ONCE,
 }
 
 _NOT_COMBINED = (FaultKind.COMBINATION, FaultKind.REPLICAS_KILLED)
-_COMBINED_AT = (0.05, 0.75)
-_COMBINED_DURATION_S = (0.05, 0.8)
-_MOST_COMBINED = 5
-_FEWEST_COMBINED = 2
+_COMBINED = _Times(((0.05, 0.75),), (0.05, 0.8))
+_FEWEST_COMBINED, _MOST_COMBINED = 2, 5
 
 
 def kinds_over(wire: Wire, kinds: Sequence[FaultKind]) -> tuple[FaultKind, ...]:
@@ -127,8 +125,8 @@ def draw_schedule(
         ]
         for _ in range(chance.randint(_FEWEST_COMBINED, _MOST_COMBINED)):
             single = chance.choice(singles)
-            at, duration_s = chance.uniform(*_COMBINED_AT), _COMBINED_DURATION_S
-            faults.append(_fault(chance, single, at, duration_s, chance.randrange(2)))
+            at = chance.uniform(*_COMBINED.at[0])
+            faults.append(_fault(chance, single, at, _COMBINED.duration_s, chance.randrange(2)))
         num_clouds = chance.choice((1, 1, 2))
     else:
         times = _TIMES[kind]
@@ -136,8 +134,14 @@ def draw_schedule(
         for index, between in enumerate(times.at):
             at = chance.uniform(*between)
             faults.append(_fault(chance, kind, at, times.duration_s, index % num_clouds))
-    launches: list[Literal["on_failure", "at_start", "never"]]
-    launches = ["on_failure", "on_failure", "on_failure", "at_start", "at_start", "never"]
+    launches: list[Launch] = [
+        "on_failure",
+        "on_failure",
+        "on_failure",
+        "at_start",
+        "at_start",
+        "never",
+    ]
     if any(fault.kind is FaultKind.LOCAL_KILLED for fault in faults):
         launches.remove("never")
     launch = chance.choice(launches)

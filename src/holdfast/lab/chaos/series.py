@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import shutil
 import threading
+from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from queue import Empty, SimpleQueue
-from typing import NamedTuple
 
 import msgspec
 
@@ -28,9 +27,6 @@ __all__ = ["TRIALS_NAME", "Series", "SeriesPlan"]
 
 PLAN_NAME = "series.json"
 TRIALS_NAME = "trials.jsonl"
-
-_LOOK_S = 0.2
-"""How long the main thread waits at a time, so that it notices Ctrl-C."""
 
 
 class SeriesPlan(msgspec.Struct, frozen=True, kw_only=True):
@@ -62,11 +58,6 @@ class SeriesPlan(msgspec.Struct, frozen=True, kw_only=True):
         return wire, kinds[(turn + place * len(kinds) // len(self.wires)) % len(kinds)]
 
 
-class _Started(NamedTuple):
-    trial: int
-    kind: FaultKind
-
-
 class Series:
     """A series in its directory.
 
@@ -90,12 +81,10 @@ class Series:
         *,
         resume: bool = False,
         keep: bool = False,
-        pace: Pace | None = None,
     ) -> None:
         self._directory = directory
         self._plan = plan
         self._keep = keep
-        self._pace = pace or Pace()
         self.outcomes: list[TrialOutcome] = []
         path = directory / PLAN_NAME
         if resume:
@@ -127,47 +116,23 @@ class Series:
         """
         finished = {outcome.trial for outcome in self.outcomes}
         numbers = range(self._plan.first, self._plan.first + trials)
-        missing = [trial for trial in numbers if trial not in finished]
-        news: SimpleQueue[_Started | TrialOutcome | BaseException] = SimpleQueue()
+        missing = deque(trial for trial in numbers if trial not in finished)
         cancelled = threading.Event()
         pool = ThreadPoolExecutor(jobs, thread_name_prefix="chaos")
+        running: set[Future[TrialOutcome]] = set()
         try:
-            for trial in missing:
-                pool.submit(self._work, trial, news, cancelled)
-            left = len(missing)
-            while left:
-                try:
-                    received = news.get(timeout=_LOOK_S)
-                except Empty:
-                    continue
-                if isinstance(received, _Started):
-                    on_start(received.trial, received.kind)
-                elif isinstance(received, TrialOutcome):
-                    self._add(received)
-                    left -= 1
-                    on_outcome(received)
-                else:
-                    raise received
+            while missing or running:
+                while missing and len(running) < jobs:
+                    trial = missing.popleft()
+                    on_start(trial, self._plan.of(trial)[1])
+                    running.add(pool.submit(self._run_trial, trial, cancelled))
+                done, running = wait(running, return_when=FIRST_COMPLETED)
+                for each in done:
+                    self._add(each.result())
+                    on_outcome(self.outcomes[-1])
         finally:
             cancelled.set()
             pool.shutdown(cancel_futures=True)
-
-    def _work(
-        self,
-        trial: int,
-        news: SimpleQueue[_Started | TrialOutcome | BaseException],
-        cancelled: threading.Event,
-    ) -> None:
-        if cancelled.is_set():
-            return
-        news.put(_Started(trial, self._plan.of(trial)[1]))
-        try:
-            news.put(self._run_trial(trial, cancelled))
-        except CancelledTrialError:
-            pass
-        except BaseException as error:  # noqa: BLE001 - raised again where it is read
-            cancelled.set()
-            news.put(error)
 
     def _run_trial(self, trial: int, cancelled: threading.Event) -> TrialOutcome:
         directory = self.directory_of(trial)
@@ -177,7 +142,7 @@ class Series:
         shutil.rmtree(directory, ignore_errors=True)
         try:
             directory.mkdir()
-            outcome = run_chaos_trial(schedule, directory, self._pace, cancelled)
+            outcome = run_chaos_trial(schedule, directory, Pace(), cancelled)
         except OSError as error:
             raise OutputError(f"{directory}: cannot be written: {error.strerror}") from error
         except CancelledTrialError:

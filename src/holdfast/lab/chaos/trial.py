@@ -23,7 +23,7 @@ from holdfast.lab.testbed.fault_times import FaultTimes, times_of_faults
 from holdfast.lab.testbed.faults import FaultKind, inject
 from holdfast.lab.testbed.namespace import NetworkNamespace
 from holdfast.lab.testbed.processes import free_port
-from holdfast.lab.testbed.proxy import Place, Proxy
+from holdfast.lab.testbed.proxy import Place, Proxy, endpoint_at
 from holdfast.lab.testbed.reference_run import ReferenceRun, make_reference_run
 from holdfast.lab.testbed.world import difference_of_performances, witnessed_by
 from holdfast.recording.compare import Comparison, compare_runs
@@ -200,9 +200,6 @@ def _add_services(
     def new_place(name: str) -> Place:
         return testbed.temporary / name if wire == "unix" else free_port()
 
-    def endpoint(place: Place) -> str:
-        return f"{wire}/{place}" if isinstance(place, Path) else f"{wire}/127.0.0.1:{place}"
-
     for number in range(schedule.num_clouds):
         place = entry = new_place(f"cloud-{number}")
         proxy = None
@@ -211,9 +208,9 @@ def _add_services(
             seed = f"{schedule.seed} {schedule.trial} {number}"
             proxy = lines.enter_context(Proxy(entry, place, seed, datagrams=wire == "udp"))
         testbed.add_service(
-            endpoint(place),
+            endpoint_at(wire, place),
             *options,
-            endpoint=endpoint(entry),
+            endpoint=endpoint_at(wire, entry),
             log_name=_CLOUD_LOG_NAME.format(number),
             proxy=proxy,
             namespace=namespace,
@@ -231,30 +228,23 @@ def _make_reference_run(
     if schedule.decision_deadline_ms is not None:
         offload["decision_deadline_ms"] = schedule.decision_deadline_ms
 
-    def write_configuration(num_trials: int) -> Path:
-        document = {
-            "problem": "peg_in_hole_2d",
-            "particle_filter": {"num_particles": schedule.num_particles},
-            "active_sensing": {"num_cores": 1},
-            "simulator": {
-                "num_trials": num_trials,
-                "max_steps": _MAX_STEPS,
-                "sensing_intervals": _SENSING_INTERVALS,
-                "seed": schedule.world_seed,
-            },
-            "offload": offload,
-            "recovery": {"launch": schedule.launch},
-            "environment": witnessed_by(directory / _PERFORMED_NAME.format(_RUN_NAME)),
-        }
-        path = directory / _CONFIGURATION_NAME
-        # JSON is YAML as well.
-        text = msgspec.json.format(msgspec.json.encode(document), indent=2)
-        write_atomically(path, text + b"\n")
-        return path
-
+    document = {
+        "problem": "peg_in_hole_2d",
+        "particle_filter": {"num_particles": schedule.num_particles},
+        "active_sensing": {"num_cores": 1},
+        "simulator": {
+            "max_steps": _MAX_STEPS,
+            "sensing_intervals": _SENSING_INTERVALS,
+            "seed": schedule.world_seed,
+        },
+        "offload": offload,
+        "recovery": {"launch": schedule.launch},
+        "environment": witnessed_by(directory / _PERFORMED_NAME.format(_RUN_NAME)),
+    }
     return make_reference_run(
         directory / _REFERENCE_NAME,
-        write_configuration,
+        directory / _CONFIGURATION_NAME,
+        document,
         min_steps,
         directory / _PERFORMED_NAME.format(_REFERENCE_NAME),
     )

@@ -101,15 +101,7 @@ class Observer(Protocol):
 
 
 class Narrator:
-    """Follows a testbed with one cloud service and one robot.
-
-    Attributes
-    ----------
-    status_at : float
-        When the robot's status has changed last, in seconds since the epoch.
-    launch_ms : float or None
-        Of the last launch of the local service since the last kill of the cloud.
-    """
+    """Follows a testbed with one cloud service and one robot."""
 
     def __init__(
         self, testbed: Testbed, cloud: ServiceCommand, state: DemoState, observer: Observer
@@ -124,8 +116,6 @@ class Narrator:
         self._local: Activity = "off"
         self._is_up = self._is_held = self._has_done_all = self._has_finished = False
         self.statuses: list[list[str]] = []
-        self.status_at = state.began_at
-        self.launch_ms: float | None = None
 
     @property
     def cloud_decides(self) -> bool:
@@ -143,7 +133,6 @@ class Narrator:
     def killed_cloud(self, process: Process, killed_at: float) -> None:
         """Note a kill of the cloud service."""
         self._killed_at = killed_at
-        self.launch_ms = None
         self._mark("cloud", "kill", killed_at)
         self.say("demo", f"kill -9 {process.pid}: the cloud service", killed_at)
 
@@ -203,14 +192,12 @@ class Narrator:
     def _take(self, event: LogEvent) -> None:
         name = event.name
         if name == "status":
-            self.status_at = event.at
             self._state.status = Status(event["to"])
             self.statuses[-1].append(str(event["to"]))
         elif name == "launch":
             self._local = "starting"
         elif name == "launched":
             self._local = "ready"
-            self.launch_ms = float(event["launch_ms"])
         elif name in ("launch_failed", "recovery_exited"):
             self._local = "off"
         elif name in ("holding", "resumed"):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
@@ -19,6 +18,7 @@ from holdfast.files import write_atomically
 from holdfast.lab.demo.narrator import DemoState, Narrator, Observer
 from holdfast.lab.errors import NoProgressError
 from holdfast.lab.testbed.driver import Testbed
+from holdfast.lab.testbed.fault_times import ROBOT, FaultTimes, times_of_faults
 from holdfast.lab.testbed.processes import free_port
 from holdfast.lab.testbed.records import Decision
 from holdfast.lab.testbed.reference_run import ReferenceRun, make_reference_run
@@ -40,12 +40,9 @@ FINDINGS_NAME = "findings.json"
 KILLED_RUN_NAME = "killed"
 REFERENCE_RUN_NAME = "undisturbed"
 
-_CONFIGURATION = """\
+_COMMENT = """\
 # What holdfast demo has run. The same without services, without kills and as fast as it goes:
-#   holdfast run {path}
-problem: peg_in_hole_2d
-particle_filter: {{num_particles: 100}}
-simulator: {{num_trials: {num_trials}, max_steps: {max_steps}, seed: {seed}}}
+#   holdfast run {}
 """
 _MAX_STEPS = 250
 
@@ -69,31 +66,31 @@ _AROUND_S = 3.0
 
 
 class Outage(msgspec.Struct, frozen=True, kw_only=True):
-    """One kill of the cloud service and its return.
+    """One kill of the cloud service and its return, in ms; None where nothing was measured.
 
     Attributes
     ----------
-    found_ms : float
-        From the kill until the robot's status is ``local_recovery``.
-    first_local_decision_ms : float
+    found_ms : float or None
+        From the kill until the robot logs the loss.
+    first_local_decision_ms : float or None
         From then until the robot carries out a decision of the local service. Until then it uses
         the actions that it has.
-    longest_wait_ms : float
+    longest_wait_ms : float or None
         Longest time that the robot stood still for a decision while the cloud was away.
     launched_ms : float or None
         From the start of the local service until the robot sees it; None if it ran already.
     listening_ms : float
         From the start of the new cloud service until it listens.
-    used_again_ms : float
-        From then until the robot has an answer of it.
+    used_again_ms : float or None
+        From then until the robot carries out a decision of it.
     """
 
-    found_ms: float
-    first_local_decision_ms: float
-    longest_wait_ms: float
+    found_ms: float | None
+    first_local_decision_ms: float | None
+    longest_wait_ms: float | None
     launched_ms: float | None
     listening_ms: float
-    used_again_ms: float
+    used_again_ms: float | None
 
 
 class Findings(msgspec.Struct, frozen=True, kw_only=True):
@@ -103,7 +100,7 @@ class Findings(msgspec.Struct, frozen=True, kw_only=True):
     ----------
     rate_hz : float
         Task actions per second.
-    robot_acting_again_ms : float
+    robot_acting_again_ms : float or None
         From the kill of the robot's own process until a new one carries out its first decision.
     usual_wait_ms : float
         Median time that the robot waits for the cloud's task actions: one round trip.
@@ -119,7 +116,7 @@ class Findings(msgspec.Struct, frozen=True, kw_only=True):
     steps: int
     rate_hz: float
     outages: tuple[Outage, ...]
-    robot_acting_again_ms: float
+    robot_acting_again_ms: float | None
     usual_wait_ms: float
     statuses: tuple[tuple[str, ...], ...]
     comparison: Comparison
@@ -181,9 +178,11 @@ class Demo:
         )
         self._narrator.started_robot(robot.process)
         self._wait(lambda: bool(robot.decisions), "the robot's first decision")
-        first = self._outage(_FIRST_KILL, _FIRST_RESTART)
-        second = self._outage(_SECOND_KILL, _SECOND_RESTART)
-        acting_again_ms = self._kill_robot()
+        listening_s = [
+            self._kill_cloud(_FIRST_KILL, _FIRST_RESTART),
+            self._kill_cloud(_SECOND_KILL, _SECOND_RESTART),
+        ]
+        self._kill_robot()
         self._wait(lambda: robot.is_done, "the end of the robot's run", steps / rate_hz)
         robot.table.read()
         waits = [
@@ -193,14 +192,15 @@ class Demo:
             and row.service == self._cloud.endpoint
             and row.status != Status.LOCAL_RECOVERY.value
         ]
+        *kills, robot_kill = times_of_faults(testbed.faults, robot.events, robot.decisions)
         findings = Findings(
             problem="peg_in_hole_2d",
             seed=self._seed,
             trials=len(reference.steps_of_trials),
             steps=steps,
             rate_hz=rate_hz,
-            outages=(first, second),
-            robot_acting_again_ms=acting_again_ms,
+            outages=tuple(map(_outage, kills, listening_s)),
+            robot_acting_again_ms=robot_kill.recovery_ms,
             usual_wait_ms=statistics.median(waits) if waits else 0.0,
             statuses=tuple(map(tuple, self._narrator.statuses)),
             comparison=compare_runs(directory / REFERENCE_RUN_NAME, robot.out),
@@ -211,17 +211,18 @@ class Demo:
 
     def _make_reference_run(self) -> ReferenceRun:
         directory = self._testbed.directory
-
-        def write_configuration(num_trials: int) -> Path:
-            path = directory / CONFIGURATION_NAME
-            text = _CONFIGURATION.format(
-                path=path, num_trials=num_trials, max_steps=_MAX_STEPS, seed=self._seed
-            )
-            write_atomically(path, text.encode())
-            return path
-
+        path = directory / CONFIGURATION_NAME
+        document = {
+            "problem": "peg_in_hole_2d",
+            "particle_filter": {"num_particles": 100},
+            "simulator": {"max_steps": _MAX_STEPS, "seed": self._seed},
+        }
         reference = make_reference_run(
-            directory / REFERENCE_RUN_NAME, write_configuration, self._plan.min_steps
+            directory / REFERENCE_RUN_NAME,
+            path,
+            document,
+            self._plan.min_steps,
+            comment=_COMMENT.format(path),
         )
         self._state.title = (
             f"{reference.configuration.problem_name}, seed {self._seed}: "
@@ -232,53 +233,45 @@ class Demo:
         self._narrator.say("demo", text)
         return reference
 
-    def _outage(self, kill_at: float, restart_at: float) -> Outage:
-        """Kill the cloud, let the robot do without it for a while, and start it again."""
-        narrator = self._narrator
+    def _kill_cloud(self, kill_at: float, restart_at: float) -> float:
+        """Kill the cloud, let the robot do without it for a while, and start it again.
+
+        Returns how long the new service took until it listened, in s.
+        """
+        testbed, cloud, narrator = self._testbed, self._cloud, self._narrator
+        decisions = testbed.robot.decisions
         self._wait_for_progress(kill_at)
-        self._wait(lambda: narrator.cloud_decides, "the use of the cloud service")
-        process = self._cloud.process
-        killed_at = process.kill()
-        narrator.killed_cloud(process, killed_at)
+        self._wait(
+            lambda: narrator.cloud_decides and decisions[-1].service == cloud.endpoint,
+            "the use of the cloud service",
+        )
+        fault = testbed.note_fault("cloud_killed", cloud.endpoint, cloud.process.kill())
+        narrator.killed_cloud(cloud.process, fault.injected_at)
         self._wait(lambda: not narrator.cloud_decides, "the loss being noticed")
-        found_at = max(narrator.status_at, killed_at)
         local = self._wait_for_decision(
-            lambda row: row.service == RECOVERY_SERVICE and row.at >= found_at,
+            lambda row: row.service == RECOVERY_SERVICE and row.at >= fault.injected_at,
             "a decision of the local service",
         )
         narrator.say("local", f"decides, from step {local.step} on", local.at)
         self._wait_for_progress(restart_at)
         start_s = self._start_cloud()
-        listening_at = self._cloud.process.spawned_at + start_s
-        self._wait(lambda: narrator.cloud_decides, "the cloud being used again")
-        used_at = narrator.status_at
-        # That decision may have been waited for since before.
-        last = self._wait_for_decision(lambda row: row.at > used_at, "the decision after that")
-        decisions = self._testbed.robot.decisions
-        waits = [row.waited_ms for row in decisions if killed_at <= row.at <= last.at]
-        return Outage(
-            found_ms=1e3 * (found_at - killed_at),
-            first_local_decision_ms=1e3 * (local.at - found_at),
-            longest_wait_ms=max(waits),
-            launched_ms=narrator.launch_ms,
-            listening_ms=1e3 * start_s,
-            used_again_ms=1e3 * max(0.0, used_at - listening_at),
+        fault.usable_at = ready_at = cloud.process.spawned_at + start_s
+        self._wait_for_decision(
+            lambda row: row.service == cloud.endpoint and row.at >= ready_at,
+            "the cloud being used again",
         )
+        return start_s
 
-    def _kill_robot(self) -> float:
-        """Kill the robot's own process in mid-step and resume its run; return for how long, in ms.
-
-        It ends with the first decision that the new process carries out.
-        """
+    def _kill_robot(self) -> None:
+        """Kill the robot's own process in mid-step, resume its run and wait until it acts."""
         self._wait_for_progress(_ROBOT_KILL)
         robot = self._testbed.robot
-        killed_at = robot.process.kill()
-        self._narrator.killed_robot(robot.process, killed_at)
+        fault = self._testbed.note_fault("robot_killed", ROBOT, robot.process.kill())
+        self._narrator.killed_robot(robot.process, fault.injected_at)
         robot.resume()
         self._narrator.started_robot(robot.process, "--resume")
-        resumed_at = robot.process.spawned_at
-        again = self._wait_for_decision(lambda row: row.at > resumed_at, "the robot acting again")
-        return 1e3 * (again.at - killed_at)
+        fault.usable_at = resumed_at = robot.process.spawned_at
+        self._wait_for_decision(lambda row: row.at >= resumed_at, "the robot acting again")
 
     def _start_cloud(self) -> float:
         """Start the cloud service and wait until it listens; return how long it took in s."""
@@ -311,3 +304,17 @@ class Demo:
             raise NoProgressError(
                 f"the robot's run was over before {what}; the logs are in {self._testbed.directory}"
             )
+
+
+def _outage(times: FaultTimes, listening_s: float) -> Outage:
+    decided_ms = None
+    if times.recovery_ms is not None and times.detection_ms is not None:
+        decided_ms = max(0.0, times.recovery_ms - times.detection_ms)
+    return Outage(
+        found_ms=times.detection_ms,
+        first_local_decision_ms=decided_ms,
+        longest_wait_ms=times.longest_wait_ms,
+        launched_ms=times.launch_ms,
+        listening_ms=1e3 * listening_s,
+        used_again_ms=times.failback_ms,
+    )

@@ -142,13 +142,16 @@ class WireChecker:
         """Take note that a request arrives once more, under another number."""
         self._sent[copy] = self._sent[call]
 
-    def arrived(self, service: str, incarnation: int, call: int, payload: bytes) -> None:
+    def arrived(self, service: str, incarnation: int, call: int) -> None:
         """Take note of a request; its service's process must have ended enough of those before."""
         process = service, incarnation
         self._arrived[call] = process
         unended = self._unended[process] = self._unended.get(process, 0) + 1
         if unended > _MAX_UNENDED + self._crowd:
             raise Violation(f"{service} has {unended} calls that it has not ended")
+
+    def taken(self, service: str, incarnation: int, call: int, payload: bytes) -> None:
+        """Take note that a service's process reads a request: one that was stopped does so late."""
         owner, sent = self._sent[call]
         if payload != sent:
             return  # damaged: it says nothing

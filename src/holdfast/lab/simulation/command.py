@@ -25,7 +25,6 @@ from holdfast.runtime.command_line import (
 if TYPE_CHECKING:
     from holdfast.lab.simulation.exploration import ExplorationTally
     from holdfast.lab.simulation.schedule import SimulationSchedule
-    from holdfast.lab.simulation.story import RunOutcome
 
 __all__ = ["main"]
 
@@ -113,18 +112,16 @@ def _run_file(path: Path, *, shrink: bool) -> bool:
     from holdfast.lab.simulation.schedule import parse_schedule
 
     try:
-        text = read_bounded(path, _MAX_SCHEDULE_BYTES).decode()
+        schedule = parse_schedule(read_bounded(path, _MAX_SCHEDULE_BYTES).decode())
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not text in UTF-8"
         raise HoldfastError(f"{path}: cannot be read: {reason}") from error
-    try:
-        schedule = parse_schedule(text)
     except ScheduleError as error:
         raise HoldfastError(f"{path}: {error}") from error
-    good = _tell(schedule).violation is None
-    if shrink and not good:
+    is_good = _tell(schedule)
+    if shrink and not is_good:
         _print_smaller(schedule)
-    return good
+    return is_good
 
 
 def _tell_seed(seed: int) -> bool:
@@ -132,26 +129,24 @@ def _tell_seed(seed: int) -> bool:
 
     schedule = draw_schedule(seed)
     sys.stdout.write(f"# seed {seed}\n{schedule.text()}\n")
-    return _tell(schedule).violation is None
+    return _tell(schedule)
 
 
-def _tell(schedule: SimulationSchedule) -> RunOutcome:
+def _tell(schedule: SimulationSchedule) -> bool:
+    """Run a schedule and print its story; tell whether all was as it should be."""
     from holdfast.lab.simulation.story import story_lines
     from holdfast.lab.simulation.world import Simulator
 
     outcome = Simulator().run(schedule, tell=True)
-    for line in story_lines(outcome):
-        sys.stdout.write(f"{line}\n")
-    sys.stdout.write(f"\n{_verdict(outcome)}\n")
-    return outcome
-
-
-def _verdict(outcome: RunOutcome) -> str:
     if outcome.violation is not None:
-        return f"VIOLATION: {outcome.violation}"
-    if outcome.held is not None:
-        return f"the robot rightly holds still: {outcome.held}"
-    return f"the run decided as the one without faults, in {outcome.duration_s:.3f} s of its time"
+        verdict = f"VIOLATION: {outcome.violation}"
+    elif outcome.held is not None:
+        verdict = f"the robot rightly holds still: {outcome.held}"
+    else:
+        took_s = outcome.duration_s
+        verdict = f"the run decided as the one without faults, in {took_s:.3f} s of its time"
+    sys.stdout.write("".join(f"{line}\n" for line in [*story_lines(outcome), "", verdict]))
+    return outcome.violation is None
 
 
 # -- many runs -------------------------------------------------------------------------------------
@@ -163,15 +158,12 @@ def _explore(seeds: range, jobs: int, *, shrink: bool) -> bool:
     from holdfast.robot.trials import available_cores
 
     tally = ExplorationTally()
-    following = seeds.start
     begun_at = perf_counter()
     progress = progress_line(len(seeds), quiet=False, noun="run")
     progress.start(f"seeds {seeds.start}:{seeds.stop}", 0, "no violation")
 
-    def on_batch(some: range, seen: ExplorationTally) -> bool:
-        nonlocal following
+    def on_batch(_: range, seen: ExplorationTally) -> bool:
         tally.add(seen)
-        following = some.stop
         progress.show(tally.runs, "a violation" if tally.findings else "no violation")
         return not tally.findings
 
@@ -179,14 +171,15 @@ def _explore(seeds: range, jobs: int, *, shrink: bool) -> bool:
         explore(seeds, jobs or available_cores(), on_batch)
     except KeyboardInterrupt:
         progress.stop()
-        _print_tally(tally, range(seeds.start, following), perf_counter() - begun_at)
+        _print_tally(tally, seeds.start, perf_counter() - begun_at)
+        following = seeds.start + tally.runs
         sys.stdout.write(
             f"\nInterrupted. Go on with: holdfast simulate --seeds {following}:{seeds.stop}\n"
         )
         raise
     finally:
         progress.stop()
-    _print_tally(tally, range(seeds.start, following), perf_counter() - begun_at)
+    _print_tally(tally, seeds.start, perf_counter() - begun_at)
     if tally.findings:
         _print_finding(tally, shrink=shrink)
         return False
@@ -200,13 +193,13 @@ def _explore(seeds: range, jobs: int, *, shrink: bool) -> bool:
     return True
 
 
-def _print_tally(tally: ExplorationTally, seeds: range, elapsed_s: float) -> None:
+def _print_tally(tally: ExplorationTally, first: int, elapsed_s: float) -> None:
     from holdfast.cli.terminal import duration
 
     kinds = sorted(tally.faults.items(), key=lambda kind: -kind[1])
     by_kind = "".join(f"\n  {count:>10,}  {kind}" for kind, count in kinds)
     sys.stdout.write(
-        f"seeds         {seeds.start}:{seeds.stop}\n"
+        f"seeds         {first}:{first + tally.runs}\n"
         f"runs          {tally.runs:,} in {duration(elapsed_s)}"
         f" ({tally.runs / elapsed_s:.0f} a second)\n"
         f"messages      {tally.messages:,}\n"
@@ -241,7 +234,7 @@ def _print_finding(tally: ExplorationTally, *, shrink: bool) -> None:
 
 
 def _print_smaller(schedule: SimulationSchedule) -> None:
-    from holdfast.lab.simulation.shrinking import shrink
+    from holdfast.lab.simulation.exploration import shrink
     from holdfast.lab.simulation.world import Simulator
 
     sys.stderr.write("Making it smaller (Ctrl-C ends that with what there is) ...\n")

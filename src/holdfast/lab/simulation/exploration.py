@@ -1,4 +1,4 @@
-"""Many seeds, on one core or on several, and what was found under them."""
+"""Many seeds, on one core or on several, what was found under them, and that made small."""
 
 from __future__ import annotations
 
@@ -9,22 +9,27 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import cache
+from typing import TypeAlias
 
 import msgspec
 
 from holdfast.errors import InvalidValueError
 from holdfast.lab.errors import SimulationError
+from holdfast.lab.simulation.schedule import RunSettings, SimulatedFault, SimulationSchedule
 from holdfast.lab.simulation.schedule_draws import draw_schedule
 from holdfast.lab.simulation.world import Simulator
 from holdfast.runtime.command_line import MAX_JOBS
 
-__all__ = ["ExplorationTally", "ViolationFound", "explore"]
+__all__ = ["ExplorationTally", "ViolationFound", "explore", "shrink"]
 
 _BATCH = 25
 """Seeds that a process runs between two reports: a fraction of a second's work."""
 
 _AHEAD = 3
 """Batches that wait for each process."""
+
+_MAX_CANDIDATES = 2000
+"""Schedules that are tried to make one smaller."""
 
 
 class ViolationFound(msgspec.Struct, frozen=True):
@@ -154,3 +159,81 @@ def _run(seeds: range, simulator: Simulator) -> ExplorationTally:
             tally.findings.append(ViolationFound(seed, outcome.violation))
     tally.faults = dict(faults)
     return tally
+
+
+# -- making a finding small ------------------------------------------------------------------------
+
+
+_Holds: TypeAlias = Callable[[RunSettings, tuple[SimulatedFault, ...]], bool]
+
+
+class _BudgetSpentError(Exception):
+    """Enough has been tried."""
+
+
+def shrink(
+    schedule: SimulationSchedule, fails: Callable[[SimulationSchedule], bool]
+) -> SimulationSchedule:
+    """Return a smaller schedule that fails as well; the same one if there is none.
+
+    A drawn schedule has dozens of faults, and most have nothing to do with what went wrong. First
+    faults are left out, in ever smaller groups (delta debugging; Zeller and Hildebrandt, IEEE
+    Transactions on Software Engineering 28, 2002). Then what is unusual about the run itself is
+    made usual, value by value.
+
+    Ctrl-C, or 2,000 candidates, end the search with the smallest one so far.
+    """
+    smallest = schedule
+    left = _MAX_CANDIDATES
+
+    def holds(run: RunSettings, faults: tuple[SimulatedFault, ...]) -> bool:
+        nonlocal smallest, left
+        if not left:
+            raise _BudgetSpentError
+        left -= 1
+        candidate = SimulationSchedule(run, faults)
+        if not fails(candidate):
+            return False
+        smallest = candidate
+        return True
+
+    try:
+        before = None
+        while smallest != before:
+            before = smallest
+            _leave_out(smallest, holds)
+            _make_usual(smallest, holds)
+    except (_BudgetSpentError, KeyboardInterrupt):
+        pass
+    return smallest
+
+
+def _leave_out(schedule: SimulationSchedule, holds: _Holds) -> None:
+    """Leave faults out, in groups of half of them down to one."""
+    faults = schedule.faults
+    size = max(1, len(faults) // 2)
+    while faults:
+        begin = 0
+        while begin < len(faults):
+            rest = faults[:begin] + faults[begin + size :]
+            if holds(schedule.run, rest):
+                faults = rest
+            else:
+                begin += size
+        if size == 1:
+            return
+        size //= 2
+
+
+def _make_usual(schedule: SimulationSchedule, holds: _Holds) -> None:
+    """Give each value of the run the one that it has by default, where that changes nothing."""
+    run, faults = schedule.run, schedule.faults
+    for field in msgspec.structs.fields(RunSettings):
+        if getattr(run, field.name) == field.default:
+            continue
+        usual = msgspec.structs.replace(run, **{field.name: field.default})
+        named = {getattr(fault, "service", None) for fault in faults}
+        if field.name == "replicas" and not named <= {None, "local", *usual.services}:
+            continue
+        if holds(usual, faults):
+            run = usual

@@ -22,10 +22,8 @@ from holdfast.lab.errors import Violation
 from holdfast.lab.simulation.checkers import StatusChecker
 from holdfast.lab.simulation.disk import Disk
 from holdfast.lab.simulation.environment_model import EnvironmentModel
-from holdfast.lab.simulation.event_queue import Clock, EventQueue
-from holdfast.lab.simulation.network import Network
-from holdfast.lab.simulation.reference_runs import ReferenceRuns
-from holdfast.lab.simulation.schedule import LOCAL_SERVICE, RunSettings
+from holdfast.lab.simulation.event_queue import Clock
+from holdfast.lab.simulation.schedule import LOCAL_SERVICE
 from holdfast.planning import Planner
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.events import (
@@ -52,15 +50,14 @@ from holdfast.protocol.events import (
     VerificationNoted,
     WriteRecords,
 )
-from holdfast.protocol.messages import MAX_TASK_ACTIONS, SessionConfiguration
-from holdfast.protocol.records import replay
+from holdfast.protocol.messages import MAX_TASK_ACTIONS
+from holdfast.protocol.records import TrialHistory, replay
 from holdfast.protocol.robot import Robot
 
 if TYPE_CHECKING:
     from holdfast.lab.simulation.world import World
 
-__all__ = ["SESSION", "RobotNode", "RobotTask"]
-
+__all__ = ["SESSION", "RobotNode"]
 
 SESSION = bytes(range(16))
 """Of the robot that is looked at."""
@@ -80,53 +77,38 @@ _WITHOUT_CONSEQUENCES = (LogEvent, Timing, ComputeOwnAnswer, VerificationNoted)
 """Effects before which the process need not die: nothing outside it changes by them."""
 
 
-class RobotTask:
-    """What the robot is to do."""
-
-    def __init__(self, planner: Planner, run: RunSettings, seed: int, steps: int) -> None:
-        self.planner = planner
-        self.first_trial = run.trial
-        self.last_trial = run.trial + run.num_trials - 1
-        self.simulator = SimulatorSettings(
-            num_trials=self.last_trial + 1, max_steps=max(1, steps // run.num_trials), seed=seed
-        )
-        self.session_configuration = SessionConfiguration(
-            planner.problem.name, {}, {}, planner.settings, seed
-        )
-
-
 class RobotNode:
     """The robot, over all lives of its process.
 
     Attributes
     ----------
-    process : int
-        Number of the process that lives; 0 if none does.
+    machine : Robot or None
+        Of the process that lives.
+    incarnation : int
+        Of the process; 0 before the first.
+    stopped : bool
+        Whether the process is stopped.
+    stopped_until : float
+        Until when it is to be.
     finished : bool
         Whether all trials are.
     stopped_by : HoldfastError or None
         Why the process holds still for good.
     """
 
-    def __init__(
-        self,
-        task: RobotTask,
-        run: RunSettings,
-        queue: EventQueue,
-        clock: Clock,
-        disk: Disk,
-        network: Network,
-        references: ReferenceRuns,
-        world: World,
-    ) -> None:
-        self._task = task
-        self._run = run
-        self._queue = queue
-        self._clock = clock
-        self._disk = disk
-        self._network = network
-        self._references = references
+    def __init__(self, world: World) -> None:
         self._world = world
+        self._run = run = world.run
+        self._queue = world.queue
+        self._planner: Planner = world.simulator.planner
+        self._clock = Clock(world.queue, run.robot_clock_offset_s, run.robot_clock_rate)
+        self._disk = Disk(forces_out=run.journal_survives == "power_cut")
+        self._trials = range(run.trial, run.trial + run.num_trials)
+        self._simulator = SimulatorSettings(
+            num_trials=self._trials.stop,
+            max_steps=max(1, world.simulator.max_steps // run.num_trials),
+            seed=world.simulator.seed,
+        )
         self._offload = OffloadSettings(
             services=run.services,
             lease_ms=max(50.0, 1e3 * run.lease_s),
@@ -134,8 +116,6 @@ class RobotNode:
         )
         self._recovery = RecoverySettings(launch=run.launch, journal_survives=run.journal_survives)
         self._environment: EnvironmentModel | None = None
-        self._environment_trial = -1
-        self._robot: Robot | None = None
         self._statuses = StatusChecker()
         self._asked: dict[int, str] = {}
         self._todo: deque[RobotEffect] = deque()
@@ -146,10 +126,8 @@ class RobotNode:
         self._is_ending = False
         self._rewards_are_known = True
         self._is_stalled = False
-        self._stopped = False
         self._wakes_at: float | None = None
-        self._lives = 0
-        self._body_obeys = 0
+        self._obeyed = 0
         self._may_doubt = False
         self._is_in_doubt = False
         self._does: dict[type, Callable[[Any], None]] = {
@@ -157,37 +135,38 @@ class RobotNode:
             Act: self._act,
             Sense: self._sense,
             Send: self._send,
-            Abandon: lambda effect: network.abandon(effect.call),
+            Abandon: lambda effect: world.network.abandon(effect.call),
             LogEvent: self._report,
             Timing: world.decided,
             ComputeOwnAnswer: self._decide,
             VerificationNoted: self._verified,
             Launch: lambda effect: world.launch(effect.number),
             EndTrial: self._end_trial,
-            Paused: self._paused,
+            Paused: lambda _: self._end_in_order(),
             Halt: self._hold_still,
         }
-        self.process = 0
+        self.machine: Robot | None = None
+        self.incarnation = 0
+        self.stopped = False
+        self.stopped_until = 0.0
         self.finished = False
         self.stopped_by: HoldfastError | None = None
 
     @property
-    def machine(self) -> Robot | None:
-        """The machine of the process that lives."""
-        return self._robot
+    def up(self) -> bool:
+        """Whether a process lives."""
+        return self.machine is not None
 
     # -- its life --------------------------------------------------------------------------------
 
     def start(self) -> None:
         """Start a new process, which goes on where the journal ends."""
-        self._lives += 1
-        self.process = self._lives
-        self._is_stalled = self._stopped = False
+        self.incarnation += 1
+        self.stopped = self._is_stalled = self._is_ending = False
+        self.stopped_until = 0.0
         self._wakes_at = None
         self._statuses = StatusChecker()
         self._asked.clear()
-        self._is_ending = False
-        task = self._task
         dispatcher = Dispatcher(
             self._run.services,
             LOCAL_SERVICE,
@@ -195,14 +174,14 @@ class RobotNode:
             self._recovery,
             SESSION,
             self._disk.opened(),
-            task.session_configuration,
-            task.planner.problem,
+            self._world.simulator.session_configuration,
+            self._planner.problem,
             _SECRET,
         )
-        self._robot = Robot(task.planner, task.simulator, dispatcher, self._run.rate_hz)
-        self._network.robot_started(self.process)
-        self._carry_out(self._robot.start(self._now()))
-        if self.process:  # else it was killed meanwhile
+        self.machine = Robot(self._planner, self._simulator, dispatcher, self._run.rate_hz)
+        self._world.network.review_all()
+        self._carry_out(self.machine.start(self._now()))
+        if self.up:  # else it was killed meanwhile
             self._begin_next()
 
     def kill(self, *, lost_appends: int | None = None, body_goes_on: bool = False) -> None:
@@ -219,35 +198,36 @@ class RobotNode:
         if lost_appends is not None:
             self._disk.cut_power(lost_appends)
         if body_goes_on and self._run.environment != "simulated":
-            self._body_obeys = self.process
+            self._obeyed = self.incarnation
         self._may_doubt = True
         self._end()
 
     def pause(self) -> None:
         """Ask the process to end in order."""
-        self._happens(self.process, self._pause)
+        self._happens(self.incarnation, self._pause)
 
-    def stop(self) -> None:
+    def stop(self, until: float) -> None:
         """Stop the process where it is."""
-        if self._robot is not None and not self._stopped:
-            self._stopped = True
-            self._network.robot_stopped(stopped=True)
+        self.stopped = True
+        self.stopped_until = max(self.stopped_until, until)
 
     def go_on(self) -> None:
         """Let a stopped process go on."""
-        if self._stopped:
-            self._stopped = False
-            self._network.robot_stopped(stopped=False)
+        if self.stopped:
+            self.stopped = False
             if not self._is_stalled:
                 self._catch_up()
 
     def _end(self) -> None:
-        self._robot = None
-        self.process = 0
-        self._stopped = self._is_stalled = False
+        self.machine = None
+        self.stopped = self._is_stalled = False
         self._todo.clear()
         self._deferred.clear()
-        self._network.robot_ended()
+        self._world.network.robot_ended()
+
+    def _end_in_order(self) -> None:
+        self._end()
+        self._world.robot_ended()
 
     # -- what happens to it ----------------------------------------------------------------------
 
@@ -259,13 +239,16 @@ class RobotNode:
         """Tell the process that started it that a local service has ended."""
         self._happens(process, self._heard, RecoveryExited(launch, reason))
 
+    def _is_gone(self, process: int) -> bool:
+        return process != self.incarnation or self.machine is None
+
     def _happens(self, process: int, do: Callable[..., None], *arguments: Any) -> None:
-        if process != self.process or self._robot is None:
+        if self._is_gone(process):
             return
-        if self._stopped or self._is_stalled:
+        if self.stopped or self._is_stalled:
             # What comes during a write is heard of later; to a process that is stopped nothing
             # comes before it goes on.
-            came_at = None if self._stopped else self._clock.now()
+            came_at = None if self.stopped else self._clock.now()
             self._deferred.append((came_at, do, arguments))
         else:
             do(*arguments)
@@ -278,49 +261,49 @@ class RobotNode:
 
     def _catch_up(self) -> None:
         """Let everything happen that came while the process did not listen."""
-        robot = self._robot
+        robot = self.machine
         assert robot is not None
         wake_at, now = robot.next_wakeup(), self._clock.now()
         if not self._deferred and wake_at is not None and wake_at <= now:
             robot.event_loop_stalled(now - wake_at)
             self._wake(wake_at)
-        while self._deferred and not self._is_stalled and not self._stopped:
+        while self._deferred and not self._is_stalled and not self.stopped:
             self._came_at, do, arguments = self._deferred.popleft()
             do(*arguments)
             self._came_at = None
-        if self._robot is not None and not self._is_stalled:
+        if self.machine is not None and not self._is_stalled:
             self._set_alarm()
 
     def _heard(self, event: TransportEvent | EnvironmentEvent | OwnAnswer | RecoveryExited) -> None:
-        assert self._robot is not None
+        assert self.machine is not None
         if isinstance(event, ReplyReceived):
             self._statuses.heard(self._asked[event.call], event.payload)
-        self._carry_out(self._robot.handle(event, self._now()))
+        self._carry_out(self.machine.handle(event, self._now()))
 
     def _pause(self) -> None:
-        assert self._robot is not None
+        assert self.machine is not None
         self._is_ending = True
-        self._carry_out(self._robot.pause(self._now()))
+        self._carry_out(self.machine.pause(self._now()))
 
     def _alarm(self, process: int, due: float) -> None:
-        if process == self.process and due == self._wakes_at:
+        if not self._is_gone(process) and due == self._wakes_at:
             self._wakes_at = None
-            if not self._stopped and not self._is_stalled:
+            if not self.stopped and not self._is_stalled:
                 self._wake(due)
 
     def _wake(self, due: float) -> None:
-        assert self._robot is not None
+        assert self.machine is not None
         self._last_time = max(self._last_time, self._clock.reached(due))
-        self._carry_out(self._robot.wake(self._last_time))
+        self._carry_out(self.machine.wake(self._last_time))
 
     def _set_alarm(self) -> None:
-        robot = self._robot
+        robot = self.machine
         if robot is None:
             return
         due = robot.next_wakeup()
         if due is not None and due != self._wakes_at:
             self._wakes_at = due
-            self._queue.after(self._clock.until(due), self._alarm, self.process, due)
+            self._queue.after(self._clock.until(due), self._alarm, self.incarnation, due)
         elif due is None:
             self._wakes_at = None
 
@@ -349,23 +332,23 @@ class RobotNode:
         stall_s = self._world.stall_s()
         if stall_s:
             self._is_stalled = True
-            self._queue.after(stall_s, self._written, self.process, stall_s)
+            self._queue.after(stall_s, self._written, self.incarnation, stall_s)
 
     def _act(self, effect: Act) -> None:
         self._world.note("robot", "performs task action %s", effect.step)
         self._queue.after(
-            _PERFORMS_AFTER_S, self._performs, self.process, effect.step, effect.action
+            _PERFORMS_AFTER_S, self._performs, self.incarnation, effect.step, effect.action
         )
 
     def _sense(self, effect: Sense) -> None:
         step, sensing_action = effect
         self._world.note("robot", "performs sensing action %s of step %s", sensing_action, step)
-        self._queue.after(self._run.sense_s, self._senses, self.process, step, sensing_action)
+        self._queue.after(self._run.sense_s, self._senses, self.incarnation, step, sensing_action)
 
     def _send(self, effect: Send) -> None:
         self._asked[effect.call] = effect.service
         self._world.note("robot", "asks %s, call %s", effect.service, effect.call)
-        self._network.call(effect.service, effect.call, effect.payload)
+        self._world.network.call(effect.service, effect.call, effect.payload)
 
     def _report(self, effect: LogEvent) -> None:
         if effect.name == "status":
@@ -375,10 +358,10 @@ class RobotNode:
         self._world.log_event(effect.name, effect.fields)
 
     def _decide(self, effect: ComputeOwnAnswer) -> None:
-        actions, sensing_action, ahead = self._task.planner.decide(effect.state, MAX_TASK_ACTIONS)
-        digest = self._task.planner.digest(ahead)
+        actions, sensing_action, ahead = self._planner.decide(effect.state, MAX_TASK_ACTIONS)
+        digest = self._planner.digest(ahead)
         event = OwnAnswer(effect.number, actions, sensing_action, digest, _DECIDES_AFTER_S)
-        self._queue.after(_DECIDES_AFTER_S, self._happens, self.process, self._heard, event)
+        self._queue.after(_DECIDES_AFTER_S, self._happens, self.incarnation, self._heard, event)
 
     def _verified(self, effect: VerificationNoted) -> None:
         if effect.verdict not in ("asked", "same"):
@@ -393,11 +376,6 @@ class RobotNode:
         self._world.note("robot", "ends trial %s after %s steps", result.trial, result.steps)
         self._begin_next()
 
-    def _paused(self, effect: Paused) -> None:
-        del effect
-        self._end()
-        self._world.robot_ended()
-
     def _hold_still(self, effect: Halt) -> None:
         """Make sure that the process had a reason to hold still for good."""
         self.stopped_by = error = effect.error
@@ -405,58 +383,49 @@ class RobotNode:
             raise Violation(f"the robot holds still: {error}")
 
     def _written(self, process: int, stall_s: float) -> None:
-        if process != self.process:
+        if self._is_gone(process):
             return
-        if self._stopped:
+        if self.stopped:
             self._deferred.appendleft((None, self._written, (process, stall_s)))
             self._is_stalled = False  # what comes waits for the process now, not for the disk
             return
         self._is_stalled = False
         self._carry_out(())
-        if self._robot is not None:
+        if self.machine is not None:
             if stall_s > _STALL_S:
-                self._robot.event_loop_stalled(stall_s)
+                self.machine.event_loop_stalled(stall_s)
             if not self._is_stalled:
                 self._catch_up()
 
     def _begin_next(self) -> None:
         if self._is_ending:
             # It was asked to while it performed the last action of a trial.
-            self._end()
-            self._world.robot_ended()
+            self._end_in_order()
             return
         unfinished = self._disk.unfinished()
-        task = self._task
         if unfinished is not None:
             trial, records, is_complete = unfinished
         else:
-            numbers = range(task.first_trial, task.last_trial + 1)
-            following = next((n for n in numbers if n not in self._disk.results), None)
+            following = next((n for n in self._trials if n not in self._disk.results), None)
             if following is None:
                 self.finished = True
                 return
             trial, records, is_complete = following, [], True
-        simulator = task.simulator
-        history = replay(task.planner, simulator.seed, trial, records)
-        self._queue.after(
-            _BEGINS_AFTER_S,
-            self._happens,
-            self.process,
-            self._begin,
-            trial,
-            history,
-            is_complete,
-        )
+        history = replay(self._planner, self._simulator.seed, trial, records)
+        begin = (self.incarnation, self._begin, trial, history, is_complete)
+        self._queue.after(_BEGINS_AFTER_S, self._happens, *begin)
 
-    def _begin(self, trial: int, history: Any, is_complete: bool) -> None:
-        robot = self._robot
+    def _begin(self, trial: int, history: TrialHistory, is_complete: bool) -> None:
+        robot = self.machine
         assert robot is not None
         simulated = self._run.environment == "simulated"
-        if self._environment is None or self._environment_trial != trial:
+        if self._environment is None or self._environment.trial != trial:
             self._environment = EnvironmentModel(
-                trial, self._task.simulator.max_steps, self._references, shows_the_same=simulated
+                trial,
+                self._simulator.max_steps,
+                self._world.simulator.references,
+                shows_the_same=simulated,
             )
-            self._environment_trial = trial
         environment = self._environment
         if simulated:
             environment.begin_again(history.actions)
@@ -481,19 +450,19 @@ class RobotNode:
     # -- its body --------------------------------------------------------------------------------
 
     def _senses(self, process: int, step: int, sensing_action: int) -> None:
-        if process != self.process:
+        if self._is_gone(process):
             return
         assert self._environment is not None
         shown = self._environment.sense(step, sensing_action)
         self._happens(process, self._heard, Sensed(step, shown))
 
     def _performs(self, process: int, step: int, action: FloatArray) -> None:
-        if process != self.process:
-            if process == self._body_obeys and self._environment is not None:
+        if self._is_gone(process):
+            if process == self._obeyed and self._environment is not None:
                 self._world.note("robot", "'s body performs task action %s all the same", step)
                 self._environment.act(step, action)
             return
-        if self._stopped:
+        if self.stopped:
             self._deferred.append((None, self._performs, (process, step, action)))
             return
         assert self._environment is not None

@@ -1,10 +1,8 @@
-"""What is to go wrong in one simulated run: plain data, readable text, and a draw by seed.
+"""What is to go wrong in one simulated run: plain data, and readable text.
 
-Nothing is left to chance while a run goes on. All that happens to it is drawn beforehand and
-written down, down to the single message that is lost, so a run can be told to somebody else as a
-few lines of text, repeated, and made smaller by leaving lines out.
-
-A schedule as text has one line for each item: what it is, and its values. Times are seconds::
+All that happens to a run is written down before, to the single message that is lost, so a run can
+be repeated, and made smaller by leaving lines out. A schedule as text has one line for each item:
+what it is, and its values. Times are seconds::
 
     run trial=3 replicas=2 deadline_ms=15
     crash service=cloud-1 at=0.12 down_s=0.4
@@ -39,7 +37,6 @@ __all__ = [
     "SimulationSchedule",
     "Slow",
     "Stop",
-    "cloud_service",
     "line_of",
     "parse_schedule",
 ]
@@ -56,11 +53,6 @@ Count = Annotated[int, msgspec.Meta(ge=0, le=1_000_000)]
 Node = Annotated[str, msgspec.Meta(pattern="^(robot|local|cloud-[1-9])$")]
 Service = Annotated[str, msgspec.Meta(pattern="^(local|cloud-[1-9])$")]
 Direction = Literal["to", "from", "both"]
-
-
-def cloud_service(number: int) -> str:
-    """Return the name of a service of the cloud, numbered from 1."""
-    return f"cloud-{number}"
 
 
 class _Item(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -104,7 +96,7 @@ class RunSettings(_Item, frozen=True, kw_only=True, tag="run", tag_field="item")
     @property
     def services(self) -> tuple[str, ...]:
         """The cloud's services in order of preference."""
-        return tuple(cloud_service(number) for number in range(1, self.replicas + 1))
+        return tuple(f"cloud-{number}" for number in range(1, self.replicas + 1))
 
 
 class Crash(_Item, frozen=True, kw_only=True, tag="crash", tag_field="item"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterable
-from typing import ClassVar, TypeVar
+from typing import TypeVar
 
 import msgspec
 
@@ -29,6 +29,12 @@ from holdfast.lab.simulation.schedule import (
 
 __all__ = ["draw_schedule"]
 
+_SPAN_S = 0.7
+"""Faults begin within this time: a run without any takes about half a second."""
+
+_MESSAGES = 60
+"""Of each service and direction, among which some are struck; a run without faults has fewer."""
+
 _T = TypeVar("_T")
 
 
@@ -44,23 +50,14 @@ def draw_schedule(seed: int) -> SimulationSchedule:
 class _Draw:
     """One draw; see :func:`draw_schedule`."""
 
-    _SPAN_S: ClassVar[float] = 0.7
-    """Faults begin within this time: a run without any takes about half a second."""
-
     def __init__(self, seed: int) -> None:
         # Another generator than the planning's: the world must not be of one mind with the robot.
         self._chance = random.Random(f"holdfast simulation {seed}")
-        # Each by a name of its own, so that the other draws of a seed are what they were before.
-        self._losses, self._bodies, self._aims, self._certificates = (
-            random.Random(f"holdfast simulation {seed}: {name}")
-            for name in ("losses", "bodies", "aims", "certificates")
-        )
+        self._run = self._draw_run()
+        self._services = [*self._run.services, LOCAL_SERVICE]
 
     def schedule(self) -> SimulationSchedule:
-        run = self._run()
-        chance = self._chance
-        services = [*run.services, LOCAL_SERVICE]
-        kinds: list[Callable[[RunSettings, list[str]], Iterable[SimulatedFault]]] = [
+        kinds: list[Callable[[], Iterable[SimulatedFault]]] = [
             self._crash,
             self._crash,
             self._stop,
@@ -73,21 +70,21 @@ class _Draw:
             self._launch,
             self._crowd,
         ]
-        allowed = [kind for kind in kinds if chance.random() < 0.5]
+        allowed = [kind for kind in kinds if self._sometimes(0.5)]
         faults: list[SimulatedFault] = []
         if allowed:
-            for _ in range(self._any((1, 2, 3, 5, 8))):
-                faults += self._any(allowed)(run, services)
-        share = self._any((0.0, 0.0, 0.02, 0.1, 0.3))
+            for _ in range(self._any(1, 2, 3, 5, 8)):
+                faults += self._any(*allowed)()
+        share = self._any(0.0, 0.0, 0.02, 0.1, 0.3)
         if any(isinstance(fault, Crash) and fault.for_good for fault in faults):
             # The robot has nobody but the local service now, and is patient with that: what goes
             # from one process to another of the same machine is not lost again and again.
-            services.remove(LOCAL_SERVICE)
-        faults += self._messages(services, share)
-        return SimulationSchedule(run, tuple(faults))
+            self._services.remove(LOCAL_SERVICE)
+        faults += self._messages(share)
+        return SimulationSchedule(self._run, tuple(faults))
 
-    def _any(self, choices: Iterable[_T]) -> _T:
-        return self._chance.choice(tuple(choices))
+    def _any(self, *choices: _T) -> _T:
+        return self._chance.choice(choices)
 
     def _between(self, low: float, high: float) -> float:
         return round(self._chance.uniform(low, high), 6)
@@ -95,140 +92,122 @@ class _Draw:
     def _sometimes(self, share: float) -> bool:
         return self._chance.random() < share
 
-    def _run(self) -> RunSettings:
+    def _at(self) -> float:
+        return self._between(0.0, _SPAN_S)
+
+    def _draw_run(self) -> RunSettings:
         any_of, between, sometimes = self._any, self._between, self._sometimes
         skewed = sometimes(0.3)
         return RunSettings(
             trial=self._chance.randrange(NUM_TRIALS),
             num_trials=2 if sometimes(0.15) else 1,
-            replicas=any_of((1, 1, 2, 2, 3)),
-            launch=any_of(("on_failure", "on_failure", "on_failure", "at_start", "never")),
-            deadline_ms=any_of((None, None, 5.0, 15.0)),
-            rate_hz=any_of((None, None, 100.0)),
-            act_s=any_of((0.0, 0.005, 0.01, 0.01, 0.02, 0.1)),
-            latency_s=any_of((0.0002, 0.001, 0.001, 0.01, 0.04)),
-            jitter_s=any_of((0.0, 0.0, 0.005)),
-            sensing_s=any_of((0.003, 0.003, 0.03)),
-            launch_s=any_of((0.02, 0.15, 0.15, 0.6)),
-            workers=any_of((1, 2)),
-            sessions_kept=any_of((2, 100)),
-            answers_kept=any_of((1, 8, 8)),
-            certificates=self._certificates.random() < 0.5,
-            forgets_after_s=any_of((600.0, 600.0, 600.0, 0.03)),
-            environment=any_of(("counting", "counting", "simulated", "not_counting")),
-            journal_survives=any_of(("process_crash", "process_crash", "power_cut")),
-            lease_s=any_of((0.4, 0.4, 0.1)),
-            bytes_per_s=any_of((None, None, None, None, 1e5)),
+            replicas=any_of(1, 1, 2, 2, 3),
+            launch=any_of("on_failure", "on_failure", "on_failure", "at_start", "never"),
+            deadline_ms=any_of(None, None, 5.0, 15.0),
+            rate_hz=any_of(None, None, 100.0),
+            act_s=any_of(0.0, 0.005, 0.01, 0.01, 0.02, 0.1),
+            latency_s=any_of(0.0002, 0.001, 0.001, 0.01, 0.04),
+            jitter_s=any_of(0.0, 0.0, 0.005),
+            sensing_s=any_of(0.003, 0.003, 0.03),
+            launch_s=any_of(0.02, 0.15, 0.15, 0.6),
+            workers=any_of(1, 2),
+            sessions_kept=any_of(2, 100),
+            answers_kept=any_of(1, 8, 8),
+            certificates=sometimes(0.5),
+            forgets_after_s=any_of(600.0, 600.0, 600.0, 0.03),
+            environment=any_of("counting", "counting", "simulated", "not_counting"),
+            journal_survives=any_of("process_crash", "process_crash", "power_cut"),
+            lease_s=any_of(0.4, 0.4, 0.1),
+            bytes_per_s=any_of(None, None, None, None, 1e5),
             lost_in_cut=sometimes(0.5),
             robot_clock_offset_s=between(0.0, 1e6) if skewed else 0.0,
-            robot_clock_rate=any_of((0.97, 1.0, 1.03)) if skewed else 1.0,
+            robot_clock_rate=any_of(0.97, 1.0, 1.03) if skewed else 1.0,
             services_clock_offset_s=between(0.0, 1e6) if skewed else 0.0,
-            services_clock_rate=any_of((0.97, 1.0, 1.03)) if skewed else 1.0,
+            services_clock_rate=any_of(0.97, 1.0, 1.03) if skewed else 1.0,
         )
 
-    def _at(self) -> float:
-        return self._between(0.0, self._SPAN_S)
-
-    def _crash(self, run: RunSettings, services: list[str]) -> Iterable[SimulatedFault]:
+    def _crash(self) -> Iterable[SimulatedFault]:
         crash = Crash(
-            service=self._any(services),
+            service=self._any(*self._services),
             at=self._at(),
-            found_after_s=self._any((0.0, 0.002, 0.002, 0.05, 10.0)),
-            down_s=self._any((0.005, 0.05, 0.3, 0.3, 1.0)),
+            found_after_s=self._any(0.0, 0.002, 0.002, 0.05, 10.0),
+            down_s=self._any(0.005, 0.05, 0.3, 0.3, 1.0),
             keeps_memory=self._sometimes(0.25),
         )
-        if run.launch == "never" or self._losses.random() < 0.8:
-            yield crash
-            return
+        if self._run.launch == "never" or self._sometimes(0.8):
+            return [crash]
         # The robot is left alone with what it has aboard.
-        for service in run.services:
-            yield msgspec.structs.replace(
-                crash, service=service, for_good=True, keeps_memory=False, down_s=0.0
-            )
+        gone = msgspec.structs.replace(crash, for_good=True, keeps_memory=False, down_s=0.0)
+        return [msgspec.structs.replace(gone, service=name) for name in self._run.services]
 
-    def _stop(self, run: RunSettings, services: list[str]) -> Iterable[SimulatedFault]:
-        del run
-        node = "robot" if self._sometimes(0.3) else self._any(services)
-        yield Stop(node=node, at=self._at(), for_s=self._any((0.01, 0.1, 0.3, 0.8)))
+    def _stop(self) -> Iterable[SimulatedFault]:
+        node = "robot" if self._sometimes(0.3) else self._any(*self._services)
+        return [Stop(node=node, at=self._at(), for_s=self._any(0.01, 0.1, 0.3, 0.8))]
 
-    def _slow(self, run: RunSettings, services: list[str]) -> Iterable[SimulatedFault]:
-        del run
-        yield Slow(
-            service=self._any(services),
-            at=self._at(),
-            for_s=self._between(0.05, 0.6),
-            factor=self._any((3.0, 20.0, 100.0)),
-        )
+    def _slow(self) -> Iterable[SimulatedFault]:
+        service, at = self._any(*self._services), self._at()
+        for_s, factor = self._between(0.05, 0.6), self._any(3.0, 20.0, 100.0)
+        return [Slow(service=service, at=at, for_s=for_s, factor=factor)]
 
-    def _cut(self, run: RunSettings, services: list[str]) -> Iterable[SimulatedFault]:
-        direction: Direction = self._any(("both", "both", "to", "from"))
-        at, for_s = self._at(), self._any((0.02, 0.1, 0.3, 0.3, 1.0))
+    def _cut(self) -> Iterable[SimulatedFault]:
+        direction: Direction = self._any("both", "both", "to", "from")
+        at, for_s = self._at(), self._any(0.02, 0.1, 0.3, 0.3, 1.0)
         # All of the cloud at once, as when the robot's own link fails, or a part of it.
-        together = self._sometimes(0.5)
-        for service in run.services if together else (self._any(services),):
-            yield Cut(service=service, at=at, for_s=for_s, direction=direction)
+        struck = self._run.services if self._sometimes(0.5) else (self._any(*self._services),)
+        return [Cut(service=each, at=at, for_s=for_s, direction=direction) for each in struck]
 
-    def _crowd(self, run: RunSettings, services: list[str]) -> Iterable[SimulatedFault]:
-        del services
-        robots = self._any((1, 5, 20, 60))
-        yield Crowd(service=self._any(run.services), at=self._at(), robots=robots)
+    def _crowd(self) -> Iterable[SimulatedFault]:
+        service, robots = self._any(*self._run.services), self._any(1, 5, 20, 60)
+        return [Crowd(service=service, at=self._at(), robots=robots)]
 
-    def _kill(self, run: RunSettings, services: list[str]) -> Iterable[SimulatedFault]:
-        del services
+    def _kill(self) -> Iterable[SimulatedFault]:
         power_cut = self._sometimes(0.3)
         at = self._at() if self._sometimes(0.3) else None
         yield KillRobot(
             boundary=0 if at is not None else self._chance.randrange(150),
             at=at,
-            down_s=self._any((0.001, 0.05, 0.2, 0.6)),
+            down_s=self._any(0.001, 0.05, 0.2, 0.6),
             power_cut=power_cut,
-            lost_appends=self._any((0, 1, 2, 5, 100)) if power_cut else 0,
-            body_goes_on=self._bodies.random() < 0.5,
-            before=self._aims.choice(("anything", "anything", "journal", "send", "sense", "act")),
+            lost_appends=self._any(0, 1, 2, 5, 100) if power_cut else 0,
+            body_goes_on=self._sometimes(0.5),
+            before=self._any("anything", "anything", "journal", "send", "sense", "act"),
         )
-        if self._aims.random() < 0.3:
+        if self._sometimes(0.3):
             # What the process has asked may arrive when the next one lives.
-            for service in run.services:
+            for service in self._run.services:
                 yield MessageFault(
                     service=service,
                     direction="to",
-                    number=self._aims.randrange(8),
+                    number=self._chance.randrange(8),
                     what="delay",
-                    seconds=self._aims.choice((0.1, 0.3, 0.6)),
+                    seconds=self._any(0.1, 0.3, 0.6),
                 )
 
-    def _pause(self, run: RunSettings, services: list[str]) -> Iterable[SimulatedFault]:
-        del run, services
-        yield PauseRobot(at=self._at(), down_s=self._any((0.001, 0.2)))
+    def _pause(self) -> Iterable[SimulatedFault]:
+        return [PauseRobot(at=self._at(), down_s=self._any(0.001, 0.2))]
 
-    def _stall(self, run: RunSettings, services: list[str]) -> Iterable[SimulatedFault]:
-        del run, services
-        yield DiskStall(at=self._at(), for_s=self._any((0.004, 0.03, 0.3)))
+    def _stall(self) -> Iterable[SimulatedFault]:
+        return [DiskStall(at=self._at(), for_s=self._any(0.004, 0.03, 0.3))]
 
-    def _launch(self, run: RunSettings, services: list[str]) -> Iterable[SimulatedFault]:
-        del run, services
-        yield LaunchFault(
-            number=self._any((1, 1, 2, 3)),
-            what=self._any(("late", "fails", "silent")),
-            seconds=self._any((0.0, 0.01, 0.3, 2.0)),
-        )
-
-    def _messages(self, services: list[str], share: float) -> Iterable[SimulatedFault]:
-        if not share:
-            return
-        kinds = [
-            kind
-            for kind in ("drop", "delay", "duplicate", "corrupt", "misroute")
-            if self._chance.random() < 0.6
+    def _launch(self) -> Iterable[SimulatedFault]:
+        return [
+            LaunchFault(
+                number=self._any(1, 1, 2, 3),
+                what=self._any("late", "fails", "silent"),
+                seconds=self._any(0.0, 0.01, 0.3, 2.0),
+            )
         ]
-        if not kinds:
+
+    def _messages(self, share: float) -> Iterable[SimulatedFault]:
+        every = ("drop", "delay", "duplicate", "corrupt", "misroute")
+        kinds = [kind for kind in every if self._sometimes(0.6)]
+        if not share or not kinds:
             return
-        among = 60
-        for service in services:
+        for service in self._services:
             for direction in ("to", "from"):
-                count = self._chance.randint(0, round(2 * share * among))
-                for number in sorted(self._chance.sample(range(among), count)):
-                    what = self._any(kinds)
+                count = self._chance.randint(0, round(2 * share * _MESSAGES))
+                for number in sorted(self._chance.sample(range(_MESSAGES), count)):
+                    what = self._any(*kinds)
                     if what == "misroute" and direction == "to":
                         what = "delay"
                     late = what in ("delay", "duplicate", "misroute")
@@ -237,6 +216,6 @@ class _Draw:
                         direction=direction,
                         number=number,
                         what=what,  # type: ignore[arg-type]
-                        seconds=self._any((0.0, 0.002, 0.02, 0.3)) if late else 0.0,
+                        seconds=self._any(0.0, 0.002, 0.02, 0.3) if late else 0.0,
                         bit=self._chance.randrange(1 << 16) if what == "corrupt" else 0,
                     )

@@ -20,7 +20,6 @@ import msgspec
 import pandas as pd
 
 from holdfast.config.settings import ActiveSensingSettings
-from holdfast.files import write_atomically
 from holdfast.lab.errors import NoProgressError, ProcessEndedError, TaskError
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.testbed.driver import Script, Testbed, after
@@ -257,7 +256,8 @@ class _Series:
         load = os.getloadavg()[0]
         reference = make_reference_run(
             directory / _REFERENCE,
-            lambda num_trials: self._write_configuration(directory, run, num_trials),
+            directory / _CONFIGURATION_NAME,
+            self._configuration(directory, run),
             wanted.min_steps,
             performed[_REFERENCE],
         )
@@ -325,12 +325,12 @@ class _Series:
         carried = self._path.carried_bytes
         return None if carried is None or since is None else carried() - since
 
-    def _write_configuration(self, directory: Path, run: int, num_trials: int) -> Path:
+    def _configuration(self, directory: Path, run: int) -> dict[str, Any]:
         wanted = self._wanted
         offload: dict[str, Any] = {"services": [self._path.connect]}
         if self._keys is not None:
             offload["tls"] = str(self._keys / "robot")
-        document = {
+        return {
             "problem": PROBLEM,
             "particle_filter": {"num_particles": wanted.particles},
             "active_sensing": {
@@ -338,9 +338,9 @@ class _Series:
                 "num_nearest_neighbors": SENSING.num_nearest_neighbors,
                 "num_cores": SENSING.num_cores,
             },
-            "selector": {"estimator": "nearest_neighbor"},  # the thesis's
+            # The thesis's.
+            "selector": {"method": "action_entropy", "estimator": "nearest_neighbor"},
             "simulator": {
-                "num_trials": num_trials,
                 "max_steps": MAX_STEPS,
                 "sensing_intervals": SENSING_INTERVAL,
                 "seed": wanted.seed + run,
@@ -348,7 +348,3 @@ class _Series:
             "offload": offload,
             "environment": witnessed_by(directory / f"{_WITH_KILL}.txt"),
         }
-        path = directory / _CONFIGURATION_NAME
-        # JSON is YAML as well.
-        write_atomically(path, msgspec.json.encode(document) + b"\n")
-        return path

@@ -8,22 +8,18 @@ happens, no process is left when the ``with`` statement ends.
 
 from __future__ import annotations
 
-import contextlib
-import os
-import secrets
 import shutil
 import signal
 import tempfile
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from typing import Self, TypeAlias
 
 from holdfast.lab.errors import NoProgressError, ProcessEndedError
 from holdfast.lab.testbed.fault_times import InjectedFault
 from holdfast.lab.testbed.namespace import NetworkNamespace
-from holdfast.lab.testbed.processes import HOLDFAST, Ended, Process, end_marked_processes
+from holdfast.lab.testbed.processes import HOLDFAST, Process, ProcessGroup
 from holdfast.lab.testbed.proxy import Proxy
 from holdfast.lab.testbed.records import Decision, DecisionTable, LogEvent
 from holdfast.recording.run_directory import TIMINGS_NAME
@@ -33,8 +29,6 @@ __all__ = ["RobotCommand", "Script", "ServiceCommand", "Testbed", "after"]
 
 Script: TypeAlias = Generator[Callable[[], bool], None, None]
 """Yields what it waits for, and goes on once that is true."""
-
-_MARK = "HOLDFAST_TESTBED"
 
 _TURN_S = 0.008
 """How long the loop may sleep, so how late a fault may be injected."""
@@ -53,7 +47,7 @@ class ServiceCommand:
         self,
         start: Callable[[], Process],
         endpoint: str,
-        port: int | None = None,
+        port: int = 0,
         proxy: Proxy | None = None,
         namespace: NetworkNamespace | None = None,
     ) -> None:
@@ -96,8 +90,7 @@ class ServiceCommand:
 class RobotCommand:
     """``holdfast run`` into one directory: one process, or several that resume the run.
 
-    ``steps_of_trials`` has the task actions of each trial, as in the reference run; ``events`` are
-    those of all its processes, in order.
+    ``steps_of_trials`` has the task actions of each trial, as in the reference run.
     """
 
     def __init__(
@@ -112,14 +105,22 @@ class RobotCommand:
         self.rate_hz = rate_hz
         self.out = out
         self.table = DecisionTable(out / TIMINGS_NAME)
-        self.events: list[LogEvent] = []
-        self.is_done = False
         self.processes = [start(())]
 
     @property
     def process(self) -> Process:
         """The process that was started last."""
         return self.processes[-1]
+
+    @property
+    def events(self) -> list[LogEvent]:
+        """What all its processes have logged, in order."""
+        return [event for process in self.processes for event in process.events.copy()]
+
+    @property
+    def is_done(self) -> bool:
+        """Whether its run has ended well."""
+        return self.process.exit_code == 0
 
     @property
     def decisions(self) -> list[Decision]:
@@ -188,11 +189,9 @@ class Testbed:
         self.on_turn = on_turn
         self._prefix = tuple(prefix)
         self._orderly_end_s = orderly_end_s
-        self._happened: SimpleQueue[tuple[Process, LogEvent | Ended]] = SimpleQueue()
+        self._group = ProcessGroup()
         self._scripts: list[Iterator[None]] = []
-        self._processes: list[Process] = []
         self.robot_or_none: RobotCommand | None = None
-        self._mark = secrets.token_hex(16)
         self.temporary = Path(tempfile.mkdtemp(prefix="holdfast-"))
         self.services: list[ServiceCommand] = []
         self.faults: list[InjectedFault] = []
@@ -202,24 +201,10 @@ class Testbed:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End all processes; an exception meanwhile kills them at once."""
         try:
-            if self._orderly_end_s > 0.0:
-                for process in self._processes:
-                    process.process.terminate()
-                for process in self._processes:
-                    process.close(self._orderly_end_s)
-        finally:
-            for process in self._processes:
-                process.process.kill()
-            for process in self._processes:
-                process.close(0.0)
-            self._processes.clear()
             # Local services end with their robot.
-            self.left_behind = end_marked_processes(_MARK, self._mark, _END_S)
+            self.left_behind = self._group.close(_END_S, self._orderly_end_s)
+        finally:
             if self.robot_or_none is not None:
                 self.robot_or_none.table.close()
             shutil.rmtree(self.temporary, ignore_errors=True)
@@ -242,7 +227,7 @@ class Testbed:
         service = ServiceCommand(
             lambda: self._start(arguments, log_name, prefix),
             endpoint or listen,
-            int(port) if port.isdigit() else None,
+            int(port) if port.isdigit() else 0,
             proxy,
             namespace,
         )
@@ -273,6 +258,8 @@ class Testbed:
         if self.robot_or_none is not None:
             self.robot_or_none.process.close(_END_S)
             self.robot_or_none.table.close()
+            for process in self.robot_or_none.processes:
+                self._group.processes.remove(process)
             self._scripts.clear()
         arguments = ["run", str(configuration), *options, "--rate", f"{rate_hz:g}"]
         arguments += ["--log", "json", "--out", str(out)]
@@ -294,14 +281,13 @@ class Testbed:
         return self.robot_or_none
 
     def _start(self, arguments: Sequence[str], log_name: str, prefix: Sequence[str]) -> Process:
-        environment = {**os.environ, _MARK: self._mark, "TMPDIR": str(self.temporary)}
         process = Process(
             (*self._prefix, *prefix, *HOLDFAST, *arguments),
-            environment,
+            self._group.environment({"TMPDIR": str(self.temporary)}),
             log_path=self.directory / log_name,
-            deliver=lambda process, happened: self._happened.put((process, happened)),
+            changed=self._group.changed,
         )
-        self._processes.append(process)
+        self._group.processes.append(process)
         return process
 
     # -- faults --------------------------------------------------------------------------------
@@ -357,7 +343,9 @@ class Testbed:
                 raise NoProgressError(f"waited {limit_s:.0f} s in vain for {what}")
             if now - began > _LONGEST_S:
                 raise NoProgressError(f"waited {_LONGEST_S:.0f} s in vain for {what}")
-            self._take_what_happened()
+            self._require_nobody_ended()
+            with self._group.changed:
+                self._group.changed.wait(_TURN_S)
 
     def wait_for_end_of_run(self, limit_s: float) -> None:
         """Wait until the robot's run has ended; the limit begins anew with each decision."""
@@ -370,24 +358,13 @@ class Testbed:
         )
         robot.table.read()
 
-    def _take_what_happened(self) -> None:
-        with contextlib.suppress(Empty):
-            process, happened = self._happened.get(timeout=_TURN_S)
-            while True:
-                if isinstance(happened, Ended):
-                    self._note_end(process, happened.code)
-                elif self._is_robot(process):
-                    self.robot.events.append(happened)
-                process, happened = self._happened.get_nowait()
-
-    def _is_robot(self, process: Process) -> bool:
-        return self.robot_or_none is not None and process in self.robot_or_none.processes
-
-    def _note_end(self, process: Process, code: int) -> None:
-        if code == 0 and self._is_robot(process):
-            self.robot.is_done = True
-        elif not process.killed:
-            name = "robot" if self._is_robot(process) else "cloud service"
+    def _require_nobody_ended(self) -> None:
+        robots = [] if self.robot_or_none is None else self.robot_or_none.processes
+        for process in self._group.processes:
+            code, is_robot = process.exit_code, process in robots
+            if code is None or process.killed or (is_robot and code == 0):
+                continue
+            name = "robot" if is_robot else "cloud service"
             how = f"exit code {code}" if code >= 0 else signal.Signals(-code).name
             last = process.last_line()
             raise ProcessEndedError(

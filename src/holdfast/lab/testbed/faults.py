@@ -17,7 +17,7 @@ import msgspec
 
 from holdfast.lab.testbed.driver import Script, Testbed, after
 from holdfast.lab.testbed.fault_times import ROBOT
-from holdfast.lab.testbed.processes import local_services_of
+from holdfast.lab.testbed.processes import Process, local_services_of
 from holdfast.lab.testbed.proxy import Direction, Impairment
 from holdfast.robot.links import RECOVERY_SERVICE
 
@@ -45,6 +45,25 @@ class FaultKind(StrEnum):
     PACKETS_DROPPED = "packets_dropped"
     PACKETS_DROPPED_ONE_WAY = "packets_dropped_one_way"
     COMBINATION = "combination"
+
+
+DESCRIPTIONS = {
+    FaultKind.CLOUD_KILLED: "the cloud service is killed (SIGKILL) and started again",
+    FaultKind.CLOUD_STOPPED: "the cloud service is stopped for a while (SIGSTOP, SIGCONT)",
+    FaultKind.LOCAL_KILLED: "the local service is killed while the cloud is away",
+    FaultKind.ROBOT_KILLED: "the robot's process is killed and resumed",
+    FaultKind.ROBOT_STOPPED: "the robot's process is stopped for a while",
+    FaultKind.REPLICAS_KILLED: "of two cloud services, one after the other is killed",
+    FaultKind.LINK_DELAYED: "a proxy adds latency and jitter",
+    FaultKind.LINK_LOSSY: "a proxy delivers late, as after lost packets",
+    FaultKind.LINK_SILENT: "a proxy lets nothing through, and breaks no connection",
+    FaultKind.LINK_SILENT_ONE_WAY: "a proxy lets nothing through in one direction",
+    FaultKind.LINK_CUT: "a proxy resets all connections and refuses new ones",
+    FaultKind.PACKETS_LOST: "nftables drops some packets, at random",
+    FaultKind.PACKETS_DROPPED: "nftables drops all packets",
+    FaultKind.PACKETS_DROPPED_ONE_WAY: "nftables drops all packets in one direction",
+    FaultKind.COMBINATION: "several of these at once",
+}
 
 
 class Fault(msgspec.Struct, frozen=True, kw_only=True):
@@ -87,10 +106,17 @@ def _kill_cloud(testbed: Testbed, fault: Fault) -> Script:
 
 def _stop_cloud(testbed: Testbed, fault: Fault) -> Script:
     cloud = testbed.services[fault.cloud]
-    if cloud.is_away:
-        return
-    process = cloud.process
-    injected = testbed.note_fault(fault.kind.value, cloud.endpoint, process.stop())
+    if not cloud.is_away:
+        yield from _stop(testbed, fault, cloud.process, cloud.endpoint)
+
+
+def _stop_robot(testbed: Testbed, fault: Fault) -> Script:
+    if not testbed.robot.process.killed:
+        yield from _stop(testbed, fault, testbed.robot.process, ROBOT)
+
+
+def _stop(testbed: Testbed, fault: Fault, process: Process, target: str) -> Script:
+    injected = testbed.note_fault(fault.kind.value, target, process.stop())
     yield after(fault.duration_s)
     if not process.killed:
         injected.usable_at = process.resume()
@@ -138,16 +164,6 @@ def _kill_robot(testbed: Testbed, fault: Fault) -> Script:
     injected.usable_at = testbed.robot.process.spawned_at
 
 
-def _stop_robot(testbed: Testbed, fault: Fault) -> Script:
-    process = testbed.robot.process
-    if process.killed:
-        return
-    injected = testbed.note_fault(fault.kind.value, ROBOT, process.stop())
-    yield after(fault.duration_s)
-    if not process.killed:
-        injected.usable_at = process.resume()
-
-
 def _impair_line(testbed: Testbed, fault: Fault) -> Script:
     proxy = testbed.services[fault.cloud].proxy
     assert proxy is not None
@@ -165,7 +181,7 @@ def _impair_line(testbed: Testbed, fault: Fault) -> Script:
 def _drop_packets(testbed: Testbed, fault: Fault) -> Script:
     cloud = testbed.services[fault.cloud]
     namespace, port = cloud.namespace, cloud.port
-    assert namespace is not None and port is not None
+    assert namespace is not None
     share = fault.loss if fault.kind is FaultKind.PACKETS_LOST else 1.0
     return _until_healed(testbed, fault, lambda: namespace.drop(port, fault.direction, share))
 
@@ -181,61 +197,35 @@ def _until_healed(
     heal()
 
 
-_FAULTS: dict[FaultKind, tuple[str, Callable[[Testbed, Fault], Script]]] = {
-    FaultKind.CLOUD_KILLED: (
-        "the cloud service is killed (SIGKILL) and started again",
-        _kill_cloud,
-    ),
-    FaultKind.CLOUD_STOPPED: (
-        "the cloud service is stopped for a while (SIGSTOP, SIGCONT)",
-        _stop_cloud,
-    ),
-    FaultKind.LOCAL_KILLED: ("the local service is killed while the cloud is away", _kill_local),
-    FaultKind.ROBOT_KILLED: ("the robot's process is killed and resumed", _kill_robot),
-    FaultKind.ROBOT_STOPPED: ("the robot's process is stopped for a while", _stop_robot),
-    FaultKind.REPLICAS_KILLED: (
-        "of two cloud services, one after the other is killed",
-        _kill_cloud,
-    ),
-    FaultKind.LINK_DELAYED: ("a proxy adds latency and jitter", _impair_line),
-    FaultKind.LINK_LOSSY: ("a proxy delivers late, as after lost packets", _impair_line),
-    FaultKind.LINK_SILENT: (
-        "a proxy lets nothing through, and breaks no connection",
-        _impair_line,
-    ),
-    FaultKind.LINK_SILENT_ONE_WAY: (
-        "a proxy lets nothing through in one direction",
-        _impair_line,
-    ),
-    FaultKind.LINK_CUT: ("a proxy resets all connections and refuses new ones", _impair_line),
-    FaultKind.PACKETS_LOST: ("nftables drops some packets, at random", _drop_packets),
-    FaultKind.PACKETS_DROPPED: ("nftables drops all packets", _drop_packets),
-    FaultKind.PACKETS_DROPPED_ONE_WAY: (
-        "nftables drops all packets in one direction",
-        _drop_packets,
-    ),
+_SCRIPTS: dict[FaultKind, Callable[[Testbed, Fault], Script]] = {
+    FaultKind.CLOUD_KILLED: _kill_cloud,
+    FaultKind.CLOUD_STOPPED: _stop_cloud,
+    FaultKind.LOCAL_KILLED: _kill_local,
+    FaultKind.ROBOT_KILLED: _kill_robot,
+    FaultKind.ROBOT_STOPPED: _stop_robot,
+    FaultKind.REPLICAS_KILLED: _kill_cloud,
+    FaultKind.LINK_DELAYED: _impair_line,
+    FaultKind.LINK_LOSSY: _impair_line,
+    FaultKind.LINK_SILENT: _impair_line,
+    FaultKind.LINK_SILENT_ONE_WAY: _impair_line,
+    FaultKind.LINK_CUT: _impair_line,
+    FaultKind.PACKETS_LOST: _drop_packets,
+    FaultKind.PACKETS_DROPPED: _drop_packets,
+    FaultKind.PACKETS_DROPPED_ONE_WAY: _drop_packets,
 }
 
-DESCRIPTIONS = {
-    **{kind: text for kind, (text, _) in _FAULTS.items()},
-    FaultKind.COMBINATION: "several of these at once",
-}
+NEEDS_PROXY = frozenset(kind for kind, script in _SCRIPTS.items() if script is _impair_line)
 
-NEEDS_PROXY = frozenset(kind for kind, (_, script) in _FAULTS.items() if script is _impair_line)
-
-NEEDS_NAMESPACE = frozenset(
-    kind for kind, (_, script) in _FAULTS.items() if script is _drop_packets
-)
+NEEDS_NAMESPACE = frozenset(kind for kind, script in _SCRIPTS.items() if script is _drop_packets)
 """Kinds that need nftables and a network namespace."""
 
 
 def inject(testbed: Testbed, fault: Fault) -> None:
     """Have the testbed inject a fault once its robot has come to the fault's step."""
-    _, script = _FAULTS[fault.kind]
 
     def at_its_step() -> Script:
         step = int(fault.at * testbed.robot.steps)
         yield lambda: testbed.robot.steps_done >= step
-        yield from script(testbed, fault)
+        yield from _SCRIPTS[fault.kind](testbed, fault)
 
     testbed.run_script(at_its_step())

@@ -109,19 +109,37 @@ class NetworkNamespace:
         return lambda: self._nft(f"delete chain {chain}")
 
     def _nft(self, rules: str) -> None:
+        self.run(("nft", "-f", "-"), f"nft refuses {rules!r}", text=f"{rules}\n")
+
+    def run(
+        self,
+        command: Sequence[str],
+        refusal: str,
+        *,
+        text: str = "",
+        descriptors: Sequence[int] = (),
+    ) -> None:
+        """Run a command in it to its end, with a text as input and some open descriptors.
+
+        Raises
+        ------
+        CannotStartError
+            If it cannot be run or fails: the refusal, and what it says.
+        """
         try:
             done = subprocess.run(
-                [*self.prefix, "nft", "-f", "-"],
-                input=f"{rules}\n".encode(),
+                [*self.prefix, *command],
+                input=text.encode(),
+                pass_fds=descriptors,
                 capture_output=True,
                 timeout=_PATIENCE_S,
                 check=False,
             )
         except (OSError, subprocess.TimeoutExpired) as error:
-            raise CannotStartError(f"nft cannot be run: {error}") from error
+            raise CannotStartError(f"{command[0]} cannot be run: {error}") from error
         if done.returncode:
             said = done.stderr.decode(errors="replace").strip()
-            raise CannotStartError(f"nft refuses {rules!r}: {said}")
+            raise CannotStartError(f"{refusal}: {said}")
 
 
 def why_no_namespace(find: Callable[[str], str | None] = shutil.which) -> str | None:

@@ -7,26 +7,28 @@ a caller may wait for an event, or hand in a function that gets each event and t
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import random
+import secrets
 import signal
 import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from typing import NamedTuple
 
 from holdfast.lab.errors import CannotStartError, NoProgressError, ProcessEndedError
 from holdfast.lab.testbed.records import LogEvent, log_event_of
 
 __all__ = [
     "HOLDFAST",
-    "Ended",
+    "Ports",
     "Process",
-    "end_marked_processes",
+    "ProcessGroup",
     "free_port",
     "local_services_of",
     "marked_processes",
@@ -34,6 +36,7 @@ __all__ = [
 
 HOLDFAST = (sys.executable, "-m", "holdfast")
 
+_MARK = "HOLDFAST_TESTBED"
 _SHOWN_CHARACTERS = 300
 _POLL_S = 0.008
 _READER_S = 30.0
@@ -41,13 +44,6 @@ _READER_S = 30.0
 _LOWEST_PORT = 20_000
 _OUTGOING_PORTS = Path("/proc/sys/net/ipv4/ip_local_port_range")
 _USUAL_FIRST_OUTGOING_PORT = 32_768
-_PORT_ATTEMPTS = 1000
-
-
-class Ended(NamedTuple):
-    """A process has ended and all its events are delivered; the code is negative after a signal."""
-
-    code: int
 
 
 class Process:
@@ -60,8 +56,8 @@ class Process:
     ----------
     log_path : Path or None
         Its output is appended to this file.
-    deliver : callable or None
-        Gets each event and the end; called from a thread.
+    changed : threading.Condition or None
+        Notified of each line and of the end; several processes may share it.
     own_session : bool
         Whether it leads a session, so that it may have a terminal of its own.
 
@@ -71,6 +67,8 @@ class Process:
         In seconds since the epoch.
     killed_at : float or None
         When :meth:`kill` was called.
+    exit_code : int or None
+        Negative after a signal; None until it has ended and all its events are here.
 
     Raises
     ------
@@ -85,16 +83,15 @@ class Process:
         *,
         directory: Path | None = None,
         log_path: Path | None = None,
-        deliver: Callable[[Process, LogEvent | Ended], None] | None = None,
+        changed: threading.Condition | None = None,
         own_session: bool = False,
     ) -> None:
         self.log_path = log_path
-        self._deliver = deliver
-        self._changed = threading.Condition()
-        self._has_ended = False
+        self._changed = changed or threading.Condition()
         self.lines: list[str] = []
         self.events: list[LogEvent] = []
         self.killed_at: float | None = None
+        self.exit_code: int | None = None
         self.spawned_at = time.time()
         try:
             self.process = subprocess.Popen(
@@ -179,7 +176,7 @@ class Process:
         with self._changed:
             while len(found := self.matching(name, **fields)) < count:
                 awaited = f"event {name} {fields or ''} (number {count})"
-                if self._has_ended:
+                if self.exit_code is not None:
                     raise ProcessEndedError(f"no {awaited}: {self.account()}")
                 left = deadline - time.monotonic()
                 if left <= 0.0:
@@ -210,10 +207,8 @@ class Process:
                 self._take(line.decode(errors="replace"))
         code = self.process.wait()
         with self._changed:
-            self._has_ended = True
+            self.exit_code = code
             self._changed.notify_all()
-        if self._deliver is not None:
-            self._deliver(self, Ended(code))
 
     def _take(self, line: str) -> None:
         event = log_event_of(line)
@@ -223,37 +218,105 @@ class Process:
             if event is not None:
                 self.events.append(event)
             self._changed.notify_all()
-        if event is not None and self._deliver is not None:
-            self._deliver(self, event)
 
 
-def free_port() -> int:
-    """Return a port of this machine that is free for streams and datagrams.
+class ProcessGroup:
+    """Processes, and all that they start: a variable, which children inherit, marks them.
 
-    It is outside the range from which the system takes ports for outgoing connections: otherwise a
-    connection attempt to a service that is away could get the service's own port and connect to
-    itself.
+    Attributes
+    ----------
+    changed : threading.Condition
+        Notified when one of them writes a line, or has ended.
+    """
 
-    Raises
-    ------
-    CannotStartError
-        If there is none.
+    def __init__(self) -> None:
+        self._mark = secrets.token_hex(16)
+        self.processes: list[Process] = []
+        self.changed = threading.Condition()
+
+    def environment(self, variables: Mapping[str, str]) -> dict[str, str]:
+        """Return the environment of a process of this group."""
+        return {**os.environ, _MARK: self._mark, **variables}
+
+    def living(self) -> list[int]:
+        """Return all of them that have not ended, whoever started them."""
+        return marked_processes(_MARK, self._mark)
+
+    def close(self, patience_s: float, orderly_end_s: float = 0.0) -> list[int]:
+        """End all of them, and return those that had to be killed although nobody knew them.
+
+        Parameters
+        ----------
+        patience_s : float
+            How long what they have started has to end by itself, after them.
+        orderly_end_s : float
+            How long they have after SIGTERM; at 0, or by an exception, they are killed at once.
+        """
+        try:
+            if orderly_end_s > 0.0:
+                for process in self.processes:
+                    process.process.terminate()
+                for process in self.processes:
+                    process.close(orderly_end_s)
+        finally:
+            for process in self.processes:
+                process.process.kill()
+            for process in self.processes:
+                process.close(0.0)
+            deadline = time.monotonic() + patience_s
+            while (left := self.living()) and time.monotonic() <= deadline:
+                time.sleep(_POLL_S)
+            for pid in left:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+        return left
+
+
+class Ports:
+    """A range of ports, taken one after another from a random one on: none is taken again soon."""
+
+    def __init__(self, first: int, end: int) -> None:
+        self._first = first
+        self._size = end - first
+        # A run that begins when another one has just ended begins elsewhere.
+        self._numbers = itertools.count(random.SystemRandom().randrange(self._size))
+
+    def free(self, host: str = "127.0.0.1") -> int:
+        """Return a port that is free for streams and datagrams.
+
+        Raises
+        ------
+        CannotStartError
+            If there is none.
+        """
+        for number in itertools.islice(self._numbers, self._size):
+            port = self._first + number % self._size
+            with contextlib.suppress(OSError):
+                for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
+                    with socket.socket(type=kind) as probe:
+                        probe.bind((host, port))
+                return port
+        end = self._first + self._size - 1
+        raise CannotStartError(f"no port of {host} from {self._first} to {end} is free")
+
+
+@cache
+def _own_ports() -> Ports:
+    """Return those below the range from which the system takes ports for outgoing connections.
+
+    From within it a connection attempt to a service that is away could get the service's own port
+    and connect to itself.
     """
     try:
         end = int(_OUTGOING_PORTS.read_text().split()[0])
     except (OSError, ValueError, IndexError):
         end = _USUAL_FIRST_OUTGOING_PORT
-    if end <= _LOWEST_PORT:
-        end = _USUAL_FIRST_OUTGOING_PORT
-    chance = random.SystemRandom()
-    for _ in range(_PORT_ATTEMPTS):
-        port = chance.randrange(_LOWEST_PORT, end)
-        with contextlib.suppress(OSError):
-            for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
-                with socket.socket(type=kind) as probe:
-                    probe.bind(("127.0.0.1", port))
-            return port
-    raise CannotStartError(f"no port of 127.0.0.1 from {_LOWEST_PORT} to {end - 1} is free")
+    return Ports(_LOWEST_PORT, end if end > _LOWEST_PORT else _USUAL_FIRST_OUTGOING_PORT)
+
+
+def free_port() -> int:
+    """Return a port of this machine that is free for streams and datagrams."""
+    return _own_ports().free()
 
 
 def local_services_of(robot: int) -> list[int]:
@@ -286,16 +349,3 @@ def _state_and_parent(folder: Path) -> tuple[str, int]:
     # The name, in parentheses, may hold anything.
     fields = (folder / "stat").read_text().rpartition(")")[2].split()
     return fields[0], int(fields[1])
-
-
-def end_marked_processes(name: str, value: str, patience_s: float) -> list[int]:
-    """Wait until all :func:`marked_processes` have ended; kill the rest and return them."""
-    deadline = time.monotonic() + patience_s
-    while left := marked_processes(name, value):
-        if time.monotonic() > deadline:
-            for pid in left:
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(pid, signal.SIGKILL)
-            break
-        time.sleep(_POLL_S)
-    return left

@@ -6,8 +6,8 @@ waits; so here loss makes a piece late. On a silent line all pieces, and the end
 are late until it is healed. Only a cut breaks connections: it resets both ends and refuses new
 ones.
 
-It may carry datagrams beside streams, at the same port. Loss and silence drop datagrams, and jitter
-reorders them.
+It may carry datagrams beside streams, at the same port. Loss and silence drop datagrams, jitter
+reorders them, and they may come twice, again later, or from another address.
 
 Several impairments may be active at the same time; a piece suffers from all of them. The queue of
 pieces is bounded: when it is full, the proxy stops reading, as with a full TCP window.
@@ -21,15 +21,16 @@ import random
 import socket
 import struct
 import threading
-from collections.abc import Callable, Coroutine
+from collections import deque
+from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self, TypeAlias
+from typing import Any, Literal, Self, TypeAlias, get_args
 
 from holdfast.lab.errors import CannotStartError
 
-__all__ = ["Direction", "Impairment", "Place", "Proxy"]
+__all__ = ["Carrier", "Direction", "Impairment", "Place", "Proxy", "endpoint_at"]
 
 Direction: TypeAlias = Literal["both", "to_service", "to_robot"]
 
@@ -46,6 +47,15 @@ _RESET_ON_CLOSE = struct.pack("ii", 1, 0)
 _BACKLOG = 16
 _LARGEST_DATAGRAM = 65_536
 _MOST_CLIENTS = 64
+_KEPT_DATAGRAMS = 50
+
+Carrier: TypeAlias = Literal["streams", "datagrams"]
+_CARRIERS: tuple[Carrier, ...] = get_args(Carrier)
+
+
+def endpoint_at(transport: str, place: Place) -> str:
+    """Return the endpoint of a service at a place of this machine."""
+    return f"{transport}/{place}" if isinstance(place, Path) else f"{transport}/127.0.0.1:{place}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +71,10 @@ class Impairment:
     loss : float
         Share of pieces that are late by TCP's retransmission timeout, and of datagrams that are
         dropped.
+    doubled : bool
+        Whether datagrams come twice.
+    carriers : tuple of {"streams", "datagrams"}
+        What it affects.
     """
 
     direction: Direction = "both"
@@ -69,6 +83,8 @@ class Impairment:
     loss: float = 0.0
     silent: bool = False
     cut: bool = False
+    doubled: bool = False
+    carriers: tuple[Carrier, ...] = _CARRIERS
 
 
 class Proxy:
@@ -80,6 +96,8 @@ class Proxy:
         Where the service listens. If nothing does, connections are closed at once.
     datagrams : bool
         Whether it carries datagrams between the same ports, too.
+    overhear : callable
+        Gets what is carried, a piece of a stream or a datagram, and which way; in another thread.
 
     Raises
     ------
@@ -87,16 +105,25 @@ class Proxy:
         If it cannot listen.
     """
 
-    def __init__(self, place: Place, target: Place, seed: str, *, datagrams: bool = False) -> None:
-        self._place = place
+    def __init__(
+        self,
+        place: Place,
+        target: Place,
+        seed: str,
+        *,
+        datagrams: bool = False,
+        overhear: Callable[[Carrier, Direction, bytes], object] = lambda *_: None,
+    ) -> None:
+        self.place = place
+        self._overhear = overhear
         self._target = target
         self._chance = random.Random(seed)
-        self._impairments: dict[int, Impairment] = {}
-        self._numbers = 0
+        self._impairments: dict[object, Impairment] = {}
         self._listener: socket.socket | None = None
         self._datagrams: socket.socket | None = None
         self._carries_datagrams = datagrams
         self._clients: dict[Any, socket.socket] = {}
+        self._kept: deque[bytes] = deque(maxlen=_KEPT_DATAGRAMS)
         self._connections: set[asyncio.Task[None]] = set()
         self._sockets: set[socket.socket] = set()
         self._loop = asyncio.new_event_loop()
@@ -104,7 +131,7 @@ class Proxy:
         self._thread = threading.Thread(target=self._run, name=f"proxy-{place}", daemon=True)
         self._thread.start()
         try:
-            self._call(self._listen())
+            self._call(self._open())
         except OSError as error:
             self.close()
             named = place if isinstance(place, Path) else f"127.0.0.1:{place}"
@@ -120,10 +147,17 @@ class Proxy:
 
     def impair(self, impairment: Impairment) -> Callable[[], None]:
         """Put an impairment on the line; return what takes it away, which may be repeated."""
-        number = self._numbers
-        self._numbers += 1
-        self._call(self._add(number, impairment))
-        return lambda: self._call(self._remove(number))
+        key = object()
+        self._call(self._change(key, impairment))
+        return lambda: self._call(self._change(key, None))
+
+    def change_address(self) -> None:
+        """Let datagrams come to the service from other ports, as after a change of networks."""
+        self._call(self._change_address())
+
+    def replay(self) -> None:
+        """Send the last datagrams to the service again, from an address that nobody has had."""
+        self._call(self._replay())
 
     def close(self) -> None:
         """Reset all connections, and listen no more; may be repeated."""
@@ -147,17 +181,33 @@ class Proxy:
         future: Future[None] = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
         future.result(_START_TIMEOUT_S)
 
-    async def _listen(self) -> None:
-        self._listener = self._bound()
-        self._open(self._listener)
-        self._open_datagrams()
+    async def _open(self) -> None:
+        for carrier in _CARRIERS:
+            await self._set_up(carrier)
 
-    def _open(self, listener: socket.socket) -> None:
-        listener.listen(_BACKLOG)
-        self._loop.add_reader(listener, self._accept, listener)
+    async def _set_up(self, carrier: Carrier) -> None:
+        """Listen, or refuse whatever comes where the line is cut."""
+        is_cut = self._is_cut(carrier)
+        if carrier == "streams":
+            if is_cut or self._listener is None:
+                await self._hang_up()
+                # A port that is bound but not listened on refuses connections, and stays reserved.
+                self._listener = self._bound()
+            if not is_cut:
+                self._listener.listen(_BACKLOG)
+                self._loop.add_reader(self._listener, self._accept, self._listener)
+            return
+        self._close_datagrams()
+        if self._carries_datagrams:
+            self._datagrams = self._bound(socket.SOCK_DGRAM)
+            if is_cut:
+                # Connected to itself, it refuses all other senders.
+                self._datagrams.connect(_address(self.place))
+            else:
+                self._loop.add_reader(self._datagrams, self._questions_come, self._datagrams)
 
     def _bound(self, kind: socket.SocketKind = socket.SOCK_STREAM) -> socket.socket:
-        place = self._place
+        place = self.place
         if isinstance(place, Path):
             place.unlink(missing_ok=True)
         bound = socket.socket(_family(place), kind)
@@ -171,33 +221,23 @@ class Proxy:
             raise
         return bound
 
-    async def _add(self, number: int, impairment: Impairment) -> None:
-        was_cut = self._is_cut()
-        self._impairments[number] = impairment
+    async def _change(self, key: object, impairment: Impairment | None) -> None:
+        """Put an impairment on the line, or take it away."""
+        were_cut = [self._is_cut(carrier) for carrier in _CARRIERS]
+        if impairment is None:
+            self._impairments.pop(key, None)
+        else:
+            self._impairments[key] = impairment
         self._tell()
-        if impairment.cut and not was_cut:
-            await self._hang_up()
-            # A port that is bound but not listened on refuses connections, and stays reserved.
-            self._listener = self._bound()
-            if self._carries_datagrams:
-                # Connected to itself, it refuses all other senders.
-                self._datagrams = self._bound(socket.SOCK_DGRAM)
-                self._datagrams.connect(_address(self._place))
-
-    async def _remove(self, number: int) -> None:
-        was_cut = self._is_cut()
-        self._impairments.pop(number, None)
-        self._tell()
-        if was_cut and not self._is_cut():
-            assert self._listener is not None
-            self._open(self._listener)
-            self._close_datagrams()
-            self._open_datagrams()
+        for carrier, was_cut in zip(_CARRIERS, were_cut, strict=True):
+            if self._is_cut(carrier) != was_cut:
+                await self._set_up(carrier)
 
     async def _end(self) -> None:
         self._impairments.clear()
         self._tell()
         await self._hang_up()
+        self._close_datagrams()
 
     async def _hang_up(self) -> None:
         """Stop listening, and reset all connections."""
@@ -213,37 +253,35 @@ class Proxy:
         if self._listener is not None:
             self._listener.close()
             self._listener = None
-        self._close_datagrams()
 
     def _tell(self) -> None:
         """Wake the tasks that wait for a change of the line."""
         self._changed.set()
         self._changed = asyncio.Event()
 
-    def _is_cut(self) -> bool:
-        return any(each.cut for each in self._impairments.values())
+    def _active(self, carrier: Carrier, direction: Direction = "both") -> Iterator[Impairment]:
+        for each in self._impairments.values():
+            if carrier in each.carriers and (
+                direction == each.direction or "both" in (direction, each.direction)
+            ):
+                yield each
 
-    def _is_silent(self, direction: Direction) -> bool:
-        return any(
-            each.silent and each.direction in ("both", direction)
-            for each in self._impairments.values()
-        )
+    def _is_cut(self, carrier: Carrier) -> bool:
+        return any(each.cut for each in self._active(carrier))
 
-    def _fate(self, direction: Direction) -> tuple[float, int]:
+    def _is_silent(self, carrier: Carrier, direction: Direction) -> bool:
+        return any(each.silent for each in self._active(carrier, direction))
+
+    def _fate(self, carrier: Carrier, direction: Direction) -> tuple[float, int]:
         """Return by how much something comes later, and how often it is lost."""
         delay_s, losses = 0.0, 0
-        for each in self._impairments.values():
-            if each.direction in ("both", direction):
-                delay_s += each.latency_s + each.jitter_s * self._chance.random()
-                losses += each.loss > 0.0 and self._chance.random() < each.loss
+        for each in self._active(carrier, direction):
+            delay_s += each.latency_s + each.jitter_s * self._chance.random()
+            losses += each.loss > 0.0 and self._chance.random() < each.loss
         return delay_s, losses
 
-    def _delay_s(self, direction: Direction) -> float:
-        delay_s, losses = self._fate(direction)
-        return delay_s + losses * _RETRANSMISSION_S
-
     async def _until_heard(self, direction: Direction) -> None:
-        while self._is_silent(direction):
+        while self._is_silent("streams", direction):
             await self._changed.wait()
 
     def _accept(self, listener: socket.socket) -> None:
@@ -295,6 +333,7 @@ class Proxy:
                 await self._until_heard(direction)
                 if not piece:
                     break
+                self._overhear("streams", direction, piece)
                 await self._loop.sock_sendall(sink, piece)
             with contextlib.suppress(OSError):
                 sink.shutdown(socket.SHUT_WR)
@@ -315,18 +354,14 @@ class Proxy:
                 piece = await self._loop.sock_recv(source, _PIECE_BYTES)
             except OSError:
                 piece = b""
+            delay_s, losses = self._fate("streams", direction)
             # No piece overtakes another.
-            due = max(due, self._loop.time() + self._delay_s(direction))
+            due = max(due, self._loop.time() + delay_s + losses * _RETRANSMISSION_S)
             await pieces.put((due, piece))
             if not piece:
                 return
 
     # -- datagrams -------------------------------------------------------------------------------
-
-    def _open_datagrams(self) -> None:
-        if self._carries_datagrams:
-            self._datagrams = self._bound(socket.SOCK_DGRAM)
-            self._loop.add_reader(self._datagrams, self._questions_come, self._datagrams)
 
     def _close_datagrams(self) -> None:
         for each in (*self._clients.values(), *([self._datagrams] if self._datagrams else [])):
@@ -362,11 +397,28 @@ class Proxy:
                 if self._datagrams is not None:
                     self._carry_datagram(content, "to_robot", self._datagrams, address)
 
+    async def _change_address(self) -> None:
+        for address, client in list(self._clients.items()):
+            self._loop.remove_reader(client)
+            self._clients[address] = self._new_client(address)
+            client.close()
+
+    async def _replay(self) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.connect(_address(self._target))
+            for content in self._kept:
+                self._send_datagram(content, stranger, None)
+
     def _carry_datagram(
         self, content: bytes, direction: Direction, sender: socket.socket, address: Any
     ) -> None:
-        delay_s, losses = self._fate(direction)
-        if not losses and not self._is_silent(direction):
+        if direction == "to_service":
+            self._kept.append(content)
+        delay_s, losses = self._fate("datagrams", direction)
+        if losses or self._is_silent("datagrams", direction):
+            return
+        self._overhear("datagrams", direction, content)
+        for _ in range(1 + any(each.doubled for each in self._active("datagrams", direction))):
             self._loop.call_later(delay_s, self._send_datagram, content, sender, address)
 
     @staticmethod

@@ -104,19 +104,8 @@ class DecisionTable:
                 self._columns = fields
                 continue
             row = dict(zip(self._columns, fields, strict=True))
-            self.rows.append(
-                Decision(
-                    time_of(row["time"]),
-                    int(row["trial"]),
-                    int(row["step"]),
-                    row["kind"],
-                    row["service"],
-                    row["status"],
-                    float(row["waited_ms"]),
-                    float(row["round_trip_ms"]),
-                    float(row["computed_ms"]),
-                )
-            )
+            values = [time_of(row["time"]), *(row[name] for name in Decision._fields[1:])]
+            self.rows.append(msgspec.convert(values, Decision, strict=False))
 
     def close(self) -> None:
         """Close the file."""

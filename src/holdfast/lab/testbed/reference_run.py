@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import yaml
 
 from holdfast.config.loader import Configuration, load
+from holdfast.files import write_atomically
 from holdfast.lab.testbed.world import WitnessedWorld
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner
 from holdfast.recording.run_directory import RunDirectory
-from holdfast.robot.environment import Environment
 from holdfast.robot.trial import run_trial
 
 __all__ = ["ReferenceRun", "make_reference_run"]
@@ -26,15 +28,7 @@ _MAX_TRIALS = 1000
 
 
 class ReferenceRun(NamedTuple):
-    """A reference run.
-
-    Attributes
-    ----------
-    configuration : Configuration
-        With as many trials as were needed.
-    took_s : float
-        Of the computation.
-    """
+    """A reference run, the configuration of all runs of as many trials, and what it took."""
 
     configuration: Configuration
     steps_of_trials: tuple[int, ...]
@@ -43,45 +37,58 @@ class ReferenceRun(NamedTuple):
 
 def make_reference_run(
     out: Path,
-    write_configuration: Callable[[int], Path],
+    path: Path,
+    document: Mapping[str, Any],
     min_steps: int,
     performed: Path | None = None,
+    *,
+    comment: str = "",
 ) -> ReferenceRun:
-    """Run trials until there are enough steps, and write the directory of the run.
+    """Run trials until there are enough steps; write the configuration and the run's directory.
+
+    Parameters
+    ----------
+    path : Path
+        Gets the document, with the number of trials, as a configuration that begins with the
+        comment.
+    performed : Path or None
+        Gets the performed task actions: see :mod:`~holdfast.lab.testbed.world`.
 
     Raises
     ------
     OutputError
         If something cannot be written.
     """
-    configuration = load(write_configuration(_MAX_TRIALS))
-    planner = Planner(configuration.problem, configuration.planning)
+
+    def configure(num_trials: int) -> Configuration:
+        simulator = {"num_trials": num_trials, **document["simulator"]}
+        text = yaml.safe_dump({**document, "simulator": simulator}, sort_keys=False)
+        write_atomically(path, comment + text)
+        return load(path)
+
+    configuration = configure(_MAX_TRIALS)
+    problem, simulator = configuration.problem, configuration.simulator
+    planner = Planner(problem, configuration.planning)
     began = time.perf_counter()
     results: list[TrialResult] = []
-    with contextlib.ExitStack() as worlds:
-
-        def world(trial: int) -> Environment | None:
-            if performed is None:
-                return None
-            made = WitnessedWorld(
-                str(performed), configuration.problem, configuration.simulator.seed, trial
-            )
-            worlds.callback(made.close)
-            return made
-
-        while sum(result.steps for result in results) < min_steps:
-            trial = len(results)
+    while sum(result.steps for result in results) < min_steps:
+        trial = len(results)
+        with contextlib.ExitStack() as stack:
+            world = None
+            if performed is not None:
+                world = WitnessedWorld(str(performed), problem, simulator.seed, trial)
+                stack.callback(world.close)
             results.append(
                 run_trial(
                     planner,
-                    configuration.simulator.seed,
+                    simulator.seed,
                     trial,
-                    max_steps=configuration.simulator.max_steps,
-                    environment=world(trial),
+                    max_steps=simulator.max_steps,
+                    environment=world,
                 )
             )
     took_s = time.perf_counter() - began
-    configuration = load(write_configuration(len(results)))
+    configuration = configure(len(results))
     with RunDirectory.create(out, configuration) as directory:
         for result in results:
             directory.add(result)

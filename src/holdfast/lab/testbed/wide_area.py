@@ -19,7 +19,6 @@ import os
 import random
 import select
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -44,6 +43,7 @@ _ROBOT, _SERVICE = "10.77.0.1", "10.77.0.2"
 """Addresses in the two namespaces, which have no other members."""
 
 _DEVICE = "wan"
+_NO_DEVICE = "no tunnel device can be made"
 _LARGEST = 65_536
 _PATIENCE_S = 10.0
 _CAPACITY = 4096
@@ -271,17 +271,16 @@ class _Device:
     """The tunnel device of one namespace, read and written by this process."""
 
     def __init__(self, network: NetworkNamespace, own: str, other: str) -> None:
-        self._prefix = network.prefix
         self.received_bytes = 0
         here, there = socket.socketpair()
         with here, there:
             here.settimeout(_PATIENCE_S)
             passed = [sys.executable, "-I", "-S", "-c", _OPEN, str(there.fileno())]
-            self._run(passed, (there.fileno(),))
+            network.run(passed, _NO_DEVICE, descriptors=(there.fileno(),))
             try:
                 _, descriptors, _, _ = socket.recv_fds(here, 1, 1)
             except OSError as error:
-                raise CannotStartError(f"no tunnel device can be made: {error}") from error
+                raise CannotStartError(f"{_NO_DEVICE}: {error}") from error
         (self.descriptor,) = descriptors
         try:
             os.set_blocking(self.descriptor, False)
@@ -289,7 +288,7 @@ class _Device:
                 f"ip addr add {own} peer {other} dev {_DEVICE}",
                 f"ip link set {_DEVICE} up",
             ):
-                self._run(command.split(), ())
+                network.run(command.split(), _NO_DEVICE)
         except BaseException:
             os.close(self.descriptor)
             raise
@@ -307,18 +306,3 @@ class _Device:
 
     def send(self, packet: bytes) -> None:
         os.write(self.descriptor, packet)
-
-    def _run(self, command: list[str], descriptors: tuple[int, ...]) -> None:
-        try:
-            done = subprocess.run(
-                [*self._prefix, *command],
-                pass_fds=descriptors,
-                capture_output=True,
-                timeout=_PATIENCE_S,
-                check=False,
-            )
-        except (OSError, subprocess.TimeoutExpired) as error:
-            raise CannotStartError(f"{command[0]} cannot be run: {error}") from error
-        if done.returncode:
-            said = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
-            raise CannotStartError(f"no tunnel device can be made: {said}")
