@@ -68,6 +68,7 @@ class Ros2Server:
         self._on_event = on_event or ignore_event
         self._decisions = DecisionThread(_MAX_WAITING)
         self._zenoh_error = zenoh_module().ZError
+        messages.typestore()  # raises now what the first request would
         self._tokens: list[zenoh.LivelinessToken] = []
         self._session = ZenohSession(
             endpoint, listens=listens, on_open=self._declare, on_event=self._on_event
