@@ -6,13 +6,17 @@ import math
 
 __all__ = ["ExpectedTime"]
 
-_MEAN_INERTIA = 8.0
 _TYPICAL_INERTIA = 16.0
-"""A time moves the mean by one such part of its distance, and a longer one the typical time."""
+"""A longer time raises the typical time by one such part of the difference."""
 
 
 class ExpectedTime:
     """Two estimates of how long one kind of computation takes.
+
+    Parameters
+    ----------
+    inertia : float
+        A time moves the mean by one such part of its distance.
 
     Attributes
     ----------
@@ -24,8 +28,9 @@ class ExpectedTime:
         would send brief work to threads, which makes it busier.
     """
 
-    def __init__(self, mean_s: float = 0.0) -> None:
+    def __init__(self, mean_s: float = 0.0, inertia: float = 8.0) -> None:
         self.mean_s = mean_s
+        self._inertia = inertia
         self.typical_s = math.inf
 
     def learn(self, computed_s: float) -> None:
@@ -33,7 +38,7 @@ class ExpectedTime:
         # One outlier (a stopped process) moves the mean little, so that robots are not turned away
         # for it.
         bounded_s = min(computed_s, 4.0 * self.mean_s + 0.01)
-        self.mean_s += (bounded_s - self.mean_s) / _MEAN_INERTIA
+        self.mean_s += (bounded_s - self.mean_s) / self._inertia
         if computed_s > self.typical_s:
             computed_s = self.typical_s + (computed_s - self.typical_s) / _TYPICAL_INERTIA
         self.typical_s = computed_s

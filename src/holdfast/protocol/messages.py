@@ -187,12 +187,6 @@ class _SentRequest(Request, array_like=True, frozen=True, forbid_unknown_fields=
     settings: Digest | None = None
 
 
-class _Versioned(msgspec.Struct, array_like=True):
-    """A request of any version, whatever its other fields are."""
-
-    version: Word
-
-
 class TaskAnswer(msgspec.Struct, array_like=True, frozen=True, tag=1):
     """The task actions from the state on, up to the next sensing step.
 
@@ -281,13 +275,19 @@ class Refused(msgspec.Struct, array_like=True, frozen=True, tag=6):
 Reply: TypeAlias = TaskAnswer | SensingAnswer | Progress | NeedState | Busy | Refused
 
 _ENCODER = msgspec.msgpack.Encoder()
-_VERSION_DECODER = msgspec.msgpack.Decoder(_Versioned)
 _REQUEST_DECODER = msgspec.msgpack.Decoder(_SentRequest)
 _CONFIGURATION_DECODER = msgspec.msgpack.Decoder(SessionConfiguration)
 _REPLY_DECODER: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)
 
 _CONTAINERS = (dict, list, tuple)
 """Values of a configuration that contain others."""
+
+
+_ARRAY_HEADERS = {0xDC: 3, 0xDD: 5}
+"""Sizes in bytes of the longer array headers of MessagePack, by their first byte."""
+
+_WORDS = {0xCC: 1, 0xCD: 2, 0xCE: 4}
+"""Sizes in bytes of the longer unsigned integers of MessagePack, by their first byte."""
 
 
 def encode(message: Request | Reply) -> bytes:
@@ -354,13 +354,11 @@ def decode_request(payload: bytes) -> Request:
         settings mean something else here than on the robot.
     """
     content = _checked_content(payload)
+    # Other versions may have other fields. A decoder would look at all of a large message first.
+    version = _version_of(content)
+    if version is not None and version != PROTOCOL_VERSION:
+        raise _other_version(version)
     try:
-        version = _VERSION_DECODER.decode(content).version
-        if version != PROTOCOL_VERSION:
-            raise MessageError(
-                "version",
-                f"protocol version {version}: this holdfast speaks version {PROTOCOL_VERSION}",
-            )
         sent = _REQUEST_DECODER.decode(content)
         session_configuration = (
             None
@@ -369,6 +367,8 @@ def decode_request(payload: bytes) -> Request:
         )
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
         raise MessageError("malformed", f"{len(payload)} bytes are no request: {error}") from error
+    if sent.version != PROTOCOL_VERSION:
+        raise _other_version(sent.version)
     if sent.checkpoint is not None and sent.observations:
         raise MessageError("malformed", "a request has a checkpoint and observations as well")
     fields = msgspec.structs.asdict(sent) | {"session_configuration": session_configuration}
@@ -410,6 +410,27 @@ def decode_floats(data: bytes, size: int) -> FloatArray:
     if not numerics.all_finite(numbers):
         raise MessageError("malformed", f"{numbers} are not all finite")
     return numbers
+
+
+def _other_version(version: int) -> MessageError:
+    return MessageError(
+        "version", f"protocol version {version}: this holdfast speaks version {PROTOCOL_VERSION}"
+    )
+
+
+def _version_of(content: memoryview) -> int | None:
+    """Return the version of what looks like a request of ours, from its first bytes alone."""
+    first = content[0]
+    start = 1 if first & 0xF0 == 0x90 else _ARRAY_HEADERS.get(first)
+    if start is None or len(content) <= start:
+        return None
+    word = content[start]
+    if word < 0x80:
+        return word
+    size = _WORDS.get(word)
+    if size is None or len(content) <= start + size:
+        return None
+    return int.from_bytes(content[start + 1 : start + 1 + size], "big")
 
 
 def _session_configuration_of(data: bytes, settings: bytes | None) -> SessionConfiguration:

@@ -34,6 +34,9 @@ _OUT_OF_MEMORY_RETRY_S = 0.1
 _MAX_REPLAYED_STEPS = 1024
 """In a longer trial a service without any state of it is sent the state."""
 
+_MAX_DIVERGED = 2
+"""A service that diverged so often in a row is sent the state each time."""
+
 _LARGE_CHECKPOINT = 1 << 20
 """From this size in bytes on, a service replays the trial instead of being sent the state."""
 
@@ -189,10 +192,11 @@ class Replica:
         Whether it knows the session.
     acknowledged : tuple of int or None
         Trial and number of observations of the latest state that it is known to hold.
-    diverges : bool
-        Whether it has come to another state than the robot from the same observations.
-    num_refusals : int
-        Since its last whole answer: a problem's code can fail in one part only.
+    num_diverged : int
+        Times in a row that it came to another state than the robot from the same observations.
+    num_refusals : list of int
+        Of the task and of the sensing part, since it last gave that part: a problem's code can fail
+        in one part only.
     complaint : str or None
         Text of the last of these.
     refusal, refusal_code : str or None, str
@@ -219,8 +223,8 @@ class Replica:
         """Reset what was known of the previous process."""
         self.opened = False
         self.acknowledged: tuple[int, int] | None = None
-        self.diverges = False
-        self.num_refusals = 0
+        self.num_diverged = 0
+        self.num_refusals = [0, 0]
         self.complaint: str | None = None
         self.refusal = self.distrusted
         self.refusal_code = "" if self.refusal is None else _WRONG_ANSWER
@@ -266,22 +270,27 @@ class Replica:
                 return min(self.late_s)
         return None
 
-    def note_answer(self, question: Question, now: float) -> None:
-        """Record a part of an answer: it lives and holds the question's state."""
+    def note_answer(self, question: Question, now: float, *, sensing: bool, restored: bool) -> None:
+        """Record a part of an answer: it lives and holds the question's state.
+
+        Parameters
+        ----------
+        sensing : bool
+            Whether it is the sensing part.
+        restored : bool
+            Whether the request carried the state.
+        """
         self.detector.heard(now)
         self.opened = True
         self.retry_at = 0.0
-        if not self.num_refusals:
+        self.num_refusals[sensing] = 0
+        if not any(self.num_refusals):
             self.backoff_s = _FIRST_RETRY_S
+            self.complaint = None
+        if not restored:
+            self.num_diverged = 0
         holds = (question.state.trial, question.num_observations)
         self.acknowledged = max(self.acknowledged or holds, holds)
-
-    def note_whole_answer(self) -> None:
-        """Record that an answer is complete."""
-        self.detector.answered()
-        self.num_refusals = 0
-        self.complaint = None
-        self.backoff_s = _FIRST_RETRY_S
 
     def note_busy(self, retry_after_s: float, now: float) -> float:
         """Record that it is busy; return for how long it is left alone, in seconds."""
@@ -297,16 +306,22 @@ class Replica:
         self.opened = False
         self.acknowledged = None
 
-    def note_refusal(self, code: str, text: str, now: float) -> bool:
-        """Record a refusal, which delays it; return whether it is no longer asked."""
+    def note_refusal(self, code: str, text: str, now: float, *, sensing: bool) -> bool:
+        """Record a refusal, which delays it; return whether it is no longer asked.
+
+        Parameters
+        ----------
+        sensing : bool
+            Whether it refuses the sensing part.
+        """
         most = _MAX_REFUSALS
         if code == _OUT_OF_MEMORY:
             most = _MAX_OUT_OF_MEMORY
             self.backoff_s = max(self.backoff_s, _OUT_OF_MEMORY_RETRY_S)
         self.delay(now)
-        self.num_refusals += 1
+        self.num_refusals[sensing] += 1
         self.complaint = f"{code}: {text}"
-        final = code in _FINAL_REFUSALS or self.num_refusals >= most
+        final = code in _FINAL_REFUSALS or self.num_refusals[sensing] >= most
         if final:
             self.refusal = text
             self.refusal_code = code
@@ -347,7 +362,7 @@ class Replica:
                 8 * state.belief.states.size <= _LARGE_CHECKPOINT
                 or state.step > _MAX_REPLAYED_STEPS
             )
-        if self.diverges or missing > len(question.observations):
+        if self.num_diverged >= _MAX_DIVERGED or missing > len(question.observations):
             whole_state = True
         if whole_state:
             return (), question.checkpoint()

@@ -351,7 +351,8 @@ class OpenRequests:
             call.has_sensing_part = True
         else:
             call.has_task_part = True
-        replica.note_answer(question, now)
+        sensing = isinstance(reply, SensingAnswer)
+        replica.note_answer(question, now, sensing=sensing, restored=call.restores)
         for earlier in self.to(replica):
             if earlier.call_number < call.call_number:
                 # Whatever became of it, nothing is awaited of it any more.
@@ -362,14 +363,14 @@ class OpenRequests:
                 "restored", service=replica.name, step=question.state.step, restore_ms=restore_ms
             )
         if call.finished:
-            replica.note_whole_answer()
+            replica.detector.answered()
             self.settle(call)
 
     def _take_need_state(self, call: OpenRequest, reply: NeedState, now: float) -> None:
         replica = call.replica
         replica.note_lost_state()
         if reply.diverged:
-            replica.diverges = True
+            replica.num_diverged += 1
             self._effects.report(
                 "state_diverged",
                 service=replica.name,
@@ -379,9 +380,7 @@ class OpenRequests:
                 "observations, so it is handed the robot's",
             )
         if call.has_everything:
-            self._note_refusal(
-                replica, "need_state", "asks again for a state that it was sent", now
-            )
+            self._note_refusal(call, "need_state", "asks again for a state that it was sent", now)
 
     def _take_refusal(self, call: OpenRequest, reply: Refused, now: float) -> None:
         replica = call.replica
@@ -395,10 +394,12 @@ class OpenRequests:
             self._effects.report("damaged_request", service=replica.name, reason=reply.text)
             return
         replica.note_lost_state()
-        self._note_refusal(replica, reply.code, reply.text, now)
+        self._note_refusal(call, reply.code, reply.text, now)
 
-    def _note_refusal(self, replica: Replica, code: str, text: str, now: float) -> None:
-        final = replica.note_refusal(code, text, now)
+    def _note_refusal(self, call: OpenRequest, code: str, text: str, now: float) -> None:
+        replica = call.replica
+        sensing = call.has_task_part or call.question.task_count == 0
+        final = replica.note_refusal(code, text, now, sensing=sensing)
         self._effects.report("refused", service=replica.name, code=code, reason=text, final=final)
 
 

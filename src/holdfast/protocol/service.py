@@ -65,6 +65,9 @@ from holdfast.protocol.service_sessions import (
 
 __all__ = ["Service"]
 
+_INERTIA_OF_ONE = 4.0
+"""Of the mean times of one session, whose decisions are alike."""
+
 _NO_ROOM_RETRY_MS = 100.0
 """Shortest retry time for a robot that finds no free session."""
 
@@ -262,8 +265,8 @@ class Service:
             key,
             request,
             configuration,
-            ExpectedTime(self._task_time.mean_s),
-            ExpectedTime(self._sensing_time.mean_s),
+            ExpectedTime(self._task_time.mean_s, _INERTIA_OF_ONE),
+            ExpectedTime(self._sensing_time.mean_s, _INERTIA_OF_ONE),
         )
         session.used_at = now
         while not self._sessions.has_room_for(session):
@@ -467,7 +470,7 @@ class Service:
 
     def _succeeded(self, task: PendingTask, outcome: JobResult, now: float) -> None:
         session, statistics = task.session, self._statistics
-        session.served, session.newcomer = True, False
+        self._sessions.mark_served(session)
         most = self._limits.answers_per_session
         computed_s = now - task.started_at
         computed_us = min(MAX_WORD, max(0, round(1e6 * computed_s)))

@@ -15,7 +15,7 @@ calls. A part is identified by the digest of its state, so equal questions share
 from __future__ import annotations
 
 import hashlib
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -290,52 +290,75 @@ class ForgottenEpochs:
 
     def __init__(self, most: int) -> None:
         self._most = most
-        self._epochs: OrderedDict[SessionKey, int] = OrderedDict()
-        self._num_of: Counter[Owner] = Counter()
+        self._count = 0
+        # Owners in the order in which they were noted last.
+        self._of: OrderedDict[Owner, OrderedDict[bytes, int]] = OrderedDict()
 
     def __iter__(self) -> Iterator[SessionKey]:
-        return iter(self._epochs)
+        return ((owner, session) for owner, epochs in self._of.items() for session in epochs)
 
     def get(self, key: SessionKey) -> int:
         """Return a session's epoch; 0 if unknown."""
-        return self._epochs.get(key, 0)
+        owner, session = key
+        epochs = self._of.get(owner)
+        return 0 if epochs is None else epochs.get(session, 0)
 
     def note(self, key: SessionKey, epoch: int) -> None:
         """Keep an epoch."""
+        owner, session = key
         self.forget(key)
-        self._epochs[key] = epoch
-        self._num_of[key[0]] += 1
-        if len(self._epochs) > self._most:
-            largest = max(self._num_of, key=lambda owner: self._num_of[owner])
-            self.forget(next(each for each in self._epochs if each[0] == largest))
+        self._of.setdefault(owner, OrderedDict())[session] = epoch
+        self._of.move_to_end(owner)
+        self._count += 1
+        if self._count > self._most:
+            largest = max(self._of, key=lambda each: len(self._of[each]))
+            self.forget((largest, next(iter(self._of[largest]))))
 
     def forget(self, key: SessionKey) -> None:
         """Drop the epoch of a session that is held again."""
-        if self._epochs.pop(key, None) is not None:
-            self._num_of[key[0]] -= 1
-            if not self._num_of[key[0]]:
-                del self._num_of[key[0]]
+        owner, session = key
+        epochs = self._of.get(owner)
+        if epochs is not None and epochs.pop(session, None) is not None:
+            self._count -= 1
+            if not epochs:
+                del self._of[owner]
+
+
+class _Holding:
+    """What all sessions take, or all of one owner."""
+
+    def __init__(self) -> None:
+        self.sessions = 0
+        self.unserved = 0
+        self.state_bytes = 0
+        self.configuration_bytes = 0
+
+    def count(self, session: Session, sign: int) -> None:
+        """Add a session without states, or subtract it."""
+        self.sessions += sign
+        self.unserved += 0 if session.served else sign
+        self.configuration_bytes += sign * len(session.configuration)
 
 
 class SessionTable:
-    """All sessions, least recently used first.
-
-    Attributes
-    ----------
-    state_bytes : int
-        Of all states and answers, as counted by :meth:`update_size`.
-    """
+    """All sessions, least recently used first."""
 
     def __init__(self, limits: ServiceLimits) -> None:
         self._limits = limits
         self._sessions: OrderedDict[SessionKey, Session] = OrderedDict()
+        self._holdings: dict[Owner, _Holding] = {}
         self._epochs = ForgottenEpochs(max(4 * limits.max_sessions, _LEAST_EPOCHS))
-        self.state_bytes = 0
+        self._total = _Holding()
+
+    @property
+    def state_bytes(self) -> int:
+        """Bytes of all states and answers, as counted by :meth:`update_size`."""
+        return self._total.state_bytes
 
     @property
     def configuration_bytes(self) -> int:
         """Bytes of all packed session configurations."""
-        return sum(len(each.configuration) for each in self._sessions.values())
+        return self._total.configuration_bytes
 
     def __len__(self) -> int:
         return len(self._sessions)
@@ -355,14 +378,24 @@ class SessionTable:
         A new identity costs nothing without a certificate. With one, each owner may have one
         session that was never served and still ranks with the known robots.
         """
-        return owner is None or any(
-            each.owner == owner and not each.served for each in self._sessions.values()
-        )
+        holding = self._holdings.get(owner)
+        return owner is None or (holding is not None and holding.unserved > 0)
+
+    def mark_served(self, session: Session) -> None:
+        """Note that a robot got an answer."""
+        if not session.served:
+            for holding in self._holdings_with(session):
+                holding.unserved -= 1
+        session.served = True
+        session.newcomer = False
 
     def add(self, session: Session) -> None:
         """Add a session."""
         session.newcomer = self.is_newcomer(session.owner)
         self._sessions[session.key] = session
+        self._holdings.setdefault(session.owner, _Holding())
+        for holding in self._holdings_with(session):
+            holding.count(session, 1)
         self._epochs.forget(session.key)
 
     def use(self, session: Session, now: float) -> None:
@@ -375,6 +408,10 @@ class SessionTable:
         session.closed = True
         del self._sessions[session.key]
         self._count_state(session, 0)
+        for holding in self._holdings_with(session):
+            holding.count(session, -1)
+        if not self._holdings[session.owner].sessions:
+            del self._holdings[session.owner]
         self.note_epoch(session.key, session.epoch)
 
     def note_epoch(self, key: SessionKey, epoch: int) -> None:
@@ -388,8 +425,7 @@ class SessionTable:
         return not self._sessions or not (
             self._is_full_for(session.owner)
             or self._is_full
-            or self.configuration_bytes + len(session.configuration)
-            > self._limits.max_configuration_bytes
+            or self._lacks_room_for_configuration(session)
         )
 
     def evictable_for(self, session: Session) -> Session | None:
@@ -402,41 +438,50 @@ class SessionTable:
         if self._is_full_for(session.owner):
             owner = session.owner
             return self._first_unused(lambda each: each.owner == owner)
-        unserved = sum(not each.served for each in self._sessions.values())
-        is_full = self._is_full
+        only_unserved = 2 * self._total.unserved >= self._limits.max_sessions
+        if self._is_full:
+            return self._unused_of_most(
+                lambda holding: holding.sessions, only_unserved=only_unserved
+            )
         return self._unused_of_most(
-            lambda each: 1 if is_full else len(each.configuration),
-            only_unserved=2 * unserved >= self._limits.max_sessions,
+            lambda holding: holding.configuration_bytes, only_unserved=only_unserved
         )
 
     def _is_full_for(self, owner: Owner) -> bool:
-        most = self._limits.max_sessions_per_robot
-        if owner is None or most is None:
+        most, holding = self._limits.max_sessions_per_robot, self._holdings.get(owner)
+        if owner is None or most is None or holding is None:
             return False
-        return sum(each.owner == owner for each in self._sessions.values()) >= most
+        return holding.sessions >= most
 
     @property
     def _is_full(self) -> bool:
         return len(self._sessions) >= self._limits.max_sessions
 
+    def _lacks_room_for_configuration(self, session: Session) -> bool:
+        return (
+            self.configuration_bytes + len(session.configuration)
+            > self._limits.max_configuration_bytes
+        )
+
     def _unused_of_most(
-        self, amount: Callable[[Session], int], *, only_unserved: bool
+        self, amount: Callable[[_Holding], int], *, only_unserved: bool
     ) -> Session | None:
         """Return the least recently used session without tasks, of the owners that hold the most.
 
         These hold at least half of the largest holding: among near equals the same one is not
         dropped each time. If all of these have tasks, it is one of the others.
         """
-        found = None
-        if len({each.owner for each in self._sessions.values()}) > 1:
-            held: Counter[Owner] = Counter()
-            for each in self._sessions.values():
-                held[each.owner] += amount(each)
-            least = max(held.values()) / 2
+        holdings = self._holdings
+        if len(holdings) > 1:
+            least = max(map(amount, holdings.values())) / 2
             found = self._first_unused(
-                lambda each: held[each.owner] >= least and not (only_unserved and each.served)
+                lambda each: (
+                    amount(holdings[each.owner]) >= least and not (only_unserved and each.served)
+                )
             )
-        return found or self._first_unused(lambda each: not (only_unserved and each.served))
+            if found is not None:
+                return found
+        return self._first_unused(lambda each: not (only_unserved and each.served))
 
     def _first_unused(self, fits: Callable[[Session], bool]) -> Session | None:
         return next(
@@ -470,7 +515,7 @@ class SessionTable:
 
     def largest_evictable(self) -> Session | None:
         """Return the session without tasks to be dropped for its memory; None if there is none."""
-        return self._unused_of_most(lambda each: each.num_bytes, only_unserved=False)
+        return self._unused_of_most(lambda holding: holding.state_bytes, only_unserved=False)
 
     def drop_states(self, session: Session) -> None:
         """Drop a session's states and answers; the robot will send its state each time."""
@@ -479,8 +524,12 @@ class SessionTable:
         self._count_state(session, 0)
 
     def _count_state(self, session: Session, num_bytes: int) -> None:
-        self.state_bytes += num_bytes - session.num_bytes
+        for holding in self._holdings_with(session):
+            holding.state_bytes += num_bytes - session.num_bytes
         session.num_bytes = num_bytes
+
+    def _holdings_with(self, session: Session) -> tuple[_Holding, _Holding]:
+        return self._total, self._holdings[session.owner]
 
 
 def _digest_of(data: object) -> bytes:

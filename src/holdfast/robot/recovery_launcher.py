@@ -83,7 +83,8 @@ class RecoveryLauncher:
 
     def _account_of(self, code: int) -> str:
         if code < 0:
-            return f"was ended by {signal.Signals(-code).name}"
+            names = {int(number): number.name for number in signal.Signals}
+            return f"was ended by {names.get(-code, f'signal {-code}')}"
         log = "" if self._log_path is None else f"; see {self._log_path}"
         return f"ended with exit code {code}{log}"
 

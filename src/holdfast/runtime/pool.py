@@ -7,6 +7,7 @@ threads of ``concurrent.futures``, however long that takes.)
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 from collections.abc import Callable
 from queue import SimpleQueue
@@ -76,10 +77,9 @@ class ThreadPool:
                 result = function()
             except BaseException as error:  # noqa: BLE001 - the loop handles it
                 done, result = self._failed, error
-            try:
+            # A loop that is closed wants no result; what was queued last is run all the same.
+            with contextlib.suppress(RuntimeError):
                 self._loop.call_soon_threadsafe(self._deliver, done, result)
-            except RuntimeError:
-                return  # the loop is closed
             # Release everything before waiting for the next task.
             del task, function, done, result
 
