@@ -214,16 +214,18 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     kept = list(sessions._sessions.values())
     assert statistics.sessions == len(kept) <= limits["max_sessions"]
     epochs = list(sessions._epochs)
-    assert (
-        len(epochs)
-        == sum(sessions._epochs._num_of.values())
-        <= max(4 * limits["max_sessions"], 4096)
-    )
+    assert len(epochs) == sessions._epochs._count <= max(4 * limits["max_sessions"], 4096)
     assert not set(epochs) & set(sessions._sessions)
     # Owners.
     owners = {session.owner for session in kept}
+    assert set(sessions._holdings) == owners
     for owner in owners:
         theirs = [session for session in kept if session.owner == owner]
+        holding = sessions._holdings[owner]
+        assert holding.sessions == len(theirs)
+        assert holding.unserved == sum(not session.served for session in theirs)
+        assert holding.state_bytes == sum(session.num_bytes for session in theirs)
+        assert holding.configuration_bytes == sum(len(session.configuration) for session in theirs)
         if owner is not None and limits["max_sessions_per_robot"] is not None:
             assert len(theirs) <= limits["max_sessions_per_robot"]
             known = [session for session in theirs if not session.newcomer and not session.served]
@@ -232,6 +234,7 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     assert sum(session.num_bytes for session in kept) == sessions.state_bytes
     assert sum(session.size() for session in kept) <= sessions.state_bytes
     assert sessions.state_bytes <= limits["max_state_bytes"]
+    assert sum(len(session.configuration) for session in kept) == sessions.configuration_bytes
     assert sessions.configuration_bytes <= limits["max_configuration_bytes"] or len(kept) == 1
     assert all(len(session.answers) <= limits["answers_per_session"] for session in kept)
     # Works.

@@ -3,23 +3,31 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import pytest
-from tests.ports import free_port
 
 from holdfast.errors import GuardError
 from holdfast.ros.master.settings import GuardLock, MasterAddress
 
 
-def test_a_second_guard_is_kept_away() -> None:
-    port = free_port()
-    with GuardLock(port):
-        with pytest.raises(GuardError, match=f"has a guard already: process {os.getpid()}"):
-            GuardLock(port)
-        with GuardLock(free_port()):
+class TestLock:
+    def test_a_second_guard_is_kept_away_even_if_the_file_is_removed(self, tmp_path: Path) -> None:
+        path = tmp_path / "lock"
+        with GuardLock(path, 11311) as lock:
+            path.unlink()
+            lock.keep()
+            with pytest.raises(GuardError, match=f"has a guard already: process {os.getpid()}"):
+                GuardLock(path, 11311)
+        with GuardLock(path, 11311):
             pass
-    with GuardLock(port):
-        pass
+
+    def test_it_is_kept_young(self, tmp_path: Path) -> None:
+        path = tmp_path / "lock"
+        with GuardLock(path, 11311) as lock:
+            os.utime(path, (0, 0))
+            lock.keep()
+            assert path.stat().st_mtime > 0
 
 
 class TestAddress:

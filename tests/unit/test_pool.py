@@ -79,3 +79,16 @@ async def test_after_the_end_nothing_is_delivered_and_the_last_function_runs() -
     pool.close(30.0)
     await asyncio.sleep(0)
     assert (ran, delivered) == (["first", "last"], [])
+
+
+def test_the_last_function_runs_also_when_the_loop_ends_before_the_work_does() -> None:
+    gate, ended = threading.Event(), threading.Event()
+
+    async def submit() -> None:
+        pool = ThreadPool(1, "test")
+        pool.submit(gate.wait, lambda _: None)
+        pool.close(last=ended.set)
+
+    asyncio.run(submit())
+    gate.set()
+    assert ended.wait(30.0)

@@ -142,3 +142,11 @@ def test_a_busy_service_is_asked_again_soon_whatever_it_says() -> None:
     assert not service.usable(14.9)
     service.detector.appeared("b1", 0.0)
     assert service.usable(15.0)
+
+
+def test_refusals_of_the_two_parts_of_an_answer_are_counted_apart() -> None:
+    service = Replica("cloud", 0.25)
+    for _ in range(2):
+        assert not service.note_refusal("failed", "no", 1.0, sensing=False)
+        assert not service.note_refusal("failed", "no", 1.0, sensing=True)
+    assert service.note_refusal("failed", "no", 1.0, sensing=True)

@@ -111,11 +111,16 @@ def in_words(error: BaseException) -> str:
 
 
 def _frames_listed(frames: list[traceback.FrameSummary]) -> str:
-    listed = traceback.format_list(frames)
-    left_out = len(frames) - 2 * _MAX_FRAMES
-    if left_out > 0:
-        # A recursion has a thousand of them; a few from its beginning and its end are enough.
-        listed[_MAX_FRAMES:-_MAX_FRAMES] = [f"  ... {left_out} more\n"]
+    # A recursion has a thousand of them; a few from its beginning and its end are enough.
+    if len(frames) > 2 * _MAX_FRAMES:
+        left_out = len(frames) - 2 * _MAX_FRAMES
+        listed = [
+            *traceback.format_list(frames[:_MAX_FRAMES]),
+            f"  ... {left_out} more\n",
+            *traceback.format_list(frames[-_MAX_FRAMES:]),
+        ]
+    else:
+        listed = traceback.format_list(frames)
     return "".join(listed).rstrip()
 
 

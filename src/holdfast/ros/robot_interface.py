@@ -147,7 +147,7 @@ _REQUEST_KEYS = frozenset(("trial", "step", "index", "label", "fields", "action"
 _ANSWER_KEYS = frozenset(("success", "message", "reward", "done", "failed", "steps"))
 """Parameters that name fields of a request, or of an answer."""
 
-_Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+_Positive = Annotated[float, msgspec.Meta(gt=0.0, le=1e300)]
 _Finite = Annotated[float, msgspec.Meta(ge=-1e300, le=1e300)]
 _Numbers = _Finite | list[_Finite]
 _Texts = str | list[Annotated[str, msgspec.Meta(min_length=1)]]

@@ -133,6 +133,7 @@ class Ros2Server:
                 b"" if payload is None else payload.to_bytes(),
                 on_refused=lambda reason: self._on_event("ros2_refused", reason=reason),
             )
+            send(answer)
         except Exception as error:  # noqa: BLE001 - else there would be no answer
             reason = f"{type(error).__name__}: {error}"
             where = traceback.extract_tb(error.__traceback__)[-1]
@@ -140,8 +141,6 @@ class Ros2Server:
             with contextlib.suppress(self._zenoh_error):
                 query.reply_err(f"a defect of the service: {reason}")
                 query.drop()
-        else:
-            send(answer)
 
     def _send(self, query: zenoh.Query, key: str, asked: Attachment, answer: bytes) -> None:
         attachment = asked._replace(source_timestamp=time_ns())

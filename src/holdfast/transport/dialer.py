@@ -174,7 +174,11 @@ class Dialer:
             stream = socket.socket(family, socket.SOCK_STREAM)
             stream.setblocking(False)
             async with asyncio.timeout(_CONNECT_TIMEOUT_S):
-                await self._loop.sock_connect(stream, address)
+                if family == socket.AF_UNIX:
+                    # At once, or not at all: asyncio takes a full queue for a beginning.
+                    stream.connect(address)
+                else:
+                    await self._loop.sock_connect(stream, address)
         except BaseException as error:
             if stream is not None:
                 stream.close()

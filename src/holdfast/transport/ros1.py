@@ -371,13 +371,17 @@ class RosScheme(Scheme):
         Raises TransportError if that is not known; the message gives the reason.
         """
         master = RosEnvironment.of().master
+        # Not asyncio.run, which waits without bound for a look-up of the master's name.
+        loop = asyncio.new_event_loop()
         try:
             lookup = call(master, "lookupService", exchange_name(endpoint), within_s=_LOOKUP_S)
-            return *place_of_service(asyncio.run(lookup)), socket.AF_INET
+            return *place_of_service(loop.run_until_complete(lookup)), socket.AF_INET
         except GoneError:
             raise TransportError(f"there is no ROS master at {master}") from None
         except CallError as error:
             raise TransportError(f"the ROS master does not say where it is: {error}") from error
+        finally:
+            loop.close()
 
     def listening_endpoint(self, endpoint: Endpoint) -> Endpoint:
         """Return the address of this machine in ROS, with any free port."""

@@ -72,6 +72,7 @@ _SECOND_LOOK_S = 1.0
 _KEPT_S = 5.0
 """Longest time that calls wait for a master; after it they are refused."""
 
+_LOCKED_EVERY_S = 1.0
 _BACKLOG = 1024
 
 
@@ -110,11 +111,12 @@ class MasterGuard:
             If nothing can be guarded.
         """
         directory = self._settings.directory or own_directory()
-        if not os.access(directory, os.W_OK | os.X_OK):
-            raise GuardError(f"{directory}: is no directory that can be written to")
         port = self._settings.address.port
         self._journal = directory / f"master-{port}.journal"
-        with GuardLock(port):
+        with (
+            GuardLock(directory / f"master-{port}.lock", port) as lock,
+            _running(_keep_lock(lock)),
+        ):
             try:
                 self._new_socket(0.0)
                 # Missing software is reported now, not when the master dies.
@@ -539,6 +541,12 @@ def _running(*works: Coroutine[Any, Any, Any]) -> Iterator[list[asyncio.Task[Any
     finally:
         for task in tasks:
             task.cancel()
+
+
+async def _keep_lock(lock: GuardLock) -> None:
+    while True:
+        lock.keep()
+        await asyncio.sleep(_LOCKED_EVERY_S)
 
 
 def _words_of(error: Exception) -> str:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import socket
 import stat
-import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple, Self
 from urllib.parse import urlsplit
 
 from holdfast.errors import GuardError
+from holdfast.ros.master.process import touch
 
 __all__ = [
     "DEFAULT_PORT",
@@ -24,9 +25,6 @@ __all__ = [
 ]
 
 DEFAULT_PORT = 11311
-
-_PEER = struct.Struct("3i")
-"""A peer's process, user and group."""
 
 
 class MasterAddress(NamedTuple):
@@ -122,37 +120,59 @@ def own_directory() -> Path:
 class GuardLock:
     """Keeps a second guard of the same master away.
 
-    It is a socket without a file, which the system removes with the process.
-
-    Raises GuardError if there is one already.
+    Raises
+    ------
+    GuardError
+        If there is one already.
     """
 
-    def __init__(self, port: int) -> None:
-        name = f"\0holdfast-ros1-guard-{port}"
-        self._socket = socket.socket(socket.AF_UNIX)
+    def __init__(self, path: Path, port: int) -> None:
+        self._path = path
         try:
-            self._socket.bind(name)
-            self._socket.listen()
+            self._descriptor = self._open()
         except OSError as error:
-            self._socket.close()
+            raise GuardError(f"{path}: cannot be written: {error.strerror}") from error
+        if not self._take(self._descriptor):
+            who = os.pread(self._descriptor, 20, 0).decode(errors="replace").strip()
+            os.close(self._descriptor)
             raise GuardError(
-                f"the master at port {port} has a guard already: process {_listener_of(name)}"
-            ) from error
+                f"the master at port {port} has a guard already: process {who or 'unknown'}"
+            )
+
+    def _open(self) -> int:
+        return os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+
+    def _take(self, descriptor: int) -> bool:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            return False
+        # The lock is on the file; its content is optional, as the disk may be full.
+        with contextlib.suppress(OSError):
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+        return True
+
+    def keep(self) -> None:
+        """Keep the file young for cleaners of old files, and lock a new one if it is gone."""
+        try:
+            found = self._path.lstat()
+            if os.path.samestat(found, os.fstat(self._descriptor)):
+                touch(self._path, found)
+                return
+        except OSError:
+            pass
+        with contextlib.suppress(OSError):
+            descriptor = self._open()
+            if self._take(descriptor):
+                descriptor, self._descriptor = self._descriptor, descriptor
+            os.close(descriptor)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._socket.close()
-
-
-def _listener_of(name: str) -> int | str:
-    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
-        probe.connect(name)
-        peer = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
-        pid: int = _PEER.unpack(peer)[0]
-        return pid or "unknown"
-    return "unknown"
+        os.close(self._descriptor)
 
 
 def listens_at(pid: int, port: int) -> bool:

@@ -103,7 +103,7 @@ class MasterProcess:
         self._control.setblocking(False)
         script = str(Path(master_process.__file__).resolve())
         # In memory, because the disk may be full.
-        self._state = open(os.memfd_create("master-state"), "wb")  # noqa: PTH123, SIM115
+        self._state = open(os.memfd_create("master-state"), "wb", buffering=0)  # noqa: PTH123, SIM115
         descriptors = (listening.fileno(), its.fileno(), self._state.fileno())
         try:
             self.process = DetachedProcess(
@@ -139,11 +139,15 @@ class MasterProcess:
     async def serve(self, state: MasterState) -> None:
         """Make it the master, with this state.
 
-        Raises GuardError if it does not begin. Raises OSError if there is no room for the state.
+        Raises GuardError if it does not begin, or if there is no room for the state.
         """
         await self.warm()
-        self._state.write(master_process.journal_of(state))
-        self._state.flush()
+        content = memoryview(master_process.journal_of(state))
+        try:
+            while content:
+                content = content[self._state.write(content) :]
+        except OSError as error:
+            raise GuardError(f"the new master's state: {error.strerror}") from error
         with contextlib.suppress(OSError):
             await asyncio.get_running_loop().sock_sendall(self._control, b"go")
         if (said := await self._hear()) != "serving":
