@@ -7,7 +7,8 @@ sockets, within one process and in the fault simulator.
 The robot's end: :mod:`robot` is the loop (sense, decide, write down, act), :mod:`question` what it
 asks, :mod:`dispatcher` chooses the service to ask, :mod:`requests` sends and reads the replies,
 :mod:`replica_set` is what is known of each service, :mod:`local_service` says when the local one is
-launched, :mod:`verification` recomputes answers. The service's end: :mod:`service` handles
-requests, :mod:`service_sessions` remembers robots, :mod:`request_queue` orders their work,
-:mod:`service_jobs` computes, :mod:`service_calls` replies. Both speak :mod:`messages`.
+launched, :mod:`verification` has answers recomputed, and compares. The service's end:
+:mod:`service` handles requests, :mod:`service_sessions` remembers robots, :mod:`request_queue`
+orders their work, :mod:`service_jobs` computes, :mod:`service_calls` replies. Both speak
+:mod:`messages`.
 """

@@ -379,7 +379,8 @@ class Dispatcher(DecisionSource):
                 OwnDecisionError(
                     f"trial {state.trial}, step {state.step}: services answer differently, or "
                     "outside the problem's limits, and the robot's own planner has not decided "
-                    f"within {1e3 * self._limit_s:g} ms, which is offload.decision_timeout_ms"
+                    f"when it has waited for {1e3 * self._limit_s:g} ms, which is "
+                    "offload.decision_timeout_ms"
                 )
             )
 
@@ -458,7 +459,10 @@ class Dispatcher(DecisionSource):
         self._hold(question, services.why_nobody(), now)
 
     def _try_others(self, question: Question, now: float) -> None:
-        """Probe suspected services with this question too: an answer brings them back."""
+        """Ask services that do not decide, and for a late answer a further one, the question too.
+
+        An answer of a suspected one brings it back.
+        """
         needed_at = question.needed_at
         is_late = needed_at is not None and now >= needed_at + self._timeout_s
         for replica in self._services.cloud:
@@ -508,13 +512,13 @@ class Dispatcher(DecisionSource):
             )
 
     def _hold(self, question: Question, reason: str, now: float) -> None:
-        """Report that no service is usable, if the robot needs the answer."""
+        """Report why the robot holds still, if it needs the answer."""
         if question.needed_at is not None and self.holding_since is None:
             self.holding_since = now
             self.effects.report("holding", step=question.state.step, reason=reason)
 
     def _end_hold(self, now: float) -> None:
-        """Report that a service works on the question, if the robot holds still."""
+        """Report that the robot need not hold still any more, if it does."""
         if self.holding_since is not None:
             self.effects.report("resumed", held_ms=1e3 * (now - self.holding_since))
             self.holding_since = None

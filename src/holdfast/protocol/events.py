@@ -1,8 +1,8 @@
 """The robot's end: events in, effects out.
 
 Events tell what happened on the wire and in the environment. A call is one request with any number
-of replies, and always ends; a service whose call ends without any is suspected. An
-order to the environment ends in one event, which may be a failure.
+of replies, and always ends; a service whose call ends before the question is answered is suspected.
+An order to the environment ends in one event, which may be a failure.
 
 Effects are orders to the shell. It carries out each before it begins the next, and
 :class:`WriteRecords` is done only when the records are as safe as the settings ask. So nothing is

@@ -21,7 +21,7 @@ class ExpectedTime:
     Attributes
     ----------
     mean_s : float
-        How long a queue of such computations takes for each.
+        A moving average: what each computation of a queue costs.
     typical_s : float
         How long one takes on a free core; infinite before the first. Contention only lengthens a
         computation, so a shorter time counts at once and a longer one little. Else a busy process

@@ -5,7 +5,7 @@ has up to two parts: the task actions up to the next sensing step, which need no
 are known at once, and the sensing action of that step, which takes longer and is computed while the
 robot moves. A service that holds the robot's state needs only the observations since; the digest
 shows whether both hold the same state, bit for bit. A service without it replies so and is sent the
-state.
+state, or the observations that lead to it.
 
 Every request may be sent twice, to two services, or late: a decision is a function of the state
 that the digest names.
@@ -226,7 +226,7 @@ class Progress(msgspec.Struct, array_like=True, frozen=True, tag=3):
 
 
 class NeedState(msgspec.Struct, array_like=True, frozen=True, tag=4):
-    """The service lacks the state: send the session configuration and the checkpoint.
+    """The service lacks the state: send the session configuration, and what leads to the state.
 
     Attributes
     ----------
@@ -253,7 +253,7 @@ class Busy(msgspec.Struct, array_like=True, frozen=True, tag=5):
 
 
 class Refused(msgspec.Struct, array_like=True, frozen=True, tag=6):
-    """The request can never be answered as it is.
+    """The request is not answered; ``code`` says whether it may be sent again.
 
     Attributes
     ----------

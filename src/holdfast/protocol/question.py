@@ -76,7 +76,7 @@ class AnswerPart:
     outside_limits : bool
         Whether the problem's ``execute`` would change the task actions.
     judged : bool
-        Whether it was compared with the own planner's answer.
+        Whether it was compared with the own planner's answer, or never can be.
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class Question:
     own : OwnAnswer or None
         The own planner's answer.
     own_is_certain : bool or None
-        Whether the own planner, asked twice, agreed with itself; None if asked once.
+        Whether the own planner, asked twice, agreed with itself; None until both have come.
     """
 
     def __init__(
@@ -253,7 +253,7 @@ class DecisionSource:
         Since when the robot holds still because no service is usable, or its own planner has to
         decide.
     stopped : bool
-        Whether the robot must not continue.
+        Whether this source has stopped the run.
     """
 
     def __init__(self) -> None:

@@ -1,8 +1,8 @@
 """The journal of an unfinished trial: its records, and the state that they fold to.
 
 An observation is in the journal before it is used, and a task action before it is performed. After
-a crash the journal therefore holds all decisions. It cannot tell one thing, whether the last task
-action was still performed; only the environment can.
+a crash the journal therefore holds all that was done and seen. It cannot tell one thing, whether
+the last task action was still performed; only the environment can.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class PausedRecord(msgspec.Struct, array_like=True, frozen=True, tag=4):
 
 
 class LocalTookOverRecord(msgspec.Struct, array_like=True, frozen=True, tag=5):
-    """The local service took over so often since the last such record; for the tables only."""
+    """The cloud was lost so often since the last such record; for the tables only."""
 
     times: int
 

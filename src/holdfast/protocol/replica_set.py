@@ -3,7 +3,8 @@
 All services answer alike, so they are replicas of one another. Known of a replica are its presence
 and silence (:class:`FailureDetector`), how it last answered (well, busy, refusing) and which of the
 robot's states it holds. The last determines what a request carries: only the latest observations
-for a replica that holds the previous state, else the whole state. Nothing here sends anything.
+for a replica that holds the previous state, else the whole state, or all observations where the
+state is large. Nothing here sends anything.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The robot's loop as a state machine: sense, decide, write down, act, once and in order.
 
 The robot holds the true state: its belief, folded from what it sensed and did. Services only
-compute what follows from it. Each turn takes the next decision from the current answer, journals
-it, orders it from the environment and folds in the result. When the answer is used up, the robot
-asks a new question.
+compute what follows from it. Each turn takes the next decision from the current answer, orders it
+from the environment and folds in the result. A task action is in the journal before it is ordered,
+an observation before it is used. When the answer is used up, the robot asks a new question.
 
 While the robot performs the task actions of an answer, the next sensing action is already being
 computed. It is used only if the state in which it was chosen is, bit for bit, the one in which the

@@ -313,7 +313,7 @@ class ProblemPool:
     Parameters
     ----------
     max_problems : int
-        Problems kept; the least recently released goes first.
+        Distinct problems of which instances are kept; the least recently released goes first.
     """
 
     def __init__(self, max_problems: int) -> None:

@@ -15,8 +15,8 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
     Attributes
     ----------
     max_sessions : int
-        Sessions held. The least recently used is dropped first, of the owners with the most; for
-        newcomers one never served, if such sessions are half of all.
+        Sessions held. The least recently used is dropped first, of the owners with the most; one
+        that was never served, while such sessions fill half of the room.
     max_sessions_per_robot : int or None
         Sessions of one certificate; a further one replaces its least recently used. None: no limit.
     max_state_bytes, max_configuration_bytes : int
@@ -44,7 +44,7 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
     max_steps : int
         Steps by which a state is rolled forward for one request.
     max_problems : int
-        Problems kept for reuse.
+        Distinct problems of which unused instances are kept.
     answers_per_session : int
         Cached parts of answers.
     """
@@ -78,7 +78,7 @@ class ServiceStatistics(msgspec.Struct):
     attached : int
         Requests that joined a pending task.
     superseded : int
-        Requests dropped for a newer one of the same robot.
+        Requests and prefetches dropped for a newer request of the same robot.
     restores, states_diverged : int
         States that came from a checkpoint, or came out differently than on the robot.
     state_requests, busy : int

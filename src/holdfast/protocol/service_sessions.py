@@ -90,7 +90,8 @@ class PendingTask:
     """A part of an answer to be computed, and the calls that wait for it.
 
     The service creates and drops tasks; :class:`RequestQueue` writes ``urgent``, ``running`` and
-    ``started_at``, :class:`WaitingCalls` writes ``calls``.
+    ``started_at``, and has a waiting task carry a newer request; :class:`WaitingCalls` writes
+    ``calls``.
 
     Parameters
     ----------
@@ -101,7 +102,7 @@ class PendingTask:
     size : int
         Bytes of the request.
     since : float
-        When it was queued.
+        When it was queued; of one that carries a newer request, the first of them.
     """
 
     def __init__(
@@ -164,7 +165,7 @@ class PendingTask:
         return num_steps <= _TYPICAL_STEPS
 
     def become(self, request: Request, *, sensing: bool, size: int) -> None:
-        """Take the place of a superseded request of the same robot."""
+        """Carry a newer request of the same robot instead of its own."""
         self.digest, self.request = request.digest, request
         self.sensing, self.size = sensing, size
         self.cost_s = self._expected_s()
@@ -173,8 +174,8 @@ class PendingTask:
 class Session:
     """What is remembered of one robot.
 
-    :class:`~holdfast.protocol.service.Service` writes its states, answers, tasks, epoch and number,
-    and whether the robot was served; :class:`SessionTable` the rest.
+    :class:`SessionTable` writes ``served``, ``newcomer``, ``closed`` and ``num_bytes``, and drops
+    states and answers; :class:`~holdfast.protocol.service.Service` writes all else.
 
     Attributes
     ----------
@@ -280,7 +281,7 @@ class Session:
 
 
 class ForgottenEpochs:
-    """Epochs of sessions that are no longer held, so that a replaced process stays replaced.
+    """Epochs of forgotten sessions, remembered so that a replaced process stays replaced.
 
     Parameters
     ----------

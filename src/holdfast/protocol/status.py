@@ -24,7 +24,7 @@ class Status(Enum):
     """A cloud service; the local one was never needed."""
 
     LOCAL_RECOVERY = "local_recovery"
-    """The local service; the cloud is tried with every question."""
+    """The local service, or nobody until it is up; the cloud is tried with each question, too."""
 
     KEEP_ALIVE = "keep_alive"
     """A cloud service again; the local one stays ready."""
@@ -71,7 +71,7 @@ def next_status(status: Status, cause: Cause) -> Status:
 
 
 class StatusTracker:
-    """The status of a run, with how often and since when the cloud is lost.
+    """The status of a robot's process, with how often and since when the cloud is lost.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class StatusTracker:
 
     @property
     def is_recovering(self) -> bool:
-        """Whether the local service decides."""
+        """Whether the cloud is considered lost."""
         return self.status is Status.LOCAL_RECOVERY
 
     def change(

@@ -1,15 +1,18 @@
 """Services are not trusted blindly: the robot's own planner recomputes some of their answers.
 
 A service can be faulty, outdated or in the wrong hands. The robot holds the true state and has a
-planner, so it can check. It does so in three cases:
+planner, so it can check. In these cases it waits for its own planner, and follows that:
 
 - an action that the problem's ``execute`` would change (it is outside the limits);
 - two answers to one question that differ;
-- a random share of the questions, selected with the robot's secret, so no service can predict it.
+- an answer of a service that is under suspicion (see below).
 
-In the first two cases the robot waits for its own planner and follows that. In the third it follows
-the service, and the planner computes while the robot moves. A service whose answer differs from the
-own planner's is not asked again in this run.
+In these it follows the service, and the planner computes while the robot moves:
+
+- a random share of the questions, selected with the robot's secret, so no service can predict it;
+- a sensing action that was chosen for another state than the one in which the robot arrived.
+
+A service whose answer differs from the own planner's is not asked again in this run.
 
 Before a service is blamed for an action within the limits, the planner decides a second time, with
 a new instance of the problem. If it disagrees with itself, the problem is not deterministic and no
