@@ -34,6 +34,7 @@ __all__ = [
     "rewards",
     "sample_observation",
     "scalar",
+    "scene",
     "states_of",
     "truth",
 ]
@@ -251,6 +252,20 @@ def move_each(
 def scalar(problem: Any, function: str, value: object) -> float:
     """Return one number that a function of the problem gave for one state."""
     return float(_single(problem, function, value))
+
+
+def scene(problem: Any) -> Any:
+    """Return the problem's drawing, a ``Scene`` or None; its coordinates are those of a state."""
+    drawn = problem.scene()
+    if drawn is None:
+        return None
+    indices = (*drawn.axes, *(() if drawn.angle is None else (drawn.angle,)))
+    if len(drawn.axes) != 2 or not all(index in range(problem.state_size) for index in indices):
+        raise ProblemError(
+            f"scene of {name_of(problem)} has axes {drawn.axes} and angle {drawn.angle}: need "
+            f"two coordinates, and one or None, each from 0 to {problem.state_size - 1}"
+        )
+    return drawn
 
 
 def truth(problem: Any, function: str, value: object) -> bool:

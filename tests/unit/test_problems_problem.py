@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
+from holdfast import checked
 from holdfast.errors import ProblemError
-from holdfast.problems.problem import ProblemBase
+from holdfast.problems.problem import ProblemBase, Scene
+from holdfast.problems.registry import make
 
 
 class Minimal(ProblemBase):
@@ -32,3 +36,29 @@ class TestProblemBase:
         assert problem.scene() is None
         actions = np.ones(2)
         np.testing.assert_array_equal(problem.execute(actions), actions)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"body": [1, 2, 3]}, r"body of a Scene has the shape \(3,\): must be \(any number, 2\)"),
+        ({"body": "boat"}, "body of a Scene is 'boat': must be numbers"),
+        ({"goal": [1, 2, 3]}, r"goal of a Scene has the shape \(3,\): must be \(2\)"),
+        ({"limits": (1, 2, 3)}, r"limits of a Scene has the shape \(3,\): must be \(4\)"),
+        ({"obstacles": [1, 2, 3]}, r"obstacles of a Scene .* must be \(any number, 4\)"),
+    ],
+)
+def test_a_scene_says_what_does_not_fit(arguments: dict[str, Any], words: str) -> None:
+    with pytest.raises(ProblemError, match=words):
+        Scene(**{"axes": (0, 1), "limits": (0, 0, 1, 1)} | arguments)
+
+
+@pytest.mark.parametrize("wrong", [{"axes": (0, 5)}, {"angle": 7}])
+def test_a_scene_of_coordinates_that_no_state_has(
+    wrong: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = make("peg_in_hole_2d")
+    drawn = Scene(**{"axes": (0, 1), "limits": (0, 0, 1, 1)} | wrong)
+    monkeypatch.setattr(problem, "scene", lambda: drawn, raising=False)
+    with pytest.raises(ProblemError, match=r"scene of peg_in_hole_2d has axes .* from 0 to 2"):
+        checked.scene(problem)

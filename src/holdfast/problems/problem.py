@@ -72,6 +72,11 @@ class Scene:
         Centre of the goal.
     points : array of shape (q, 2) or None
         Places of interest (via points, lamps); all of them are shown.
+
+    Raises
+    ------
+    ProblemError
+        If an argument has another shape.
     """
 
     def __init__(
@@ -85,12 +90,33 @@ class Scene:
         points: npt.ArrayLike | None = None,
     ) -> None:
         self.axes = axes
+        _in_scene("limits", limits, (4,))
         self.limits = limits
-        self.obstacles = np.asarray(obstacles, dtype=np.float64).reshape(-1, 4)
+        boxes = obstacles if np.size(obstacles) else np.empty((0, 4))
+        self.obstacles = _in_scene("obstacles", boxes, (None, 4))
+        if body is not None:
+            outline = _in_scene("body", body, () if np.ndim(body) == 0 else (None, 2))
+            body = float(outline) if outline.ndim == 0 else outline
         self.body = body
         self.angle = angle
-        self.goal = None if goal is None else np.asarray(goal, dtype=np.float64)
-        self.points = None if points is None else np.asarray(points, dtype=np.float64)
+        self.goal = None if goal is None else _in_scene("goal", goal, (2,))
+        self.points = None if points is None else _in_scene("points", points, (None, 2))
+
+
+def _in_scene(name: str, value: object, shape: tuple[int | None, ...]) -> FloatArray:
+    try:
+        numbers = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ProblemError(f"{name} of a Scene is {value!r:.80}: must be numbers") from error
+    fits = len(shape) == numbers.ndim and all(
+        want in (None, have) for want, have in zip(shape, numbers.shape, strict=True)
+    )
+    if not fits or np.isnan(numbers).any():
+        need = ", ".join("any number" if want is None else str(want) for want in shape)
+        raise ProblemError(
+            f"{name} of a Scene has the shape {numbers.shape}: must be ({need}), without NaN"
+        )
+    return numbers
 
 
 @runtime_checkable

@@ -28,6 +28,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from holdfast import checked
 from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration
 from holdfast.files import write_atomically
@@ -102,7 +103,7 @@ def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) 
         If it cannot be written.
     """
     problem = configuration.problem
-    scene = problem.scene()
+    scene: Scene | None = checked.scene(problem)
     num_panels = problem.state_size + 2
     height = max(6.2, 1.12 * num_panels + 1.6)
     with mpl.rc_context(STYLE):

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from holdfast import checked
 from holdfast.arrays import FloatArray
 from holdfast.belief import Belief, estimate
 from holdfast.geometry import BoxWorld
@@ -68,7 +69,7 @@ def scene_markers(
 
     Its poses are in ``frame``; the body is at the origin of the two other frames.
     """
-    scene = problem.scene()
+    scene: Scene | None = checked.scene(problem)
     axes = None if scene is None else _position_axes(scene, layout)
     if scene is None or axes is None:
         return []
@@ -119,7 +120,7 @@ def sensing_markers(
     Its label always; and, if it is the name of a coordinate of the pose (``x`` of ``x (m)``), an
     arrow along that axis or an arc about it.
     """
-    scene = problem.scene()
+    scene: Scene | None = checked.scene(problem)
     spread = np.sqrt(np.trace(layout.covariance(belief)[:3, :3]))
     size = _size(scene) if scene is not None else 10.0 * max(float(spread), 0.1)
     middle = layout.poses(estimate(belief))[:3]
