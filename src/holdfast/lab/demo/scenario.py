@@ -214,7 +214,6 @@ class Demo:
         path = directory / CONFIGURATION_NAME
         document = {
             "problem": "peg_in_hole_2d",
-            "particle_filter": {"num_particles": 100},
             "simulator": {"max_steps": _MAX_STEPS, "seed": self._seed},
         }
         reference = make_reference_run(
