@@ -69,6 +69,12 @@ def path_points(
         points = checked.executed_action(problem, points)
     if (bad := first_unbounded(points.reshape(-1, points.shape[-1]))) is not None:
         row, particle = divmod(bad, states.shape[0])
+        if not np.isfinite(states_at[row, particle]).all():
+            raise ProblemError(
+                f"following the policy of {problem.name} without noise (policy, execute, move) led "
+                f"from the state {in_brief(states[particle])} in {offsets[row]} steps to "
+                f"{in_brief(states_at[row, particle])}: every coordinate must be finite"
+            )
         raise ProblemError(
             f"policy of {problem.name} returned {in_brief(points[row, particle])} in "
             f"state {in_brief(states_at[row, particle])}, {offsets[row]} steps on: every "

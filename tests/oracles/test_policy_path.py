@@ -328,3 +328,12 @@ class TestErrors:
 
         with pytest.raises(ProblemError, match=message):
             choose(Wrong(), path(), some_belief(Wrong(), 40, "uniform"))
+
+    def test_a_path_into_nowhere_is_not_the_policys(self) -> None:
+        class Lost(Drifting):
+            def expected_move(self, states: FloatArray, actions: FloatArray) -> FloatArray:
+                return np.asarray(states + np.nan)
+
+        states = np.array([[1.0, 2.0, 3.0]])
+        with pytest.raises(ProblemError, match=r"led from the state .* in 1 steps to .*nan"):
+            path_points(Lost(), path((0, 1)), states, 0)
