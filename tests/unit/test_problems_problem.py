@@ -46,11 +46,19 @@ class TestProblemBase:
         ({"goal": [1, 2, 3]}, r"goal of a Scene has the shape \(3,\): must be \(2\)"),
         ({"limits": (1, 2, 3)}, r"limits of a Scene has the shape \(3,\): must be \(4\)"),
         ({"obstacles": [1, 2, 3]}, r"obstacles of a Scene .* must be \(any number, 4\)"),
+        ({"obstacles": [[1, 2, 3, 4], [1, 2]]}, "obstacles of a Scene is .*: must be numbers"),
+        ({"body": [[1, 2], [3]]}, "body of a Scene is .*: must be numbers"),
     ],
 )
 def test_a_scene_says_what_does_not_fit(arguments: dict[str, Any], words: str) -> None:
     with pytest.raises(ProblemError, match=words):
         Scene(**{"axes": (0, 1), "limits": (0, 0, 1, 1)} | arguments)
+
+
+def test_a_scene_without_points_or_obstacles() -> None:
+    scene = Scene((0, 1), (0, 0, 1, 1), obstacles=[], points=[])
+    assert scene.points is not None
+    assert (scene.obstacles.shape, scene.points.shape) == ((0, 4), (0, 2))
 
 
 @pytest.mark.parametrize("wrong", [{"axes": (0, 5)}, {"angle": 7}])

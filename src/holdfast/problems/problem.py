@@ -92,11 +92,11 @@ class Scene:
         self.axes = axes
         _in_scene("limits", limits, (4,))
         self.limits = limits
-        boxes = obstacles if np.size(obstacles) else np.empty((0, 4))
-        self.obstacles = _in_scene("obstacles", boxes, (None, 4))
+        self.obstacles = _in_scene("obstacles", obstacles, (None, 4))
         if body is not None:
-            outline = _in_scene("body", body, () if np.ndim(body) == 0 else (None, 2))
-            body = float(outline) if outline.ndim == 0 else outline
+            is_radius = isinstance(body, str | float | int | np.number)
+            outline = _in_scene("body", body, () if is_radius else (None, 2))
+            body = float(outline) if is_radius else outline
         self.body = body
         self.angle = angle
         self.goal = None if goal is None else _in_scene("goal", goal, (2,))
@@ -106,8 +106,10 @@ class Scene:
 def _in_scene(name: str, value: object, shape: tuple[int | None, ...]) -> FloatArray:
     try:
         numbers = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ProblemError(f"{name} of a Scene is {value!r:.80}: must be numbers") from error
+    if numbers.shape == (0,) and len(shape) == 2:
+        return np.empty((0, shape[1] or 0))
     fits = len(shape) == numbers.ndim and all(
         want in (None, have) for want, have in zip(shape, numbers.shape, strict=True)
     )

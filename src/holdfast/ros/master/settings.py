@@ -118,7 +118,7 @@ def own_directory() -> Path:
 
 
 class GuardLock:
-    """Keeps a second guard of the same master away.
+    """Keeps a second guard of the same master, with the same directory, away.
 
     Raises
     ------
