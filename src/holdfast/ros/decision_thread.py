@@ -28,7 +28,8 @@ class DecisionThread:
     @property
     def is_busy(self) -> bool:
         """Whether answers are owed."""
-        return bool(self._owed)
+        with self._lock:  # a request that was handed over may have begun before it is noted
+            return bool(self._owed)
 
     def take_no_more(self) -> None:
         """Have the waiting requests answered, and later ones refused."""
