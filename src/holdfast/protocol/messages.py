@@ -282,7 +282,6 @@ _REPLY_DECODER: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)
 _CONTAINERS = (dict, list, tuple)
 """Values of a configuration that contain others."""
 
-
 _ARRAY_HEADERS = {0xDC: 3, 0xDD: 5}
 """Sizes in bytes of the longer array headers of MessagePack, by their first byte."""
 

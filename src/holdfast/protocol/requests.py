@@ -91,12 +91,15 @@ class OpenRequest:
         return self.has_task_part or self.has_sensing_part
 
     @property
+    def lacks_sensing(self) -> bool:
+        """Whether the sensing part is the next to come."""
+        return self.has_task_part or self.question.task_count == 0
+
+    @property
     def finished(self) -> bool:
         """Whether the whole answer has come."""
         question = self.question
-        return (self.has_task_part or question.task_count == 0) and (
-            self.has_sensing_part or question.sensing_step is None
-        )
+        return self.lacks_sensing and (self.has_sensing_part or question.sensing_step is None)
 
     @property
     def has_everything(self) -> bool:
@@ -341,17 +344,17 @@ class OpenRequests:
         """
         replica, question = call.replica, call.question
         first = not call.answered
+        sensing = isinstance(reply, SensingAnswer)
         if isinstance(reply, SensingAnswer):
             part = question.read_sensing(reply, self._num_sensing_actions, replica.name)
         else:
             part = question.read_tasks(reply, self._action_size, replica.name)
         provenance = Provenance(replica.name, now - call.sent_at, 1e-6 * reply.computed_us)
         self._verification.take(question, part, provenance)
-        if isinstance(reply, SensingAnswer):
+        if sensing:
             call.has_sensing_part = True
         else:
             call.has_task_part = True
-        sensing = isinstance(reply, SensingAnswer)
         replica.note_answer(question, now, sensing=sensing, restored=call.restores)
         for earlier in self.to(replica):
             if earlier.call_number < call.call_number:
@@ -398,8 +401,7 @@ class OpenRequests:
 
     def _note_refusal(self, call: OpenRequest, code: str, text: str, now: float) -> None:
         replica = call.replica
-        sensing = call.has_task_part or call.question.task_count == 0
-        final = replica.note_refusal(code, text, now, sensing=sensing)
+        final = replica.note_refusal(code, text, now, sensing=call.lacks_sensing)
         self._effects.report("refused", service=replica.name, code=code, reason=text, final=final)
 
 
