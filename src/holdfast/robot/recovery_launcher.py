@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import subprocess
 import sys
 import weakref
@@ -18,6 +17,7 @@ from typing import IO
 
 from holdfast.protocol.events import RecoveryExited
 from holdfast.runtime.pool import ThreadPool
+from holdfast.runtime.signal_names import signal_name
 
 __all__ = ["RecoveryLauncher"]
 
@@ -83,8 +83,7 @@ class RecoveryLauncher:
 
     def _account_of(self, code: int) -> str:
         if code < 0:
-            names = {int(number): number.name for number in signal.Signals}
-            return f"was ended by {names.get(-code, f'signal {-code}')}"
+            return f"was ended by {signal_name(-code)}"
         log = "" if self._log_path is None else f"; see {self._log_path}"
         return f"ended with exit code {code}{log}"
 

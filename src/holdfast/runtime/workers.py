@@ -19,6 +19,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from holdfast.runtime.parent_death import end_with_parent
+from holdfast.runtime.signal_names import signal_name
 
 __all__ = ["WorkerProcess", "end_workers"]
 
@@ -96,7 +97,7 @@ class WorkerProcess:
         self._process.join(_END_S)
         code = self._process.exitcode
         if code is not None and code < 0:
-            return f"was killed by {signal.Signals(-code).name}", True
+            return f"was killed by {signal_name(-code)}", True
         return f"ended with exit code {code}", False
 
 

@@ -31,6 +31,7 @@ import msgspec
 from holdfast.errors import ServiceProcessError
 from holdfast.runtime.events import EventSink
 from holdfast.runtime.service_manager import ServiceManager
+from holdfast.runtime.signal_names import signal_name
 from holdfast.service.metrics import ServiceReport, summed
 
 if TYPE_CHECKING:
@@ -381,7 +382,7 @@ class Supervisor:
         child.process.kill()
         code = self._reap(index, child)
         if code < 0:
-            reason = f"was ended by {signal.Signals(-code).name}"
+            reason = f"was ended by {signal_name(-code)}"
         else:
             reason = f"ended with exit code {code}"
         if not self._stopping:

@@ -9,7 +9,6 @@ happens, no process is left when the ``with`` statement ends.
 from __future__ import annotations
 
 import shutil
-import signal
 import tempfile
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -24,6 +23,7 @@ from holdfast.lab.testbed.proxy import Proxy
 from holdfast.lab.testbed.records import Decision, DecisionTable, LogEvent
 from holdfast.recording.run_directory import TIMINGS_NAME
 from holdfast.runtime.parent_death import parent_death_prefix
+from holdfast.runtime.signal_names import signal_name
 
 __all__ = ["RobotCommand", "Script", "ServiceCommand", "Testbed", "after"]
 
@@ -365,7 +365,7 @@ class Testbed:
             if code is None or process.killed or (is_robot and code == 0):
                 continue
             name = "robot" if is_robot else "cloud service"
-            how = f"exit code {code}" if code >= 0 else signal.Signals(-code).name
+            how = f"exit code {code}" if code >= 0 else signal_name(-code)
             last = process.last_line()
             raise ProcessEndedError(
                 f"the {name} ended with {how}; see {process.log_path}"
