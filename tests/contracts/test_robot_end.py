@@ -28,7 +28,7 @@ from tests.contracts.wires import (
     service_process,
     until,
 )
-from tests.stopping import stop
+from tests.process_states import stop
 
 from holdfast.protocol.events import (
     CallEnded,

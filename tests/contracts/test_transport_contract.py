@@ -28,7 +28,7 @@ from tests.contracts.wires import (
     service_process,
     silent,
 )
-from tests.stopping import stop
+from tests.process_states import stop
 
 from holdfast.errors import InvalidValueError
 from holdfast.protocol.events import (

@@ -18,10 +18,10 @@ from typing import Any, Self
 
 import yaml
 from tests.ports import free_port
+from tests.process_states import stop
 from tests.processes.world import PATIENCE_S as PATIENCE_S
 from tests.processes.world import Gate, World
 from tests.processes.world import Hook as Hook
-from tests.stopping import stop
 
 from holdfast.config.loader import load
 from holdfast.lab.testbed import processes as lab

@@ -19,6 +19,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
+from tests.process_states import state_of
 
 from holdfast.lab.chaos.schedule import WIRES, Schedule, Wire, draw_schedule, kinds_over
 from holdfast.lab.chaos.trial import Pace, TrialOutcome, run_chaos_trial
@@ -281,7 +282,7 @@ def test_nothing_is_left_of_it_even_if_it_is_killed(tmp_path: Path, started: lis
     chaos = Chaos(tmp_path, "--trials", "2", "--jobs", "2", *only([FaultKind.ROBOT_STOPPED]))
     started.append(chaos)
     deadline = time.monotonic() + PATIENCE_S
-    while not any(_state_of(pid) == "T" for pid in chaos.others()):
+    while not any(state_of(pid) == "T" for pid in chaos.others()):
         assert time.monotonic() < deadline
         time.sleep(0.002)
     chaos.process.kill()
@@ -332,13 +333,6 @@ def test_a_storm_of_signals_is_one(
     assert re.search(r"Go on with: (holdfast chaos .*)", errors)
     assert not list(chaos.out.glob("trial-*"))
     assert (chaos.out / "summary.json").exists()
-
-
-def _state_of(pid: int) -> str:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return ""
 
 
 @pytest.mark.slow

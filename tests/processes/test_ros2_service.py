@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import zenoh
 from tests.ports import free_port
-from tests.stopping import stop
+from tests.process_states import stop
 from tests.unit.test_ros_client import EXAMPLE, configuration, decisions, in_process
 
 from holdfast.config.loader import Configuration

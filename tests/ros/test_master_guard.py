@@ -12,10 +12,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tests.process_states import alive, stop
 from tests.ros.conftest import PATIENCE_S
 from tests.ros.graph import Graph, keeps_on, replaced, settled, start_everything, topic_tool
 from tests.ros.ros1_processes import SYSTEM_PYTHON, wait_for
-from tests.stopping import stop
 
 from holdfast.errors import GuardError
 from holdfast.ros.master.settings import MasterAddress
@@ -28,14 +28,6 @@ KILLS = 10
 def graph(tmp_path: Path, ros1: dict[str, str]) -> Iterator[Graph]:
     with Graph(tmp_path, ros1) as graph:
         yield graph
-
-
-def alive(pid: int) -> bool:
-    """Tell whether a process has not ended; who should have waited for it may not have."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 class TestItsOwnMaster:

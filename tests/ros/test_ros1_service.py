@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.process_states import stop
 from tests.ros.conftest import line_of
 from tests.ros.ros1_processes import SYSTEM_PYTHON, Ros1, ros1_in, wait_for
-from tests.stopping import stop
 from tests.unit.test_ros_client import in_process
 
 from holdfast.config.loader import Configuration, load

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from tests.process_states import alive
 
 from holdfast.lab.errors import CannotStartError, NoProgressError, ProcessEndedError
 from holdfast.lab.testbed.processes import (
@@ -102,19 +103,12 @@ def test_a_command_on_a_leash_ends_with_whoever_started_it(tmp_path: Path, how: 
             time.sleep(0.5)
             assert Path(f"/proc/{pid}/exe").exists()
             return
-        while _lives(pid):
+        while alive(pid):
             assert time.monotonic() < deadline
             time.sleep(0.01)
     finally:
-        if _lives(pid):
+        if alive(pid):
             os.kill(pid, signal.SIGKILL)
-
-
-def _lives(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 def test_a_command_is_stopped_and_resumed() -> None:
