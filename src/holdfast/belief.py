@@ -22,6 +22,7 @@ from holdfast.arrays import FloatArray, in_brief
 from holdfast.errors import InvalidValueError
 from holdfast.problem_attributes import has_general_observations
 from holdfast.randomness import Stream
+from holdfast.validation_gate import gate, is_within
 
 __all__ = [
     "Belief",
@@ -121,12 +122,16 @@ class ObservationInfo(NamedTuple):
     mahalanobis_distance : float or None
         Distance of the observation from the nearest particle's prediction, in standard deviations;
         None for a general likelihood, which has no such distance.
+    within_gate : bool
+        Whether the observation is one that the belief makes likely: within the gate of
+        :mod:`holdfast.validation_gate` (for a general likelihood: possible for some particle).
     """
 
     effective_sample_size: float
     explained: bool
     resampled: bool
     mahalanobis_distance: float | None = None
+    within_gate: bool = True
 
 
 def estimate(belief: Belief, kind: Literal["mean", "most_likely"] = "mean") -> FloatArray:
@@ -187,11 +192,16 @@ def update(
         )
         explained = squared_distance <= VALIDATION_GATE_SQUARED
         distance = float(np.sqrt(squared_distance))
+        # Most observations are near a particle, and cost no more than this comparison.
+        within_gate = squared_distance <= gate(observed.shape[0]) or is_within(
+            observed, mean, variance, belief.weights
+        )
     else:
         distance = None
         log_likelihood = checked.log_likelihood(problem, belief.states, sensing_action, observed)
         explained = bool(((log_likelihood > -np.inf) & (belief.weights > 0.0)).any())
-    return _reweighted(belief, log_likelihood, explained, distance)
+        within_gate = explained
+    return _reweighted(belief, log_likelihood, explained, distance, within_gate)
 
 
 def update_by_move(
@@ -205,7 +215,7 @@ def update_by_move(
     observed = _finite(observation)
     log_likelihood = checked.move_log_likelihood(problem, belief.states, task_action, observed)
     explained = bool(((log_likelihood > -np.inf) & (belief.weights > 0.0)).any())
-    return _reweighted(belief, log_likelihood, explained, None)
+    return _reweighted(belief, log_likelihood, explained, None, explained)
 
 
 def _finite(observation: npt.ArrayLike) -> FloatArray:
@@ -218,14 +228,19 @@ def _finite(observation: npt.ArrayLike) -> FloatArray:
 
 
 def _reweighted(
-    belief: Belief, log_likelihood: FloatArray, explained: bool, distance: float | None
+    belief: Belief,
+    log_likelihood: FloatArray,
+    explained: bool,
+    distance: float | None,
+    within_gate: bool,
 ) -> tuple[Belief, ObservationInfo]:
     weights, survivors = _kernel.normalize(numerics.log(belief.weights) + log_likelihood, False)
-    if survivors == 0:
-        return belief, ObservationInfo(effective_sample_size(belief), False, False, distance)
-    weights.setflags(write=False)
-    after = Belief(belief.states, weights)
-    return after, ObservationInfo(effective_sample_size(after), explained, False, distance)
+    after = belief
+    if survivors:
+        weights.setflags(write=False)
+        after = Belief(belief.states, weights)
+    found = effective_sample_size(after), explained and survivors > 0, False
+    return after, ObservationInfo(*found, distance, within_gate)
 
 
 def _gaussian_log_likelihood(

@@ -295,9 +295,7 @@ class Planner:
         resampled = threshold == count or found.effective_sample_size <= threshold
         if resampled:
             belief = resample(belief, stream(state.seed, state.trial, state.step, purpose))
-        return state._replace(belief=belief), ObservationInfo(
-            found.effective_sample_size, found.explained, resampled, found.mahalanobis_distance
-        )
+        return state._replace(belief=belief), found._replace(resampled=resampled)
 
     def reinitialise(self, state: PlanningState) -> PlanningState:
         """Return the state with a new belief, for a robot that is lost.

@@ -1,0 +1,88 @@
+"""The validation gate: its odds, its two distances, its covariance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from holdfast import randomness
+from holdfast.belief import Belief, uniform_weights, update
+from holdfast.validation_gate import OUTSIDE_PROBABILITY, _squared_distance, gate, is_within
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 6, 20, 100, 1000])
+def test_the_quantile(size: int) -> None:
+    exact = stats.chi2.isf(OUTSIDE_PROBABILITY, size)
+    assert gate(size) == pytest.approx(exact, rel=0.01)
+    assert stats.chi2.sf(gate(size), size) == pytest.approx(OUTSIDE_PROBABILITY, rel=0.03)
+
+
+@pytest.mark.parametrize("size", [1, 2, 5])
+@pytest.mark.parametrize("varying", [False, True])
+def test_the_distance_is_that_of_the_whole_covariance(size: int, varying: bool) -> None:
+    draws = np.random.default_rng(3)
+    mean = draws.normal(size=(40, size)) @ draws.normal(size=(size, size))
+    variance = draws.uniform(0.1, 2.0, (40, size) if varying else size)
+    weights = draws.dirichlet(np.ones(40))
+    observed = draws.normal(size=size)
+    residual = observed - weights @ mean
+    noise = weights @ variance if varying else variance
+    covariance = np.cov(mean.T, aweights=weights, ddof=0).reshape(size, size) + np.diag(noise)
+    expected = residual @ np.linalg.solve(covariance, residual)
+    assert _squared_distance(observed, mean, variance, weights) == pytest.approx(expected)
+
+
+class TwoDoors:
+    """Observes the coordinates of the state."""
+
+    def __init__(self, variance: float) -> None:
+        self.variance = variance
+
+    def observation_mean(self, states: np.ndarray, sensing_action: int) -> np.ndarray:
+        return states
+
+    def observation_variance(self, states: np.ndarray, sensing_action: int) -> np.ndarray:
+        return np.full(states.shape[-1], self.variance)
+
+
+def within(belief: Belief, variance: float, *observed: float) -> bool:
+    return update(TwoDoors(variance), belief, 0, observed)[1].within_gate
+
+
+def test_one_mode_of_two_is_no_alarm() -> None:
+    """It is far from the mean prediction of a belief that is nearly sure of another place."""
+    belief = Belief.weighted([[0.0], [10.0]], [0.999, 0.001])
+    assert within(belief, 0.01, 10.1)
+    assert not within(belief, 0.01, 12.0)
+
+
+def test_a_gap_between_few_particles_is_no_alarm() -> None:
+    """It is twenty deviations of the sensor from any of them."""
+    belief = Belief.uniform([[-1.0], [0.0], [1.0]])
+    assert within(belief, 0.0004, 0.5)
+    assert not within(belief, 0.0004, 3.0)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("observed", [1e200, -1e308])
+def test_what_overflows_is_outside(observed: float) -> None:
+    with np.errstate(over="raise", invalid="raise"):
+        assert not is_within(
+            np.array([observed]), np.zeros((3, 1)), np.array([1.0]), uniform_weights(3)
+        )
+
+
+def test_how_often_a_sound_belief_is_surprised() -> None:
+    """The truth is one more draw of what the particles are drawn from.
+
+    With 3,000 observations each of probability at most 0.01, more than 52 would come once in
+    10,000 series; and the gate is no wall.
+    """
+    outside = 0
+    for trial in range(3000):
+        random = randomness.stream(5, trial, 0, randomness.Purpose.INITIAL_BELIEF)
+        states = random.normal((201, 2))
+        observed = states[0] + 0.5 * random.substream(1).normal(2)
+        outside += not within(Belief.uniform(states[1:]), 0.25, *observed)
+    assert 3 <= outside <= 52
