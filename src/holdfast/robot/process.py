@@ -226,7 +226,7 @@ class RobotProcess:
             may_be_brief=":" not in configuration.problem_name,
         )
         self._planner = links.make_planner(problem, configuration.planning)
-        self._robot = Robot(self._planner, simulator, dispatcher, rate_hz)
+        self._robot = Robot(self._planner, simulator, dispatcher, rate_hz, configuration.lost)
 
     @property
     def missed_ticks(self) -> int:
@@ -564,7 +564,8 @@ class RobotProcess:
             trial, records, tail_is_certain = following, (), True
         self._replayed = trial
         seed = self._configuration.simulator.seed
-        history = replay(self._planner, seed, trial, records)
+        rate = self._configuration.lost.false_alarm_rate
+        history = replay(self._planner, seed, trial, records, rate)
         self._replayed = None
         self._starting = (trial, history, tail_is_certain)
         self._runner = make_runner(
