@@ -310,9 +310,9 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     mean_sensing_ms: float
     recoveries: int
     unexplained_observations: int
+    digest: str
     lost: int = 0
     suspect_sensors: int = 0
-    digest: str
     sensing_ms: tuple[float, ...]
     decisions: Decisions | None = None
 

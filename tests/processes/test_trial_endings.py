@@ -208,12 +208,13 @@ def test_a_filter_that_has_lost_the_robot_is_told(tmp_path: Path) -> None:
         each = [event for event in told if event["event"] == "unexplained"]
         assert [event["step"] for event in each] == list(range(int(row["steps"])))
         assert all(event["deviations"] > 8.0 for event in each)
-        (diverged,) = [event for event in told if event["event"] == "filter_diverged"]
-        assert diverged["step"] == 4
+        (lost,) = [event for event in told if event["event"] == "lost"]
+        assert lost["step"] == 4
+        assert row["lost"] == 1
     assert command.summary()["unexplained_observations"] == 21
     assert "unexplained" in ended.stdout
     assert "21 of 21 observations" in ended.stdout
-    assert ended.stderr.count("filter diverged") == 3
+    assert ended.stderr.count("lost") == 3
 
 
 def test_a_run_from_before_trials_could_fail_goes_on(tmp_path: Path) -> None:

@@ -48,6 +48,8 @@ class TestTables:
             "recoveries",
             "unexplained_observations",
             "digest",
+            "lost",
+            "suspect_sensors",
             "outcome",
             "reason",
         )

@@ -17,10 +17,8 @@ The machine touches nothing. Methods take an event and the time and return effec
 from __future__ import annotations
 
 from holdfast.arrays import FloatArray
-from holdfast.belief import VALIDATION_GATE_SQUARED
 from holdfast.config.settings import LostSettings, SimulatorSettings
 from holdfast.errors import HeldError, HoldfastError, UnknownPerformanceError
-from holdfast.lost import MOVE, Verdict
 from holdfast.outcome import Ending
 from holdfast.planning import ObservationInfo, Planner, PlanningState
 from holdfast.protocol.events import (
@@ -43,6 +41,7 @@ from holdfast.protocol.events import (
     WriteRecords,
 )
 from holdfast.protocol.messages import DIGEST_SIZE, encode_floats
+from holdfast.protocol.observation_reports import ObservationReports, held_error
 from holdfast.protocol.question import DecisionSource, Provenance, Question, same_actions
 from holdfast.protocol.records import (
     ActingRecord,
@@ -65,21 +64,6 @@ _TICKS_INTERVAL_S = 1.0
 """Missed ticks are reported at most this often."""
 
 
-_MAX_REPORTS = 10
-"""Bound on reports of each kind about what is observed per trial; all are counted."""
-
-
-_LOST_BY_DEFAULT = LostSettings()
-
-_WHY = {
-    "lost": "so many observations outside the validation gate say that the belief does not know "
-    "where the robot is",
-    "sensor_suspect": "what this sensing action shows is outside the validation gate, while other "
-    "observations are explained: the sensor may be dead, or its model wrong",
-}
-_OR_ITS_SENSOR = "; all were of one sensing action, so its sensor may be dead instead"
-
-
 class Robot:
     """The loop of one robot over the trials of a run.
 
@@ -87,6 +71,8 @@ class Robot:
     ----------
     rate_hz : float or None
         Task actions per second; None for as soon as possible.
+    lost : LostSettings, optional
+        When it counts as lost, and what it does then.
 
     Attributes
     ----------
@@ -102,12 +88,13 @@ class Robot:
         simulator: SimulatorSettings,
         source: DecisionSource,
         rate_hz: float | None = None,
-        lost: LostSettings = _LOST_BY_DEFAULT,
+        lost: LostSettings | None = None,
     ) -> None:
         self._planner = planner
         self._simulator = simulator
         self._source = source
-        self._lost = lost
+        self._lost = LostSettings() if lost is None else lost
+        self._reports = ObservationReports(source.effects, self._lost)
         self._period_s = None if rate_hz is None else 1.0 / rate_hz
         # One list for both, because the order of all effects counts.
         self._effects = source.effects
@@ -165,11 +152,6 @@ class Robot:
         return 0 if self._history is None else self._history.num_unexplained
 
     @property
-    def num_lost(self) -> int:
-        """Times that the robot was found lost in the current trial; 0 between trials."""
-        return 0 if self._history is None else self._history.lost_test.num_lost
-
-    @property
     def _current_history(self) -> TrialHistory:
         assert self._history is not None, "between trials"
         return self._history
@@ -211,9 +193,10 @@ class Robot:
         except UnknownPerformanceError as error:
             self._stop(error)
             return self._take()
-        if history.alarm is not None and self._lost.on_lost == "reinitialise":
+        alarm = history.alarm
+        if alarm is not None and alarm.kind == "lost" and self._lost.on_lost == "reinitialise":
             # The process ended between the observation and this, or held still there.
-            self._reinitialise(history.alarm)
+            self._reinitialise()
         if again is not None:
             # It is in the journal already, and the environment says that it was not performed.
             self._awaits_environment = True
@@ -336,72 +319,23 @@ class Robot:
             self._ask(self._planner.digest(history.state), now)
 
     def _judge(self, step: int, info: ObservationInfo, **of_what: object) -> None:
-        """Report an observation that no particle explains, and act on an alarm that it raised."""
+        """Report what an observation has shown, and act if the robot is lost."""
         history = self._current_history
-        if not info.explained and history.num_unexplained <= _MAX_REPORTS:
-            gate = f"{VALIDATION_GATE_SQUARED**0.5:g} standard deviations"
-            distance = info.mahalanobis_distance
-            fields: dict[str, object] = {} if distance is None else {"deviations": distance}
-            more = history.num_unexplained == _MAX_REPORTS
-            self._effects.report(
-                "unexplained",
-                trial=self._trial,
-                step=step,
-                **of_what,
-                **fields,
-                reason=(
-                    "no particle can have made it"
-                    if distance is None
-                    else f"outside the validation gate of every particle ({gate})"
-                )
-                + ("; further ones of this trial are counted only" if more else ""),
-            )
-        alarm = history.alarm
-        if alarm is None:
-            return
-        raised = history.lost_test
-        kind, action, outside, observations = alarm
-        if (raised.num_lost if kind == "lost" else raised.num_suspect) <= _MAX_REPORTS:
-            self._effects.report(
-                kind,
-                trial=self._trial,
-                step=step,
-                **({} if action is None else {"sensing_action": self._label(action)}),
-                outside=outside,
-                observations=observations,
-                false_alarm_rate=self._lost.false_alarm_rate,
-                reason=_WHY[kind]
-                + (_OR_ITS_SENSOR if kind == "lost" and action is not None else ""),
-            )
-        if kind == "lost" and self._lost.on_lost == "hold":
-            self._stop(
-                HeldError(
-                    f"the robot is lost in trial {self._trial}, step {step} ({outside} of the last "
-                    f"{observations} observations were outside the validation gate) and holds "
-                    "still, as lost.on_lost says. Bring it to where it believes to be and resume "
-                    "the run, or resume it with lost.on_lost=reinitialise"
-                )
-            )
-        elif kind == "lost" and self._lost.on_lost == "reinitialise":
-            self._reinitialise(alarm)
+        on_lost = self._reports.observed(history, step, info, **of_what)
+        if on_lost == "hold":
+            self._stop(held_error(history, step))
+        elif on_lost == "reinitialise":
+            self._reinitialise()
 
-    def _reinitialise(self, alarm: Verdict) -> None:
-        """Begin the belief anew if the robot is lost, before anything else is decided."""
-        if alarm.kind != "lost":
-            return
-        history = self._current_history
+    def _reinitialise(self) -> None:
+        """Begin the belief anew, before anything else is decided."""
         try:
-            record = history.reinitialised()
+            record = self._current_history.reinitialised()
         except HoldfastError as error:
             self._stop(error)
             return
         self._write(record)
         self._effects.report("reinitialised", trial=self._trial, step=record.step)
-
-    def _label(self, sensing_action: int) -> str:
-        if sensing_action == MOVE:
-            return "move"
-        return f"{sensing_action} ({self._planner.problem.sensing_actions[sensing_action]})"
 
     def _performed(self, event: Acted) -> None:
         history = self._current_history
