@@ -12,7 +12,7 @@ from holdfast.arrays import FloatArray
 from holdfast.config.settings import LostSettings, OnLost, SimulatorSettings
 from holdfast.errors import HeldError
 from holdfast.lost import MOVE, Verdict
-from holdfast.outcome import TrialResult
+from holdfast.outcome import MoveResult, TrialResult
 from holdfast.planning import ObservationInfo, Planner
 from holdfast.protocol.events import Effects, LogEvent, RobotEffect, WriteRecords
 from holdfast.protocol.observation_reports import ObservationReports
@@ -27,7 +27,7 @@ SIMULATOR = SimulatorSettings(num_trials=1, max_steps=120, seed=11)
 class Kidnapped(SimulatedEnvironment):
     """Somebody moves the peg every 40 steps, far away."""
 
-    def perform(self, task_action: FloatArray) -> float | None:
+    def perform(self, task_action: FloatArray) -> float | MoveResult | None:
         reward = super().perform(task_action)
         if self.step % 40 == 0:
             self.state = self.state + np.array([9.0, 9.0, 1.0])

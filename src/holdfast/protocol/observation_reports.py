@@ -5,6 +5,8 @@ The trial counts (:mod:`holdfast.tracking`); here is what becomes an event, with
 
 from __future__ import annotations
 
+from collections import Counter
+
 from holdfast.belief import VALIDATION_GATE_SQUARED
 from holdfast.config.settings import LostSettings, OnLost
 from holdfast.errors import HeldError
@@ -28,11 +30,18 @@ _OR_ITS_SENSOR = ", or this sensor is dead: nothing else was sensed meanwhile"
 
 
 class ObservationReports:
-    """Reports to ``effects`` what is observed in trials."""
+    """Reports to ``effects`` what is observed in trials.
+
+    Attributes
+    ----------
+    counts : Counter of str
+        Events of each kind in this process, also those that were counted only.
+    """
 
     def __init__(self, effects: Effects[RobotEffect], lost: LostSettings) -> None:
         self._effects = effects
         self._lost = lost
+        self.counts: Counter[str] = Counter()
 
     def observed(
         self, trial: Trial, step: int, info: ObservationInfo, **of_what: object
@@ -41,6 +50,7 @@ class ObservationReports:
 
         ``of_what`` says in the report which observation it was.
         """
+        self.counts["unexplained"] += not info.explained
         if not info.explained and trial.num_unexplained <= _MAX_REPORTS:
             distance = info.mahalanobis_distance
             more = trial.num_unexplained == _MAX_REPORTS
@@ -56,8 +66,14 @@ class ObservationReports:
         alarm = trial.alarm
         if alarm is None:
             return None
+        self.counts[alarm.kind] += 1
         self._raised(trial, step, alarm)
         return self._lost.on_lost if alarm.kind == "lost" else None
+
+    def reinitialised(self, trial: Trial) -> None:
+        """Report that the belief of a lost robot has begun anew."""
+        self.counts["reinitialised"] += 1
+        self._effects.report("reinitialised", trial=trial.state.trial, step=trial.state.step)
 
     def _raised(self, trial: Trial, step: int, alarm: Verdict) -> None:
         is_lost = alarm.kind == "lost"

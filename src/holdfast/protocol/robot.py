@@ -76,6 +76,8 @@ class Robot:
 
     Attributes
     ----------
+    num_performed : int
+        Task actions performed.
     missed_ticks : int
         Ticks of ``rate_hz`` at which the robot was not ready.
     has_decided : bool
@@ -94,7 +96,7 @@ class Robot:
         self._simulator = simulator
         self._source = source
         self._lost = LostSettings() if lost is None else lost
-        self._reports = ObservationReports(source.effects, self._lost)
+        self.reports = ObservationReports(source.effects, self._lost)
         self._period_s = None if rate_hz is None else 1.0 / rate_hz
         # One list for both, because the order of all effects counts.
         self._effects = source.effects
@@ -114,6 +116,7 @@ class Robot:
         self._reported_ticks = 0
         self._report_ticks_at = 0.0
         self.missed_ticks = 0
+        self.num_performed = 0
         self.has_decided = False
 
     @property
@@ -321,7 +324,7 @@ class Robot:
     def _judge(self, step: int, info: ObservationInfo, **of_what: object) -> None:
         """Report what an observation has shown, and act if the robot is lost."""
         history = self._current_history
-        on_lost = self._reports.observed(history, step, info, **of_what)
+        on_lost = self.reports.observed(history, step, info, **of_what)
         if on_lost == "hold":
             self._stop(held_error(history, step))
         elif on_lost == "reinitialise":
@@ -329,13 +332,9 @@ class Robot:
 
     def _reinitialise(self) -> None:
         """Begin the belief anew, before anything else is decided."""
-        try:
-            record = self._current_history.reinitialised()
-        except HoldfastError as error:
-            self._stop(error)
-            return
-        self._write(record)
-        self._effects.report("reinitialised", trial=self._trial, step=record.step)
+        history = self._current_history
+        self._write(history.reinitialised())
+        self.reports.reinitialised(history)
 
     def _performed(self, event: Acted) -> None:
         history = self._current_history
@@ -346,6 +345,7 @@ class Robot:
         )
         record = PerformedRecord(event.step, event.reward, motion, shown)
         self._unwritten.append(record)
+        self.num_performed += 1
         try:
             info = history.performed(record)
             if info is not None:

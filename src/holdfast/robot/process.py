@@ -281,7 +281,7 @@ class RobotProcess:
         sys.setswitchinterval(_SWITCH_INTERVAL_S)
         try:
             if self._watch is not None:
-                loop.run_until_complete(self._watch.start(self.condition))
+                loop.run_until_complete(self._watch.start(self.condition, self._robot))
             with ending_signals(loop, self._interrupt):
                 loop.call_soon(self._start)
                 loop.run_forever()
@@ -493,6 +493,8 @@ class RobotProcess:
                 self._runner.sense(effect.step, effect.sensing_action)
             elif isinstance(effect, Timing):
                 self._on_timing(effect)
+                if self._watch is not None:
+                    self._watch.timed(effect)
             elif isinstance(effect, Plan):
                 self._in_process.ask(effect)
             elif isinstance(effect, Send):
@@ -527,6 +529,8 @@ class RobotProcess:
             self._runner.close()
             self._runner = None
         self._on_result(result)
+        if self._watch is not None:
+            self._watch.ended(result)
         self._finished.add(result.trial)
         self._events.event(
             "trial",
