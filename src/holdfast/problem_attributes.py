@@ -22,6 +22,7 @@ from holdfast.errors import InvalidValueError, ProblemError
 __all__ = [
     "check_problem",
     "check_sizes",
+    "choice_labels",
     "has_general_observations",
     "has_own",
     "moves_show",
@@ -240,6 +241,11 @@ def sensing_costs(problem: Any) -> FloatArray:
 def has_general_observations(problem: object) -> bool:
     """Tell whether a problem gives a likelihood of its own instead of a Gaussian one."""
     return hasattr(problem, "log_likelihood")
+
+
+def choice_labels(problem: Any) -> list[str]:
+    """Return a label for each choice: the sensing actions, and not to sense."""
+    return [*map(str, problem.sensing_actions), "no sensing"]
 
 
 def moves_show(problem: object) -> bool:

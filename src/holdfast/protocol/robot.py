@@ -46,10 +46,12 @@ from holdfast.protocol.question import DecisionSource, Provenance, Question, sam
 from holdfast.protocol.records import (
     DIVERGENCE_RUN,
     ActingRecord,
+    LateRecord,
     LocalTookOverRecord,
     PausedRecord,
     PerformedRecord,
     Record,
+    ReinitialisedRecord,
     TrialHistory,
 )
 from holdfast.protocol.status import Status
@@ -67,6 +69,13 @@ _TICKS_INTERVAL_S = 1.0
 
 _MAX_REPORTS = 10
 """Bound on reports of each kind about unexplained observations per trial; all are counted."""
+
+
+def _has_shown(record: Record) -> bool:
+    """Return whether a record has what neither the decisions nor a simulated world can tell."""
+    if isinstance(record, PerformedRecord):
+        return bool(record.motion or record.observation)
+    return isinstance(record, LateRecord | ReinitialisedRecord)
 
 
 class Robot:
@@ -555,6 +564,8 @@ class Robot:
         history = self._current_history
         self._report_ticks(now)
         self._count_recoveries()
+        if any(_has_shown(record) for record in self._unwritten):
+            self._write()
         result = history.result(self._ending)
         self._history = None
         self._unwritten = []  # the result says all of it
