@@ -198,8 +198,10 @@ class Robot:
         if resumed:
             self._effects.report("resumed_trial", trial=trial, step=history.state.step)
         try:
-            again = self._settle_pending_action(begun.steps_performed, resumed, tail_is_certain)
-        except UnknownPerformanceError as error:
+            again = self._settle_pending_action(begun, resumed, tail_is_certain)
+            for late in begun.late:
+                self._came_late(late)
+        except HoldfastError as error:
             self._stop(error)
             return self._take()
         if again is not None:
@@ -211,10 +213,10 @@ class Robot:
         return self._take()
 
     def _settle_pending_action(
-        self, performed: int | None, resumed: bool, tail_is_certain: bool
+        self, begun: EnvironmentReady, resumed: bool, tail_is_certain: bool
     ) -> FloatArray | None:
         """Return the pending task action if it was not performed and must be performed now."""
-        history = self._current_history
+        history, performed = self._current_history, begun.steps_performed
         known = history.state.step
         where = f"trial {self._trial}, step {history.state.step}"
         if performed is None:
@@ -232,10 +234,8 @@ class Robot:
                 "trial anew in another directory (--out)"
             )
         if history.pending is not None and performed == known + 1:
-            record = PerformedRecord(known, None)
-            self._unwritten.append(record)
             self._effects.report("performed_unseen", trial=self._trial, step=known)
-            history.performed(record)
+            self._fold_move(begun.last or Acted(known, None, None))
             return None
         if performed != known:
             raise UnknownPerformanceError(
@@ -359,22 +359,25 @@ class Robot:
             )
 
     def _performed(self, event: Acted) -> None:
-        history = self._current_history
         self._ending = event.ending
+        try:
+            self._fold_move(event)
+            for late in event.late:
+                self._came_late(late)
+        except HoldfastError as error:
+            self._stop(error)
+
+    def _fold_move(self, event: Acted) -> None:
+        """Fold in what a performed task action has shown."""
         motion, shown = (
             b"" if each is None else encode_floats(each)
             for each in (event.motion, event.observation)
         )
         record = PerformedRecord(event.step, event.reward, motion, shown)
         self._unwritten.append(record)
-        try:
-            info = history.performed(record)
-            if info is not None:
-                self._judge(event.step, info, of="move")
-            for late in event.late:
-                self._came_late(late)
-        except HoldfastError as error:
-            self._stop(error)
+        info = self._current_history.performed(record)
+        if info is not None:
+            self._judge(event.step, info, of="move")
 
     def _came_late(self, late: LateObservation) -> None:
         """Fold in an observation of an earlier step."""

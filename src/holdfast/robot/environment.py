@@ -39,6 +39,7 @@ __all__ = [
     "LateSensingEnvironment",
     "Later",
     "ObservationSizes",
+    "RememberingEnvironment",
     "SimulatedEnvironment",
     "load_environment",
 ]
@@ -113,6 +114,19 @@ class CountingEnvironment(Environment, Protocol):
 
         The count is the environment's own and survives the robot's process. It is right even if
         that process died during a task action.
+        """
+        ...
+
+
+@runtime_checkable
+class RememberingEnvironment(CountingEnvironment, Protocol):
+    """A counting environment that can say again what its last task action has shown."""
+
+    def last_move(self) -> float | MoveResult | None:
+        """Return again what the last ``perform`` of this trial has returned, or would have.
+
+        Asked after a crash of the robot's process in the midst of a move. Without this method what
+        the move has shown is lost then: its reward counts as 0, and its motion is the model's.
         """
         ...
 
