@@ -94,12 +94,13 @@ def expected_returns(
     hypotheses: Stream,
     posteriors: Posteriors,
 ) -> Returns:
-    """Return the expected return after each sensing action.
+    """Return the expected return after each sensing action; if sensing is optional, without one.
 
+    Not to sense comes last, has no price, and ``posteriors`` is asked for it as for the others.
     ProblemError says if a function of the problem breaks its contract, or a hypothetical
     observation has no likelihood under any particle.
     """
-    costs = sensing_costs(problem)
+    costs = sensing_costs(problem, optional=settings.selector.sensing_is_optional)
     count = costs.shape[0]
     size = settings.active_sensing.num_observation_samples
     limit = max(size, settings.selector.max_observation_samples)
@@ -199,7 +200,7 @@ def rollout_returns(
     rollouts = _Rollouts(problem, settings, true_states, estimates, clouds, stage)
     interval = settings.sensing_interval + 1
     looks = settings.selector.rollout_looks
-    costs = sensing_costs(problem)
+    costs = sensing_costs(problem, optional=settings.selector.sensing_is_optional)
     price = numerics.sum(costs) / costs.shape[0]
     for step in range(settings.selector.rollout_steps):
         later, between = divmod(step, interval)

@@ -218,12 +218,21 @@ def _takes(function: Any, arguments: tuple[str | None, ...]) -> str | None:
     return None
 
 
-def sensing_costs(problem: Any) -> FloatArray:
-    """Return the checked price of each sensing action, shape ``(J,)``; zeros if there is none."""
+def sensing_costs(problem: Any, *, otherwise: float = 0.0, optional: bool = False) -> FloatArray:
+    """Return the checked price of each sensing action, shape ``(J,)``.
+
+    ``otherwise`` is that of each where the problem has no prices. With ``optional`` a last entry of
+    zero stands for not sensing.
+    """
+    costs = _costs_of_actions(problem, otherwise)
+    return np.append(costs, 0.0) if optional else costs
+
+
+def _costs_of_actions(problem: Any, otherwise: float) -> FloatArray:
     count = len(problem.sensing_actions)
     given = getattr(problem, "sensing_costs", None)
     if given is None:
-        return np.zeros(count)
+        return np.full(count, otherwise)
     costs = _numbers(given)
     # A comparison with NaN is false.
     if (
