@@ -16,11 +16,13 @@ gate if it is far in both. If the truth is a draw from the belief, that is rarer
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 
 import numpy as np
 
 from holdfast import _kernel
 from holdfast.arrays import FloatArray
+from holdfast.circular import differences, mean_angles
 
 __all__ = ["OUTSIDE_PROBABILITY", "gate", "is_within"]
 
@@ -45,7 +47,11 @@ def gate(size: int) -> float:
 
 
 def is_within(
-    observed: FloatArray, mean: FloatArray, variance: FloatArray, weights: FloatArray
+    observed: FloatArray,
+    mean: FloatArray,
+    variance: FloatArray,
+    weights: FloatArray,
+    circular: Sequence[int] = (),
 ) -> bool:
     """Tell whether an observation is near the mean prediction of all particles.
 
@@ -57,25 +63,34 @@ def is_within(
     variance : array of shape (observation_size,) or (num_particles, observation_size)
         Of the sensor's noise.
     weights : array of shape (num_particles,)
+    circular : sequence of int
+        Coordinates of the observation that are angles.
     """
     with np.errstate(over="ignore", invalid="ignore"):
-        squared = _squared_distance(observed, mean, variance, weights)
+        squared = _squared_distance(observed, mean, variance, weights, circular)
     return squared <= gate(observed.shape[0])
 
 
 def _squared_distance(
-    observed: FloatArray, mean: FloatArray, variance: FloatArray, weights: FloatArray
+    observed: FloatArray,
+    mean: FloatArray,
+    variance: FloatArray,
+    weights: FloatArray,
+    circular: Sequence[int] = (),
 ) -> float:
     """Return ``r' S^-1 r``, r the innovation and S its covariance, by a Cholesky factorisation."""
     size = observed.shape[0]
     predicted = _kernel.weighted_sums(weights, mean)
-    spread = mean - predicted
+    if circular:
+        angles = list(circular)
+        predicted[angles] = mean_angles(mean[:, angles], weights)
+    spread = differences(mean, predicted, circular)
     noise = variance if variance.ndim == 1 else _kernel.weighted_sums(weights, variance)
     columns = [
         _kernel.weighted_sums(weights, spread * spread[:, column : column + 1])
         for column in range(size)
     ]
-    innovation = observed - predicted
+    innovation = differences(observed, predicted, circular)
     squared = 0.0
     for column in range(size):
         columns[column][column] += noise[column]

@@ -64,6 +64,14 @@ def test_a_gap_between_few_particles_is_no_alarm() -> None:
     assert not within(belief, 0.0004, 3.0)
 
 
+def test_angles_are_near_across_the_cut() -> None:
+    mean = np.array([[3.10], [-3.12], [3.14], [-3.08]])
+    for observed, near in ((3.12, True), (-3.11, True), (0.0, False), (2.0, False)):
+        shown = np.array([observed]), mean, np.array([1e-4]), uniform_weights(4)
+        assert is_within(*shown, circular=(0,)) is near
+    assert not is_within(np.array([3.0]), mean, np.array([1e-4]), uniform_weights(4), (0,))
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("observed", [1e200, -1e308])
 def test_what_overflows_is_outside(observed: float) -> None:

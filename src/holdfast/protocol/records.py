@@ -39,6 +39,7 @@ __all__ = [
     "TrialHistory",
     "decode_record",
     "encode_record",
+    "has_shown",
     "reinitialised_after",
     "replay",
 ]
@@ -250,6 +251,13 @@ def replay(
         except (RecordError, MessageError, InvalidValueError) as error:
             raise RecordError(f"trial {trial}: record {position} of its journal {error}") from error
     return history
+
+
+def has_shown(record: Record) -> bool:
+    """Return whether a record has what neither the decisions nor a simulated world can tell."""
+    if isinstance(record, PerformedRecord):
+        return bool(record.motion or record.observation)
+    return isinstance(record, LateRecord)
 
 
 def reinitialised_after(records: Sequence[Record]) -> frozenset[int]:

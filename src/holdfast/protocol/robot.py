@@ -50,6 +50,7 @@ from holdfast.protocol.records import (
     PerformedRecord,
     Record,
     TrialHistory,
+    has_shown,
 )
 from holdfast.protocol.status import Status
 from holdfast.tracking import LateObservation
@@ -67,12 +68,7 @@ _TICKS_INTERVAL_S = 1.0
 class Robot:
     """The loop of one robot over the trials of a run.
 
-    Parameters
-    ----------
-    rate_hz : float or None
-        Task actions per second; None for as soon as possible.
-    lost : LostSettings, optional
-        When it counts as lost, and what it does then.
+    ``rate_hz`` is task actions per second; None is as soon as possible.
 
     Attributes
     ----------
@@ -191,15 +187,17 @@ class Robot:
         resumed = history.begun
         if resumed:
             self._effects.report("resumed_trial", trial=trial, step=history.state.step)
+        is_lost = history.alarm is not None and history.alarm.kind == "lost"
         try:
-            again = self._settle_pending_action(begun.steps_performed, resumed, tail_is_certain)
-        except UnknownPerformanceError as error:
+            if is_lost and history.pending is None and self._lost.on_lost == "reinitialise":
+                # The process ended between the observation and this, or held still there.
+                self._reinitialise()
+            again = self._settle_pending_action(begun, resumed, tail_is_certain)
+            for late in begun.late:
+                self._came_late(late)
+        except HoldfastError as error:
             self._stop(error)
             return self._take()
-        alarm = history.alarm
-        if alarm is not None and alarm.kind == "lost" and self._lost.on_lost == "reinitialise":
-            # The process ended between the observation and this, or held still there.
-            self._reinitialise()
         if again is not None:
             # It is in the journal already, and the environment says that it was not performed.
             self._awaits_environment = True
@@ -209,10 +207,10 @@ class Robot:
         return self._take()
 
     def _settle_pending_action(
-        self, performed: int | None, resumed: bool, tail_is_certain: bool
+        self, begun: EnvironmentReady, resumed: bool, tail_is_certain: bool
     ) -> FloatArray | None:
         """Return the pending task action if it was not performed and must be performed now."""
-        history = self._current_history
+        history, performed = self._current_history, begun.steps_performed
         known = history.state.step
         where = f"trial {self._trial}, step {history.state.step}"
         if performed is None:
@@ -230,10 +228,8 @@ class Robot:
                 "trial anew in another directory (--out)"
             )
         if history.pending is not None and performed == known + 1:
-            record = PerformedRecord(known, None)
-            self._unwritten.append(record)
             self._effects.report("performed_unseen", trial=self._trial, step=known)
-            history.performed(record)
+            self._fold_move(begun.last or Acted(known, None, None))
             return None
         if performed != known:
             raise UnknownPerformanceError(
@@ -337,8 +333,16 @@ class Robot:
         self.reports.reinitialised(history)
 
     def _performed(self, event: Acted) -> None:
-        history = self._current_history
         self._ending = event.ending
+        try:
+            self._fold_move(event)
+            for late in event.late:
+                self._came_late(late)
+        except HoldfastError as error:
+            self._stop(error)
+
+    def _fold_move(self, event: Acted) -> None:
+        """Fold in what a performed task action has shown."""
         motion, shown = (
             b"" if each is None else encode_floats(each)
             for each in (event.motion, event.observation)
@@ -346,14 +350,9 @@ class Robot:
         record = PerformedRecord(event.step, event.reward, motion, shown)
         self._unwritten.append(record)
         self.num_performed += 1
-        try:
-            info = history.performed(record)
-            if info is not None:
-                self._judge(event.step, info, of="move")
-            for late in event.late:
-                self._came_late(late)
-        except HoldfastError as error:
-            self._stop(error)
+        info = self._current_history.performed(record)
+        if info is not None:
+            self._judge(event.step, info, of="move")
 
     def _came_late(self, late: LateObservation) -> None:
         """Fold in an observation of an earlier step."""
@@ -543,6 +542,8 @@ class Robot:
         history = self._current_history
         self._report_ticks(now)
         self._count_recoveries()
+        if any(has_shown(record) for record in self._unwritten):
+            self._write()
         result = history.result(self._ending)
         self._history = None
         self._unwritten = []  # the result says all of it
