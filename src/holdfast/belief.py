@@ -24,7 +24,7 @@ from holdfast.circular import differences, mean_angles
 from holdfast.errors import InvalidValueError
 from holdfast.problem_attributes import circular_observation, has_general_observations
 from holdfast.randomness import Stream
-from holdfast.validation_gate import gate, is_within
+from holdfast.validation_gate import gate, is_typical, is_within
 
 __all__ = [
     "Belief",
@@ -173,7 +173,11 @@ def effective_sample_size(belief: Belief) -> float:
 
 
 def update(
-    problem: Any, belief: Belief, sensing_action: int, observation: npt.ArrayLike
+    problem: Any,
+    belief: Belief,
+    sensing_action: int,
+    observation: npt.ArrayLike,
+    rank_stream: Stream | None = None,
 ) -> tuple[Belief, ObservationInfo]:
     """Multiply the weights by the likelihood of an observation (Bayes' rule); do not resample.
 
@@ -185,6 +189,8 @@ def update(
         Has the mean and variance of the observation in each state, or a method
         ``log_likelihood(states, sensing_action, observation)``.
     observation : array of shape (observation_size,)
+    rank_stream : Stream, optional
+        For a general likelihood: draws what the rank test of the validation gate compares with.
 
     Raises
     ------
@@ -217,7 +223,32 @@ def update(
         log_likelihood = checked.log_likelihood(problem, belief.states, sensing_action, observed)
         explained = bool(((log_likelihood > -np.inf) & (belief.weights > 0.0)).any())
         within_gate = explained
+        if explained and rank_stream is not None:
+            within_gate = _is_typical(problem, belief, sensing_action, log_likelihood, rank_stream)
     return _reweighted(belief, log_likelihood, explained, distance, within_gate)
+
+
+def _is_typical(
+    problem: Any, belief: Belief, sensing_action: int, log_likelihood: FloatArray, random: Stream
+) -> bool:
+    """Tell whether an observation is as likely as others that the belief makes."""
+    states, weights = belief
+
+    def predictive(log_likelihoods: FloatArray) -> float:
+        peak = float(log_likelihoods.max())
+        if peak == -np.inf:
+            return peak
+        total = numerics.sum(weights * numerics.exp(log_likelihoods - peak))
+        return peak + float(numerics.log(total))
+
+    def draw(number: int) -> float:
+        own = random.substream(number)
+        drawn = _kernel.systematic_resample(weights, float(own.substream(0).uniform()))
+        chosen = states[drawn[int(own.substream(1).uniform() * drawn.shape[0])]]
+        shown = checked.sample_observation(problem, chosen, sensing_action, own.substream(2))
+        return predictive(checked.log_likelihood(problem, states, sensing_action, shown))
+
+    return is_typical(predictive(log_likelihood), draw)
 
 
 def update_by_move(

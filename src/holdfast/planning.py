@@ -262,7 +262,10 @@ class Planner:
         if observation is None:
             size = effective_sample_size(state.belief)
             return state._replace(sensed=True), ObservationInfo(size, True, False)
-        updated = update(problem, state.belief, sensing_action, observation)
+        ranks = None
+        if getattr(problem, "rank_test", False):
+            ranks = stream(state.seed, state.trial, state.step, Purpose.RANK_TEST)
+        updated = update(problem, state.belief, sensing_action, observation, ranks)
         after, info = self._resampled(state, *updated, Purpose.RESAMPLING)
         return after._replace(sensed=True), info
 

@@ -11,12 +11,15 @@ no particle explains can say that all of them are wrong, so several modes are no
 *mean prediction*, in units of its whole covariance: between few particles there are gaps, which a
 sharp sensor finds, and there the belief's spread says what is near. An observation is outside the
 gate if it is far in both. If the truth is a draw from the belief, that is rarer than either.
+
+A likelihood of its own has no such distance. There an observation is outside if no particle can
+have made it; and if the problem asks for it, a rank test takes the distance's place.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -24,10 +27,13 @@ from holdfast import _kernel
 from holdfast.arrays import FloatArray
 from holdfast.circular import differences, mean_angles
 
-__all__ = ["OUTSIDE_PROBABILITY", "gate", "is_within"]
+__all__ = ["OUTSIDE_PROBABILITY", "gate", "is_typical", "is_within"]
 
 OUTSIDE_PROBABILITY = 0.01
 """Of an observation, if the belief and the model are right."""
+
+NUM_RANKED = 19
+"""Drawn observations of a rank test: 1 / (19 + 1) is what :mod:`holdfast.lost` allows."""
 
 _QUANTILE = 2.3263478740408408
 """Of the standard normal distribution, at 1 - OUTSIDE_PROBABILITY."""
@@ -69,6 +75,18 @@ def is_within(
     with np.errstate(over="ignore", invalid="ignore"):
         squared = _squared_distance(observed, mean, variance, weights, circular)
     return squared <= gate(observed.shape[0])
+
+
+def is_typical(log_density: float, draw_log_density: Callable[[int], float]) -> bool:
+    """Tell whether an observation is as likely as one of 19 that the belief itself makes.
+
+    ``draw_log_density(n)`` draws the n-th one and returns the logarithm of its predictive density.
+    If the observation is drawn from the same distribution, it is the least likely of the 20 with
+    probability at most 1 / 20, exactly, for any distribution: Barnard (1963), Journal of the Royal
+    Statistical Society B 25. The draws end with the first that decides (Besag and Clifford 1991,
+    "Sequential Monte Carlo p-values", Biometrika 78): after 3.5 of them on average.
+    """
+    return any(draw_log_density(n) <= log_density for n in range(NUM_RANKED))
 
 
 def _squared_distance(

@@ -79,7 +79,7 @@ def test_a_record_that_does_not_follow_is_named(record: Record, why: str) -> Non
 
 def test_when_a_belief_was_begun_anew_is_in_the_records() -> None:
     """As in the log of decisions, where moves that have shown nothing are no inputs."""
-    records = [
+    records: list[Record] = [
         first_record(),
         ActingRecord(0, encode_floats(np.zeros(3))),
         PerformedRecord(0, None),

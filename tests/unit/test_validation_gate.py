@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy import stats
 
-from holdfast import randomness
+from holdfast import numerics, randomness
 from holdfast.belief import Belief, uniform_weights, update
+from holdfast.planning import Planner
+from holdfast.problems.problem import ProblemBase
 from holdfast.validation_gate import OUTSIDE_PROBABILITY, _squared_distance, gate, is_within
 
 
@@ -94,3 +98,91 @@ def test_how_often_a_sound_belief_is_surprised() -> None:
         observed = states[0] + 0.5 * random.substream(1).normal(2)
         outside += not within(Belief.uniform(states[1:]), 0.25, *observed)
     assert 3 <= outside <= 52
+
+
+class Heavy(ProblemBase):
+    """Observes a place with noise of long tails (Cauchy), whose likelihood is zero nowhere."""
+
+    name = "heavy"
+    state_size = action_size = 1
+    sensing_actions = ("look",)
+    asked = 0
+
+    def initial_states(self, stream: randomness.Stream, count: int) -> np.ndarray:
+        return stream.normal((count, 1))
+
+    def move(
+        self, states: np.ndarray, actions: np.ndarray, stream: randomness.Stream
+    ) -> np.ndarray:
+        return states
+
+    def policy(self, states: np.ndarray, stage: int) -> np.ndarray:
+        return states
+
+    def is_goal(self, states: np.ndarray) -> np.ndarray:
+        return states[..., 0] > 99.0
+
+    def log_likelihood(
+        self, states: np.ndarray, sensing_action: int, observation: np.ndarray
+    ) -> np.ndarray:
+        self.asked += 1
+        away = (observation[0] - states[:, 0]) / 0.1
+        return -numerics.log(1.0 + away * away)
+
+    def sample_observation(
+        self, state: np.ndarray, sensing_action: int, stream: randomness.Stream
+    ) -> np.ndarray:
+        above, below = stream.normal(2)
+        shown: np.ndarray = state + 0.1 * above / below
+        return shown
+
+
+def ranked(problem: Heavy, belief: Belief, observed: np.ndarray, trial: int) -> bool:
+    random = randomness.stream(7, trial, 0, randomness.Purpose.RANK_TEST)
+    return update(problem, belief, 0, observed, random)[1].within_gate
+
+
+def test_the_rank_test_is_exact() -> None:
+    """Of 2,000 observations that the belief itself makes 5 % are outside, which is 100.
+
+    More than 140 or fewer than 62 come once in 10,000 series. It takes few draws.
+    """
+    outside = 0
+    problem = Heavy()
+    for trial in range(2000):
+        random = randomness.stream(5, trial, 0, randomness.Purpose.INITIAL_BELIEF)
+        states = np.concatenate([random.normal((20, 1)), 5.0 + random.substream(0).normal((20, 1))])
+        truth = states[int(40 * random.substream(1).uniform())]
+        observed = problem.sample_observation(truth, 0, random.substream(2))
+        problem.asked -= 1  # the update itself
+        outside += not ranked(problem, Belief.uniform(states), observed, trial)
+    assert 62 <= outside <= 140
+    assert problem.asked / 2000 < 4.5
+
+
+def test_the_rank_test_finds_what_is_far_and_repeats_itself() -> None:
+    belief = Belief.uniform(
+        randomness.stream(3, 0, 0, randomness.Purpose.PREDICTION).normal((50, 1))
+    )
+    far = [ranked(Heavy(), belief, np.array([80.0]), trial) for trial in range(20)]
+    near = [ranked(Heavy(), belief, np.array([0.5]), trial) for trial in range(20)]
+    assert sum(far) <= 4
+    assert all(near)
+    assert far == [ranked(Heavy(), belief, np.array([80.0]), trial) for trial in range(20)]
+    # Who does not ask for it gets none: every observation is possible.
+    assert update(Heavy(), belief, 0, [80.0])[1].within_gate
+
+
+def test_a_problem_asks_for_the_rank_test() -> None:
+    class Asking(Heavy):
+        rank_test = True
+
+    reached = []
+    problem: Any
+    for problem, within in ((Heavy(), True), (Asking(), False)):
+        planner = Planner(problem, particles=50)
+        after, info = planner.observe(planner.init(3), 0, np.array([1e3]))
+        assert info.within_gate is within
+        assert info.explained
+        reached.append(planner.digest(after))
+    assert reached[0] == reached[1], "it draws from a stream of its own"
