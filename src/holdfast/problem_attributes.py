@@ -22,8 +22,10 @@ from holdfast.errors import InvalidValueError, ProblemError
 __all__ = [
     "check_problem",
     "check_sizes",
+    "choice_labels",
     "has_general_observations",
     "has_own",
+    "moves_show",
     "name_of",
     "resolution_of",
     "sensing_costs",
@@ -50,6 +52,11 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "sample_observation": ("state", "sensing_action", "stream"),
     "known_state_return": ("states", "stages"),
     "move_each": ("states", "actions", "streams", "threads"),
+    "move_by_measurement": ("states", "motion", "stream"),
+    "measure_motion": ("before", "after", "stream"),
+    "move_log_likelihood": ("states", "action", "observation"),
+    "sample_move_observation": ("state", "action", "stream"),
+    "reinitial_states": ("states", "stream"),
 }
 """Arguments of a problem's functions, by position."""
 
@@ -243,6 +250,16 @@ def _costs_of_actions(problem: Any, otherwise: float) -> FloatArray:
 def has_general_observations(problem: object) -> bool:
     """Tell whether a problem gives a likelihood of its own instead of a Gaussian one."""
     return hasattr(problem, "log_likelihood")
+
+
+def choice_labels(problem: Any) -> list[str]:
+    """Return a label for each choice: the sensing actions, and not to sense."""
+    return [*map(str, problem.sensing_actions), "no sensing"]
+
+
+def moves_show(problem: object) -> bool:
+    """Tell whether a problem can fold in what a move shows: a measured motion, an observation."""
+    return hasattr(problem, "move_by_measurement") or hasattr(problem, "move_log_likelihood")
 
 
 def has_own(problem: Any, function: str, stands_for: tuple[str, ...]) -> bool:

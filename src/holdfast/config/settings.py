@@ -312,12 +312,16 @@ class EnvironmentSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
         Plain data, passed to the class as keyword arguments.
     timeout_ms : float
         Any call of the environment that takes longer has failed.
+    sense_in_background : bool
+        Whether the robot goes on while it senses; ``perform_sensing`` and ``perform`` then run at
+        the same time.
     """
 
     object: Text | None = None
     directory: Text | None = None
     arguments: dict[str, Any] = msgspec.field(default_factory=dict)
     timeout_ms: Milliseconds = 60_000.0
+    sense_in_background: bool = False
 
 
 class PlanningSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Literal, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from holdfast.arrays import FloatArray
 from holdfast.belief import estimate
@@ -33,6 +34,7 @@ from holdfast.recording.facts import (
     Decider,
     EventFact,
     FactSink,
+    LateFact,
     SensingFact,
     TaskFact,
     TrialBeginFact,
@@ -45,7 +47,7 @@ from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME
 from holdfast.recording.step_times import NS_PER_S, StepClock, TrialTimes, read_events, trial_ends
 from holdfast.recording.timings import rows_by_trial
 from holdfast.robot.environment import Environment, SimulatedEnvironment
-from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
+from holdfast.robot.trial import LateStep, SensingStep, TaskStep, TrialObserver, run_trial
 
 __all__ = ["RecordedRun"]
 
@@ -275,7 +277,7 @@ class _Replay(TrialObserver):
             after=after.belief,
             stage=step.before.stage,
             entropies=None if entropies is None else np.array(entropies, dtype=np.float64),
-            observation=np.asarray(step.observation, dtype=np.float64).reshape(-1),
+            observation=step.observation,
             explained=info.explained,
             resampled=info.resampled,
             effective_sample_size=info.effective_sample_size,
@@ -300,12 +302,28 @@ class _Replay(TrialObserver):
             estimate=np.array(step.task_info.estimate, dtype=np.float64),
             true_state=self._true_state,
             reward=None if step.reward is None else float(step.reward),
+            motion=_numbers(step.shown.motion),
+            observation=_numbers(step.shown.observation),
         )
         for sink in self._output.at(fact.time_ns):
             sink.acted(fact)
         self._true_state = _true_state(step.environment)
         self._steps = number + 1
         self._state = None  # the next one is not known before something is done in it
+
+    def observed_late(self, step: LateStep) -> None:
+        number = step.after.step
+        fact = LateFact(
+            trial=self._trial,
+            step=number,
+            time_ns=self._times.at(number - 1, 3),
+            taken=step.late.step,
+            observation=step.late.observation,
+            after=step.after.belief,
+            explained=step.observation_info.explained,
+        )
+        for sink in self._output.at(fact.time_ns):
+            sink.observed_late(fact)
 
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
         if self._result is None or result.decisions != self._result.decisions:
@@ -342,6 +360,10 @@ def _same(one: SensingDecision | TaskDecision, other: SensingDecision | TaskDeci
             np.array(one.action).tobytes() == np.array(other.action).tobytes()
         )
     return type(one) is type(other) and one == other
+
+
+def _numbers(shown: npt.ArrayLike | None) -> FloatArray | None:
+    return None if shown is None else np.array(shown, dtype=np.float64)
 
 
 def _true_state(environment: Environment) -> FloatArray | None:
