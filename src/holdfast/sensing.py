@@ -189,7 +189,7 @@ def _least(scores: FloatArray, *, optional: bool) -> int:
     index = int(scores.argmin())
     # A comparison with NaN is false.
     if optional and scores[-1] - scores[index] <= _ROUNDING * abs(scores[-1]):
-        return scores.shape[0] - 1
+        return len(scores) - 1
     return index
 
 
