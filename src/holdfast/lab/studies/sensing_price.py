@@ -53,7 +53,7 @@ WAYS: Mapping[str, tuple[float, ...]] = {
     FIXED: INTERVALS,
     "nats": NATS,
     "nats, executed": NATS,
-    "return, intervals": (4.0, 8.0, 14.0),
+    "return, intervals": (4.0, 8.0),
     "return": (0.0, 4.0),
 }
 """With the numbers among which each chooses: intervals in steps, or nats."""
@@ -112,14 +112,14 @@ class SensingPrice(JudgedStudy):
     name = "sensing_price"
     title = "When to sense at a price, and what to sense where one sensor is weak"
     columns = ("problem", "way", "number", "price")
-    num_trials: ClassVar = {CHOICE: 40, CLAIM: 200}
+    num_trials: ClassVar = {CHOICE: 20, CLAIM: 100}
 
     def cells(self, scale: Scale) -> Iterator[_Cell]:
         """Return all cells, in the order of the tables."""
         for problem in list(PROBLEMS)[: 1 if scale.quick else None]:
             for way, numbers in WAYS.items():
                 for number in numbers:
-                    for price in PRICES if way.startswith("return") else (0.0,):
+                    for price in PRICES if way == "return" else (0.0,):
                         yield _Cell(problem, way, number, price)
         for way, selector in _OF_BOAT.items():
             depends = selector.method in ("path_entropy", "action_entropy")
