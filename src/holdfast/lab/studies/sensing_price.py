@@ -23,6 +23,7 @@ import pandas as pd
 
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import (
+    ENTROPY_METHODS,
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,
@@ -31,7 +32,7 @@ from holdfast.config.settings import (
 from holdfast.lab.studies import statistics
 from holdfast.lab.studies.judged_study import JudgedStudy
 from holdfast.lab.studies.statistics import cells_of, interval_in
-from holdfast.lab.studies.study import CHOICE, CLAIM, TRIALS, Number, Report, Scale
+from holdfast.lab.studies.study import CHOICE, CLAIM, TRIALS, Number, Report, Scale, drawn
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.trial_batches import TrialSeries
 
@@ -84,7 +85,7 @@ _MODULE = "holdfast.lab.studies.priced_problems"
 PROBLEMS: Mapping[str, _Posed] = {
     "dock": _Posed(f"{_MODULE}:Dock", 300, 1.0),
     "boat": _Posed(f"{_MODULE}:Boat", 200, 1.0),
-    "peg in hole": _Posed(f"{_MODULE}:PricedPeg", 500, 0.3),
+    "peg in hole": _Posed(f"{_MODULE}:PricedPeg", 500, 0.4),
 }
 
 _WEAK = "boat, 80 steps"
@@ -112,7 +113,7 @@ class SensingPrice(JudgedStudy):
     name = "sensing_price"
     title = "When to sense at a price, and what to sense where one sensor is weak"
     columns = ("problem", "way", "number", "price")
-    num_trials: ClassVar = {CHOICE: 20, CLAIM: 100}
+    num_trials: ClassVar = {CHOICE: 20, CLAIM: 60}
 
     def cells(self, scale: Scale) -> Iterator[_Cell]:
         """Return all cells, in the order of the tables."""
@@ -122,8 +123,8 @@ class SensingPrice(JudgedStudy):
                     for price in PRICES if way == "return" else (0.0,):
                         yield _Cell(problem, way, number, price)
         for way, selector in _OF_BOAT.items():
-            depends = selector.method in ("path_entropy", "action_entropy")
-            for resolution in RESOLUTIONS if depends else RESOLUTIONS[:1]:
+            numbers = RESOLUTIONS if _depends_on_resolution(selector) else RESOLUTIONS[:1]
+            for resolution in numbers:
                 yield _Cell(_WEAK, way, resolution, 0.0)
 
     def names(self, cell: _Cell) -> tuple[Cell, ...]:
@@ -134,7 +135,8 @@ class SensingPrice(JudgedStudy):
         """Return the trials of a cell for a purpose."""
         if cell.problem == _WEAK:
             selector, interval = _OF_BOAT[cell.way], 8
-            posed = PROBLEMS["boat"]._replace(max_steps=80)
+            # Cheap, and shares of trials need many.
+            posed = PROBLEMS["boat"]._replace(max_steps=80, share=3.0)
             model = {"resolution": cell.number}
             particles = 300
         else:
@@ -164,8 +166,16 @@ class SensingPrice(JudgedStudy):
         when, weak = _when(choosing, cells), _weak_sensor(cells)
         return Report(
             summary={"when_to_sense": when, "weak_sensor": weak, "cells": _all_cells(cells)},
+            figures={
+                "when_to_sense": drawn("sensing_price_figures:when_to_sense", when),
+                "weak_sensor": drawn("sensing_price_figures:weak_sensor", weak),
+            },
             numbers=[*_numbers_of_when(when), *_numbers_of_weak(weak)],
         )
+
+
+def _depends_on_resolution(selector: SelectorSettings) -> bool:
+    return selector.method in ENTROPY_METHODS
 
 
 def _selector_of(cell: _Cell) -> tuple[SelectorSettings, int]:
@@ -251,6 +261,7 @@ def _weak_sensor(cells: _Cells) -> pd.DataFrame:
             {
                 "way": cell.way,
                 "resolution": cell.number,
+                "by_resolution": _depends_on_resolution(_OF_BOAT[cell.way]),
                 "trials": len(table),
                 **cells_of("success", statistics.rate_interval(int(success.sum()), len(table))),
                 **cells_of("gain", gain),
