@@ -26,7 +26,7 @@ class _Point(ProblemBase):
 
     state_size = 2
     action_size = 2
-    state_labels = ("x (m)", "y (m)")
+    state_labels: Sequence[str] = ("x (m)", "y (m)")
     start: ClassVar[tuple[float, float]]
     start_deviation: ClassVar[float]
     motion_deviation: ClassVar[float]
@@ -71,7 +71,7 @@ class Dock(_Point):
     """Both axes show equally well."""
 
     name = "dock"
-    sensing_actions = ("x", "y")
+    sensing_actions: Sequence[str] = ("x", "y")
     start = (2.0, 1.0)
     start_deviation = 0.7
     motion_deviation = 0.03
@@ -84,7 +84,7 @@ class Boat(_Point):
     """A range finder shows x to 0.02 m, a GPS shows y to 1 m; the harbour is 0.6 m wide."""
 
     name = "boat"
-    sensing_actions = ("range", "GPS")
+    sensing_actions: Sequence[str] = ("range", "GPS")
     start = (6.0, 3.0)
     start_deviation = 1.0
     motion_deviation = 0.05
