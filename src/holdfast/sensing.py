@@ -28,6 +28,7 @@ import numpy as np
 from holdfast import _kernel, checked, numerics
 from holdfast.arrays import FloatArray, in_brief
 from holdfast.belief import Belief, estimate
+from holdfast.circular import embedded, unwrapped
 from holdfast.config.settings import NEIGHBOR_ESTIMATORS, PlanningSettings, estimator_of
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.estimators import (
@@ -44,7 +45,15 @@ from holdfast.estimators import (
 )
 from holdfast.expected_return import expected_returns
 from holdfast.policy_path import path_points
-from holdfast.problem_attributes import has_general_observations, resolution_of, sensing_costs
+from holdfast.problem_attributes import (
+    circular_actions,
+    circular_observation,
+    circular_states,
+    has_circular_observations,
+    has_general_observations,
+    resolution_of,
+    sensing_costs,
+)
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Stream, Words
 
@@ -142,6 +151,7 @@ def choose_sensing_action(
     else:
         sets, factors = points_of(belief.states, stage)[np.newaxis], (1.0,)
     estimator = _estimator(problem, settings, belief, sets[0])
+    sets = _on_a_line(problem, settings, sets)
     points = sets.reshape(-1, sets.shape[-1])
     threads = settings.active_sensing.num_cores
     size = settings.active_sensing.num_observation_samples
@@ -274,6 +284,15 @@ def _points_of(
     return lambda states, stage: checked.policy(problem, states, stage)
 
 
+def _on_a_line(problem: Problem, settings: PlanningSettings, sets: FloatArray) -> FloatArray:
+    """Return sets of points, shape (..., n, d), as the kernel takes them, which knows no angles."""
+    method = settings.selector.method
+    angles = circular_states if method == "state_entropy" else circular_actions
+    if not (circular := angles(problem)):
+        return sets
+    return (embedded if method == "action_covariance" else unwrapped)(sets, circular)
+
+
 def _estimator(
     problem: Problem, settings: PlanningSettings, belief: Belief, points: FloatArray
 ) -> KernelEstimator:
@@ -286,7 +305,10 @@ def _estimator(
     if selector.method == "action_covariance":
         if not each_its_own:
             return TOTAL_VARIANCE
-        return TOTAL_VARIANCE._replace(scale=scale_of(np.asarray(resolution), dimension)[0])
+        scale, _ = scale_of(np.asarray(resolution), dimension)
+        # An angle has two coordinates there.
+        scale = np.concatenate([scale, scale[list(circular_actions(problem))]])
+        return TOTAL_VARIANCE._replace(scale=scale)
     kind = estimator_of(selector, points.shape[0])
     if kind in NEIGHBOR_ESTIMATORS:
         neighbors = settings.active_sensing.num_nearest_neighbors
@@ -327,10 +349,11 @@ class _GaussianHypotheses(NamedTuple):
 
     ``arguments`` are what its functions take: the particles' weights, N; the sizes of the
     observations, D in all; their means in each particle's state, (D, N); their variances, (D, N),
-    or (D, 1) where none depends on the state; M; and the words of the stream.
+    or (D, 1) where none depends on the state; M; the words of the stream; and, unless none is an
+    angle, whether each of the D is one.
     """
 
-    arguments: tuple[FloatArray, list[int], FloatArray, FloatArray, int, Words]
+    arguments: tuple[FloatArray, list[int], FloatArray, FloatArray, int, Words, list[int]]
 
     def entropies(
         self,
@@ -352,7 +375,7 @@ class _GaussianHypotheses(NamedTuple):
     def weights(self, drop_negligible: bool) -> FloatArray:
         """Return the posteriors' weights, shape (J, M, N)."""
         weights = _kernel.hypothetical_weights(*self.arguments, drop_negligible)
-        _, sizes, _, _, samples, _ = self.arguments
+        _, sizes, _, _, samples, _, _ = self.arguments
         return weights.reshape(len(sizes), samples, -1)
 
 
@@ -410,7 +433,14 @@ def _hypotheses(
     if not usable or not numerics.all_finite(predicted):
         for action, (mean, variance) in zip(actions, found, strict=True):
             checked.require_usable(problem, action, mean, variance)
-    return _GaussianHypotheses((belief.weights, sizes, predicted, variances, samples, stream.words))
+    angles = [
+        int(coordinate in circular_observation(problem, action, size))
+        for action, size in zip(actions, sizes, strict=True)
+        for coordinate in range(size if has_circular_observations(problem) else 0)
+    ]
+    return _GaussianHypotheses(
+        (belief.weights, sizes, predicted, variances, samples, stream.words, angles)
+    )
 
 
 def _general_hypotheses(
@@ -473,7 +503,11 @@ def _later_entropies(
             for row, each in enumerate(own):
                 # One by one, as in planning: the policy of a user who does not keep to exact
                 # operations may have other bits for many estimates at once.
-                estimated = estimate(Belief(states[row], each), settings.particle_filter.estimate)
+                estimated = estimate(
+                    Belief(states[row], each),
+                    settings.particle_filter.estimate,
+                    circular_states(problem),
+                )
                 stages[row] = checked.next_stage(problem, estimated, stages[row])
                 commanded = checked.policy(problem, estimated, stages[row])
                 actions[row] = checked.executed_action(problem, commanded)
@@ -483,8 +517,10 @@ def _later_entropies(
             points = _points_by_stage(points_of, states, stages)
             flat_states = states.reshape(-1, states.shape[-1])
             _require_bounded(problem, points, flat_states, "the predicted state")
+            sets = _on_a_line(problem, settings, points.reshape(len(own), -1, points.shape[1]))
+            rows_of_points = scaled(sets.reshape(-1, sets.shape[-1]), estimator)
             later[block] += factor * _kernel.entropies_of_each(
-                scaled(points, estimator).reshape(len(own), -1, points.shape[1]),
+                rows_of_points.reshape(sets.shape),
                 own,
                 *estimator.parameters,
                 sensing.num_cores,

@@ -28,12 +28,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from holdfast import checked
+from holdfast import checked, numerics
 from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration
 from holdfast.files import write_atomically
 from holdfast.outcome import Outcome
-from holdfast.problem_attributes import choice_labels
+from holdfast.problem_attributes import choice_labels, circular_states
 from holdfast.problems.problem import Problem, Scene
 from holdfast.recording.recorder import SensingRecord, TrialRecord
 
@@ -400,6 +400,8 @@ def _draw_coordinates(
     estimates = _stacked(record.estimates, problem.state_size)
     deviations = _stacked(record.standard_deviations, problem.state_size)
     truth = _stacked(record.true_states, problem.state_size)
+    for index in circular_states(problem):
+        _follow_turns(estimates[:, index], truth[:, index])
     steps = np.arange(len(estimates))
     for index, (panel, label) in enumerate(zip(panels, _labels(problem), strict=True)):
         mean, two = estimates[:, index], 2.0 * deviations[:, index]
@@ -424,6 +426,17 @@ def _draw_coordinates(
         handles.append(_dot(_TRUE, "x", "far from every particle", size=7.0, hollow=1.0))
     above: Any = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": len(handles)}
     panels[0].legend(handles=handles, columnspacing=1.2, handletextpad=0.5, **above)
+
+
+def _follow_turns(estimates: FloatArray, truth: FloatArray) -> None:
+    """Make a heading a line without jumps, in place; an estimate is as near the truth as it is."""
+    if len(truth):
+        truth[:] = np.unwrap(truth)
+        known = min(len(truth), len(estimates))
+        difference = estimates[:known] - truth[:known]
+        estimates[:known] = truth[:known] + numerics.wrapped(difference)
+    else:
+        estimates[:] = np.unwrap(estimates)
 
 
 def _scatter_sensing(panel: Axes, record: TrialRecord, heights: Sequence[float]) -> None:

@@ -17,13 +17,12 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
 from holdfast.arrays import FloatArray
-from holdfast.belief import estimate
 from holdfast.config.loader import Configuration
 from holdfast.errors import DecidedOtherwiseError, EndOfRecordsError, HoldfastError
 from holdfast.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
@@ -85,7 +84,7 @@ class RecordedRun:
             directory = path.parent
             self._meta = self._journal.meta()
             self.configuration, self.world_is_simulated = _configuration(self._meta, path)
-            self._estimate = self.configuration.planning.particle_filter.estimate
+            self._planner = Planner(self.configuration.problem, self.configuration.planning)
             self._begun = self._journal.unfinished()
             self.unfinished = None if self._begun is None else self._begun.trial
             trials = self._journal.finished()
@@ -163,7 +162,7 @@ class RecordedRun:
         if world is None:
             _write_decisions(result, decisions, times, output)
         else:
-            replay = _Replay(trial, list(decisions), times, output, result, self._estimate)
+            replay = _Replay(trial, list(decisions), times, output, result, self._planner)
             self._run_again(trial, world, replay)
         return trial
 
@@ -180,7 +179,7 @@ class RecordedRun:
         simulated = self._simulated_world(trial) if self.world_is_simulated else None
         world = RecordedEnvironment(trial, begun.records, simulated=simulated)
         times = self._times(trial, steps, clock)
-        replay = _Replay(trial, expected, times, output, None, self._estimate)
+        replay = _Replay(trial, expected, times, output, None, self._planner)
         try:
             self._run_again(trial, world, replay)
         except EndOfRecordsError:
@@ -193,10 +192,9 @@ class RecordedRun:
 
     def _run_again(self, trial: int, world: Environment, replay: _Replay) -> None:
         configuration = self.configuration
-        planner = Planner(configuration.problem, configuration.planning)
         try:
             run_trial(
-                planner,
+                self._planner,
                 configuration.simulator.seed,
                 trial,
                 max_steps=configuration.simulator.max_steps,
@@ -239,10 +237,10 @@ class _Replay(TrialObserver):
         times: TrialTimes,
         output: _Output,
         result: TrialResult | None,
-        estimate_kind: Literal["mean", "most_likely"],
+        planner: Planner,
     ) -> None:
         self._trial = trial
-        self._estimate = estimate_kind
+        self._planner = planner
         self._expected = expected
         self._times = times
         self._output = output
@@ -339,7 +337,7 @@ class _Replay(TrialObserver):
             steps=self._steps,
             result=self._result,
             belief=belief,
-            estimate=None if belief is None else estimate(belief, self._estimate),
+            estimate=None if self._state is None else self._planner.estimate(self._state),
             true_state=self._true_state,
         )
         for sink in self._output.at(end.time_ns):
