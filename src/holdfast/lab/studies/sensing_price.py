@@ -73,19 +73,24 @@ _OF_BOAT: Mapping[str, SelectorSettings] = {
 
 
 class _Posed(NamedTuple):
-    """A problem, the limit of a trial, and the share of the trials that are run."""
+    """A problem, the limit of a trial, and which share of the trials is run, at which prices."""
 
     place: str
     max_steps: int
-    share: float
+    share: float = 1.0
+    prices: tuple[float, ...] = PRICES
+    ways: tuple[str, ...] = tuple(WAYS)
 
 
 _MODULE = "holdfast.lab.studies.priced_problems"
 
 PROBLEMS: Mapping[str, _Posed] = {
-    "dock": _Posed(f"{_MODULE}:Dock", 300, 1.0),
-    "boat": _Posed(f"{_MODULE}:Boat", 200, 1.0),
-    "peg in hole": _Posed(f"{_MODULE}:PricedPeg", 500, 0.4),
+    "dock": _Posed(f"{_MODULE}:Dock", 300),
+    "boat": _Posed(f"{_MODULE}:Boat", 200),
+    # A trial of expected_return takes seconds here.
+    "peg in hole": _Posed(
+        f"{_MODULE}:PricedPeg", 500, 0.4, PRICES[:1], (FIXED, "nats", "nats, executed", "return")
+    ),
 }
 
 _WEAK = "boat, 80 steps"
@@ -117,10 +122,10 @@ class SensingPrice(JudgedStudy):
 
     def cells(self, scale: Scale) -> Iterator[_Cell]:
         """Return all cells, in the order of the tables."""
-        for problem in list(PROBLEMS)[: 1 if scale.quick else None]:
-            for way, numbers in WAYS.items():
-                for number in numbers:
-                    for price in PRICES if way == "return" else (0.0,):
+        for problem, posed in list(PROBLEMS.items())[: 1 if scale.quick else None]:
+            for way in posed.ways:
+                for number in WAYS[way]:
+                    for price in posed.prices if way == "return" else (0.0,):
                         yield _Cell(problem, way, number, price)
         for way, selector in _OF_BOAT.items():
             numbers = RESOLUTIONS if _depends_on_resolution(selector) else RESOLUTIONS[:1]
@@ -218,9 +223,9 @@ def _when(choosing: _Cells, cells: _Cells) -> pd.DataFrame:
     """Return what each way costs, and how much less than fixed intervals do."""
     rows: list[dict[str, Cell]] = []
     for problem in [name for name in PROBLEMS if any(cell.problem == name for cell in cells)]:
-        for price in PRICES:
+        for price in PROBLEMS[problem].prices:
             costs: dict[str, FloatArray] = {}
-            for way in WAYS:
+            for way in PROBLEMS[problem].ways:
                 tried = _of(choosing, problem, way, price)
                 best = min(tried, key=lambda number: float(_cost(tried[number], price).mean()))
                 table = _of(cells, problem, way, price)[best]

@@ -25,7 +25,9 @@ def when_to_sense(when: pd.DataFrame) -> Figure:
     )
     ways = [way for way in WAYS if way != FIXED]
     for number, (problem, panel) in enumerate(panels.items()):
-        rows = when[(when["problem"] == problem) & (when["way"] != FIXED)]
+        rows = when[when["problem"] == problem].set_index(["price", "way"])
+        places = pd.MultiIndex.from_product([PRICES, ways])
+        rows = rows.reindex(places).reset_index(names=["price", "way"])
         kinds = [
             plots.dots_of(f"a look costs {price:g}", rows[rows["price"] == price], "saved")
             for price in PRICES
