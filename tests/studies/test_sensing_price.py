@@ -52,7 +52,7 @@ def known() -> Iterator[Report]:
 
 def test_each_way_chooses_its_number(known: Report) -> None:
     when = known.summary["when_to_sense"]
-    assert len(when) == len(PROBLEMS) * len(PRICES) * len(sensing_price.WAYS)
+    assert len(when) == sum(len(each.prices) * len(each.ways) for each in PROBLEMS.values())
     chosen = when.groupby("way")["number"].agg(["min", "max"])
     for way, number in ((FIXED, 8.0), ("nats", 0.8), ("nats, executed", 0.8)):
         assert chosen.loc[way].tolist() == [number, number]
