@@ -1,4 +1,4 @@
-"""A problem of your own with a price for looking: a robot that may also drive on without it.
+r"""A problem of your own with a price for looking: a robot that may also drive on without it.
 
 The robot drives to a dock in the plane. Each step costs 1, each look along an axis as much as four
 steps. ``expected_return`` knows what a look saves, so it looks where that is more than the price.
