@@ -12,7 +12,7 @@ any problem. Run them with::
 Ways that minimise an entropy ask what a look must gain at least, in nats for each unit of its
 price; without, they look every time::
 
-    holdfast run examples/optional_looks.yaml --set selector.method=path_entropy \\
+    holdfast run examples/optional_looks.yaml --set selector.method=path_entropy \
         --set selector.actions=executed --set selector.nats_per_cost=0.1
 """
 
