@@ -164,7 +164,9 @@ class Problem(Protocol):
 
     It may have ``sensing_costs``, the price of each sensing action in units of reward, numbers
     from 0 to 1e150. A trial's reward is less by it at each sensing, and ``expected_return`` weighs
-    it against what sensing gains. Without this attribute sensing costs nothing.
+    it against what sensing gains; methods that minimise an entropy do with a rate,
+    ``selector.nats_per_cost``. Without this attribute sensing costs nothing. Not to sense is no
+    sensing action: ``selector.sensing_is_optional`` makes it a choice, of price 0.
     """
 
     name: str
