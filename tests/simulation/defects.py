@@ -432,7 +432,7 @@ _defect(
     "The journal does not record that an action was performed; the next action implies it.",
     Edit(
         Robot,
-        "_performed",
+        "_fold_move",
         "self._unwritten.append(record)",
         "pass",
     ),
