@@ -31,8 +31,8 @@ from holdfast.recording.facts import (
     TrialBeginFact,
     TrialEndFact,
 )
-from holdfast.ros.markers import Marker, scene_markers, sensing_markers
-from holdfast.ros.poses import pose_layout
+from holdfast.recording.markers import Marker, scene_markers, sensing_markers
+from holdfast.recording.poses import pose_layout
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
