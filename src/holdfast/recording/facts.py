@@ -14,6 +14,7 @@ from holdfast.belief import Belief
 from holdfast.outcome import TrialResult
 
 __all__ = [
+    "SCORES",
     "Decider",
     "EventFact",
     "FactSink",
@@ -22,6 +23,16 @@ __all__ = [
     "TrialBeginFact",
     "TrialEndFact",
 ]
+
+
+SCORES = {
+    "action_entropy": "expected entropy of the actions (nats)",
+    "path_entropy": "expected entropies of the actions, sum (nats)",
+    "state_entropy": "expected entropy of the state (nats)",
+    "action_covariance": "expected covariance of the actions (trace)",
+    "expected_return": "expected loss (minus the return)",
+}
+"""What a fact's entropies are, by the method that weighs them."""
 
 
 class Decider(NamedTuple):

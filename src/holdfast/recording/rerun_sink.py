@@ -1,0 +1,510 @@
+"""The facts of a run in Rerun's viewer: what the robot believes, why it senses what it senses.
+
+Rerun shows what was logged under a path at a time. The scene and the styles are logged once,
+without a time, and the blueprint says which view shows which paths, so that nothing is left to the
+viewer's guesses. A plane is drawn in a 3-D view, from above: Rerun's 2-D view has y pointing down.
+
+There are three timelines. ``time`` is when something happened. ``step`` counts task actions, on
+over all trials that are shown, so that no trial lies over another one. ``trial`` is the number of
+the trial.
+
+This module imports Rerun (extra ``view``); import it only where something is to be viewed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from holdfast import checked
+from holdfast.arrays import FloatArray
+from holdfast.belief import Belief, standard_deviation
+from holdfast.config.loader import Configuration
+from holdfast.errors import HoldfastError
+from holdfast.problems.problem import Problem, Scene
+from holdfast.protocol.status import Status
+from holdfast.randomness import NoiseFreeStream
+from holdfast.recording.csv_export import state_labels
+from holdfast.recording.facts import (
+    SCORES,
+    Decider,
+    EventFact,
+    SensingFact,
+    TaskFact,
+    TrialBeginFact,
+    TrialEndFact,
+)
+from holdfast.recording.markers import Marker, scene_markers, sensing_markers
+from holdfast.recording.poses import PoseLayout, pose_layout
+from holdfast.runtime.events import severity
+from holdfast.runtime.log_lines import fields_as_text
+
+__all__ = ["MAX_PARTICLES", "RerunSink"]
+
+MAX_PARTICLES = 1000
+"""Particles that are drawn of a belief: evenly spread ones, if it has more."""
+
+_MAX_PATH = 2000
+"""Places of a path that are kept; of a longer one every second, every fourth, ..."""
+
+_PATH_GROWTH = 20
+"""A path is logged anew when it is longer by this part of itself: all of them together take twenty
+times its length, not the square of it."""
+
+_TASK, _ESTIMATE, _TRUTH = "world", "world/estimate", "world/truth"
+
+_OBSTACLE = (92, 99, 110)
+_GOAL = (67, 190, 113)
+_ESTIMATED = (92, 164, 255)
+_TRUE = (240, 240, 240)
+_SENSED = (245, 178, 52)
+_ACTED = (255, 92, 92)
+_FAINT, _STRONG = np.array([30.0, 60.0, 110.0]), np.array([130.0, 190.0, 255.0])
+"""Of particles: without weight, and with the largest of the belief."""
+
+_SERIES = (
+    (92, 164, 255), (245, 178, 52), (235, 98, 86), (84, 181, 166), (190, 130, 220), (176, 186, 104),
+)  # fmt: skip
+_STATUSES = {
+    Status.STANDARD.value: (67, 160, 100),
+    Status.LOCAL_RECOVERY.value: (245, 178, 52),
+    Status.KEEP_ALIVE.value: (92, 164, 255),
+}
+_OUTCOMES = {"succeeded": _GOAL, "failed": (235, 98, 86), "truncated": _SENSED}
+
+_MAX_DRAWS = 10_000
+"""Of a move without noise, as in :mod:`holdfast.policy_path`."""
+
+_ACROSS = 2.0
+"""Distance of the eye from the scene, by half of its height: a little more than shows all of it."""
+
+
+class RerunSink:
+    """Logs the facts of a run.
+
+    Parameters
+    ----------
+    recording : rerun.RecordingStream
+        With its sinks; its blueprint is :meth:`blueprint`.
+    has_times : bool
+        Whether the times of the facts are those of a clock, in nanoseconds since 1970.
+    """
+
+    def __init__(
+        self, recording: rr.RecordingStream, configuration: Configuration, *, has_times: bool
+    ) -> None:
+        problem = configuration.problem
+        self._recording = recording
+        self._problem = problem
+        self._configuration = configuration
+        self._has_times = has_times
+        self._scene: Scene | None = checked.scene(problem)
+        self._layout = _layout(problem, self._scene)
+        self._labels = state_labels(problem)
+        self._actions = [*map(str, problem.sensing_actions), "none"]
+        self._offset = self._last = 0
+        self._has_scene = False
+        self._paths: dict[str, list[FloatArray]] = {}
+        self._places: dict[str, int] = {}
+        self._logged: dict[str, int] = {}
+        self._states: dict[str, str] = {}
+        self._move_error = False
+        recording.set_log_time_enabled(False)
+        recording.set_log_tick_enabled(False)
+
+    # -- facts -------------------------------------------------------------------------------------
+
+    def trial_begins(self, fact: TrialBeginFact) -> None:
+        """Log the scene and the styles, once, and that the trial begins."""
+        self._offset = self._last
+        self._paths, self._places, self._logged = {}, {}, {}
+        if not self._has_scene:
+            self._has_scene = True
+            self._log_styles()
+        self._at(fact.time_ns, fact.trial, 0)
+        for entity in (
+            f"{_ESTIMATE}_path",
+            f"{_TRUTH}_path",
+            f"{_TASK}/sensing",
+            f"{_TASK}/action",
+        ):
+            self._recording.log(entity, rr.Clear(recursive=True))
+        self._state("trial", f"trial {fact.trial}")
+        self._text("INFO", f"trial {fact.trial} begins")
+
+    def sensed(self, fact: SensingFact) -> None:
+        """Log the choice and the alternatives, then the belief that the observation led to."""
+        self._at(fact.decided_ns, fact.trial, fact.step)
+        self._belief(fact.before)
+        label = self._actions[fact.sensing_action]
+        self._state("sensing_action", label)
+        self._decider(fact.decider)
+        entropies = fact.entropies
+        if entropies is not None:
+            self._recording.log("scores", rr.Scalars(_finite(entropies)))
+            self._recording.log(
+                "scores/chosen", rr.Scalars(_finite(entropies[fact.sensing_action]))
+            )
+        if self._layout is not None and fact.before is not None and label != "none":
+            self._sensing(fact.before, fact.sensing_action)
+        self._at(fact.observed_ns, fact.trial, fact.step)
+        self._belief(fact.after)
+        for name in ("effective_sample_size", "mahalanobis_distance"):
+            value = getattr(fact, name)
+            if value is not None:
+                self._recording.log(f"filter/{name}", rr.Scalars(_finite(value)))
+        if fact.explained is False:
+            distance = fact.mahalanobis_distance
+            self._recording.log(
+                "filter/mahalanobis_distance/unexplained",
+                rr.Scalars(_finite(0.0 if distance is None else distance)),
+            )
+            self._text("WARN", f"trial {fact.trial}, step {fact.step}: no particle explains the "
+                       f"observation of {label}")  # fmt: skip
+
+    def acted(self, fact: TaskFact) -> None:
+        """Log the belief, its estimate, the true state if it is known, and the action."""
+        self._at(fact.time_ns, fact.trial, fact.step)
+        self._decider(fact.decider)
+        self._place(fact.belief, fact.estimate, fact.true_state)
+        if fact.estimate is not None:
+            self._action(fact.estimate, fact.action)
+
+    def trial_ends(self, fact: TrialEndFact) -> None:
+        """Log the last belief, and what the trial came to."""
+        self._at(fact.time_ns, fact.trial, fact.steps)
+        self._place(fact.belief, fact.estimate, fact.true_state, last=True)
+        self._recording.log(f"{_TASK}/action", rr.Clear(recursive=True))
+        result = fact.result
+        if result is None:
+            self._text("INFO", f"trial {fact.trial}: {fact.steps} steps so far; not finished")
+            return
+        text = f"trial {fact.trial} {result.outcome} after {result.steps} steps"
+        reason = getattr(result, "reason", "")
+        text += f": {reason}" if reason else ""
+        if result.reward is not None:
+            text += f"; reward {result.reward:.6g}"
+        self._state("trial", result.outcome)
+        self._text("INFO" if result.outcome == "succeeded" else "WARN", text)
+        # The next trial's first step comes after this one's last belief.
+        self._last += 1
+
+    def happened(self, fact: EventFact) -> None:
+        """Log an event of the services."""
+        if fact.name == "trial":
+            return  # its beginning and its end are there
+        fields = {key: value for key, value in fact.fields.items() if key != "component"}
+        self._time(fact.time_ns)
+        if fact.name == "status":
+            self._state("status", str(fields.get("to", "")))
+        words = fields_as_text(fields)
+        name = fact.name.replace("_", " ")
+        self._text(severity(fact.name, fact.fields), f"{name}: {words}" if words else name)
+
+    def note(self, text: str) -> None:
+        """Log a remark of the view itself, at the time of the last fact."""
+        self._text("WARN", text)
+
+    # -- what is logged ----------------------------------------------------------------------------
+
+    def _at(self, time_ns: int, trial: int, step: int) -> None:
+        self._time(time_ns)
+        self._last = self._offset + step
+        self._recording.set_time("step", sequence=self._last)
+        self._recording.set_time("trial", sequence=trial)
+
+    def _time(self, time_ns: int) -> None:
+        if self._has_times:
+            self._recording.set_time("time", timestamp=np.datetime64(time_ns, "ns"))
+        else:
+            self._recording.set_time("time", duration=np.timedelta64(time_ns, "ns"))
+
+    def _belief(self, belief: Belief | None) -> None:
+        if belief is None or self._layout is None:
+            return
+        every = -(-len(belief.states) // MAX_PARTICLES)
+        weights = belief.weights[::every]
+        largest = weights.max()
+        share = (weights / largest if largest > 0.0 else weights)[:, np.newaxis]
+        self._recording.log(
+            f"{_TASK}/belief",
+            rr.Points3D(
+                self._layout.poses(belief.states[::every])[:, :3],
+                colors=(_FAINT + share * (_STRONG - _FAINT)).astype(np.uint8),
+            ),
+        )
+
+    def _place(
+        self,
+        belief: Belief | None,
+        estimate: FloatArray | None,
+        true_state: FloatArray | None,
+        *,
+        last: bool = False,
+    ) -> None:
+        self._belief(belief)
+        if belief is not None and estimate is not None:
+            spread = standard_deviation(belief)
+            for index, label in enumerate(self._labels):
+                values = estimate[index] + np.array([0.0, -1.0, 1.0]) * spread[index]
+                self._recording.log(["state", label], rr.Scalars(values))
+        if true_state is not None:
+            for label, value in zip(self._labels, true_state.tolist(), strict=True):
+                self._recording.log(["state", label, "true"], rr.Scalars(value))
+        if self._layout is None:
+            return
+        for entity, state in ((_ESTIMATE, estimate), (_TRUTH, true_state)):
+            if state is not None:
+                pose = self._layout.poses(state)
+                self._recording.log(
+                    entity,
+                    rr.Transform3D(translation=pose[:3], quaternion=rr.Quaternion(xyzw=pose[3:])),
+                )
+                self._extend_path(f"{entity}_path", pose[:3], last=last)
+
+    def _extend_path(self, entity: str, place: FloatArray, *, last: bool) -> None:
+        path = self._paths.setdefault(entity, [])
+        every = self._places.setdefault(entity, 1)
+        count = self._logged.get(entity, 0)
+        self._logged[entity] = count + 1
+        if count % every and not last:
+            return
+        path.append(place)
+        if len(path) > _MAX_PATH:
+            self._paths[entity] = path = path[::2]
+            self._places[entity] = 2 * every
+        if last or len(path) < _PATH_GROWTH or len(path) % (1 + len(path) // _PATH_GROWTH) == 0:
+            self._recording.log(entity, rr.LineStrips3D([path]))
+
+    def _action(self, estimate: FloatArray, action: FloatArray) -> None:
+        """Log where the task action leads from the estimate, as far as the problem says so."""
+        if self._layout is None or self._move_error:
+            return
+        try:
+            after = checked.expected_move(
+                self._problem, estimate[np.newaxis], action[np.newaxis], NoiseFreeStream(_MAX_DRAWS)
+            )
+        except HoldfastError:
+            self._move_error = True  # a problem that has no move without noise has no arrows
+            return
+        begin, end = self._layout.poses(np.stack([estimate, after[0]]))[:, :3]
+        self._recording.log(
+            f"{_TASK}/action", rr.Arrows3D(origins=begin, vectors=end - begin, colors=_ACTED)
+        )
+
+    def _sensing(self, belief: Belief, sensing_action: int) -> None:
+        assert self._layout is not None
+        entity = f"{_TASK}/sensing"
+        self._recording.log(entity, rr.Clear(recursive=True))
+        for marker in sensing_markers(self._problem, self._layout, _TASK, belief, sensing_action):
+            self._recording.log(f"{entity}/{marker.namespace}", _shape(marker, _SENSED))
+
+    def _decider(self, decider: Decider | None) -> None:
+        if decider is not None:
+            self._state("decider", decider.service)
+            self._state("status", decider.status)
+
+    def _state(self, name: str, state: str) -> None:
+        """Log a state of the timeline, if it has changed."""
+        if self._states.get(name) != state:
+            self._states[name] = state
+            self._recording.log(f"decisions/{name}", rr.StateChange(state=state))
+
+    def _text(self, level: str, text: str) -> None:
+        self._recording.log("log", rr.TextLog(text, level=level))
+
+    def _log_styles(self) -> None:
+        def static(entity: str | list[object], *shapes: rr.AsComponents) -> None:
+            self._recording.log(entity, *shapes, static=True)
+
+        actions = self._actions[:-1]
+        colors = [_SERIES[index % len(_SERIES)] for index in range(len(self._actions))]
+        static("scores", rr.SeriesLines(names=self._actions, colors=colors))
+        static("scores/chosen", rr.SeriesPoints(names="chosen", colors=_TRUE, marker_sizes=4))
+        for label in self._labels:
+            static(
+                ["state", label],
+                rr.SeriesLines(
+                    names=["estimate", "- standard deviation", "+ standard deviation"],
+                    colors=[_ESTIMATED, (45, 82, 128), (45, 82, 128)],
+                    widths=[2.0, 1.0, 1.0],
+                ),
+            )
+            static(["state", label, "true"], rr.SeriesLines(names="true", colors=_TRUE))
+        static(
+            "filter/effective_sample_size",
+            rr.SeriesLines(names="effective sample size", colors=_ESTIMATED),
+        )
+        static(
+            "filter/mahalanobis_distance",
+            rr.SeriesLines(names="distance of the observation (standard deviations)",
+                           colors=_SENSED),
+        )  # fmt: skip
+        static(
+            "filter/mahalanobis_distance/unexplained",
+            rr.SeriesPoints(names="outside the validation gate", colors=_ACTED, marker_sizes=6,
+                            markers="cross"),
+        )  # fmt: skip
+        _static_states = {
+            "status": dict(_STATUSES),
+            "trial": dict(_OUTCOMES),
+            "sensing_action": dict(zip(actions, colors, strict=False)),
+        }
+        for name, looks in _static_states.items():
+            static(
+                f"decisions/{name}",
+                rr.StateConfiguration(values=list(looks), colors=list(looks.values())),
+            )
+        if self._layout is None:
+            return
+        static(
+            f"{_TASK}/belief",
+            rr.Points3D.from_fields(radii=rr.Radius.ui_points(2.0)),
+        )
+        static(f"{_TASK}/action", rr.Arrows3D.from_fields(radii=rr.Radius.ui_points(2.0)))
+        for entity, color in ((_ESTIMATE, _ESTIMATED), (_TRUTH, _TRUE)):
+            static(
+                f"{entity}_path",
+                rr.LineStrips3D.from_fields(colors=color, radii=rr.Radius.ui_points(1.0)),
+            )
+        self._log_scene()
+
+    def _log_scene(self) -> None:
+        assert self._layout is not None
+        looks = {"obstacle": _OBSTACLE, "goal": _GOAL, "landmark": _GOAL}
+        solid: list[Marker] = []
+        for number, marker in enumerate(
+            scene_markers(self._problem, self._layout, _TASK, _ESTIMATE, _TRUTH)
+        ):
+            if marker.namespace == "obstacle":
+                solid.append(marker)
+            else:
+                color = looks.get(
+                    marker.namespace, _ESTIMATED if marker.frame == _ESTIMATE else _TRUE
+                )
+                name = "body" if marker.frame != _TASK else f"{marker.namespace}/{number}"
+                self._recording.log(f"{marker.frame}/{name}", _shape(marker, color), static=True)
+        if solid:
+            centers = np.array([marker.pose[:3] for marker in solid])
+            if self._is_flat:
+                # What moves in the plane is seen in front of it.
+                centers[:, 2] -= [marker.scale[2] for marker in solid]
+            self._recording.log(
+                f"{_TASK}/obstacles",
+                rr.Boxes3D(
+                    centers=centers,
+                    sizes=[marker.scale for marker in solid],
+                    colors=_OBSTACLE,
+                    fill_mode="majorwireframe" if not self._is_flat else "solid",
+                ),
+                static=True,
+            )
+
+    # -- the blueprint -----------------------------------------------------------------------------
+
+    @property
+    def _is_flat(self) -> bool:
+        return self._layout is not None and self._layout.indices[2] is None
+
+    def blueprint(self, *, live: bool) -> rrb.Blueprint:
+        """Return which view shows what; a live one follows the last fact."""
+        method = self._configuration.planning.selector.method
+        state_views = [
+            rrb.TimeSeriesView(
+                origin=rr.new_entity_path(["state", label]), name=label,
+                plot_legend=rrb.PlotLegend(visible=False),
+            )
+            for label in self._labels
+        ]  # fmt: skip
+        plots = rrb.Vertical(
+            rrb.TimeSeriesView(origin="scores", name=f"{SCORES.get(method, method)}, by what is "
+                               "sensed"),
+            rrb.Tabs(
+                rrb.Grid(*state_views, name="state: estimate, its spread, truth")
+                if len(state_views) > 3
+                else rrb.Vertical(*state_views, name="state: estimate, its spread, truth"),
+                rrb.TimeSeriesView(origin="filter/effective_sample_size",
+                                   name="effective sample size"),
+                rrb.TimeSeriesView(origin="filter/mahalanobis_distance",
+                                   name="observations: distance"),
+            ),
+            rrb.StateTimelineView(origin="decisions", name="decisions"),
+            rrb.TextLogView(
+                origin="log",
+                name="log",
+                columns=rrb.TextLogColumns(text_log_columns=["loglevel", "body"]),
+            ),
+            row_shares=[2.0, 2.7, 2.0, 1.3],
+        )  # fmt: skip
+        views: list[Any] = [plots]
+        if self._layout is not None:
+            views.insert(0, self._spatial_view())
+        return rrb.Blueprint(
+            rrb.Horizontal(*views),
+            rrb.TimePanel(
+                state="collapsed",
+                timeline="step",
+                play_state="following" if live else "playing",
+                fps=10.0,
+            ),
+            rrb.SelectionPanel(state="hidden"),
+            rrb.BlueprintPanel(state="hidden"),
+        )
+
+    def _spatial_view(self) -> rrb.Spatial3DView:
+        name = f"{self._configuration.problem_name}: belief, estimate, truth"
+        eye = None
+        if self._scene is not None:
+            x_min, y_min, x_max, y_max = self._scene.limits
+            across = max(x_max - x_min, y_max - y_min)
+            if self._is_flat:
+                middle = np.array([0.5 * (x_min + x_max), 0.5 * (y_min + y_max), 0.0])
+                away, up = np.array([0.0, 0.0, 0.5 * _ACROSS * across]), (0.0, 1.0, 0.0)
+            else:
+                middle = np.array([0.0, 0.0, 0.12 * across])
+                away, up = np.array([0.9, -1.5, 0.8]) * 0.4 * across, (0.0, 0.0, 1.0)
+            eye = rrb.EyeControls3D(position=middle + away, look_target=middle, eye_up=up)
+        return rrb.Spatial3DView(
+            origin=f"/{_TASK}",
+            name=name,
+            line_grid=rrb.LineGrid3D(visible=False),
+            eye_controls=eye,
+        )
+
+
+def _layout(problem: Problem, scene: Scene | None) -> PoseLayout | None:
+    """Return where the pose is: as the problem says, else as its drawing does."""
+    layout = pose_layout(problem)
+    if layout is not None or scene is None:
+        return layout
+    across, upwards = scene.axes
+    return PoseLayout((across, upwards, None, None, None, scene.angle), (0.0, 0.0, 0.0, 1.0))
+
+
+def _shape(marker: Marker, color: Sequence[int]) -> rr.AsComponents:
+    """Return a marker as Rerun draws it; flat lines have the same width at any distance."""
+    pose = marker.pose
+    line = rr.Radius.ui_points(1.5)
+    if marker.kind == "CUBE":
+        return rr.Boxes3D(centers=[pose[:3]], quaternions=[pose[3:]], sizes=[marker.scale],
+                          colors=color)  # fmt: skip
+    if marker.kind == "LINE_STRIP":
+        return rr.LineStrips3D([marker.points], colors=color, radii=line)
+    if marker.kind == "ARROW":
+        begin, end = map(np.asarray, marker.points)
+        return rr.Arrows3D(origins=begin, vectors=end - begin, colors=color, radii=line)
+    if marker.kind == "TEXT_VIEW_FACING":
+        return rr.Points3D([pose[:3]], labels=[marker.text], show_labels=True, colors=color,
+                           radii=rr.Radius.ui_points(0.0))  # fmt: skip
+    return rr.Points3D([pose[:3]], colors=color, radii=0.5 * marker.scale[0])
+
+
+def _finite(values: Any) -> Any:
+    """Return values of which the infinite are missing: a plot would have no scale."""
+    array = np.asarray(values, dtype=np.float64)
+    return np.where(np.isfinite(array), array, math.nan)
