@@ -26,13 +26,13 @@ __all__ = [
 
 
 SCORES = {
-    "action_entropy": "expected entropy of the actions (nats)",
-    "path_entropy": "expected entropies of the actions, sum (nats)",
-    "state_entropy": "expected entropy of the state (nats)",
-    "action_covariance": "expected covariance of the actions (trace)",
-    "expected_return": "expected loss (minus the return)",
+    "action_entropy": "expected entropy of\nthe actions (nats)",
+    "path_entropy": "expected entropies of\nthe actions, sum (nats)",
+    "state_entropy": "expected entropy of\nthe state (nats)",
+    "action_covariance": "expected covariance\nof the actions (trace)",
+    "expected_return": "expected loss\n(minus the return)",
 }
-"""What a fact's entropies are, by the method that weighs them."""
+"""What a fact's entropies are, by the method that weighs them, in two lines."""
 
 
 class Decider(NamedTuple):

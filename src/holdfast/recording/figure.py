@@ -70,7 +70,6 @@ _MAX_MARKS = 120
 
 _LABEL_WIDTH = 14
 _SHORT_LABEL = 8
-_SCORE_WIDTH = 25
 _DOTS_PER_INCH = 150
 _WIDTH = 11.0
 _SMALLEST = 8.0
@@ -449,8 +448,7 @@ def _draw_choices(panel: Axes, problem: Problem, record: TrialRecord) -> None:
 def _draw_entropies(panel: Axes, configuration: Configuration, record: TrialRecord) -> None:
     """Draw every sensing action's score at each sensing step; the lowest was chosen."""
     problem = configuration.problem
-    name = SCORES.get(configuration.planning.selector.method, "")
-    panel.set_ylabel(fill(name, _SCORE_WIDTH), fontsize=_SMALLEST)
+    panel.set_ylabel(SCORES.get(configuration.planning.selector.method, ""), fontsize=_SMALLEST)
     panel.yaxis.set_major_locator(MaxNLocator(nbins=4))
     known = [sensing for sensing in record.sensing if sensing.entropies is not None]
     if not known:

@@ -15,23 +15,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 
 from holdfast import checked
 from holdfast.arrays import FloatArray
 from holdfast.belief import Belief, standard_deviation
 from holdfast.config.loader import Configuration
 from holdfast.errors import HoldfastError
-from holdfast.problems.problem import Problem, Scene
 from holdfast.protocol.status import Status
 from holdfast.randomness import NoiseFreeStream
 from holdfast.recording.csv_export import state_labels
 from holdfast.recording.facts import (
-    SCORES,
     Decider,
     EventFact,
     SensingFact,
@@ -40,7 +37,9 @@ from holdfast.recording.facts import (
     TrialEndFact,
 )
 from holdfast.recording.markers import Marker, scene_markers, sensing_markers
-from holdfast.recording.poses import PoseLayout, pose_layout
+from holdfast.recording.rerun_blueprint import blueprint, drawn_layout, is_flat
+from holdfast.recording.rerun_streams import RerunStreams
+from holdfast.recording.view_target import ViewTarget
 from holdfast.runtime.events import severity
 from holdfast.runtime.log_lines import fields_as_text
 
@@ -48,6 +47,9 @@ __all__ = ["MAX_PARTICLES", "RerunSink"]
 
 MAX_PARTICLES = 1000
 """Particles that are drawn of a belief: evenly spread ones, if it has more."""
+
+_BINS = 60
+"""Of a belief that is drawn as a histogram."""
 
 _MAX_PATH = 2000
 """Places of a path that are kept; of a longer one every second, every fourth, ..."""
@@ -80,60 +82,66 @@ _OUTCOMES = {"succeeded": _GOAL, "failed": (235, 98, 86), "truncated": _SENSED}
 _MAX_DRAWS = 10_000
 """Of a move without noise, as in :mod:`holdfast.policy_path`."""
 
-_ACROSS = 2.0
-"""Distance of the eye from the scene, by half of its height: a little more than shows all of it."""
-
 
 class RerunSink:
-    """Logs the facts of a run.
+    """Logs the facts of a run; to be used in a ``with`` statement.
 
     Parameters
     ----------
-    recording : rerun.RecordingStream
-        With its sinks; its blueprint is :meth:`blueprint`.
     has_times : bool
         Whether the times of the facts are those of a clock, in nanoseconds since 1970.
+    live : bool
+        Whether the viewer follows the last fact.
+
+    Raises
+    ------
+    ViewError
+        If the viewer cannot be started or reached, or the file not be written.
     """
 
     def __init__(
-        self, recording: rr.RecordingStream, configuration: Configuration, *, has_times: bool
+        self, configuration: Configuration, target: ViewTarget, *, has_times: bool, live: bool
     ) -> None:
         problem = configuration.problem
-        self._recording = recording
         self._problem = problem
-        self._configuration = configuration
         self._has_times = has_times
-        self._scene: Scene | None = checked.scene(problem)
-        self._layout = _layout(problem, self._scene)
+        self._layout = drawn_layout(problem)
         self._labels = state_labels(problem)
         self._actions = [*map(str, problem.sensing_actions), "none"]
         self._offset = self._last = 0
         self._has_scene = False
-        self._paths: dict[str, list[FloatArray]] = {}
-        self._places: dict[str, int] = {}
-        self._logged: dict[str, int] = {}
+        self._paths: dict[str, _Path] = {}
         self._states: dict[str, str] = {}
         self._move_error = False
-        recording.set_log_time_enabled(False)
-        recording.set_log_tick_enabled(False)
+        self._recording = RerunStreams(target)
+        self._recording.open(blueprint(configuration, self._layout, live=live))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
+        # What nobody waits for any more is not sent: that may take long.
+        if kind is None or issubclass(kind, HoldfastError):
+            self._recording.close()
+
+    @property
+    def streams(self) -> RerunStreams:
+        """Where it goes."""
+        return self._recording
 
     # -- facts -------------------------------------------------------------------------------------
 
     def trial_begins(self, fact: TrialBeginFact) -> None:
         """Log the scene and the styles, once, and that the trial begins."""
         self._offset = self._last
-        self._paths, self._places, self._logged = {}, {}, {}
+        self._paths = {}
         if not self._has_scene:
             self._has_scene = True
             self._log_styles()
         self._at(fact.time_ns, fact.trial, 0)
-        for entity in (
-            f"{_ESTIMATE}_path",
-            f"{_TRUTH}_path",
-            f"{_TASK}/sensing",
-            f"{_TASK}/action",
-        ):
-            self._recording.log(entity, rr.Clear(recursive=True))
+        if self._layout is not None:
+            for name in ("estimate_path", "truth_path", "sensing", "action"):
+                self._recording.log(f"{_TASK}/{name}", rr.Clear(recursive=True))
         self._state("trial", f"trial {fact.trial}")
         self._text("INFO", f"trial {fact.trial} begins")
 
@@ -179,7 +187,8 @@ class RerunSink:
         """Log the last belief, and what the trial came to."""
         self._at(fact.time_ns, fact.trial, fact.steps)
         self._place(fact.belief, fact.estimate, fact.true_state, last=True)
-        self._recording.log(f"{_TASK}/action", rr.Clear(recursive=True))
+        if self._layout is not None:
+            self._recording.log(f"{_TASK}/action", rr.Clear(recursive=True))
         result = fact.result
         if result is None:
             self._text("INFO", f"trial {fact.trial}: {fact.steps} steps so far; not finished")
@@ -225,7 +234,10 @@ class RerunSink:
             self._recording.set_time("time", duration=np.timedelta64(time_ns, "ns"))
 
     def _belief(self, belief: Belief | None) -> None:
-        if belief is None or self._layout is None:
+        if belief is None:
+            return
+        if self._layout is None:
+            self._histograms(belief)
             return
         every = -(-len(belief.states) // MAX_PARTICLES)
         weights = belief.weights[::every]
@@ -238,6 +250,14 @@ class RerunSink:
                 colors=(_FAINT + share * (_STRONG - _FAINT)).astype(np.uint8),
             ),
         )
+
+    def _histograms(self, belief: Belief) -> None:
+        """Log how the weight is spread over each coordinate, which is in no place in space."""
+        for label, values in zip(self._labels, belief.states.T, strict=True):
+            shares, edges = np.histogram(values, _BINS, weights=belief.weights)
+            middles = 0.5 * (edges[:-1] + edges[1:])
+            bars = rr.BarChart(shares, abscissa=middles, widths=np.diff(edges), color=_ESTIMATED)
+            self._recording.log(["belief", label], bars)
 
     def _place(
         self,
@@ -265,21 +285,9 @@ class RerunSink:
                     entity,
                     rr.Transform3D(translation=pose[:3], quaternion=rr.Quaternion(xyzw=pose[3:])),
                 )
-                self._extend_path(f"{entity}_path", pose[:3], last=last)
-
-    def _extend_path(self, entity: str, place: FloatArray, *, last: bool) -> None:
-        path = self._paths.setdefault(entity, [])
-        every = self._places.setdefault(entity, 1)
-        count = self._logged.get(entity, 0)
-        self._logged[entity] = count + 1
-        if count % every and not last:
-            return
-        path.append(place)
-        if len(path) > _MAX_PATH:
-            self._paths[entity] = path = path[::2]
-            self._places[entity] = 2 * every
-        if last or len(path) < _PATH_GROWTH or len(path) % (1 + len(path) // _PATH_GROWTH) == 0:
-            self._recording.log(entity, rr.LineStrips3D([path]))
+                path = self._paths.setdefault(entity, _Path())
+                if path.add(pose[:3], last=last):
+                    self._recording.log(f"{entity}_path", rr.LineStrips3D([path.places]))
 
     def _action(self, estimate: FloatArray, action: FloatArray) -> None:
         """Log where the task action leads from the estimate, as far as the problem says so."""
@@ -391,7 +399,7 @@ class RerunSink:
                 self._recording.log(f"{marker.frame}/{name}", _shape(marker, color), static=True)
         if solid:
             centers = np.array([marker.pose[:3] for marker in solid])
-            if self._is_flat:
+            if is_flat(self._layout):
                 # What moves in the plane is seen in front of it.
                 centers[:, 2] -= [marker.scale[2] for marker in solid]
             self._recording.log(
@@ -400,90 +408,34 @@ class RerunSink:
                     centers=centers,
                     sizes=[marker.scale for marker in solid],
                     colors=_OBSTACLE,
-                    fill_mode="majorwireframe" if not self._is_flat else "solid",
+                    fill_mode="majorwireframe" if not is_flat(self._layout) else "solid",
                 ),
                 static=True,
             )
 
-    # -- the blueprint -----------------------------------------------------------------------------
 
-    @property
-    def _is_flat(self) -> bool:
-        return self._layout is not None and self._layout.indices[2] is None
+class _Path:
+    """The places of a trial, of which fewer are kept as it grows."""
 
-    def blueprint(self, *, live: bool) -> rrb.Blueprint:
-        """Return which view shows what; a live one follows the last fact."""
-        method = self._configuration.planning.selector.method
-        state_views = [
-            rrb.TimeSeriesView(
-                origin=rr.new_entity_path(["state", label]), name=label,
-                plot_legend=rrb.PlotLegend(visible=False),
-            )
-            for label in self._labels
-        ]  # fmt: skip
-        plots = rrb.Vertical(
-            rrb.TimeSeriesView(origin="scores", name=f"{SCORES.get(method, method)}, by what is "
-                               "sensed"),
-            rrb.Tabs(
-                rrb.Grid(*state_views, name="state: estimate, its spread, truth")
-                if len(state_views) > 3
-                else rrb.Vertical(*state_views, name="state: estimate, its spread, truth"),
-                rrb.TimeSeriesView(origin="filter/effective_sample_size",
-                                   name="effective sample size"),
-                rrb.TimeSeriesView(origin="filter/mahalanobis_distance",
-                                   name="observations: distance"),
-            ),
-            rrb.StateTimelineView(origin="decisions", name="decisions"),
-            rrb.TextLogView(
-                origin="log",
-                name="log",
-                columns=rrb.TextLogColumns(text_log_columns=["loglevel", "body"]),
-            ),
-            row_shares=[2.0, 2.7, 2.0, 1.3],
-        )  # fmt: skip
-        views: list[Any] = [plots]
-        if self._layout is not None:
-            views.insert(0, self._spatial_view())
-        return rrb.Blueprint(
-            rrb.Horizontal(*views),
-            rrb.TimePanel(
-                state="collapsed",
-                timeline="step",
-                play_state="following" if live else "playing",
-                fps=10.0,
-            ),
-            rrb.SelectionPanel(state="hidden"),
-            rrb.BlueprintPanel(state="hidden"),
-        )
+    def __init__(self) -> None:
+        self.places: list[FloatArray] = []
+        self._count = 0
+        self._every = 1
+        self._next_length = 0
 
-    def _spatial_view(self) -> rrb.Spatial3DView:
-        name = f"{self._configuration.problem_name}: belief, estimate, truth"
-        eye = None
-        if self._scene is not None:
-            x_min, y_min, x_max, y_max = self._scene.limits
-            across = max(x_max - x_min, y_max - y_min)
-            if self._is_flat:
-                middle = np.array([0.5 * (x_min + x_max), 0.5 * (y_min + y_max), 0.0])
-                away, up = np.array([0.0, 0.0, 0.5 * _ACROSS * across]), (0.0, 1.0, 0.0)
-            else:
-                middle = np.array([0.0, 0.0, 0.12 * across])
-                away, up = np.array([0.9, -1.5, 0.8]) * 0.4 * across, (0.0, 0.0, 1.0)
-            eye = rrb.EyeControls3D(position=middle + away, look_target=middle, eye_up=up)
-        return rrb.Spatial3DView(
-            origin=f"/{_TASK}",
-            name=name,
-            line_grid=rrb.LineGrid3D(visible=False),
-            eye_controls=eye,
-        )
-
-
-def _layout(problem: Problem, scene: Scene | None) -> PoseLayout | None:
-    """Return where the pose is: as the problem says, else as its drawing does."""
-    layout = pose_layout(problem)
-    if layout is not None or scene is None:
-        return layout
-    across, upwards = scene.axes
-    return PoseLayout((across, upwards, None, None, None, scene.angle), (0.0, 0.0, 0.0, 1.0))
+    def add(self, place: FloatArray, *, last: bool) -> bool:
+        """Add a place, and return whether it is time to show the path."""
+        if self._count % self._every == 0 or last:
+            self.places.append(place)
+        self._count += 1
+        if len(self.places) > _MAX_PATH:
+            self.places = self.places[::2]
+            self._every *= 2
+            self._next_length = 0
+        if len(self.places) < self._next_length and not last:
+            return False
+        self._next_length = len(self.places) + 1 + len(self.places) // _PATH_GROWTH
+        return True
 
 
 def _shape(marker: Marker, color: Sequence[int]) -> rr.AsComponents:
