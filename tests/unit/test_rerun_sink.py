@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
+from tests.recordings import result_of
 
 from holdfast.belief import Belief
 from holdfast.config.loader import Configuration, load
@@ -24,7 +25,6 @@ from holdfast.recording.facts import (
 )
 from holdfast.recording.rerun_sink import MAX_PARTICLES, RerunSink
 from holdfast.recording.view_target import ViewTarget
-from tests.recordings import result_of
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 DECIDER = Decider("tcp/10.0.0.7:7447", "local_recovery", 1.0, 2.0, 3.0)

@@ -90,7 +90,7 @@ def blueprint(
             name="log",
             columns=rrb.TextLogColumns(text_log_columns=["loglevel", "body"]),
         ),
-        row_shares=[2.0, 2.5, 2.2, 1.3],
+        row_shares=[1.9, 2.9, 2.2, 1.2],
     )
     views: list[Any] = [plots]
     if layout is not None:

@@ -10,6 +10,7 @@ This module imports Rerun (extra ``view``); import it only where something is to
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -36,6 +37,8 @@ _FLUSH_S = 5.0
 
 _LAST_FLUSH_S = 60.0
 _CONNECT_S = 1.0
+
+_ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class RerunStreams:
@@ -150,17 +153,22 @@ def _start_viewer(url: str) -> None:
         raise ViewError("this rerun-sdk comes without its viewer; start one yourself") from error
     name = "rerun.exe" if sys.platform == "win32" else "rerun"
     host, port = _address(url)
-    viewer = subprocess.Popen(
-        [
-            str(Path(rerun_cli.__file__).parent / name),
-            *("--bind", host, "--port", str(port), "--expect-data-soon"),
-        ],
-        env=os.environ | {"RERUN_APP_ONLY": "true"},
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
+    # A worker blocks the signals that end a run, and its child would, too.
+    before = signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING_SIGNALS)
+    try:
+        viewer = subprocess.Popen(
+            [
+                str(Path(rerun_cli.__file__).parent / name),
+                *("--bind", host, "--port", str(port), "--expect-data-soon"),
+            ],
+            env=os.environ | {"RERUN_APP_ONLY": "true"},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     until = monotonic() + _START_S
     while not _listens(url):
         if viewer.poll() is not None:
