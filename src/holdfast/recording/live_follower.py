@@ -259,15 +259,16 @@ def follow(connection: Connection, plain: dict[str, Any], target: tuple[str | No
         with RerunSink(configuration, ViewTarget(*target), has_times=True, live=True) as sink:
             _send(connection, report)
             follower = Follower(configuration, sink)
-            with open(connection.fileno(), "rb", closefd=False) as file:
-                for message in _messages(file):
+            with os.fdopen(connection.fileno(), "rb", closefd=False) as pipe:
+                for message in _messages(pipe):
                     follower.take(message)
                     sink.streams.flush()
                     if not sink.streams.is_open:
                         break
             report = FollowerReport(None, follower.steps, follower.left_out)
-        if sink.streams.lost is not None:
-            report = FollowerReport(f"the viewer {sink.streams.lost}")
+        if (lost := sink.streams.lost) is not None:
+            rest = "" if target[1] is None else "; the file is complete"
+            report = FollowerReport(f"the viewer {lost}{rest}")
     except HoldfastError as error:
         report = FollowerReport(str(error))
     except Exception as error:  # noqa: BLE001 - the problem is anybody's code

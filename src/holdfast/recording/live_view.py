@@ -145,7 +145,8 @@ class LiveView:
             while self._open and monotonic() < until:
                 self._write()
                 if self._open and self._worker.connection.poll(_POLL_S):
-                    self._ended(self._report())
+                    self._open = False
+                    self._explain(self._report(), "")
             if self._open:
                 self._open = False
                 self._tell(f"the view was not complete {_CLOSE_S:g} s after the run")
@@ -180,7 +181,10 @@ class LiveView:
             except BlockingIOError:
                 return
             except OSError:
-                self._ended(self._report())
+                self._open = False
+                self._waiting.clear()
+                # Its end may take a moment, for which the robot does not wait.
+                threading.Thread(target=self._explain_now, daemon=True).start()
                 return
             if self._sent_of_first == len(first):
                 self._waiting.popleft()
@@ -196,11 +200,12 @@ class LiveView:
             return FollowerReport(f"its process {self._worker.how_it_ended()[0]}")
         return msgspec.msgpack.decode(message, type=FollowerReport)
 
-    def _ended(self, report: FollowerReport) -> None:
-        self._open = False
-        self._waiting.clear()
+    def _explain_now(self) -> None:
+        self._explain(self._report(), "; the run goes on without it")
+
+    def _explain(self, report: FollowerReport, run: str) -> None:
         if report.error is not None:
-            self._tell(f"the view has ended: {report.error}; the run goes on without it")
+            self._tell(f"the view has ended: {report.error}{run}")
         elif report.left_out:
             self._tell(
                 f"the view was too slow for {report.left_out:,} of {report.steps:,} steps and "
