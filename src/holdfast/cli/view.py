@@ -17,14 +17,13 @@ from holdfast.cli.export import (
     size_of,
     trial_range,
 )
-from holdfast.errors import InvalidValueError, ViewError
+from holdfast.errors import InvalidValueError, OptionError, ViewError
 from holdfast.files import directory_beside, move_into_place, require_free
 from holdfast.printable import printable
 from holdfast.recording.view_target import ViewTarget, require_rerun, viewer_url
 from holdfast.runtime.command_line import (
     Options,
     argument,
-    bad_value,
     flag,
     location,
     number,
@@ -32,14 +31,6 @@ from holdfast.runtime.command_line import (
 )
 
 __all__ = ["main"]
-
-
-def _place(text: str) -> str:
-    try:
-        viewer_url(text)
-    except InvalidValueError as error:
-        raise bad_value(text, str(error)) from error
-    return text
 
 
 class ViewOptions(Options):
@@ -65,7 +56,6 @@ class ViewOptions(Options):
     )
     viewer: str | None = option(
         metavar="HOST:PORT",
-        read=_place,
         help="Show it in the viewer that listens there; Rerun's port is 9876.",
     )
     rate: float = option(
@@ -89,7 +79,10 @@ def _view(options: ViewOptions) -> None:
     save = options.save
     url = "" if save is None else None
     if options.viewer is not None:
-        url = viewer_url(options.viewer)
+        try:
+            url = viewer_url(options.viewer)
+        except InvalidValueError as error:
+            raise OptionError(f"--viewer is {options.viewer!r:.80}; allowed are {error}") from error
     require_rerun(ViewTarget(url))
     if save is not None:
         require_free(save, "--save", directory=False)
