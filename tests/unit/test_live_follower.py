@@ -24,6 +24,7 @@ from holdfast.protocol.records import (
 )
 from holdfast.recording.facts import (
     EventFact,
+    LateFact,
     SensingFact,
     TaskFact,
     TrialBeginFact,
@@ -50,9 +51,8 @@ class Facts:
 
     def __init__(self) -> None:
         self.all: list[Any] = []
-        self.trial_begins = self.sensed = self.acted = self.trial_ends = self.happened = (
-            self.all.append
-        )
+        self.trial_begins = self.sensed = self.acted = self.observed_late = self.all.append
+        self.trial_ends = self.happened = self.all.append
 
     def of(self, kind: type) -> list[Any]:
         return [fact for fact in self.all if isinstance(fact, kind)]
@@ -208,6 +208,8 @@ def test_an_observation_that_comes_late(configuration: Configuration) -> None:
     follower.take(FinishMessage())
     (sensed,) = facts.of(SensingFact)
     assert (sensed.sensing_action, sensed.observation, sensed.explained) == (1, None, None)
-    (event,) = facts.of(EventFact)
-    assert (event.name, event.fields["taken"]) == ("late_observation", 0)
+    (came_late,) = facts.of(LateFact)
+    assert (came_late.step, came_late.taken, came_late.explained) == (1, 0, came[0].explained)
+    assert came_late.observation.tobytes() == shown.tobytes()
+    assert came_late.after.states.tobytes() == history.state.belief.states.tobytes()
     assert facts.all[-1].belief.states.tobytes() == history.state.belief.states.tobytes()

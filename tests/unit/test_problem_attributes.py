@@ -18,6 +18,8 @@ from holdfast.problems.problem import (
     GeneralObservationProblem,
     KnownStateReturnProblem,
     Problem,
+    ReinitialisedProblem,
+    ShownMovesProblem,
 )
 
 
@@ -50,6 +52,20 @@ from holdfast.problems.problem import (
         ),
         ("state_resolution", [[1], [1, 2]], r"^state_resolution of line is .*: must be one num"),
         ("sensing_costs", [[1], [1, 2]], r"sensing_costs of line is .*: must be 2 numbers"),
+        (
+            "circular",
+            (2,),
+            r"circular of line is \(2,\): must be different indices .* from 0 to 1,",
+        ),
+        ("circular", (0, 0), "circular of line is .*: must be different indices"),
+        ("circular", (True,), "circular of line"),
+        ("circular", "0", "circular of line"),
+        ("circular", 0, "circular of line is 0: must be different indices"),
+        ("circular", (0.5,), "circular of line"),
+        ("circular_actions", (1,), "circular_actions of line is .* from 0 to 0, such as"),
+        ("circular_observations", (0,), "circular_observations of line is .*: must be 2 sequences"),
+        ("circular_observations", ((0,), 1), r"circular_observations\[1\] of line is 1: must be"),
+        ("circular_observations", ((0,), (-1,)), r"circular_observations\[1\] of line is"),
         ("motion_variance", [[1], [1, 2]], r"motion_variance of line is .*: must be 1 numbers"),
         ("resolution", True, "resolution of line is True: must be one number"),
         ("resolution", np.array(0.0), "resolution of line is 0.0: must be positive and finite"),
@@ -161,6 +177,8 @@ def test_the_parameters_are_those_of_the_contract() -> None:
         ExpectedMotionProblem,
         KnownStateReturnProblem,
         BatchedMotionProblem,
+        ShownMovesProblem,
+        ReinitialisedProblem,
     )
     members = {name: own for protocol in protocols for name, own in vars(protocol).items()}
     functions = {

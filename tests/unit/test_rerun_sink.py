@@ -18,6 +18,7 @@ from holdfast.outcome import TrialResult
 from holdfast.recording.facts import (
     Decider,
     EventFact,
+    LateFact,
     SensingFact,
     TaskFact,
     TrialBeginFact,
@@ -95,7 +96,7 @@ def test_a_step_in_all_its_parts(tmp_path: Path) -> None:
     (scores,) = values(rows["/scores"], "Scalars:scalars")
     assert scores[0] == -1.0
     assert np.isnan(scores[1])
-    assert values(rows["/scores"], "SeriesLines:names") == [["x", "y", "θ", "none"]]
+    assert values(rows["/scores"], "SeriesLines:names") == [["x", "y", "θ", "no sensing"]]
     assert values(rows["/scores/chosen"], "Scalars:scalars") == [[-2.0]]
     assert values(rows["/filter/effective_sample_size"], "Scalars:scalars") == [[1.5]]
     assert values(rows["/filter/mahalanobis_distance/unexplained"], "Scalars:scalars") == [[9.0]]
@@ -163,6 +164,24 @@ def test_events(tmp_path: Path) -> None:
         ["holding: no answer"],
     ]
     assert values(rows["/log"], "TextLog:level") == [["WARN"], ["WARN"]]
+
+
+def test_a_late_observation_and_the_choice_not_to_sense(tmp_path: Path) -> None:
+    def happen(sink: RerunSink) -> None:
+        belief = belief_of(2)
+        sink.sensed(SensingFact(0, 3, MS, 2 * MS, 3, bytes(32), None, belief, belief))
+        late = LateFact(0, 5, 3 * MS, 2, np.array([0.1]), belief, explained=False)
+        sink.observed_late(late)
+        sink.observed_late(late._replace(explained=True))
+
+    rows, _ = shown(tmp_path, happen)
+    assert values(rows["/decisions/sensing_action"], "StateChange:state") == [["no sensing"]]
+    assert not rows["/world/sensing/label"]
+    assert [(row["TextLog:level"][0], row["TextLog:text"][0]) for row in rows["/log"]] == [
+        ("WARN", "trial 0, step 5: the observation of step 2 came, which no particle explains"),
+        ("INFO", "trial 0, step 5: the observation of step 2 came"),
+    ]
+    assert [row["step"] for row in rows["/world/belief"]] == [3, 3, 5, 5]
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,9 @@ __all__ = [
     "KnownStateReturnProblem",
     "Problem",
     "ProblemBase",
+    "ReinitialisedProblem",
     "Scene",
+    "ShownMovesProblem",
 ]
 
 
@@ -152,10 +154,17 @@ class Problem(Protocol):
     states have the actions' resolution, which must then be one number, or an action must have as
     many coordinates as a state.
 
+    It may say which coordinates are angles in radians, so that pi is -pi: ``circular`` of a state,
+    ``circular_actions`` of a task action, both as indices (``(2,)``), and ``circular_observations``
+    of observations, a sequence of indices for each sensing action (``((), (0,))``: the second one
+    shows a bearing). Means, spreads, innovations and entropies then go round the circle the shorter
+    way. The functions of the problem may be given any whole number of turns more or less, and take
+    ``numerics.wrapped(goal - heading)`` for a difference of angles. Noise on an observed angle is
+    that of its shorter way round, so its standard deviation should be below one radian.
+
     It may have ``sensing_costs``, the price of each sensing action in units of reward, numbers
     from 0 to 1e150. A trial's reward is less by it at each sensing, and ``expected_return`` weighs
-    it against what sensing gains. Without this attribute sensing costs nothing. "Not looking" is a
-    sensing action like any other: one of price 0 whose observation says nothing (a huge variance).
+    it against what sensing gains. Without this attribute sensing costs nothing.
     """
 
     name: str
@@ -291,6 +300,54 @@ class BatchedMotionProblem(Protocol):
         ...
 
 
+class ShownMovesProblem(Protocol):
+    """Methods for moves that show something: a measured motion, an observation. Any of them.
+
+    The robot's environment returns what a move has shown
+    (:class:`~holdfast.outcome.MoveResult`); these say what it means. With the first or the third
+    the next decision waits for what the move shows, so a service is asked at each step.
+    """
+
+    def move_by_measurement(
+        self, states: FloatArray, motion: FloatArray, stream: Stream
+    ) -> FloatArray:
+        """Draw the states after a move whose motion was measured, as ``states``.
+
+        It takes the place of ``move`` in the belief: the noise is that of the measurement.
+        ``motion`` is what the environment returned, shape ``(n,)``.
+        """
+        ...
+
+    def measure_motion(self, before: FloatArray, after: FloatArray, stream: Stream) -> FloatArray:
+        """Draw the measurement of a true move from state to state, shape ``(n,)``; to simulate."""
+        ...
+
+    def move_log_likelihood(
+        self, states: FloatArray, action: FloatArray, observation: FloatArray
+    ) -> FloatArray:
+        """Return log p(observation | state after the move), up to one constant, for each state.
+
+        ``states`` has the shape ``(num_particles, state_size)``, the executed ``action``
+        ``(action_size,)`` and the result ``(num_particles,)``. Minus infinity where a state cannot
+        have shown that; never NaN or plus infinity.
+        """
+        ...
+
+    def sample_move_observation(
+        self, state: FloatArray, action: FloatArray, stream: Stream
+    ) -> FloatArray:
+        """Draw what comes with a move into one state, shape ``(n,)``; to simulate."""
+        ...
+
+
+class ReinitialisedProblem(Protocol):
+    """One more method, for a robot that is lost; without it its belief is the initial one again."""
+
+    def reinitial_states(self, states: FloatArray, stream: Stream) -> FloatArray:
+        """Draw a new belief after the particles ``states``, of the same shape."""
+        ...
+
+
 class KnownStateReturnProblem(Protocol):
     """One more method, for ``selector.method: expected_return``; no problem needs it."""
 
@@ -320,6 +377,9 @@ class ProblemBase:
     num_stages: int = 1
     resolution: float | FloatArray = 0.1
     state_resolution: float | FloatArray | None = None
+    circular: Sequence[int] = ()
+    circular_actions: Sequence[int] = ()
+    circular_observations: Sequence[Sequence[int]] = ()
     motion_variance: FloatArray = np.array([0.01])
     state_labels: Sequence[str] = ()
     pose: Sequence[str | None] = ()

@@ -17,7 +17,6 @@ from typing import Any, BinaryIO
 import msgspec
 
 from holdfast.arrays import FloatArray
-from holdfast.belief import estimate
 from holdfast.config.loader import Configuration
 from holdfast.errors import HoldfastError
 from holdfast.planning import Planner, PlanningState
@@ -34,6 +33,7 @@ from holdfast.recording.facts import (
     Decider,
     EventFact,
     FactSink,
+    LateFact,
     SensingFact,
     TaskFact,
     TrialBeginFact,
@@ -75,7 +75,6 @@ class Follower:
     ) -> None:
         self._configuration = configuration
         self._planner = Planner(configuration.problem, configuration.planning)
-        self._estimate = configuration.planning.particle_filter.estimate
         self._sink = sink
         self._clock = clock
         self._trial: Trial | None = None
@@ -148,7 +147,7 @@ class Follower:
                 steps=state.step,
                 result=None if message is None else message.result,
                 belief=state.belief,
-                estimate=estimate(state.belief, self._estimate),
+                estimate=self._planner.estimate(state),
                 true_state=self._true_state,
             )
         )
@@ -179,14 +178,18 @@ class Follower:
         elif isinstance(record, LateRecord):
             shown = decode_floats(record.observation, len(record.observation) // 8)
             found = trial.observe_late(LateObservation(record.taken, shown))
-            fields: dict[str, object] = {
-                "trial": trial.state.trial,
-                "step": record.step,
-                "taken": record.taken,
-            }
-            if found is not None and not found[0].explained:
-                fields["reason"] = "no particle explains it"
-            self._happened(time_ns, "late_observation", **fields)
+            if found is not None and not is_late:
+                self._sink.observed_late(
+                    LateFact(
+                        trial=trial.state.trial,
+                        step=record.step,
+                        time_ns=time_ns,
+                        taken=record.taken,
+                        observation=shown,
+                        after=trial.state.belief,
+                        explained=found[0].explained,
+                    )
+                )
         elif isinstance(record, ReinitialisedRecord):
             trial.reinitialise()
             self._happened(time_ns, "reinitialised", trial=trial.state.trial, step=record.step)

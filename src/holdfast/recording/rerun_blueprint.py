@@ -13,6 +13,7 @@ import rerun.blueprint as rrb
 
 from holdfast import checked
 from holdfast.config.loader import Configuration
+from holdfast.problem_attributes import circular_states
 from holdfast.problems.problem import Problem, Scene
 from holdfast.recording.csv_export import state_labels
 from holdfast.recording.facts import SCORES
@@ -40,7 +41,8 @@ def drawn_layout(problem: Problem) -> PoseLayout | None:
     layout = pose_layout(problem)
     if layout is None and (scene := _scene_of(problem)) is not None:
         across, upwards = scene.axes
-        layout = PoseLayout((across, upwards, None, None, None, scene.angle), (0.0, 0.0, 0.0, 1.0))
+        indices = (across, upwards, None, None, None, scene.angle)
+        layout = PoseLayout(indices, (0.0, 0.0, 0.0, 1.0), tuple(circular_states(problem)))
     return layout
 
 

@@ -25,12 +25,14 @@ from holdfast.arrays import FloatArray
 from holdfast.belief import Belief, standard_deviation
 from holdfast.config.loader import Configuration
 from holdfast.errors import HoldfastError
+from holdfast.problem_attributes import choice_labels, circular_states
 from holdfast.protocol.status import Status
 from holdfast.randomness import NoiseFreeStream
 from holdfast.recording.csv_export import state_labels
 from holdfast.recording.facts import (
     Decider,
     EventFact,
+    LateFact,
     SensingFact,
     TaskFact,
     TrialBeginFact,
@@ -107,7 +109,7 @@ class RerunSink:
         self._has_times = has_times
         self._layout = drawn_layout(problem)
         self._labels = state_labels(problem)
-        self._actions = [*map(str, problem.sensing_actions), "none"]
+        self._choices = choice_labels(problem)
         self._offset = self._last = 0
         self._has_scene = False
         self._paths: dict[str, _Path] = {}
@@ -149,7 +151,7 @@ class RerunSink:
         """Log the choice and the alternatives, then the belief that the observation led to."""
         self._at(fact.decided_ns, fact.trial, fact.step)
         self._belief(fact.before)
-        label = self._actions[fact.sensing_action]
+        label = self._choices[fact.sensing_action]
         self._state("sensing_action", label)
         self._decider(fact.decider)
         entropies = fact.entropies
@@ -158,7 +160,8 @@ class RerunSink:
             self._recording.log(
                 "scores/chosen", rr.Scalars(_finite(entropies[fact.sensing_action]))
             )
-        if self._layout is not None and fact.before is not None and label != "none":
+        is_performed = fact.sensing_action < len(self._problem.sensing_actions)
+        if self._layout is not None and fact.before is not None and is_performed:
             self._sensing(fact.before, fact.sensing_action)
         self._at(fact.observed_ns, fact.trial, fact.step)
         self._belief(fact.after)
@@ -183,6 +186,16 @@ class RerunSink:
         if fact.estimate is not None:
             self._action(fact.estimate, fact.action)
 
+    def observed_late(self, fact: LateFact) -> None:
+        """Log the belief that an earlier step's observation led to."""
+        self._at(fact.time_ns, fact.trial, fact.step)
+        self._belief(fact.after)
+        text = f"trial {fact.trial}, step {fact.step}: the observation of step {fact.taken} came"
+        if fact.explained:
+            self._text("INFO", text)
+        else:
+            self._text("WARN", f"{text}, which no particle explains")
+
     def trial_ends(self, fact: TrialEndFact) -> None:
         """Log the last belief, and what the trial came to."""
         self._at(fact.time_ns, fact.trial, fact.steps)
@@ -194,8 +207,7 @@ class RerunSink:
             self._text("INFO", f"trial {fact.trial}: {fact.steps} steps so far; not finished")
             return
         text = f"trial {fact.trial} {result.outcome} after {result.steps} steps"
-        reason = getattr(result, "reason", "")
-        text += f": {reason}" if reason else ""
+        text += f": {result.reason}" if result.reason else ""
         if result.reward is not None:
             text += f"; reward {result.reward:.6g}"
         self._state("trial", result.outcome)
@@ -269,7 +281,7 @@ class RerunSink:
     ) -> None:
         self._belief(belief)
         if belief is not None and estimate is not None:
-            spread = standard_deviation(belief)
+            spread = standard_deviation(belief, circular_states(self._problem))
             for index, label in enumerate(self._labels):
                 values = estimate[index] + np.array([0.0, -1.0, 1.0]) * spread[index]
                 self._recording.log(["state", label], rr.Scalars(values))
@@ -330,9 +342,9 @@ class RerunSink:
         def static(entity: str | list[object], *shapes: rr.AsComponents) -> None:
             self._recording.log(entity, *shapes, static=True)
 
-        actions = self._actions[:-1]
-        colors = [_SERIES[index % len(_SERIES)] for index in range(len(self._actions))]
-        static("scores", rr.SeriesLines(names=self._actions, colors=colors))
+        actions = self._choices[:-1]
+        colors = [_SERIES[index % len(_SERIES)] for index in range(len(self._choices))]
+        static("scores", rr.SeriesLines(names=self._choices, colors=colors))
         static("scores/chosen", rr.SeriesPoints(names="chosen", colors=_TRUE, marker_sizes=4))
         for label in self._labels:
             static(
