@@ -137,6 +137,7 @@ class RerunSink:
         """Log the scene and the styles, once, and that the trial begins."""
         self._offset = self._last
         self._paths = {}
+        self._states.pop("status", None)
         if not self._has_scene:
             self._has_scene = True
             self._log_styles()
@@ -325,8 +326,11 @@ class RerunSink:
             self._recording.log(f"{entity}/{marker.namespace}", _shape(marker, _SENSED))
 
     def _decider(self, decider: Decider | None) -> None:
-        if decider is not None:
-            self._state("decider", decider.service)
+        if decider is None:
+            return
+        self._state("decider", decider.service)
+        if "status" not in self._states:
+            # From then on there are events of it. An answer's own status may be an earlier one.
             self._state("status", decider.status)
 
     def _state(self, name: str, state: str) -> None:
