@@ -143,7 +143,7 @@ def test_what_is_late_is_folded_and_not_shown(configuration: Configuration) -> N
     now = 0
     follower = Follower(configuration, facts, clock=lambda: now)
     middle = len(records) // 2
-    now = 2 * SECOND
+    now = 4 * SECOND
     follower.take(RecordsMessage(SECOND // 2, 0, tuple(records[:middle])))
     assert facts.of(SensingFact) == facts.of(TaskFact) == []
     left_out = follower.left_out

@@ -2,7 +2,7 @@
 
 A belief is a function of the records, so this process comes to the robot's own beliefs without
 being sent any. To fold a record costs little. To compute the entropies of the alternatives again
-and to draw a step costs more, so both are left out while the last record is older than a second.
+and to draw a step costs more, so both are left out for a record that is older than three seconds.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ from holdfast.tracking import LateObservation, Trial
 
 __all__ = ["Follower", "follow"]
 
-_LATE_NS = 1_000_000_000
+_LATE_NS = 3_000_000_000
 """A step that is older than this is not drawn."""
 
 _NICENESS = 10
@@ -251,7 +251,6 @@ class Follower:
 
 def follow(connection: Connection, plain: dict[str, Any], target: tuple[str | None, ...]) -> None:
     """Show a run: the work of the other process."""
-    os.nice(_NICENESS)
     # The viewer, which outlives this process, must not hold the pipe open.
     os.set_inheritable(connection.fileno(), False)
     report = FollowerReport()
@@ -260,8 +259,9 @@ def follow(connection: Connection, plain: dict[str, Any], target: tuple[str | No
 
         configuration = Configuration.from_plain(plain)
         with RerunSink(configuration, ViewTarget(*target), has_times=True, live=True) as sink:
-            _send(connection, report)
             follower = Follower(configuration, sink)
+            _send(connection, report)
+            os.nice(_NICENESS)  # the robot waits no more
             with os.fdopen(connection.fileno(), "rb", closefd=False) as pipe:
                 for message in _messages(pipe):
                     follower.take(message)

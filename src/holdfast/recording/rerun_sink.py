@@ -111,12 +111,13 @@ class RerunSink:
         self._labels = state_labels(problem)
         self._choices = choice_labels(problem)
         self._offset = self._last = 0
-        self._has_scene = False
         self._paths: dict[str, _Path] = {}
         self._states: dict[str, str] = {}
         self._move_error = False
         self._recording = RerunStreams(target)
         self._recording.open(blueprint(configuration, self._layout, live=live))
+        # Before the run begins: what Rerun loads with the first of it takes a while.
+        self._log_styles()
 
     def __enter__(self) -> Self:
         return self
@@ -134,13 +135,10 @@ class RerunSink:
     # -- facts -------------------------------------------------------------------------------------
 
     def trial_begins(self, fact: TrialBeginFact) -> None:
-        """Log the scene and the styles, once, and that the trial begins."""
+        """Log that the trial begins."""
         self._offset = self._last
         self._paths = {}
         self._states.pop("status", None)
-        if not self._has_scene:
-            self._has_scene = True
-            self._log_styles()
         self._at(fact.time_ns, fact.trial, 0)
         if self._layout is not None:
             for name in ("estimate_path", "truth_path", "sensing", "action"):
