@@ -181,7 +181,7 @@ def test_a_late_observation_and_the_choice_not_to_sense(tmp_path: Path) -> None:
         ("WARN", "trial 0, step 5: the observation of step 2 came, which no particle explains"),
         ("INFO", "trial 0, step 5: the observation of step 2 came"),
     ]
-    assert [row["step"] for row in rows["/world/belief"]] == [3, 3, 5, 5]
+    assert values(rows["/world/belief"], "step") == [3, 3, 5, 5]
 
 
 @pytest.mark.parametrize(
