@@ -100,13 +100,17 @@ def _view(options: ViewOptions) -> None:
             recorded.configuration, target, has_times=recorded.has_times, live=False
         ) as sink:
 
-            def send() -> None:
-                sink.streams.flush()
+            def require_viewer() -> None:
                 if sink.streams.lost is not None:
                     raise ViewError(f"the viewer {sink.streams.lost}")
 
             replay_trials(
-                recorded, trials, [sink], options.rate, quiet=options.quiet, after_each=send
+                recorded,
+                trials,
+                [sink],
+                options.rate,
+                quiet=options.quiet,
+                after_each=require_viewer,
             )
         if save is not None and made is not None:
             move_into_place(made, save)

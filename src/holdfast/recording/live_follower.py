@@ -265,7 +265,6 @@ def follow(connection: Connection, plain: dict[str, Any], target: tuple[str | No
             with os.fdopen(connection.fileno(), "rb", closefd=False) as pipe:
                 for message in _messages(pipe):
                     follower.take(message)
-                    sink.streams.flush()
                     if not sink.streams.is_open:
                         break
             report = FollowerReport(None, follower.steps, follower.left_out)

@@ -184,6 +184,7 @@ class RerunSink:
         self._place(fact.belief, fact.estimate, fact.true_state)
         if fact.estimate is not None:
             self._action(fact.estimate, fact.action)
+        self._recording.flush()
 
     def observed_late(self, fact: LateFact) -> None:
         """Log the belief that an earlier step's observation led to."""
@@ -213,6 +214,7 @@ class RerunSink:
         self._text("INFO" if result.outcome == "succeeded" else "WARN", text)
         # The next trial's first step comes after this one's last belief.
         self._last += 1
+        self._recording.flush()
 
     def happened(self, fact: EventFact) -> None:
         """Log an event of the services."""

@@ -101,7 +101,10 @@ class RerunStreams:
             stream.log(entity, *shapes, static=static)
 
     def flush(self, *, last: bool = False) -> None:
-        """Send what was logged, if it is time to; give up a viewer that does not take it."""
+        """Send what was logged, if it is time to; give up a viewer that does not take it.
+
+        Raises ViewError if the file cannot be written.
+        """
         now = monotonic()
         if now < self._next_flush and not last:
             return
@@ -112,12 +115,12 @@ class RerunStreams:
                 # To close it would wait for it.
                 del self._streams[name]
                 _GIVEN_UP.append(stream)
-                timed_out = "timed out" in str(error)
-                self.lost = (
-                    f"took nothing for {_FLUSH_S:g} s"
-                    if timed_out
-                    else "was closed, or the connection was lost"
-                )
+                if name == "file":
+                    raise ViewError(f"{self._target.file}: cannot be written: {error}") from error
+                if "timed out" in str(error):
+                    self.lost = f"took nothing for {_FLUSH_S:g} s"
+                else:
+                    self.lost = "was closed, or the connection was lost"
         self._next_flush = monotonic() + _FLUSH_EVERY_S
 
     def close(self) -> None:
