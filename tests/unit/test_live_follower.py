@@ -182,6 +182,7 @@ def test_events_and_endings(configuration: Configuration) -> None:
     assert facts.all[-1].result is None
     follower.take(EndedMessage(5, history.result(None)))
     assert [fact.trial for fact in facts.of(TrialBeginFact)] == [0, 0]
+    assert (facts.all[-1].steps, facts.all[-1].belief) == (20, None)
     follower.take(FinishMessage())
     assert len(facts.of(TrialEndFact)) == 2
 

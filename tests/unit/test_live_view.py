@@ -144,14 +144,17 @@ def test_what_waits_is_bounded(
         view.records(0, [performed(step)])
         assert view._waiting_bytes <= 100_000
         step += 1
+    for _ in range(5_000):
+        view.records(0, [performed(step)])
+        view.event("status", reason="that events are lost is no reason to begin a trial midway")
     view.records(0, [performed(step)])
     view.records(1, [performed(0)])
     may_go_on.write_bytes(b"")
     view.close()
     assert notes == ["the viewer takes nothing: the view goes on with the next trial"]
     messages = _MESSAGES.decode(file.read_bytes())
-    (lost,) = [place for place, message in enumerate(messages) if isinstance(message, LostMessage)]
-    before, after = messages[:lost], messages[lost + 1 :]
+    lost = [place for place, message in enumerate(messages) if isinstance(message, LostMessage)]
+    before, after = messages[: lost[0]], messages[lost[0] + 1 :]
     arrived = [message.records for message in before if isinstance(message, RecordsMessage)]
     assert arrived == [(performed(number),) for number in range(len(arrived))]
     assert len(arrived) < step
@@ -174,6 +177,9 @@ def test_a_view_that_ends_is_told_once_and_the_run_goes_on(
 
         def start(self) -> None:
             explained[0]()
+
+        def join(self, timeout: float) -> None:
+            pass
 
     monkeypatch.setattr(threading, "Thread", AtOnce)
     for step in range(3):

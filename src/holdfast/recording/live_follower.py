@@ -140,17 +140,20 @@ class Follower:
         if self._trial is None:
             return
         state = self._trial.state
-        self._sink.trial_ends(
-            TrialEndFact(
-                trial=state.trial,
-                time_ns=time_ns,
-                steps=state.step,
-                result=None if message is None else message.result,
-                belief=state.belief,
-                estimate=self._planner.estimate(state),
-                true_state=self._true_state,
-            )
+        fact = TrialEndFact(
+            trial=state.trial,
+            time_ns=time_ns,
+            steps=state.step,
+            result=None if message is None else message.result,
+            belief=state.belief,
+            estimate=self._planner.estimate(state),
+            true_state=self._true_state,
         )
+        if message is not None and message.result.steps != state.step:
+            # Its records were lost.
+            steps = message.result.steps
+            fact = fact._replace(steps=steps, belief=None, estimate=None, true_state=None)
+        self._sink.trial_ends(fact)
         self._trial = self._simulated = None
         self._deciders = {}
 

@@ -90,7 +90,9 @@ class LiveView:
         self._waiting: deque[bytes] = deque()
         self._waiting_bytes = 0
         self._sent_of_first = 0
-        self._lost_trial: int | None = None
+        self._trial: int | None = None
+        self._is_lost = False
+        self._explaining: threading.Thread | None = None
         self._told = False
         self._open = False
 
@@ -116,11 +118,10 @@ class LiveView:
 
     def records(self, trial: int, records: Sequence[Record]) -> None:
         """Take what was journalled of a trial, in order and from its beginning on."""
-        if trial == self._lost_trial:
-            return
-        self._lost_trial = None
-        if not self._send(RecordsMessage(time.time_ns(), trial, tuple(records))):
-            self._lost_trial = trial
+        if trial != self._trial:
+            self._trial, self._is_lost = trial, False
+        if not self._is_lost:
+            self._send(RecordsMessage(time.time_ns(), trial, tuple(records)))
 
     def timing(self, timing: Timing) -> None:
         """Take who decided."""
@@ -150,26 +151,28 @@ class LiveView:
             if self._open:
                 self._open = False
                 self._tell(f"the view was not complete {_CLOSE_S:g} s after the run")
+            if self._explaining is not None:
+                self._explaining.join(_CLOSE_S)
             end_workers([self._worker])
 
-    def _send(self, message: ViewMessage) -> bool:
-        """Hand a message over; return False if it is lost with all that waited."""
+    def _send(self, message: ViewMessage) -> None:
+        """Hand a message over, or lose it with all that waited."""
         with self._lock:
             if not self._open:
-                return True
+                return
             data = self._encode(message)
             self._waiting.append(len(data).to_bytes(HEADER_BYTES, "little") + data)
             self._waiting_bytes += HEADER_BYTES + len(data)
             self._write()
             if self._waiting_bytes <= _MAX_WAITING_BYTES:
-                return True
+                return
             # What is on its way has to arrive whole.
             kept = [self._waiting[0]] if self._sent_of_first else []
             self._waiting = deque(kept)
             self._waiting_bytes = sum(map(len, kept))
+            self._is_lost = True
             self._tell("the viewer takes nothing: the view goes on with the next trial")
-        self._send(LostMessage())
-        return False
+            self._send(LostMessage())
 
     def _write(self) -> None:
         """Write as much as the pipe takes at once."""
@@ -184,7 +187,8 @@ class LiveView:
                 self._open = False
                 self._waiting.clear()
                 # Its end may take a moment, for which the robot does not wait.
-                threading.Thread(target=self._explain_now, daemon=True).start()
+                self._explaining = threading.Thread(target=self._explain_now, daemon=True)
+                self._explaining.start()
                 return
             if self._sent_of_first == len(first):
                 self._waiting.popleft()
