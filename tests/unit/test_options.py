@@ -19,6 +19,7 @@ NUMBERS = [
     ["run", "peg.yaml", "--rate"],
     ["run", "peg.yaml", "--health"],
     ["run", "peg.yaml", "--view"],
+    ["run", "peg.yaml", "--metrics"],
     ["demo", "--seed"],
     ["chaos", "--trials"],
     ["chaos", "--seed"],

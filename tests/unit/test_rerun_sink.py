@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
@@ -28,6 +29,14 @@ from holdfast.recording.rerun_sink import MAX_PARTICLES, RerunSink
 from holdfast.recording.view_target import ViewTarget
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@pytest.fixture(autouse=True)
+def own_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the examples' directory, which their problems need, to no other test."""
+    monkeypatch.setattr(sys, "path", sys.path.copy())
+
+
 DECIDER = Decider("tcp/10.0.0.7:7447", "local_recovery", 1.0, 2.0, 3.0)
 MS = 1_000_000
 

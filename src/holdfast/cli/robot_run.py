@@ -104,7 +104,7 @@ def run_as_robot(
         on_result,
         rate_hz=options.rate,
         sinks=sinks,
-        watch=lambda events: RobotWatch(manager, options.health, events),
+        watch=lambda events: RobotWatch(manager, options.health, options.metrics, events),
         view=view,
     )
     return findings

@@ -179,6 +179,12 @@ class RunOptions(Options):
         help="Answer http://HOST:PORT/livez, and /readyz while a service or the robot itself "
         "decides; a PORT alone is one of 127.0.0.1.",
     )
+    metrics: HttpAddress | None = option(
+        metavar="HOST:PORT",
+        read=http_address,
+        help="Offer this robot's metrics for Prometheus at http://HOST:PORT/metrics. The address "
+        "may be that of --health.",
+    )
     view: Viewer | None = option(
         metavar="rerun",
         read=viewer,
@@ -408,11 +414,12 @@ def _require_effect(options: RunOptions, configuration: Configuration, *, as_rob
             "out, or leave out --service, --environment, --rate and --view (and offload.services "
             "and environment.object)"
         )
-    if options.health is not None and not as_robot:
-        raise InvalidValueError(
-            f"--health {options.health} is for a robot: give --service, --environment or --rate "
-            "(or offload.services or environment.object), without which the trials are a batch"
-        )
+    for name, address in (("--health", options.health), ("--metrics", options.metrics)):
+        if address is not None and not as_robot:
+            raise InvalidValueError(
+                f"{name} {address} is for a robot: give --service, --environment or --rate "
+                "(or offload.services or environment.object), without which the trials are a batch"
+            )
     if configuration.offload.services:
         from holdfast.robot.links import check_services
 

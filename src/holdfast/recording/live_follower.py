@@ -194,8 +194,7 @@ class Follower:
                     )
                 )
         elif isinstance(record, ReinitialisedRecord):
-            trial.reinitialise()
-            self._happened(time_ns, "reinitialised", trial=trial.state.trial, step=record.step)
+            trial.reinitialise()  # an event tells of it
 
     def _sensed(self, trial: Trial, record: ObservedRecord, time_ns: int, *, is_late: bool) -> None:
         before = trial.state
