@@ -207,6 +207,7 @@ class Robot:
         if again is not None:
             # It is in the journal already, and the environment says that it was not performed.
             self._awaits_environment = True
+            self._write()
             self._effects.append(Act(history.state.step, again))
         else:
             self._go_on(now)
