@@ -32,16 +32,7 @@ from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import Job
 from holdfast.protocol.service_sessions import SessionTable
 
-__all__ = [
-    "DEFECTS",
-    "LIMIT",
-    "Defect",
-    "Finding",
-    "applied",
-    "seeds_needed",
-    "violation_of",
-    "without_faults",
-]
+__all__ = ["DEFECTS", "LIMIT", "Finding", "seeds_needed", "violation_of", "without_faults"]
 
 LIMIT = 2000
 """Seeds within which each defect is to be found."""

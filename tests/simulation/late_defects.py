@@ -95,11 +95,6 @@ _defect(
     Edit(Robot, "_came_late", "self._unwritten.append(record)", "pass"),
 )
 _defect(
-    "late_written_after_the_order",
-    "A resumed robot orders the pending action before it writes down what has come meanwhile.",
-    Edit(Robot, "begin_trial", "self._write()\nself._effects.append(Act", "self._effects.append(Act"),
-)
-_defect(
     "late_between_order_and_performance",
     "A journal that has a late observation between an action and its performance cannot be read.",
     Edit(

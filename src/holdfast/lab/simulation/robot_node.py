@@ -361,7 +361,9 @@ class RobotNode:
             self._rewards_are_known = self._rewards_are_known and self._run.remembers
         elif effect.name == "late_unused":
             assert self._environment is not None
-            self._environment.is_useless(effect.fields["taken"])
+            taken = effect.fields["taken"]
+            assert isinstance(taken, int)
+            self._environment.is_useless(taken)
         self._world.log_event(effect.name, effect.fields)
 
     def _decide(self, effect: ComputeOwnAnswer) -> None:

@@ -34,6 +34,7 @@ from holdfast.lab.simulation.schedule import (
     MessageFault,
     OutOfMemory,
     PauseRobot,
+    RunSettings,
     SimulatedFault,
     SimulationSchedule,
     Slow,
@@ -477,8 +478,7 @@ class World:
         """Return by step after how many task actions its observation comes."""
         steps = {fault.step for fault in self._late}
         return {
-            step: tuple(fault.moves for fault in self._late if fault.step == step)
-            for step in steps
+            step: tuple(fault.moves for fault in self._late if fault.step == step) for step in steps
         }
 
     def sensed_late(self, step: int) -> None:
