@@ -108,7 +108,7 @@ message service=local direction=from number=22 what=drop
    1.3548  robot    hears of call 6: SensingAnswer
    1.3620  robot    performs task actions 28 to 35
    1.4436  robot    performs sensing action 2 of step 36
-   1.4446  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   1.4446  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    1.4446  robot    asks local, call 8
    1.6006  robot    restore service=cloud-1 step=36 bytes=1567
    1.6006  robot    asks cloud-1, call 9

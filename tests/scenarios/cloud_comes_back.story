@@ -61,7 +61,7 @@ crash service=cloud-1 at=0.1 down_s=0.3
    0.4560  robot    hears of call 6: its end
    0.4632  robot    performs task actions 28 to 35
    0.5448  robot    performs sensing action 2 of step 36
-   0.5458  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.5458  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.5458  robot    asks cloud-1, call 7
    0.5488  robot    hears of call 7: TaskAnswer
    0.5488  robot    performs task action 36

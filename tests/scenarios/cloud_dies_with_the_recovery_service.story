@@ -61,7 +61,7 @@ crash service=local at=0.3
    0.5592  robot    hears of call 5: its end
    0.5664  robot    performs task actions 28 to 35
    0.6480  robot    performs sensing action 2 of step 36
-   0.6490  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.6490  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.6490  robot    asks local, call 6
    0.6502  robot    hears of call 6: TaskAnswer
    0.6502  robot    performs task action 36

@@ -76,7 +76,7 @@ crash service=cloud-1 at=0.4 down_s=0.08
    0.4020  robot    status from=keep_alive to=local_recovery silent_ms=16.2 reason=cloud-1 is gone
    0.4032  robot    performs task actions 29 to 35
    0.4746  robot    performs sensing action 2 of step 36
-   0.4756  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.4756  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.4756  robot    asks local, call 7
    0.4768  robot    hears of call 7: TaskAnswer
    0.4768  robot    performs task action 36

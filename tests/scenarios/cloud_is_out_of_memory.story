@@ -69,7 +69,7 @@ out_of_memory service=cloud-1 part=sensing at=0.03 for_s=0.5
    0.8344  robot    hears of call 8: its end
    0.8390  robot    performs task actions 27 to 35
    1.0092  robot    performs sensing action 2 of step 36
-   1.0102  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   1.0102  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    1.0102  robot    asks local, call 9
    1.0102  robot    restore service=cloud-1 step=36 bytes=1567
    1.0102  robot    asks cloud-1, call 10

@@ -92,7 +92,7 @@ message service=local direction=to number=0 what=drop
    0.8954  robot    hears of call 12: SensingAnswer
    0.9056  robot    performs task actions 28 to 35
    0.9872  robot    performs sensing action 2 of step 36
-   0.9882  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.9882  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.9882  robot    asks cloud-1, call 13
    1.2382  robot    service_suspected service=cloud-1 reason=no sign of progress for 250 ms
    1.2382  robot    status from=keep_alive to=local_recovery silent_ms=250 reason=cloud-1 no sign of progress for 250 ms

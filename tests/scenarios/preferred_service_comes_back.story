@@ -65,7 +65,7 @@ slow service=cloud-2 at=0 for_s=5 factor=1500
    0.6138  robot    hears of call 3: Progress
    0.6176  robot    performs task actions 33 to 35
    0.6482  robot    performs sensing action 2 of step 36
-   0.6492  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.6492  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.6492  robot    asks cloud-1, call 7
    0.6522  robot    hears of call 7: TaskAnswer
    0.6522  robot    performs task action 36

@@ -51,7 +51,7 @@ kill_robot boundary=19
    0.5134  robot    hears of call 4: its end
    0.5206  robot    performs task actions 28 to 35
    0.6022  robot    performs sensing action 2 of step 36
-   0.6032  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.6032  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.6032  robot    asks cloud-1, call 5
    0.6062  robot    hears of call 5: TaskAnswer
    0.6062  robot    performs task action 36

@@ -73,7 +73,7 @@ kill_robot at=0.204675 down_s=0.05 body_goes_on=true
    1.1831  robot    hears of call 7: its end
    1.1903  robot    performs task actions 28 to 35
    1.2719  robot    performs sensing action 2 of step 36
-   1.2729  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   1.2729  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    1.2729  robot    asks cloud-1, call 8
    1.2749  robot    hears of call 8: NeedState
    1.2749  robot    restore service=cloud-1 step=36 bytes=1567

@@ -95,7 +95,7 @@ stop node=cloud-1 at=0.581716 for_s=0.8
    1.4950  robot    performs task actions 34 to 35
    1.5327  robot    hears of call 8: Progress
    1.5354  robot    performs sensing action 2 of step 36
-   1.5364  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   1.5364  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    1.5364  robot    asks cloud-1, call 9
    1.6337  robot    hears of call 9: TaskAnswer
    1.6337  robot    performs task actions 36 to 37
