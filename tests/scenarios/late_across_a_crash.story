@@ -70,7 +70,7 @@ kill_robot at=0.3 down_s=0.05
    0.4210  robot    hears of call 2: its end
    0.4282  robot    performs task actions 28 to 35
    0.5098  robot    performs sensing action 2 of step 36
-   0.5108  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.5108  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.5108  robot    asks cloud-1, call 3
    0.5138  robot    hears of call 3: TaskAnswer
    0.5138  robot    performs task action 36

@@ -42,7 +42,7 @@ late step=0 moves=9
    0.3144  robot    hears of call 6: its end
    0.3216  robot    performs task actions 28 to 35
    0.4032  robot    performs sensing action 2 of step 36
-   0.4042  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.4042  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.4042  robot    asks cloud-1, call 7
    0.4072  robot    hears of call 7: TaskAnswer
    0.4072  robot    performs task action 36

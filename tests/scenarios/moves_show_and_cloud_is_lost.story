@@ -194,7 +194,7 @@ crash service=cloud-1 at=0.18 down_s=0.4
    0.6326  robot    hears of call 43: SensingAnswer
    0.6326  robot    performs sensing action 2 of step 36
    0.6326  robot    hears of call 43: its end
-   0.6336  robot    unexplained trial=2 step=36 sensing_action=2 deviations=31.9204 reason=outside the validation gate of every particle (8 standard deviations)
+   0.6336  robot    unexplained trial=2 step=36 sensing_action=2 deviations=31.9204 reason=more than 8 standard deviations from every particle
    0.6336  robot    asks cloud-1, call 44
    0.6366  robot    hears of call 44: TaskAnswer
    0.6366  robot    performs task action 36

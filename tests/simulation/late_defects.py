@@ -131,6 +131,22 @@ _defect(
     ),
 )
 
+_defect(
+    "new_belief_not_written",
+    "The journal does not say that the belief of a lost robot was begun anew.",
+    Edit(Robot, "_reinitialise", "self._write(history.reinitialised())", "history.reinitialised()"),
+)
+_defect(
+    "new_belief_not_folded_again",
+    "A late observation that was taken before the belief was begun anew brings the old one back.",
+    Edit(Trial, "_folded", "return self.planner.reinitialise(state)", "return state"),
+)
+_defect(
+    "lost_forgotten_in_a_crash",
+    "A robot that was killed when it was found lost goes on with its old belief.",
+    Edit(Robot, "begin_trial", "if is_lost and history.pending is None", "if False"),
+)
+
 # -- questions and services ------------------------------------------------------------------------
 
 _defect(

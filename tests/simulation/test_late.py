@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from holdfast.arrays import FloatArray
+from holdfast.config.settings import LostSettings
 from holdfast.lab.errors import Violation
 from holdfast.lab.simulation.checkers import WireChecker
 from holdfast.lab.simulation.environment_model import EnvironmentModel
@@ -73,9 +74,16 @@ class ShowsSometimes(SimulatedEnvironment):
 class TestReferenceRuns:
     """They have code of their own, and come to what the in-process loop comes to."""
 
+    @pytest.mark.parametrize("reinitialises", [False, True])
     @pytest.mark.parametrize("moves", [0, 1, 3, 8, 9, 10, 25])
-    def test_the_digest_is_the_one_of_a_trial_in_process(self, setup: Setup, moves: int) -> None:
+    def test_the_digest_is_the_one_of_a_trial_in_process(
+        self, setup: Setup, moves: int, reinitialises: bool
+    ) -> None:
         planner, seed = setup.planner, Simulator().seed
+        lost = LostSettings()
+        if reinitialises:
+            lost = LostSettings(false_alarm_rate=1.0, on_lost="reinitialise")
+        times = 0
         for trial in range(3):
             world = ShowsSometimes(planner.problem, seed, trial)
             result = run_trial(
@@ -84,14 +92,20 @@ class TestReferenceRuns:
                 trial,
                 max_steps=MAX_STEPS,
                 environment=SenseLater(world, moves) if moves else world,
+                lost=lost,
             )
             circumstances = Circumstances(
                 late=tuple(SENSED) if moves else (),
                 deliveries=tuple(Delivery(at + moves, BEFORE_SENSING, at) for at in SENSED),
+                reinitialises=reinitialises,
             )
             run = setup.references.get(trial, MAX_STEPS, circumstances)
             assert run.digest == result.digest
             assert run.unexplained == result.unexplained_observations
+            if reinitialises:
+                assert run.lost == result.lost
+            times += run.lost
+        assert (times > 0) == reinitialises
 
     def test_in_time_for_the_next_decision_is_as_if_at_once(self, setup: Setup) -> None:
         at_once = setup.references.get(2, MAX_STEPS)

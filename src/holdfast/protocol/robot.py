@@ -198,7 +198,7 @@ class Robot:
         except HoldfastError as error:
             self._stop(error)
             return self._take()
-        if again is not None:
+        if again is not None and not self._stopped:
             # It is in the journal already, and the environment says that it was not performed.
             self._awaits_environment = True
             self._write()

@@ -80,6 +80,8 @@ class EnvironmentModel:
         observations have come late.
     senses_on : bool
         Whether what it still senses when the robot's process dies is there when the next one asks.
+    reinitialises : bool
+        Whether the robot begins its belief anew after each observation outside the validation gate.
     """
 
     def __init__(
@@ -92,6 +94,7 @@ class EnvironmentModel:
         lateness: Mapping[int, tuple[int | None, ...]] | None = None,
         remembers: bool = False,
         senses_on: bool = False,
+        reinitialises: bool = False,
     ) -> None:
         self.trial = trial
         self._max_steps = max_steps
@@ -100,6 +103,7 @@ class EnvironmentModel:
         self._lateness = lateness or {}
         self._remembers = remembers
         self._senses_on = senses_on
+        self._reinitialises = reinitialises
         self._times: dict[int, int] = {}
         self._sensed: set[int] = set()
         self._awaited: set[int] = set()
@@ -130,6 +134,7 @@ class EnvironmentModel:
             tuple(sorted(self._lateness)),
             (*self._deliveries, *self._foreseen()),
             tuple(sorted(self._unseen)),
+            self._reinitialises,
         )
         self._reference = self._references.get(self.trial, self._max_steps, circumstances)
 
@@ -318,6 +323,7 @@ class EnvironmentModel:
             ("success", result.success, self.done),
             ("sensing decisions", result.sensing_decisions, sensed),
             ("unexplained observations", result.unexplained_observations, reference.unexplained),
+            ("times lost", result.lost if self._reinitialises else reference.lost, reference.lost),
             ("reward", result.reward if rewards_are_known else reward, reward),
         ):
             if said != true:

@@ -16,7 +16,7 @@ from holdfast.arrays import FloatArray
 from holdfast.config.settings import PlanningSettings
 from holdfast.lab.simulation.memo_cache import Memo
 from holdfast.outcome import DecisionLog, MoveResult
-from holdfast.planning import Planner, PlanningState
+from holdfast.planning import ObservationInfo, Planner, PlanningState
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import SimulatedEnvironment
 
@@ -64,12 +64,15 @@ class Circumstances(NamedTuple):
         In the order in which they come. Those that nobody awaits change nothing.
     unseen : tuple of int
         Steps of which nobody knows what the move has shown.
+    reinitialises : bool
+        Whether the belief is begun anew after each observation outside the validation gate.
     """
 
     repeats: Repeats = ()
     late: tuple[int, ...] = ()
     deliveries: tuple[Delivery, ...] = ()
     unseen: tuple[int, ...] = ()
+    reinitialises: bool = False
 
 
 UNDISTURBED = Circumstances()
@@ -108,15 +111,23 @@ class ReferenceRun(NamedTuple):
     done_at_start: bool
     digest: str
     unexplained: int = 0
+    lost: int = 0
 
 
-class _Done(NamedTuple):
-    """What is known of a step: what was sensed, and the task action, if it was performed."""
+class _Sensed(NamedTuple):
+    step: int
+    sensing_action: int
+    observation: FloatArray | None
 
-    sensed: tuple[int, FloatArray | None] | None
-    action: FloatArray | None = None
-    motion: FloatArray | None = None
-    shown: FloatArray | None = None
+
+class _Moved(NamedTuple):
+    action: FloatArray
+    motion: FloatArray | None
+    shown: FloatArray | None
+
+
+_Entry: TypeAlias = _Sensed | _Moved | None
+"""Of the list of what was sensed and done; None: the belief was begun anew."""
 
 
 class ReferenceRuns:
@@ -155,9 +166,10 @@ class _Run:
         self._world = SimulatedEnvironment(planner.problem, seed, trial)
         self._log = DecisionLog(planner.problem.action_size)
         self._state = planner.init(seed, trial)
-        self._done: list[_Done] = []
-        self._awaited: dict[int, tuple[int, FloatArray]] = {}
-        self._unexplained = 0
+        self._reinitialises = circumstances.reinitialises
+        self._entries: list[_Entry] = []
+        self._awaited: dict[int, _Sensed] = {}
+        self._unexplained = self._lost = 0
 
     def go(self, max_steps: int) -> ReferenceRun:
         planner, world, log = self._planner, self._world, self._log
@@ -166,7 +178,6 @@ class _Run:
         while not done and len(steps) < max_steps:
             step = len(steps)
             sensing_action = observation = None
-            self._done.append(_Done(None))
             if planner.needs_sensing(self._state):
                 sensing_action, observation = self._sense(step)
             self._deliver(BEFORE_CHOOSING)
@@ -180,16 +191,16 @@ class _Run:
                 ReferenceStep(sensing_action, observation, written, reward, done, motion, observed)
             )
             seen = (None, None) if step in self._unseen else (motion, observed)
-            self._done[step] = _Done(self._done[step].sensed, action, *seen)
-            self._state, explained = self._moved(self._state, self._done[step])
-            self._unexplained += not explained
+            self._entries.append(_Moved(action, *seen))
+            self._state, info = self._after(self._state, self._entries[-1])
             log.acted(step, action)
             if any(each is not None for each in seen):
                 log.moved(step, planner.digest(self._state))
+            self._judge(info)
             self._deliver(BEFORE_SENSING)
         log.ended(len(steps), planner.digest(self._state))
         digest = log.decisions().digest()
-        return ReferenceRun(tuple(steps), done_at_start, digest, self._unexplained)
+        return ReferenceRun(tuple(steps), done_at_start, digest, self._unexplained, self._lost)
 
     def _sense(self, step: int) -> tuple[int | None, FloatArray | None]:
         planner = self._planner
@@ -203,13 +214,13 @@ class _Run:
             shown.setflags(write=False)
             sensed = chosen, shown
             if step in self._late:
-                self._awaited[step] = chosen, shown
+                self._awaited[step] = _Sensed(step, chosen, shown)
             else:
                 known = shown
-        self._done[step] = _Done((chosen, known))
-        self._state, info = planner.observe(self._state, chosen, known)
-        self._unexplained += not info.explained
+        self._entries.append(_Sensed(step, chosen, known))
+        self._state, info = self._after(self._state, self._entries[-1])
         self._log.sensed(step, chosen, planner.digest(self._state))
+        self._judge(info)
         return sensed
 
     def _again(self, times: int) -> SimulatedEnvironment:
@@ -226,28 +237,47 @@ class _Run:
             if taken not in self._awaited:
                 continue
             came = self._awaited.pop(taken)
-            _, info = self._planner.observe(self._folded(self._done[:taken]), *came)
-            self._unexplained += not info.explained
-            self._done[taken] = self._done[taken]._replace(sensed=came)
-            self._state = self._folded(self._done)
+            at = next(
+                at
+                for at, entry in enumerate(self._entries)
+                if isinstance(entry, _Sensed) and entry.step == taken
+            )
+            _, info = self._after(self._folded(self._entries[:at]), came)
+            self._entries[at] = came
+            self._state = self._folded(self._entries)
             self._log.observed_late(taken, step, self._planner.digest(self._state))
+            self._judge(info)
 
-    def _folded(self, done: list[_Done]) -> PlanningState:
+    def _judge(self, info: ObservationInfo | None) -> None:
+        """Count what an observation has shown, and begin the belief anew if that is to be done."""
+        if info is None:
+            return
+        self._unexplained += not info.explained
+        if self._reinitialises and not info.within_gate:
+            self._lost += 1
+            self._entries.append(None)
+            self._state, _ = self._after(self._state, None)
+            self._log.reinitialised(self._state.step, self._planner.digest(self._state))
+
+    def _folded(self, entries: list[_Entry]) -> PlanningState:
         state = self._planner.init(self._seed, self._trial)
-        for each in done:
-            if each.sensed is not None:
-                state, _ = self._planner.observe(state, *each.sensed)
-            state, _ = self._moved(state, each)
+        for entry in entries:
+            state, _ = self._after(state, entry)
         return state
 
-    def _moved(self, state: PlanningState, done: _Done) -> tuple[PlanningState, bool]:
-        if done.action is None:
-            return state, True
-        state = self._planner.advance(state, done.action, done.motion)
-        if done.shown is None:
-            return state, True
-        state, info = self._planner.observe_move(state, done.action, done.shown)
-        return state, info.explained
+    def _after(
+        self, state: PlanningState, entry: _Entry
+    ) -> tuple[PlanningState, ObservationInfo | None]:
+        planner = self._planner
+        if entry is None:
+            return planner.reinitialise(state), None
+        if isinstance(entry, _Sensed):
+            after, info = planner.observe(state, entry.sensing_action, entry.observation)
+            return after, None if entry.observation is None else info
+        state = planner.advance(state, entry.action, entry.motion)
+        if entry.shown is None:
+            return state, None
+        return planner.observe_move(state, entry.action, entry.shown)
 
     @staticmethod
     def _shown(

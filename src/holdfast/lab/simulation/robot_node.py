@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import (
+    LostSettings,
     OffloadSettings,
     RecoverySettings,
     SimulatorSettings,
@@ -117,6 +118,11 @@ class RobotNode:
             lease_ms=max(50.0, 1e3 * run.lease_s),
             decision_deadline_ms=run.deadline_ms,
         )
+        self._lost = LostSettings(on_lost=run.on_lost)
+        if run.on_lost == "reinitialise":
+            # The test itself is not what is looked at here: at this rate each observation outside
+            # the gate raises its alarm.
+            self._lost = LostSettings(false_alarm_rate=1.0, on_lost="reinitialise")
         self._recovery = RecoverySettings(launch=run.launch, journal_survives=run.journal_survives)
         self._environment: EnvironmentModel | None = None
         self._lateness = world.lateness()
@@ -182,7 +188,9 @@ class RobotNode:
             self._planner.problem,
             _SECRET,
         )
-        self.machine = Robot(self._planner, self._simulator, dispatcher, self._run.rate_hz)
+        self.machine = Robot(
+            self._planner, self._simulator, dispatcher, self._run.rate_hz, self._lost
+        )
         self._world.network.review_all()
         self._carry_out(self.machine.start(self._now()))
         if self.up:  # else it was killed meanwhile
@@ -420,7 +428,8 @@ class RobotNode:
                 self.finished = True
                 return
             trial, records, is_complete = following, [], True
-        history = replay(self._planner, self._simulator.seed, trial, records)
+        rate = self._lost.false_alarm_rate
+        history = replay(self._planner, self._simulator.seed, trial, records, rate)
         begin = (self.incarnation, self._begin, trial, history, records, is_complete)
         self._queue.after(_BEGINS_AFTER_S, self._happens, *begin)
 
@@ -439,6 +448,7 @@ class RobotNode:
                 lateness=self._lateness,
                 remembers=self._run.remembers,
                 senses_on=self._run.senses_on,
+                reinitialises=self._run.on_lost == "reinitialise",
             )
         environment = self._environment
         resumed = environment.resumed(records, may_lack=not is_complete)

@@ -92,6 +92,7 @@ class RunSettings(_Item, frozen=True, kw_only=True, tag="run", tag_field="item")
     senses_on: bool = False
     moves_show: bool = False
     sensing_is_optional: bool = False
+    on_lost: Literal["continue", "reinitialise"] = "continue"
     journal_survives: Literal["process_crash", "power_cut"] = "process_crash"
     lease_s: Annotated[float, msgspec.Meta(gt=0.0, le=3600.0)] = 0.4
     bytes_per_s: Annotated[float, msgspec.Meta(ge=1000.0, le=1e12)] | None = None

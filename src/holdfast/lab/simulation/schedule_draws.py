@@ -68,6 +68,7 @@ def draw_schedule(seed: int) -> SimulationSchedule:
         sensing_is_optional=apart.random() < 0.2,
         remembers=apart.random() < 0.5,
         senses_on=apart.random() < 0.5,
+        on_lost="reinitialise" if apart.random() < 0.3 else "continue",
     )
     late: tuple[Late, ...] = ()
     if not (run.moves_show or run.sensing_is_optional) or apart.random() < 0.7:
