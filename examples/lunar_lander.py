@@ -88,6 +88,10 @@ class LunarLander(hf.ProblemBase):
         touches = observation.max() > 0.5
         return np.where(expected == touches, LOG_RIGHT, LOG_WRONG)
 
+    def sample_move_observation(self, state, action, stream):
+        touches = (state[1] < GROUND) != (stream.uniform() < 0.02)
+        return np.full(2, float(touches))
+
     def policy(self, states, stage):
         x, y, vx, vy, tilt, turning = np.moveaxis(states, -1, 0)
         lean = np.clip(0.5 * x + vx, -0.4, 0.4)
@@ -111,7 +115,7 @@ LOG_WRONG, LOG_RIGHT = numerics.log(np.array([0.02, 0.98]))
 """What a leg says of the height is right so often: the ground beside the pad is not flat."""
 
 
-def landed(environment, observation, info):
+def landed(environment, observation, _info):
     """Tell success from a crash; gymnasium says ``terminated`` of both."""
     lander = environment.unwrapped
     if not lander.lander.awake:

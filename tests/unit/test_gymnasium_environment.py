@@ -34,7 +34,7 @@ class Counter(gymnasium.Env[Any, Any]):
         self.observation_space = spaces.Dict(
             {"a": spaces.Box(-9.0, 9.0, (2,), np.float64), "b": spaces.Discrete(2)}
         )
-        self.seen = {"a": np.zeros(2), "b": 0}
+        self.seen: dict[str, Any] = {"a": np.zeros(2), "b": 0}
         self.ending, self.at, self.keys = ending, at, keys
         self.actions: list[Any] = []
         self.closed = False
@@ -42,13 +42,13 @@ class Counter(gymnasium.Env[Any, Any]):
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
         self.seed = seed
-        self.seen["a"][:] = 0.0  # type: ignore[index]
+        self.seen["a"][:] = 0.0
         return self.seen, {}
 
     def step(self, action: Any) -> Any:
         self.actions.append(action)
         self.seen["a"] += 1.0
-        over = self.seen["a"][0] >= self.at  # type: ignore[index]
+        over = self.seen["a"][0] >= self.at
         terminated, truncated = (over and word in self.ending for word in ("term", "trunc"))
         return self.seen, 0.5, terminated, truncated, self.keys if over else {}
 
@@ -130,7 +130,13 @@ class TestHowItEnds:
     @pytest.mark.parametrize(
         ("ending", "success", "keys", "outcome", "reason"),
         [
-            ("term", None, {}, "failed", "Counter terminated without success; no success is told"),
+            (
+                "term",
+                None,
+                {},
+                "failed",
+                "Counter terminated without success; success is not defined",
+            ),
             ("term", None, {"is_success": True}, "failed", "Counter terminated without success"),
             ("term", "terminated", {}, "succeeded", ""),
             ("term", "is_success", {"is_success": True}, "succeeded", ""),
@@ -215,12 +221,12 @@ class TestActions:
 
     def test_a_function_says_what_is_done(self) -> None:
         world = Counter(spaces.Discrete(3))
-        environment = counter(world, action=lambda env, given: int(np.argmax(given)))
+        environment = counter(world, action=lambda _, given: int(np.argmax(given)))
         environment.perform(np.array([0.0, 5.0, 1.0]))
         assert world.actions == [1]
 
     def test_what_a_function_returns_must_be_an_action(self) -> None:
-        environment = counter(Counter(spaces.Discrete(3)), action=lambda env, given: 4)
+        environment = counter(Counter(spaces.Discrete(3)), action=lambda *_: 4)
         with pytest.raises(EnvironmentFailedError, match=r"returned 4, which is not in Discrete"):
             environment.perform(RIGHT)
 
@@ -274,8 +280,8 @@ class TestWhatIsShown:
 
     def test_functions_for_what_comes_with_a_move(self) -> None:
         environment = counter(
-            motion=lambda env, before, after: after["a"] - before["a"] + 10.0,
-            observation=lambda env, observation, action: [observation["a"][0], *action],
+            motion=lambda _, before, after: after["a"] - before["a"] + 10.0,
+            observation=lambda _, observation, action: [observation["a"][0], *action],
         )
         move = environment.perform(RIGHT)
         assert np.array_equal(np.asarray(move.motion), [11.0, 11.0])
@@ -324,12 +330,12 @@ class TestWhatIsRefused:
 
     def test_observations_without_a_fixed_size_need_a_function(self) -> None:
         world = Counter()
-        world.observation_space = spaces.Sequence(spaces.Discrete(2))  # type: ignore[assignment]
+        world.observation_space = spaces.Sequence(spaces.Discrete(2))
         with pytest.raises(ConfigurationError, match=r"sensing\[0\]: .* no fixed number"):
             counter(world)
 
     def test_a_sensing_action_that_does_not_exist(self) -> None:
-        with pytest.raises(InvalidValueError, match="sensing action 2: .* has 0 to 1"):
+        with pytest.raises(InvalidValueError, match=r"sensing action 2: .* has 0 to 1"):
             car().perform_sensing(2)
 
     def test_noise_of_another_size(self) -> None:

@@ -142,9 +142,12 @@ class GymnasiumEnvironment:
         self._observation = self._reader(observation, "observation")
         self._motion_noise = _deviations(motion_noise, "motion_noise")
         self._observation_noise = _deviations(observation_noise, "observation_noise")
-        named = success in (None, _TERMINATED) or (isinstance(success, str) and ":" not in success)
-        self._success_key = success if named else None
-        self._success = None if named else _function(success, "success")
+        self._success_key: str | None = None
+        self._success: Callable[..., Any] | None = None
+        if isinstance(success, str) and ":" not in success:
+            self._success_key = success
+        elif success is not None:
+            self._success = _function(success, "success")
 
         self._steps = 0
         self._ending: Ending | None = None
@@ -228,9 +231,9 @@ class GymnasiumEnvironment:
         if bool(found):
             return Ending("succeeded")
         if terminated:
-            unsaid = "; no success is told it by" if self._success_key is None else ""
-            unsaid = unsaid if self._success is None else ""
-            return Ending("failed", f"{self._name} terminated without success{unsaid}")
+            unsaid = self._success_key is None and self._success is None
+            hint = "; success is not defined" if unsaid else ""
+            return Ending("failed", f"{self._name} terminated without success{hint}")
         if truncated:
             return Ending("truncated", f"{self._name} truncated after {self._steps} steps")
         return None
