@@ -163,15 +163,14 @@ class GymnasiumEnvironment:
         """Return what the sensing action shows of the present observation, with its noise."""
         if callable(self._sensing):
             shown = self._sensing(self.environment, self._seen, sensing_action)
-            noise = self._sensing_noise[min(sensing_action, len(self._sensing_noise) - 1)]
         elif 0 <= sensing_action < len(self._sensing):
             shown = self._vector(self._seen)[self._sensing[sensing_action]]
-            noise = self._sensing_noise[sensing_action]
         else:
             raise InvalidValueError(
                 f"sensing action {sensing_action}: sensing of {self._name} has 0 to "
                 f"{len(self._sensing) - 1}"
             )
+        noise = self._sensing_noise[sensing_action if len(self._sensing_noise) > 1 else 0]
         return self._noisy(shown, noise, "sensing", Purpose.WORLD_OBSERVATION, self._steps)
 
     def perform(self, task_action: FloatArray) -> MoveResult:
@@ -292,7 +291,7 @@ class GymnasiumEnvironment:
                     f"{len(problem.sensing_actions)} sensing actions"
                 )
         if not isinstance(noise, Sequence):
-            return readers, [_deviations(noise, "sensing_noise")] * (count or 1)
+            return readers, [_deviations(noise, "sensing_noise")]
         if count is not None and len(noise) != count:
             raise ConfigurationError(
                 f"environment.arguments.sensing_noise has {len(noise)} entries; there are "

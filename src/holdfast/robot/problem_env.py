@@ -13,9 +13,10 @@ compared with holdfast's own methods on the same worlds.
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, SupportsInt
+from typing import Any, Literal, SupportsIndex
 
 import gymnasium
 import msgspec
@@ -205,12 +206,12 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
         self._sensing_steps = 0
         return self._observation(), self._info()
 
-    def step(self, action: SupportsInt) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: SupportsIndex) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Sense what the agent has chosen, then move until the robot senses again."""
         track, world = self._running()
         if self._over:
             raise gymnasium.error.ResetNeeded("the episode has ended: reset() begins the next one")
-        choice = int(action)
+        choice = operator.index(action)
         if not 0 <= choice < self.planner.num_choices:
             raise InvalidValueError(
                 f"action {choice}: {self.problem.name} has 0 to {self.planner.num_choices - 1} "
