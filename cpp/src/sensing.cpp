@@ -89,6 +89,12 @@ class Hypotheses {
             weights);
     }
 
+    /// Weights of the belief as it is.
+    std::size_t belief(double* weights) const {
+        return vector_kernels().normalize(log_weights_.data(), input_.count, input_.drop_negligible,
+                                          weights);
+    }
+
   private:
     const HypothesisInput& input_;
     std::vector<double> log_weights_;
@@ -99,12 +105,16 @@ class Hypotheses {
 }  // namespace
 
 void hypothetical_entropies(const HypothesisInput& input, const PointSets& sets,
-                            const EntropySettings& settings, double* out, EntropyCounts& counts) {
+                            const EntropySettings& settings, bool unchanged, double* out,
+                            EntropyCounts& counts) {
     const Hypotheses hypotheses(input);
+    const std::size_t posteriors = input.sensing_actions * input.samples;
     entropies(
-        sets, input.sensing_actions * input.samples,
-        [&](std::size_t index, double* weights) { return hypotheses(index, weights); }, settings,
-        out, counts);
+        sets, posteriors + (unchanged ? 1 : 0),
+        [&](std::size_t index, double* weights) {
+            return index < posteriors ? hypotheses(index, weights) : hypotheses.belief(weights);
+        },
+        settings, out, counts);
 }
 
 void hypothetical_weights(const HypothesisInput& input, double* out) {

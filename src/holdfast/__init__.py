@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from holdfast.config.loader import load as load_configuration
     from holdfast.config.settings import (
         ActiveSensingSettings,
+        LostSettings,
         ParticleFilterSettings,
         PlanningSettings,
         SelectorSettings,
@@ -39,6 +40,7 @@ __all__ = [
     "GaussianMixture",
     "GymnasiumEnvironment",
     "HoldfastError",
+    "LostSettings",
     "MoveResult",
     "NearestNeighbor",
     "ParticleFilterSettings",
@@ -64,6 +66,7 @@ __version__ = "0.1.0"
 
 _PLACES = {
     "ActiveSensingSettings": "config.settings.ActiveSensingSettings",
+    "LostSettings": "config.settings.LostSettings",
     "ParticleFilterSettings": "config.settings.ParticleFilterSettings",
     "Belief": "belief.Belief",
     "Ending": "outcome.Ending",

@@ -262,7 +262,10 @@ class Planner:
         if observation is None:
             size = effective_sample_size(state.belief)
             return state._replace(sensed=True), ObservationInfo(size, True, False)
-        updated = update(problem, state.belief, sensing_action, observation)
+        ranks = None
+        if getattr(problem, "rank_test", False):
+            ranks = stream(state.seed, state.trial, state.step, Purpose.RANK_TEST)
+        updated = update(problem, state.belief, sensing_action, observation, ranks)
         after, info = self._resampled(state, *updated, Purpose.RESAMPLING)
         return after._replace(sensed=True), info
 
@@ -295,9 +298,7 @@ class Planner:
         resampled = threshold == count or found.effective_sample_size <= threshold
         if resampled:
             belief = resample(belief, stream(state.seed, state.trial, state.step, purpose))
-        return state._replace(belief=belief), ObservationInfo(
-            found.effective_sample_size, found.explained, resampled, found.mahalanobis_distance
-        )
+        return state._replace(belief=belief), found._replace(resampled=resampled)
 
     def reinitialise(self, state: PlanningState) -> PlanningState:
         """Return the state with a new belief, for a robot that is lost.

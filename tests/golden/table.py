@@ -99,7 +99,7 @@ def _examples() -> Iterator[Run]:
         short: dict[str, Any] = {"simulator.max_steps": 300}
         if load(path).environment.object is not None:  # what is pinned is simulated
             short["environment.object"] = None
-        if path.stem == "priced_looks":
+        if path.stem in ("priced_looks", "optional_looks"):
             yield Run(file, file, 3, short)
             continue
         yield Run(file, file, 3, {**short, **_FIRST_DEFAULTS, **_as_before(path.stem)})

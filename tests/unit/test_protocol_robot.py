@@ -425,18 +425,15 @@ class TestUnexplainedObservations:
             assert fields["trial"] == 0
             assert isinstance(fields["deviations"], float)
             assert fields["deviations"] > 8.0
-        assert not world.reports("filter_diverged")
 
     def test_none_is_told_where_all_are_explained(self) -> None:
         world = self.world(set(), 6)
         assert world.results[0].unexplained_observations == 0
         assert not world.reports("unexplained")
 
-    def test_a_run_of_them_is_told_once_and_the_lines_are_bounded(self) -> None:
+    def test_the_lines_are_bounded(self) -> None:
         world = self.world(set(range(1, 40)), 40)
         assert len(world.reports("unexplained")) == 10
-        (diverged,) = world.reports("filter_diverged")
-        assert diverged["step"] == 4 * 5
         assert world.results[0].unexplained_observations == 39
         assert "counted only" in str(world.reports("unexplained")[-1]["reason"])
 
@@ -451,10 +448,9 @@ class TestUnexplainedObservations:
         first.start()
         first.run()
         assert len(first.reports("unexplained")) == 3
-        assert not first.reports("filter_diverged")
+        assert not first.reports("lost")
         second = self.world(set(range(20)), 8, tuple(first.journal[:-1]))
-        (diverged,) = second.reports("filter_diverged")
-        assert diverged["step"] == 4 * 4
+        assert [lost["step"] for lost in second.reports("lost")] == [4 * 4]
         assert len(second.reports("unexplained")) == 5
         assert second.results[0].unexplained_observations == 8
 

@@ -22,6 +22,7 @@ from holdfast.protocol.records import (
     ReinitialisedRecord,
     decode_record,
     encode_record,
+    reinitialised_after,
     replay,
 )
 
@@ -74,3 +75,18 @@ def first_record(**changes: object) -> ObservedRecord:
 def test_a_record_that_does_not_follow_is_named(record: Record, why: str) -> None:
     with pytest.raises(RecordError, match=rf"trial 4: record 1 of its journal .*{why}"):
         replay(Planner(PROBLEM, PLANNING), 11, 4, [LocalTookOverRecord(1), record])
+
+
+def test_when_a_belief_was_begun_anew_is_in_the_records() -> None:
+    """As in the log of decisions, where moves that have shown nothing are no inputs."""
+    records: list[Record] = [
+        first_record(),
+        ActingRecord(0, encode_floats(np.zeros(3))),
+        PerformedRecord(0, None),
+        PerformedRecord(1, None, encode_floats(np.zeros(3))),
+        ReinitialisedRecord(2, bytes(32)),
+        LocalTookOverRecord(1),
+        LateRecord(2, 0, encode_floats(np.zeros(1)), bytes(32)),
+        ReinitialisedRecord(2, bytes(32)),
+    ]
+    assert reinitialised_after(records) == {2, 4}

@@ -20,6 +20,7 @@ from holdfast.errors import InvalidValueError
 __all__ = [
     "ActiveSensingSettings",
     "EnvironmentSettings",
+    "LostSettings",
     "OffloadSettings",
     "ParticleFilterSettings",
     "PlanningSettings",
@@ -85,6 +86,10 @@ Estimator = Literal[
 
 NEIGHBOR_ESTIMATORS: frozenset[Estimator] = frozenset({"nearest_neighbor", "prior_neighbors"})
 """Those that count nearest neighbours."""
+
+
+OnLost = Literal["continue", "hold", "reinitialise"]
+"""What a robot that is lost does."""
 
 
 class ParticleFilterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -293,6 +298,25 @@ class RecoverySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     launch_timeout_ms: Milliseconds = 5000.0
     relaunch_delay_ms: Milliseconds = 100.0
     journal_survives: Literal["process_crash", "power_cut"] = "process_crash"
+
+
+class LostSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``lost``: when the robot counts as lost, and what it does then.
+
+    The robot's own: services see only a recorded reinitialisation.
+
+    Attributes
+    ----------
+    false_alarm_rate : float
+        For each observation: within n of them a false alarm, of a lost robot or a dead sensor, has
+        a probability of at most n times this (:mod:`holdfast.lost` says for which beliefs).
+    on_lost : {"continue", "hold", "reinitialise"}
+        Report it only; hold still and end the run, which can be resumed; or begin the belief anew,
+        from the problem's ``reinitial_states`` or else its initial belief.
+    """
+
+    false_alarm_rate: Annotated[float, msgspec.Meta(ge=1e-12, le=0.1)] = 1e-4
+    on_lost: OnLost = "continue"
 
 
 class EnvironmentSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

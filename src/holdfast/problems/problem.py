@@ -164,7 +164,9 @@ class Problem(Protocol):
 
     It may have ``sensing_costs``, the price of each sensing action in units of reward, numbers
     from 0 to 1e150. A trial's reward is less by it at each sensing, and ``expected_return`` weighs
-    it against what sensing gains. Without this attribute sensing costs nothing.
+    it against what sensing gains; methods that minimise an entropy do with a rate,
+    ``selector.nats_per_cost``. Without this attribute sensing costs nothing. Not to sense is no
+    sensing action: ``selector.sensing_is_optional`` makes it a choice, of price 0.
     """
 
     name: str
@@ -234,6 +236,12 @@ class GeneralObservationProblem(Protocol):
     With them ``observation_mean`` and ``observation_variance`` are not used and need not be there.
     Sensing costs more: the likelihood is evaluated in Python, once for each hypothetical
     observation.
+
+    A robot is found lost (:mod:`holdfast.lost`) by observations that no particle can have made. A
+    likelihood that is zero nowhere has none of these. An attribute ``rank_test = True`` asks for
+    the test by :func:`holdfast.validation_gate.is_typical` instead: each observation is compared
+    with up to 19 drawn ones, which takes as many evaluations of the likelihood, 3.5 on average. It
+    is right if what is left out of the likelihood does not depend on the observation.
     """
 
     def log_likelihood(
