@@ -72,10 +72,8 @@ class Robot:
 
     Attributes
     ----------
-    num_performed : int
-        Task actions performed.
-    missed_ticks : int
-        Ticks of ``rate_hz`` at which the robot was not ready.
+    num_performed, missed_ticks : int
+        Task actions performed, and ticks of ``rate_hz`` at which the robot was not ready.
     has_decided : bool
         Whether this process has used an answer.
     """
