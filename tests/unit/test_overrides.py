@@ -39,6 +39,7 @@ CHOSEN = {
     "environment.arguments": {"port": 7},
     "selector.resolution": 0.25,
     "selector.estimator": "gaussian_mixture_upper",
+    "selector.nats_per_cost": 0.25,
     "selector.path_offsets": [1, 3],
     "model.init_mean": [1, 2, 3],
     "model.init_cov": [1, 2, 3],

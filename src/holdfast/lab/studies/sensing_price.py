@@ -89,7 +89,7 @@ PROBLEMS: Mapping[str, _Posed] = {
     "boat": _Posed(f"{_MODULE}:Boat", 200),
     # A trial of expected_return takes seconds here.
     "peg in hole": _Posed(
-        f"{_MODULE}:PricedPeg", 500, 0.4, PRICES[:1], (FIXED, "nats", "nats, executed", "return")
+        f"{_MODULE}:PricedPeg", 500, 0.5, PRICES[:1], (FIXED, "nats", "nats, executed", "return")
     ),
 }
 
@@ -118,19 +118,19 @@ class SensingPrice(JudgedStudy):
     name = "sensing_price"
     title = "When to sense at a price, and what to sense where one sensor is weak"
     columns = ("problem", "way", "number", "price")
-    num_trials: ClassVar = {CHOICE: 20, CLAIM: 60}
+    num_trials: ClassVar = {CHOICE: 20, CLAIM: 40}
 
     def cells(self, scale: Scale) -> Iterator[_Cell]:
         """Return all cells, in the order of the tables."""
+        for way, selector in _OF_BOAT.items():
+            numbers = RESOLUTIONS if _depends_on_resolution(selector) else RESOLUTIONS[:1]
+            for resolution in numbers:
+                yield _Cell(_WEAK, way, resolution, 0.0)
         for problem, posed in list(PROBLEMS.items())[: 1 if scale.quick else None]:
             for way in posed.ways:
                 for number in WAYS[way]:
                     for price in posed.prices if way == "return" else (0.0,):
                         yield _Cell(problem, way, number, price)
-        for way, selector in _OF_BOAT.items():
-            numbers = RESOLUTIONS if _depends_on_resolution(selector) else RESOLUTIONS[:1]
-            for resolution in numbers:
-                yield _Cell(_WEAK, way, resolution, 0.0)
 
     def names(self, cell: _Cell) -> tuple[Cell, ...]:
         """Return a cell's values of the columns."""
@@ -141,7 +141,7 @@ class SensingPrice(JudgedStudy):
         if cell.problem == _WEAK:
             selector, interval = _OF_BOAT[cell.way], 8
             # Cheap, and shares of trials need many.
-            posed = PROBLEMS["boat"]._replace(max_steps=80, share=3.0)
+            posed = PROBLEMS["boat"]._replace(max_steps=80, share=5.0)
             model = {"resolution": cell.number}
             particles = 300
         else:
