@@ -90,11 +90,11 @@ def test_what_came_late_may_stand_between_an_action_and_its_performance() -> Non
     assert found is not None
     performed = PerformedRecord(0, -1.0)
     history.performed(performed)
-    records = [sensed, ActingRecord(0, encode_floats(action)), found[1], performed]
+    records: list[Record] = [sensed, ActingRecord(0, encode_floats(action)), found[1], performed]
     again = replay(planner, 11, 4, records)
     assert planner.digest(again.state) == planner.digest(history.state)
     assert again.awaited == ()
-    for record in (sensed, records[1]):
+    for record in records[:2]:
         with pytest.raises(RecordError, match="before the action of that step is known"):
             replay(planner, 11, 4, [*records[:2], record])
 
