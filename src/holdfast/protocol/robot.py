@@ -57,7 +57,6 @@ from holdfast.tracking import LateObservation
 
 __all__ = ["Robot"]
 
-
 _FROM_ENVIRONMENT = (Sensed, Acted, EnvironmentFailed)
 """Events that complete an order to the environment."""
 
@@ -198,9 +197,10 @@ class Robot:
         except HoldfastError as error:
             self._stop(error)
             return self._take()
-        if again is not None:
+        if again is not None and not self._stopped:
             # It is in the journal already, and the environment says that it was not performed.
             self._awaits_environment = True
+            self._write()
             self._effects.append(Act(history.state.step, again))
         else:
             self._go_on(now)
