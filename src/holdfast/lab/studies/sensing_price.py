@@ -133,8 +133,8 @@ class SensingPrice(JudgedStudy):
                         yield _Cell(problem, way, number, price)
 
     def names(self, cell: _Cell) -> tuple[Cell, ...]:
-        """Return a cell's values of the columns."""
-        return cell
+        """Return a cell's values of the columns, as a file of trials has them."""
+        return (cell.problem, cell.way, float(np.float32(cell.number)), cell.price)
 
     def series(self, cell: _Cell, purpose: str, scale: Scale, num_trials: int) -> TrialSeries:
         """Return the trials of a cell for a purpose."""
