@@ -133,8 +133,8 @@ class SensingPrice(JudgedStudy):
                         yield _Cell(problem, way, number, price)
 
     def names(self, cell: _Cell) -> tuple[Cell, ...]:
-        """Return a cell's values of the columns."""
-        return cell
+        """Return a cell's values of the columns, as a file of trials has them."""
+        return (cell.problem, cell.way, float(np.float32(cell.number)), cell.price)
 
     def series(self, cell: _Cell, purpose: str, scale: Scale, num_trials: int) -> TrialSeries:
         """Return the trials of a cell for a purpose."""
@@ -170,8 +170,14 @@ class SensingPrice(JudgedStudy):
         """Return the report on all trials; InvalidValueError if they are not of this study."""
         choosing, cells = self.by_cell(tables[TRIALS]).values()
         when, weak = _when(choosing, cells), _weak_sensor(cells)
+        alone = _when_alone(when, cells)
         return Report(
-            summary={"when_to_sense": when, "weak_sensor": weak, "cells": _all_cells(cells)},
+            summary={
+                "when_to_sense": when,
+                "when_alone": alone,
+                "weak_sensor": weak,
+                "cells": _all_cells(cells),
+            },
             figures={
                 "when_to_sense": drawn("sensing_price_figures:when_to_sense", when),
                 "weak_sensor": drawn("sensing_price_figures:weak_sensor", weak),
@@ -251,6 +257,25 @@ def _when(choosing: _Cells, cells: _Cells) -> pd.DataFrame:
                 )
     found = pd.DataFrame(rows)
     statistics.add_adjusted(found, "p_value", compared=found["way"] != FIXED)
+    return found
+
+
+def _when_alone(when: pd.DataFrame, cells: _Cells) -> pd.DataFrame:
+    """Return what the return saves by choosing when, against itself at fixed intervals."""
+    chosen = when.set_index(["problem", "price", "way"])["number"]
+    rows: list[dict[str, Cell]] = []
+    for problem, price, way in chosen.index:
+        if way == "return, intervals":
+            intervals, free = (
+                _cost(_of(cells, problem, each, price)[chosen[problem, price, each]], price)
+                for each in (way, "return")
+            )
+            saved, p_value = statistics.paired_difference(intervals, free)
+            rows.append(
+                {"problem": problem, "price": price, **cells_of("saved", saved), "p_value": p_value}
+            )
+    found = pd.DataFrame(rows)
+    statistics.add_adjusted(found, "p_value")
     return found
 
 
