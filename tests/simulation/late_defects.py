@@ -141,11 +141,6 @@ _defect(
     "A late observation that was taken before the belief was begun anew brings the old one back.",
     Edit(Trial, "_folded", "return self.planner.reinitialise(state)", "return state"),
 )
-_defect(
-    "lost_forgotten_in_a_crash",
-    "A robot that was killed when it was found lost goes on with its old belief.",
-    Edit(Robot, "begin_trial", "if is_lost and history.pending is None", "if False"),
-)
 
 # -- questions and services ------------------------------------------------------------------------
 

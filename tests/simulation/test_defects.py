@@ -120,26 +120,42 @@ def test_a_reply_to_another_process_of_the_robot_is_not_taken() -> None:
     assert "the undisturbed run has" in violation
 
 
-def test_what_has_come_is_written_before_the_pending_action_is_ordered() -> None:
-    """No seed found this: it takes two ends of the robot's process, the second one between the two.
-
-    The body performs the action all the same; the observation, which led to other decisions, would
-    be lost.
-    """
-    schedule = parse_schedule(
+# Each takes an end of the robot's process at one moment of a few runs: no seed found it.
+RARE = [
+    (
+        "written_after_the_order",
+        "A resumed robot orders the pending action before it writes down what has come meanwhile: "
+        "the body performs it all the same, and the observation is lost.",
+        Edit(
+            Robot,
+            "begin_trial",
+            "self._write()\nself._effects.append(Act",
+            "self._effects.append(Act",
+        ),
         "run senses_on=true\n"
         "late step=0 moves=20\n"
         "kill_robot boundary=10 before=act\n"
-        "kill_robot boundary=11 before=journal down_s=0.05 body_goes_on=true\n"
-    )
+        "kill_robot boundary=11 before=journal down_s=0.05 body_goes_on=true\n",
+        "the journal lacks the late observation of step 0",
+    ),
+    (
+        "lost_forgotten_in_a_crash",
+        "A robot that was killed when it was found lost goes on with its old belief.",
+        Edit(Robot, "begin_trial", "if is_lost and history.pending is None", "if False"),
+        "run trial=2 on_lost=reinitialise\nkill_robot boundary=25 before=journal down_s=0.05",
+        "the undisturbed run has",
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "story", "edit", "text", "says"), RARE)
+def test_a_rare_defect_is_found(name: str, story: str, edit: Edit, text: str, says: str) -> None:
+    schedule = parse_schedule(text)
     assert Simulator().run(schedule).violation is None
-    order = Edit(
-        Robot, "begin_trial", "self._write()\nself._effects.append(Act", "self._effects.append(Act"
-    )
-    with applied(Defect("written_after_the_order", "", (order,))):
+    with applied(Defect(name, story, (edit,))):
         violation = Simulator().run(schedule).violation
     assert violation is not None
-    assert "the journal lacks the late observation of step 0" in violation
+    assert says in violation
 
 
 @pytest.mark.slow

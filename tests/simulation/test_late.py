@@ -17,6 +17,8 @@ from holdfast.lab.simulation.reference_runs import (
     BEFORE_CHOOSING,
     BEFORE_MOVING,
     BEFORE_SENSING,
+    KIDNAPPED_AT,
+    KIDNAPPED_TO,
     Circumstances,
     Delivery,
     ReferenceRun,
@@ -57,11 +59,15 @@ def decisions(run: ReferenceRun) -> list[tuple[int | None, bytes]]:
 
 
 class ShowsSometimes(SimulatedEnvironment):
-    """Leaves out of what a move shows the same as the reference runs."""
+    """Leaves out of what a move shows the same as the reference runs, and is carried away then."""
+
+    kidnapped = False
 
     def perform(self, task_action: FloatArray) -> float | MoveResult | None:
         step = self.step
         shown = super().perform(task_action)
+        if self.kidnapped and self.step == KIDNAPPED_AT:
+            self.state = self.state + KIDNAPPED_TO
         if not isinstance(shown, MoveResult):
             return shown
         return MoveResult(
@@ -75,7 +81,7 @@ class TestReferenceRuns:
     """They have code of their own, and come to what the in-process loop comes to."""
 
     @pytest.mark.parametrize("reinitialises", [False, True])
-    @pytest.mark.parametrize("moves", [0, 1, 3, 8, 9, 10, 25])
+    @pytest.mark.parametrize("moves", [0, 1, 3, 9, 10, 25])
     def test_the_digest_is_the_one_of_a_trial_in_process(
         self, setup: Setup, moves: int, reinitialises: bool
     ) -> None:
@@ -83,9 +89,9 @@ class TestReferenceRuns:
         lost = LostSettings()
         if reinitialises:
             lost = LostSettings(false_alarm_rate=1.0, on_lost="reinitialise")
-        times = 0
-        for trial in range(3):
+        for trial in range(1, 3):
             world = ShowsSometimes(planner.problem, seed, trial)
+            world.kidnapped = reinitialises
             result = run_trial(
                 planner,
                 seed,
@@ -104,8 +110,6 @@ class TestReferenceRuns:
             assert run.unexplained == result.unexplained_observations
             if reinitialises:
                 assert run.lost == result.lost
-            times += run.lost
-        assert (times > 0) == reinitialises
 
     def test_in_time_for_the_next_decision_is_as_if_at_once(self, setup: Setup) -> None:
         at_once = setup.references.get(2, MAX_STEPS)
@@ -131,6 +135,16 @@ class TestReferenceRuns:
         deliveries = (Delivery(12, BEFORE_SENSING, 9), Delivery(3, BEFORE_SENSING, 2))
         run = setup.references.get(2, MAX_STEPS, Circumstances(deliveries=deliveries))
         assert run.digest == setup.references.get(2, MAX_STEPS).digest
+
+    def test_some_are_lost(self) -> None:
+        """Those that were carried away, once they sense that."""
+        references = Setup(False, False).references
+        runs = [
+            references.get(trial, MAX_STEPS, Circumstances(reinitialises=True))
+            for trial in range(4)
+        ]
+        assert sum(run.lost > 0 for run in runs) >= 3
+        assert references.get(0, MAX_STEPS).lost == 0
 
     def test_a_move_that_nobody_saw(self) -> None:
         setup = Setup(True, False)
@@ -311,11 +325,10 @@ def test_the_robot_is_killed_between_any_two_effects(
         assert (outcome.violation, outcome.held) == (None, None), schedule.text()
 
 
-@pytest.mark.parametrize("pattern", range(0, 60, 20))
-def test_seeds_in_which_something_is_shown_late(pattern: int, simulator: Simulator) -> None:
-    """Of the seeds from 20,000 on: the others are in test_world."""
+@pytest.mark.parametrize("first", [20_000, 20_250])
+def test_seeds_in_which_something_is_shown_late(first: int, simulator: Simulator) -> None:
     found = 0
-    for seed in range(20_000 + 40 * pattern, 20_000 + 40 * pattern + 400):
+    for seed in range(first, first + 250):
         schedule = draw_schedule(seed)
         if not (schedule.run.moves_show or any(each.kind == "late" for each in schedule.faults)):
             continue

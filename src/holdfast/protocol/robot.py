@@ -57,7 +57,6 @@ from holdfast.tracking import LateObservation
 
 __all__ = ["Robot"]
 
-
 _FROM_ENVIRONMENT = (Sensed, Acted, EnvironmentFailed)
 """Events that complete an order to the environment."""
 

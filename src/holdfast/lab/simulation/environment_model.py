@@ -81,7 +81,8 @@ class EnvironmentModel:
     senses_on : bool
         Whether what it still senses when the robot's process dies is there when the next one asks.
     reinitialises : bool
-        Whether the robot begins its belief anew after each observation outside the validation gate.
+        Whether the robot is carried away, and begins its belief anew after each observation outside
+        the validation gate.
     """
 
     def __init__(

@@ -24,6 +24,8 @@ __all__ = [
     "BEFORE_CHOOSING",
     "BEFORE_MOVING",
     "BEFORE_SENSING",
+    "KIDNAPPED_AT",
+    "KIDNAPPED_TO",
     "UNDISTURBED",
     "Circumstances",
     "Delivery",
@@ -35,6 +37,10 @@ __all__ = [
 BEFORE_SENSING, BEFORE_CHOOSING, BEFORE_MOVING = range(3)
 """Moments of a step in which a late observation may come. The first is the usual one, with the move
 before. The others are those of a robot that was killed: when its next process begins."""
+
+KIDNAPPED_AT = 5
+KIDNAPPED_TO = np.array([6.0, 0.0, 0.0])
+"""After so many task actions a robot that is to be lost is carried away, by so much."""
 
 _MOST = 2_000
 
@@ -65,7 +71,8 @@ class Circumstances(NamedTuple):
     unseen : tuple of int
         Steps of which nobody knows what the move has shown.
     reinitialises : bool
-        Whether the belief is begun anew after each observation outside the validation gate.
+        Whether the robot is carried away, and its belief is begun anew after each observation
+        outside the validation gate.
     """
 
     repeats: Repeats = ()
@@ -184,6 +191,8 @@ class _Run:
             action, _ = planner.choose_task_action(self._state)
             self._deliver(BEFORE_MOVING)
             shown = world.perform(action)
+            if self._reinitialises and world.step == KIDNAPPED_AT:
+                world.state = world.state + KIDNAPPED_TO
             reward, motion, observed = self._shown(step, shown)
             done = world.is_done()
             written = np.asarray(action, dtype="<f8").tobytes()
