@@ -350,14 +350,14 @@ class TestWhatIsRefused:
 
 
 CONFIGURATION = """
-problem: cart:Cart
+problem: hill_car:Cart
 environment:
   object: gymnasium
   arguments:
     env_id: MountainCarContinuous-v0
     sensing: [[0], [1]]
     sensing_noise: [0.05, 0.01]
-    success: cart_success:at_the_top
+    success: hill_success:at_the_top
 """
 
 PROBLEM = """
@@ -398,13 +398,13 @@ def at_the_top(environment, observation, info):
 
 @pytest.fixture
 def modules(tmp_path: Path) -> Iterator[Path]:
-    (tmp_path / "cart.py").write_text(PROBLEM)
-    (tmp_path / "cart_success.py").write_text(SUCCESS)
-    path = tmp_path / "cart.yaml"
+    (tmp_path / "hill_car.py").write_text(PROBLEM)
+    (tmp_path / "hill_success.py").write_text(SUCCESS)
+    path = tmp_path / "hill_car.yaml"
     path.write_text(CONFIGURATION)
     yield path
     modules: dict[str, types.ModuleType] = sys.modules
-    for name in ("cart", "cart_success"):
+    for name in ("hill_car", "hill_success"):
         modules.pop(name, None)
 
 

@@ -67,7 +67,7 @@ def another_value(section: str, key: str, value: Any) -> Any:
     if isinstance(value, int):
         return value + 1
     assert isinstance(value, float), f"{section}.{key} needs an entry in CHOSEN"
-    return value / 2
+    return value / 2 or 0.5
 
 
 def plain(loaded: loader.Configuration) -> dict[str, Any]:

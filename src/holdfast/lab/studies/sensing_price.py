@@ -85,8 +85,8 @@ class _Posed(NamedTuple):
 _MODULE = "holdfast.lab.studies.priced_problems"
 
 PROBLEMS: Mapping[str, _Posed] = {
-    "dock": _Posed(f"{_MODULE}:Dock", 300),
-    "boat": _Posed(f"{_MODULE}:Boat", 200),
+    "dock": _Posed(f"{_MODULE}:Dock", 300, 1.5),
+    "boat": _Posed(f"{_MODULE}:Boat", 200, 1.5),
     # A trial of expected_return takes seconds here.
     "peg in hole": _Posed(
         f"{_MODULE}:PricedPeg", 500, 0.5, PRICES[:1], (FIXED, "nats", "nats, executed", "return")
@@ -147,7 +147,8 @@ class SensingPrice(JudgedStudy):
         else:
             selector, interval = _selector_of(cell)
             posed = PROBLEMS[cell.problem]
-            model = {"price": cell.price}
+            # In nats the price of a look is the least gain.
+            model = {"price": 1.0 if cell.way.startswith("nats") else cell.price}
             if cell.problem == "boat" and selector.actions == "commanded":
                 model["resolution"] = _BOAT_RESOLUTION
             particles = 100
@@ -192,7 +193,6 @@ def _selector_of(cell: _Cell) -> tuple[SelectorSettings, int]:
         return returns, int(cell.number)
     if cell.way == "return":
         return _optional(returns), int(cell.number)
-    # The price is the least gain: a look has a cost of 1.
     executed = cell.way == "nats, executed"
     by_nats = SelectorSettings(
         nats_per_cost=cell.number,
