@@ -99,7 +99,7 @@ class TestTables:
         assert (summary.successes, summary.failures, summary.finished) == (1, 2, 4)
         assert summary.success_rate == pytest.approx(0.25)
         assert summary.mean_reward_of_successes == pytest.approx(-1.0)
-        assert dict(_summary_rows(summary))["failed"] == "2 of 4 trials"
+        assert dict(_summary_rows(summary))["failed"] == "2 of 4 trials (1 truncated)"
 
     def test_the_mean_of_rewards_that_are_not_there_is_none(self) -> None:
         """A trial without a reward has not earned 0."""
