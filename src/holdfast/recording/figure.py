@@ -377,7 +377,9 @@ def _action_handles(problem: Problem, record: TrialRecord) -> list[Line2D]:
     handles = []
     for action, name in enumerate(_choices(problem, record)):
         if action in chosen:
-            handles.append(_dot(*_style_of(action), fill(f"sensed {name}", 30), size=5.5))
+            is_sensed = action < len(problem.sensing_actions)
+            label = fill(f"sensed {name}", 30) if is_sensed else "did not sense"
+            handles.append(_dot(*_style_of(action), label, size=5.5))
         elif compared:
             label = fill(f"{name}, never sensed", 30)
             handles.append(_dot(*_style_of(action), label, size=4.5, hollow=0.9))
