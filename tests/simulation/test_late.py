@@ -297,6 +297,9 @@ def test_a_service_that_diverges_is_found() -> None:
     with pytest.raises(Violation, match="comes to another state in call 1 than the robot"):
         WireChecker().replied("cloud-1", 1, 1, payload)
     WireChecker(services_forget=True).replied("cloud-1", 1, 1, payload)
+    checker = WireChecker()
+    checker.robot_forgets()
+    checker.replied("cloud-1", 1, 1, payload)
 
 
 def test_what_a_move_shows_is_folded_in_once() -> None:

@@ -121,7 +121,7 @@ class WireChecker:
     """All messages between a robot and its services."""
 
     def __init__(self, *, services_forget: bool = False) -> None:
-        self._services_forget = services_forget
+        self._may_diverge = services_forget
         self._sent: dict[int, tuple[str | None, bytes]] = {}
         self._sessions: dict[int, tuple[tuple[str | None, bytes], int]] = {}
         self._newest: dict[tuple[str, int, tuple[str | None, bytes]], int] = {}
@@ -130,6 +130,10 @@ class WireChecker:
         self._ended: set[int] = set()
         self._replies: dict[int, int] = {}
         self._crowd = 0
+
+    def robot_forgets(self) -> None:
+        """Take note of a power cut: a service may know what the robot has forgotten."""
+        self._may_diverge = True
 
     def requested(self, call: int, payload: bytes, owner: str | None = None) -> None:
         """Take note of a request, and of the certificate with which it is sent."""
@@ -179,7 +183,7 @@ class WireChecker:
             raise Violation(f"{service} has sent {count} replies to call {call}")
         fields = _decode(payload[:-_CHECKSUM_BYTES])
         tag = fields[0]
-        if tag == _NEED_STATE and fields[_DIVERGED_AT] and not self._services_forget:
+        if tag == _NEED_STATE and fields[_DIVERGED_AT] and not self._may_diverge:
             raise Violation(f"{service} comes to another state in call {call} than the robot")
         if tag not in _ANSWERS:
             return

@@ -461,6 +461,8 @@ class World:
             return
         self.happened(fault, fault.down_s)
         self.note("robot", "is killed" + (" by a power cut" if fault.power_cut else ""))
+        if fault.power_cut:
+            self.checker.robot_forgets()
         self.robot.kill(
             lost_appends=fault.lost_appends if fault.power_cut else None,
             body_goes_on=fault.body_goes_on,
