@@ -10,13 +10,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from holdfast.config.settings import (
+    LostSettings,
     OffloadSettings,
+    OnLost,
     ParticleFilterSettings,
     PlanningSettings,
     RecoverySettings,
     SimulatorSettings,
 )
-from holdfast.outcome import TrialResult
+from holdfast.outcome import MoveResult, TrialResult, ending_of
 from holdfast.planning import Planner, PlanningState, decode_checkpoint, digest
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.dispatcher import Dispatcher
@@ -49,6 +51,7 @@ from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_TASK_ACTIONS,
     NeedState,
+    Observed,
     Progress,
     Reply,
     Request,
@@ -127,7 +130,8 @@ class SmallService:
             if kept is None or kept.trial != request.trial:
                 kept = planner.init(SIMULATOR.seed, request.trial)
             state = kept
-            for item in request.observations:
+            for item in request.inputs:
+                assert isinstance(item, Observed)
                 while state.step < item.step:
                     action, _ = planner.choose_task_action(state)
                     state = planner.advance(state, action)
@@ -198,8 +202,10 @@ class World:
         simulator: SimulatorSettings = SIMULATOR,
         verify_share: float = 0.05,
         distrusted: tuple[str, ...] = (),
+        on_lost: OnLost = "continue",
     ) -> None:
         self.now = 0.0
+        self.lost = LostSettings(on_lost=on_lost)
         self.offload = OffloadSettings(
             services=services, decision_deadline_ms=deadline_ms, verify_share=verify_share
         )
@@ -227,7 +233,7 @@ class World:
         self.own = self.decide
         self.verified: list[VerificationNoted] = []
         self.planner, self.simulator = Planner(PROBLEM, planning), simulator
-        self.robot = Robot(self.planner, simulator, dispatcher, rate_hz)
+        self.robot = Robot(self.planner, simulator, dispatcher, rate_hz, self.lost)
         self.environment = SimulatedEnvironment(PROBLEM, simulator.seed, 0)
         self.heap: list[tuple[float, int, Callable[[], list[RobotEffect]]]] = []
         self.count = 0
@@ -280,11 +286,13 @@ class World:
         self.begin(0)
 
     def begin(self, trial: int) -> None:
-        history = replay(self.planner, self.simulator.seed, trial, self.journal)
+        rate = self.lost.false_alarm_rate
+        history = replay(self.planner, self.simulator.seed, trial, self.journal, rate)
         self.environment = self.environment_class(PROBLEM, self.simulator.seed, trial)
         for action in history.actions:
             self.environment.perform(action)
-        begun = EnvironmentReady(self.environment.is_done(), self.environment.step)
+        ending = ending_of(self.environment.is_done())
+        begun = EnvironmentReady(ending, self.environment.step)
         self.carry_out(
             self.robot.begin_trial(trial, history, begun, self.now, tail_is_certain=True)
         )
@@ -355,9 +363,16 @@ class World:
         assert isinstance(last, ActingRecord), "acted without having written it down"
         assert last.step == effect.step
         self.acted.append((effect.step, effect.action))
-        reward = self.environment.perform(effect.action)
+        shown = self.environment.perform(effect.action)
+        result = shown if isinstance(shown, MoveResult) else MoveResult(shown)
         self.on_act(effect.step)
-        self.after(0.01, self.later(Acted(effect.step, reward, self.environment.is_done())))
+        ending = ending_of(self.environment.is_done())
+        motion, observation = (
+            None if each is None else np.asarray(each)
+            for each in (result.motion, result.observation)
+        )
+        acted = Acted(effect.step, result.reward, ending, motion, observation)
+        self.after(0.01, self.later(acted))
 
     def launch(self, effect: Launch) -> None:
         self.kill(LOCAL)

@@ -96,6 +96,12 @@ class Hypotheses {
             weights);
     }
 
+    /// Weights of the belief as it is.
+    std::size_t belief(double* weights) const {
+        return vector_kernels().normalize(log_weights_.data(), input_.count, input_.drop_negligible,
+                                          weights);
+    }
+
   private:
     /// The predictions, of angles as many turns further as brings them nearest to the observation.
     std::vector<double> nearest_turns(const double* predicted, const double* observation,
@@ -120,12 +126,16 @@ class Hypotheses {
 }  // namespace
 
 void hypothetical_entropies(const HypothesisInput& input, const PointSets& sets,
-                            const EntropySettings& settings, double* out, EntropyCounts& counts) {
+                            const EntropySettings& settings, bool unchanged, double* out,
+                            EntropyCounts& counts) {
     const Hypotheses hypotheses(input);
+    const std::size_t posteriors = input.sensing_actions * input.samples;
     entropies(
-        sets, input.sensing_actions * input.samples,
-        [&](std::size_t index, double* weights) { return hypotheses(index, weights); }, settings,
-        out, counts);
+        sets, posteriors + (unchanged ? 1 : 0),
+        [&](std::size_t index, double* weights) {
+            return index < posteriors ? hypotheses(index, weights) : hypotheses.belief(weights);
+        },
+        settings, out, counts);
 }
 
 void hypothetical_weights(const HypothesisInput& input, double* out) {

@@ -14,25 +14,32 @@ if TYPE_CHECKING:
     from holdfast.config.loader import load as load_configuration
     from holdfast.config.settings import (
         ActiveSensingSettings,
+        LostSettings,
         ParticleFilterSettings,
         PlanningSettings,
         SelectorSettings,
     )
     from holdfast.errors import HoldfastError
     from holdfast.estimators import GaussianMixture, NearestNeighbor, PriorNeighbors, entropy
+    from holdfast.outcome import Ending, MoveResult
     from holdfast.planning import Planner, PlanningState
     from holdfast.problems.problem import Problem, ProblemBase, Scene
     from holdfast.problems.registry import make
     from holdfast.recording.reading import open_run
-    from holdfast.robot.environment import Environment, SimulatedEnvironment
+    from holdfast.robot.environment import LATER, Environment, SimulatedEnvironment
+    from holdfast.robot.late_sensing import SenseInBackground, SenseLater
     from holdfast.robot.trial import run_trial
 
 __all__ = [
+    "LATER",
     "ActiveSensingSettings",
     "Belief",
+    "Ending",
     "Environment",
     "GaussianMixture",
     "HoldfastError",
+    "LostSettings",
+    "MoveResult",
     "NearestNeighbor",
     "ParticleFilterSettings",
     "Planner",
@@ -43,6 +50,8 @@ __all__ = [
     "ProblemBase",
     "Scene",
     "SelectorSettings",
+    "SenseInBackground",
+    "SenseLater",
     "SimulatedEnvironment",
     "entropy",
     "load_configuration",
@@ -55,9 +64,15 @@ __version__ = "0.1.0"
 
 _PLACES = {
     "ActiveSensingSettings": "config.settings.ActiveSensingSettings",
+    "LostSettings": "config.settings.LostSettings",
     "ParticleFilterSettings": "config.settings.ParticleFilterSettings",
     "Belief": "belief.Belief",
+    "Ending": "outcome.Ending",
     "Environment": "robot.environment.Environment",
+    "LATER": "robot.environment.LATER",
+    "MoveResult": "outcome.MoveResult",
+    "SenseInBackground": "robot.late_sensing.SenseInBackground",
+    "SenseLater": "robot.late_sensing.SenseLater",
     "GaussianMixture": "estimators.GaussianMixture",
     "HoldfastError": "errors.HoldfastError",
     "NearestNeighbor": "estimators.NearestNeighbor",

@@ -19,7 +19,8 @@ them lead to the same actions, and a return is the sum of a hundred noisy steps.
   over an interval.
 - Where sensing has prices, the mean price is paid at each later sensing step up to the goal, as by
   a robot that senses at random from then on: a robot that is sooner at the goal pays less often. If
-  knowledge were free later, sensing would be put off for ever.
+  knowledge were free later, sensing would be put off for ever. Not to sense, where it is a choice,
+  counts in that mean, too.
 - True state i is left out of the posterior of its own observation. A robot's true state is not
   among its particles, and a posterior of few particles with it would be too good.
 - A rollout ends at the goal, or as soon as the state is known and the same after every sensing
@@ -95,12 +96,13 @@ def expected_returns(
     hypotheses: Stream,
     posteriors: Posteriors,
 ) -> Returns:
-    """Return the expected return after each sensing action.
+    """Return the expected return after each sensing action; if sensing is optional, without one.
 
+    Not to sense comes last, has no price, and ``posteriors`` is asked for it as for the others.
     ProblemError says if a function of the problem breaks its contract, or a hypothetical
     observation has no likelihood under any particle.
     """
-    costs = sensing_costs(problem)
+    costs = sensing_costs(problem, optional=settings.selector.sensing_is_optional)
     count = costs.shape[0]
     size = settings.active_sensing.num_observation_samples
     limit = max(size, settings.selector.max_observation_samples)
@@ -200,7 +202,7 @@ def rollout_returns(
     rollouts = _Rollouts(problem, settings, true_states, estimates, clouds, stage)
     interval = settings.sensing_interval + 1
     looks = settings.selector.rollout_looks
-    costs = sensing_costs(problem)
+    costs = sensing_costs(problem, optional=settings.selector.sensing_is_optional)
     price = numerics.sum(costs) / costs.shape[0]
     for step in range(settings.selector.rollout_steps):
         later, between = divmod(step, interval)

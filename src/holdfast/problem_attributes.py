@@ -22,12 +22,14 @@ from holdfast.errors import InvalidValueError, ProblemError
 __all__ = [
     "check_problem",
     "check_sizes",
+    "choice_labels",
     "circular_actions",
     "circular_observation",
     "circular_states",
     "has_circular_observations",
     "has_general_observations",
     "has_own",
+    "moves_show",
     "name_of",
     "resolution_of",
     "sensing_costs",
@@ -54,6 +56,11 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "sample_observation": ("state", "sensing_action", "stream"),
     "known_state_return": ("states", "stages"),
     "move_each": ("states", "actions", "streams", "threads"),
+    "move_by_measurement": ("states", "motion", "stream"),
+    "measure_motion": ("before", "after", "stream"),
+    "move_log_likelihood": ("states", "action", "observation"),
+    "sample_move_observation": ("state", "action", "stream"),
+    "reinitial_states": ("states", "stream"),
 }
 """Arguments of a problem's functions, by position."""
 
@@ -287,12 +294,21 @@ def _takes(function: Any, arguments: tuple[str | None, ...]) -> str | None:
     return None
 
 
-def sensing_costs(problem: Any) -> FloatArray:
-    """Return the checked price of each sensing action, shape ``(J,)``; zeros if there is none."""
+def sensing_costs(problem: Any, *, otherwise: float = 0.0, optional: bool = False) -> FloatArray:
+    """Return the checked price of each sensing action, shape ``(J,)``.
+
+    ``otherwise`` is that of each where the problem has no prices. With ``optional`` a last entry of
+    zero stands for not sensing.
+    """
+    costs = _costs_of_actions(problem, otherwise)
+    return np.append(costs, 0.0) if optional else costs
+
+
+def _costs_of_actions(problem: Any, otherwise: float) -> FloatArray:
     count = len(problem.sensing_actions)
     given = getattr(problem, "sensing_costs", None)
     if given is None:
-        return np.zeros(count)
+        return np.full(count, otherwise)
     costs = _numbers(given)
     # A comparison with NaN is false.
     if (
@@ -310,6 +326,16 @@ def sensing_costs(problem: Any) -> FloatArray:
 def has_general_observations(problem: object) -> bool:
     """Tell whether a problem gives a likelihood of its own instead of a Gaussian one."""
     return hasattr(problem, "log_likelihood")
+
+
+def choice_labels(problem: Any) -> list[str]:
+    """Return a label for each choice: the sensing actions, and not to sense."""
+    return [*map(str, problem.sensing_actions), "no sensing"]
+
+
+def moves_show(problem: object) -> bool:
+    """Tell whether a problem can fold in what a move shows: a measured motion, an observation."""
+    return hasattr(problem, "move_by_measurement") or hasattr(problem, "move_log_likelihood")
 
 
 def has_own(problem: Any, function: str, stands_for: tuple[str, ...]) -> bool:

@@ -8,6 +8,12 @@ task actions (*action covariance*, the trace of their covariance) is simpler, an
 different actions are from each other, which entropy does not. Two methods that look ahead at
 nothing, *random* and *fixed*, are there to compare with.
 
+Sensing may have a price, and not to sense may be a choice, with the entropy of the belief as it is
+and without a price. What wins then has the least sum of entropy and price: a sensing action is
+performed only if it is expected to gain more than it costs. A weighted sum of uncertainties and
+costs is the criterion of Mihaylova, Lefebvre, Bruyninckx, Gadeyne and De Schutter, "Active sensing
+for robotics - a survey", NM&A 2002 (docs/decisions/sensing_price.md has the others).
+
 Source: Greigarn, Branicky and Çavuşoğlu, "Task-oriented active sensing via action entropy
 minimization", IEEE Access, 2019; Algorithm 2 of the thesis that the configuration files come from.
 """
@@ -46,6 +52,7 @@ from holdfast.problem_attributes import (
     has_circular_observations,
     has_general_observations,
     resolution_of,
+    sensing_costs,
 )
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Stream, Words
@@ -56,6 +63,9 @@ __all__ = ["SensingInfo", "choose_sensing_action"]
 # Substreams of the stream of hypotheses; 1 is the kernel's own, for the observation noise.
 _HORIZON_MOTION = 2
 _GENERAL_OBSERVATIONS = 3
+
+_ROUNDING = 2.0**-40
+"""Relative difference below which two scores differ by rounding alone."""
 
 _LARGEST_BLOCK = 2**20
 """Coordinates of the beliefs that are predicted at the same time: 8 MB."""
@@ -71,17 +81,23 @@ class SensingInfo(NamedTuple):
         ``action_covariance`` the trace of the covariance, in the actions' units squared, or in
         resolutions squared where there is one for each coordinate; for ``expected_return`` the
         return less the price of sensing, negated and up to a constant; None for ``random`` and
-        ``fixed``.
+        ``fixed``. If sensing is optional, a last entry stands for not sensing: J is one more.
     samples : array of shape (J, M) or None
-        The entropies of the single hypothetical observations, whose means ``entropies`` are.
+        The entropies of the single hypothetical observations, whose means ``entropies`` are. Those
+        of not sensing differ by the motion of later steps alone (``horizon`` above 1).
     likelihoods, visits : int
         Work done: likelihoods evaluated and distances between points computed.
+    prices : array of shape (J,) or None
+        ``selector.nats_per_cost`` times the costs, in the unit of the entropies: what was chosen
+        has the least sum of both. None if no cost counts, and for ``expected_return``, whose
+        returns are less by the prices.
     """
 
     entropies: FloatArray | None
     samples: FloatArray | None
     likelihoods: int
     visits: int
+    prices: FloatArray | None = None
 
 
 def choose_sensing_action(
@@ -93,6 +109,10 @@ def choose_sensing_action(
     selection: Stream,
 ) -> tuple[int, SensingInfo]:
     """Choose a sensing action for a belief: an index, the lowest of equally good ones.
+
+    If ``selector.sensing_is_optional``, the index ``len(problem.sensing_actions)`` is the choice
+    not to sense. It wins where nothing gains more than its price: of equally good choices it is the
+    one without effort.
 
     The stream ``hypotheses`` has the random numbers of the hypothetical observations, ``selection``
     the one of the method ``random``.
@@ -106,15 +126,21 @@ def choose_sensing_action(
     """
     selector = settings.selector
     count = len(problem.sensing_actions)
+    choices = count + 1 if selector.sensing_is_optional else count
     if selector.method == "fixed":
-        if selector.sensing_action >= count:
+        if selector.sensing_action >= choices:
+            not_sensing = (
+                f" (and {count}, not to sense, if selector.sensing_is_optional is true)"
+                if selector.sensing_action == count
+                else ""
+            )
             raise InvalidValueError(
                 f"selector.sensing_action {selector.sensing_action}: {problem.name} has sensing "
-                f"actions 0 to {count - 1}"
+                f"actions 0 to {count - 1}{not_sensing}"
             )
         return selector.sensing_action, SensingInfo(None, None, 0, 0)
     if selector.method == "random":
-        return int(float(selection.uniform()) * count), SensingInfo(None, None, 0, 0)
+        return int(float(selection.uniform()) * choices), SensingInfo(None, None, 0, 0)
 
     if selector.method == "expected_return":
         return _greatest_return(problem, settings, belief, stage, hypotheses)
@@ -131,17 +157,21 @@ def choose_sensing_action(
     size = settings.active_sensing.num_observation_samples
     hypothetical = _hypotheses(problem, belief, range(count), size, hypotheses)
     entropies, samples, likelihoods, visits = hypothetical.entropies(
-        scaled(points, estimator), estimator, threads, factors
+        scaled(points, estimator), estimator, threads, factors, selector.sensing_is_optional
     )
     if settings.active_sensing.horizon > 1 and not np.isnan(entropies).any():
         weights = hypothetical.weights(estimator.drops_negligible)
+        if selector.sensing_is_optional:
+            same = _kernel.normalize(numerics.log(belief.weights), estimator.drops_negligible)[0]
+            weights = _with_unchanged(weights, same)
         later = _later_entropies(
             problem, settings, belief.states, weights, stage, hypotheses, estimator, points_of
         )
         samples = samples + later
         entropies = _row_means(samples)
-    index = int(entropies.argmin())
-    # argmin finds a NaN, if there is one.
+    prices = _prices(problem, settings)
+    scores = entropies if prices is None else entropies + prices
+    index = _least(scores, optional=selector.sensing_is_optional)
     if entropies[index] != entropies[index]:
         raise ProblemError(
             f"the entropy after sensing action {index} of {problem.name} is not a number: a "
@@ -151,7 +181,35 @@ def choose_sensing_action(
         # After the choice: what is the same for all must not decide it by its rounding.
         volume = estimator.log_volume * sum(factors) * _total_factor(settings)
         entropies, samples = entropies + volume, samples + volume
-    return index, SensingInfo(entropies, samples, likelihoods, visits)
+    return index, SensingInfo(entropies, samples, likelihoods, visits, prices)
+
+
+def _least(scores: FloatArray, *, optional: bool) -> int:
+    """Return the choice with the least score; a NaN, if there is one.
+
+    If sensing is optional, the last choice is not to sense. It also wins if it is worse by no more
+    than rounding, as where all actions are alike already.
+    """
+    index = int(scores.argmin())
+    # A comparison with NaN is false.
+    if optional and scores[-1] - scores[index] <= _ROUNDING * abs(scores[-1]):
+        return len(scores) - 1
+    return index
+
+
+def _prices(problem: Problem, settings: PlanningSettings) -> FloatArray | None:
+    """Return what the entropy of each choice is raised by; None if no cost counts."""
+    rate = settings.selector.nats_per_cost
+    if rate == 0.0:
+        return None
+    optional = settings.selector.sensing_is_optional
+    return rate * sensing_costs(problem, otherwise=1.0, optional=optional)
+
+
+def _with_unchanged(weights: FloatArray, same: FloatArray) -> FloatArray:
+    """Append to posteriors, shape (J, M, N), those of not sensing: M times the same weights."""
+    rows = np.broadcast_to(same, (1, *weights.shape[1:]))
+    return np.concatenate([weights, rows])
 
 
 def _total_factor(settings: PlanningSettings) -> float:
@@ -167,19 +225,24 @@ def _greatest_return(
     problem: Problem, settings: PlanningSettings, belief: Belief, stage: int, hypotheses: Stream
 ) -> tuple[int, SensingInfo]:
     likelihoods = 0
+    not_sensing = len(problem.sensing_actions)
 
     def posteriors(
         actions: Sequence[int], samples: int, stream: Stream
     ) -> tuple[list[int], FloatArray]:
         nonlocal likelihoods
-        likelihoods += len(actions) * samples * belief.weights.shape[0]
-        hypothetical = _hypotheses(problem, belief, actions, samples, stream)
-        return _stratified(belief.weights, samples, stream), hypothetical.weights(False)
+        sensing = [action for action in actions if action != not_sensing]
+        likelihoods += len(sensing) * samples * belief.weights.shape[0]
+        weights = _hypotheses(problem, belief, sensing, samples, stream).weights(False)
+        if len(sensing) < len(actions):
+            weights = _with_unchanged(weights, belief.weights)
+        return _stratified(belief.weights, samples, stream), weights
 
     returns = expected_returns(problem, settings, belief, stage, hypotheses, posteriors)
     # What is least: as for the other methods.
     losses = -returns.means
-    return int(losses.argmin()), SensingInfo(losses, -returns.samples, likelihoods, 0)
+    index = _least(losses, optional=settings.selector.sensing_is_optional)
+    return index, SensingInfo(losses, -returns.samples, likelihoods, 0)
 
 
 def _points_of(
@@ -272,8 +335,12 @@ class _GaussianHypotheses(NamedTuple):
         estimator: KernelEstimator,
         threads: int,
         factors: tuple[float, ...],
+        unchanged: bool,
     ) -> tuple[FloatArray, FloatArray, int, int]:
-        """Return the mean entropies (J,), the single ones (J, M), likelihoods and visits."""
+        """Return the mean entropies (J,), the single ones (J, M), likelihoods and visits.
+
+        With ``unchanged`` the belief as it is comes last, as if it were one more sensing action.
+        """
         return _kernel.hypothetical_entropies(
             *self.arguments,
             points,
@@ -281,6 +348,7 @@ class _GaussianHypotheses(NamedTuple):
             threads,
             factors,
             estimator.prior,
+            unchanged,
         )
 
     def weights(self, drop_negligible: bool) -> FloatArray:
@@ -293,10 +361,12 @@ class _GaussianHypotheses(NamedTuple):
 class _GeneralHypotheses(NamedTuple):
     """The same for a problem that gives ``log_likelihood`` and ``sample_observation``.
 
-    ``log_weights`` are those of the posteriors, shape (J * M, N).
+    ``log_weights`` are those of the posteriors, shape (J * M, N), and ``log_prior``, (N,), those of
+    the belief.
     """
 
     log_weights: FloatArray
+    log_prior: FloatArray
     samples: int
 
     def entropies(
@@ -305,18 +375,24 @@ class _GeneralHypotheses(NamedTuple):
         estimator: KernelEstimator,
         threads: int,
         factors: tuple[float, ...],
+        unchanged: bool,
     ) -> tuple[FloatArray, FloatArray, int, int]:
+        rows = np.vstack([self.log_weights, self.log_prior]) if unchanged else self.log_weights
         found, likelihoods, visits, _ = _kernel.entropies(
             np.ascontiguousarray(points),
-            self.log_weights,
+            rows,
             True,
             *estimator.parameters,
             threads,
             factors,
             estimator.prior,
         )
-        samples = found.reshape(-1, self.samples)
-        return _row_means(samples), samples, likelihoods, visits
+        samples = found[: len(self.log_weights)].reshape(-1, self.samples)
+        means = _row_means(samples)
+        if unchanged:
+            means = np.append(means, found[-1])
+            samples = np.vstack([samples, np.full(self.samples, found[-1])])
+        return means, samples, likelihoods, visits
 
     def weights(self, drop_negligible: bool) -> FloatArray:
         rows = [_kernel.normalize(row, drop_negligible)[0] for row in self.log_weights]
@@ -369,7 +445,7 @@ def _general_hypotheses(
             rows.append(
                 log_prior + checked.log_likelihood(problem, belief.states, action, observation)
             )
-    return _GeneralHypotheses(np.ascontiguousarray(rows, dtype=np.float64), samples)
+    return _GeneralHypotheses(np.ascontiguousarray(rows, dtype=np.float64), log_prior, samples)
 
 
 def _stratified(weights: FloatArray, samples: int, stream: Stream) -> list[int]:

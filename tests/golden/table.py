@@ -90,7 +90,7 @@ def _examples() -> Iterator[Run]:
     for path in sorted((ROOT / "examples").rglob("*.yaml")):
         file = path.relative_to(ROOT).as_posix()
         short: dict[str, Any] = {"simulator.max_steps": 300}
-        if path.stem == "priced_looks":
+        if path.stem in ("priced_looks", "optional_looks"):
             yield Run(file, file, 3, short)
             continue
         yield Run(file, file, 3, {**short, **_FIRST_DEFAULTS, **_as_before(path.stem)})

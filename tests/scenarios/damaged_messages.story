@@ -12,7 +12,7 @@ message service=cloud-1 direction=from number=4 what=corrupt bit=199
    0.0150  robot    hears of call 1: its end
    0.0160  robot    asks cloud-1, call 2
    0.0180  robot    hears of call 2: Refused
-   0.0180  robot    damaged_request service=cloud-1 reason=67 bytes do not have the checksum that they end with
+   0.0180  robot    damaged_request service=cloud-1 reason=68 bytes do not have the checksum that they end with
    0.0380  robot    retry service=cloud-1 step=0 attempt=2 waited_ms=22
    0.0380  robot    asks cloud-1, call 3
    0.0410  robot    hears of call 3: damaged
@@ -46,7 +46,7 @@ message service=cloud-1 direction=from number=4 what=corrupt bit=199
    0.3734  robot    hears of call 7: its end
    0.3806  robot    performs task actions 28 to 35
    0.4622  robot    performs sensing action 2 of step 36
-   0.4632  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.4632  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.4632  robot    asks cloud-1, call 8
    0.4662  robot    hears of call 8: TaskAnswer
    0.4662  robot    performs task action 36

@@ -26,7 +26,7 @@ from holdfast.outcome import SensingDecision
 from holdfast.planning import Planner
 from holdfast.problem_attributes import sensing_costs
 from holdfast.problems.problem import ProblemBase
-from holdfast.protocol.records import ObservedRecord, TrialHistory
+from holdfast.protocol.records import TrialHistory
 from holdfast.randomness import Purpose, Stream, stream
 from holdfast.robot.trial import run_trial
 from holdfast.sensing import SensingInfo, choose_sensing_action
@@ -436,15 +436,7 @@ class TestSensingCosts:
         history = TrialHistory(planner, 0, 0)
         observation = np.array([0.5])
         for sensing_action, total in ((0, -0.5), (1, -0.75), (2, -0.75)):
-            after, info = planner.observe(history.state, sensing_action, observation)
-            record = ObservedRecord(
-                step=0,
-                sensing_action=sensing_action,
-                observation=observation.tobytes(),
-                digest=planner.digest(after),
-                sensing_ms=0.0,
-            )
-            history.observed(record, after, explained=info.explained)
+            history.observed(sensing_action, observation, 0.0)
             assert history.rewards.total == total
 
     def test_a_price_alone_is_a_reward(self) -> None:
@@ -472,6 +464,34 @@ class TestSensingCosts:
                 == reward
             )
             assert TrialHistory(Planner(problem, settings), 0, 0).rewards.total == reward
+
+    @pytest.mark.parametrize("kind", [Dock, Sonar])
+    def test_not_to_sense_is_as_an_observation_that_says_nothing(self, kind: type[Dock]) -> None:
+        problem, belief = kind(), belief_of(0.5, 0.4)
+        problem.sensing_costs = (0.5, 0.25, 0.0)  # type: ignore[attr-defined]
+        _, info = choose(problem, settings_of(sensing_is_optional=True), belief)
+        assert info.samples is not None
+        assert info.samples.shape[0] == 4
+        assert info.prices is None
+        if kind is Dock:  # The sonar's third sensing action shows a little.
+            np.testing.assert_allclose(info.samples[3], info.samples[2], rtol=1e-6)
+
+    def test_sensing_is_left_out_where_it_costs_more_than_it_gains(self) -> None:
+        class Sensing(Dock):
+            sensing_actions = ("x", "y")
+
+        problem, belief = Sensing(), belief_of(0.5, 0.4)
+        for price, left_out in ((0.0, False), (1e3, True)):
+            problem.sensing_costs = (price, price)  # type: ignore[attr-defined]
+            chosen, info = choose(problem, settings_of(sensing_is_optional=True), belief)
+            assert (chosen == 2) is left_out
+            assert info.entropies is not None
+            assert info.entropies.shape == (3,)
+
+    def test_costs_with_the_choice_not_to_sense(self) -> None:
+        assert sensing_costs(Priced(), optional=True).tolist() == [0.5, 0.25, 0.0, 0.0]
+        assert sensing_costs(Dock(), otherwise=1.0).tolist() == [1.0, 1.0, 1.0]
+        assert sensing_costs(Priced(), otherwise=1.0).tolist() == [0.5, 0.25, 0.0]
 
     def test_none_is_free(self) -> None:
         for costs in (None, (0.0, 0.0, 0.0), np.zeros(3), [0, 0, 0]):

@@ -18,6 +18,7 @@ NUMBERS = [
     ["run", "peg.yaml", "-j"],
     ["run", "peg.yaml", "--rate"],
     ["run", "peg.yaml", "--health"],
+    ["run", "peg.yaml", "--metrics"],
     ["demo", "--seed"],
     ["chaos", "--trials"],
     ["chaos", "--seed"],

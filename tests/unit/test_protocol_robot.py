@@ -22,6 +22,7 @@ from holdfast.config.settings import (
     SimulatorSettings,
 )
 from holdfast.errors import HeldError, UnknownPerformanceError
+from holdfast.outcome import ending_of
 from holdfast.planning import Planner
 from holdfast.protocol.events import (
     Act,
@@ -110,7 +111,7 @@ def test_resumed_from_any_moment(performed: bool) -> None:
             world.environment.perform(pending)
         world.carry_out(world.robot.start(0.0))
         world.bring_up("cloud")
-        begun = EnvironmentReady(world.environment.is_done(), world.environment.step)
+        begun = EnvironmentReady(ending_of(world.environment.is_done()), world.environment.step)
         world.carry_out(world.robot.begin_trial(0, history, begun, 0.0, tail_is_certain=False))
         world.run()
         (result,) = world.results
@@ -215,7 +216,7 @@ def begin_after(
         world.robot.begin_trial(
             0,
             history,
-            EnvironmentReady(False, steps_performed),
+            EnvironmentReady(None, steps_performed),
             0.0,
             tail_is_certain=tail_is_certain,
         )
@@ -291,7 +292,7 @@ def test_what_fails_after_an_action_was_performed_leaves_it_in_the_journal(count
     def act_and_fail(effect: Act) -> None:
         act(effect)
         if effect.step == 5:
-            failure = EnvironmentFailed(5, "is_done", "returned None", False, True, -2.5)
+            failure = EnvironmentFailed(5, "is_done", "returned None", False, Acted(5, -2.5, None))
             world.heap = []
             world.after(0.1, lambda: world.robot.handle(failure, world.now))
 
@@ -367,7 +368,7 @@ class TestFailedTask:
         resumed = self.world()
         resumed.carry_out(resumed.robot.start(0.0))
         history = replay(resumed.planner, 11, 0, killed.journal)
-        begun = EnvironmentReady(killed.environment.is_done(), killed.environment.step)
+        begun = EnvironmentReady(ending_of(killed.environment.is_done()), killed.environment.step)
         resumed.carry_out(resumed.robot.begin_trial(0, history, begun, 0.0, tail_is_certain=True))
         self.assert_failed(resumed)
 
@@ -424,18 +425,15 @@ class TestUnexplainedObservations:
             assert fields["trial"] == 0
             assert isinstance(fields["deviations"], float)
             assert fields["deviations"] > 8.0
-        assert not world.reports("filter_diverged")
 
     def test_none_is_told_where_all_are_explained(self) -> None:
         world = self.world(set(), 6)
         assert world.results[0].unexplained_observations == 0
         assert not world.reports("unexplained")
 
-    def test_a_run_of_them_is_told_once_and_the_lines_are_bounded(self) -> None:
+    def test_the_lines_are_bounded(self) -> None:
         world = self.world(set(range(1, 40)), 40)
         assert len(world.reports("unexplained")) == 10
-        (diverged,) = world.reports("filter_diverged")
-        assert diverged["step"] == 4 * 5
         assert world.results[0].unexplained_observations == 39
         assert "counted only" in str(world.reports("unexplained")[-1]["reason"])
 
@@ -450,10 +448,9 @@ class TestUnexplainedObservations:
         first.start()
         first.run()
         assert len(first.reports("unexplained")) == 3
-        assert not first.reports("filter_diverged")
+        assert not first.reports("lost")
         second = self.world(set(range(20)), 8, tuple(first.journal[:-1]))
-        (diverged,) = second.reports("filter_diverged")
-        assert diverged["step"] == 4 * 4
+        assert [lost["step"] for lost in second.reports("lost")] == [4 * 4]
         assert len(second.reports("unexplained")) == 5
         assert second.results[0].unexplained_observations == 8
 

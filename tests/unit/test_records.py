@@ -13,13 +13,16 @@ from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.messages import encode_floats
 from holdfast.protocol.records import (
     ActingRecord,
+    LateRecord,
     LocalTookOverRecord,
     ObservedRecord,
     PausedRecord,
     PerformedRecord,
     Record,
+    ReinitialisedRecord,
     decode_record,
     encode_record,
+    reinitialised_after,
     replay,
 )
 
@@ -33,6 +36,9 @@ RECORDS: list[Record] = [
     PerformedRecord(8, None),
     PausedRecord(),
     LocalTookOverRecord(2),
+    PerformedRecord(8, -1.0, encode_floats([0.5]), encode_floats([1.0, 2.0])),
+    LateRecord(9, 8, encode_floats([0.5]), bytes(32)),
+    ReinitialisedRecord(9, bytes(32)),
 ]
 
 
@@ -60,13 +66,27 @@ def first_record(**changes: object) -> ObservedRecord:
         (first_record(sensing_action=99), "sensing action 99"),
         (first_record(sensing_action=-1), "sensing action -1"),
         (first_record(observation=encode_floats(np.zeros(7))), "observation"),
-        (first_record(observation=b""), "observation"),
         (first_record(observation=b"short"), "5 bytes are not 0 numbers"),
         (first_record(), "another state"),
         (first_record(step=1), "of step 1"),
     ],
-    ids=["too high", "too low", "too long", "empty", "half a number", "digest", "step"],
+    ids=["too high", "too low", "too long", "half a number", "digest", "step"],
 )
 def test_a_record_that_does_not_follow_is_named(record: Record, why: str) -> None:
     with pytest.raises(RecordError, match=rf"trial 4: record 1 of its journal .*{why}"):
         replay(Planner(PROBLEM, PLANNING), 11, 4, [LocalTookOverRecord(1), record])
+
+
+def test_when_a_belief_was_begun_anew_is_in_the_records() -> None:
+    """As in the log of decisions, where moves that have shown nothing are no inputs."""
+    records: list[Record] = [
+        first_record(),
+        ActingRecord(0, encode_floats(np.zeros(3))),
+        PerformedRecord(0, None),
+        PerformedRecord(1, None, encode_floats(np.zeros(3))),
+        ReinitialisedRecord(2, bytes(32)),
+        LocalTookOverRecord(1),
+        LateRecord(2, 0, encode_floats(np.zeros(1)), bytes(32)),
+        ReinitialisedRecord(2, bytes(32)),
+    ]
+    assert reinitialised_after(records) == {2, 4}

@@ -98,6 +98,6 @@ def run_as_robot(
         on_result,
         rate_hz=options.rate,
         sinks=sinks,
-        watch=lambda events: RobotWatch(manager, options.health, events),
+        watch=lambda events: RobotWatch(manager, options.health, options.metrics, events),
     )
     return findings

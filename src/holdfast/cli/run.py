@@ -157,6 +157,12 @@ class RunOptions(Options):
         help="Answer http://HOST:PORT/livez, and /readyz while a service or the robot itself "
         "decides; a PORT alone is one of 127.0.0.1.",
     )
+    metrics: HttpAddress | None = option(
+        metavar="HOST:PORT",
+        read=http_address,
+        help="Offer this robot's metrics for Prometheus at http://HOST:PORT/metrics. The address "
+        "may be that of --health.",
+    )
     log: LogFormat = log_option("Format of the events shown: text or json.")
 
     def resume_command(self, directory: Path) -> str:
@@ -371,11 +377,12 @@ def _require_effect(options: RunOptions, configuration: Configuration, *, as_rob
             "out, or leave out --service, --environment and --rate (and offload.services and "
             "environment.object)"
         )
-    if options.health is not None and not as_robot:
-        raise InvalidValueError(
-            f"--health {options.health} is for a robot: give --service, --environment or --rate "
-            "(or offload.services or environment.object), without which the trials are a batch"
-        )
+    for name, address in (("--health", options.health), ("--metrics", options.metrics)):
+        if address is not None and not as_robot:
+            raise InvalidValueError(
+                f"{name} {address} is for a robot: give --service, --environment or --rate "
+                "(or offload.services or environment.object), without which the trials are a batch"
+            )
     if configuration.offload.services:
         from holdfast.robot.links import check_services
 

@@ -20,6 +20,7 @@ from holdfast.errors import InvalidValueError
 __all__ = [
     "ActiveSensingSettings",
     "EnvironmentSettings",
+    "LostSettings",
     "OffloadSettings",
     "ParticleFilterSettings",
     "PlanningSettings",
@@ -90,6 +91,9 @@ NEIGHBOR_ESTIMATORS: frozenset[Estimator] = frozenset({"nearest_neighbor", "prio
 Estimate = Literal["mean", "most_likely", "heaviest_mode"]
 """Which state stands for a belief: ``holdfast.belief.estimate`` has a branch each."""
 
+OnLost = Literal["continue", "hold", "reinitialise"]
+"""What a robot that is lost does."""
+
 
 class ParticleFilterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The section ``particle_filter``.
@@ -148,6 +152,12 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         policy leads each particle without noise.
     sensing_action : int
         What ``fixed`` chooses.
+    sensing_is_optional : bool
+        Whether not to sense is a choice, too: the one whose number is that of the sensing actions.
+    nats_per_cost : float
+        What a unit of the problem's ``sensing_costs`` is worth in nats of entropy, for the methods
+        that minimise one (for ``action_covariance`` in the unit of its trace). A problem without
+        costs counts 1 for each sensing action. With 0 no cost counts.
     estimator : Estimator or None
         ``prior_neighbors`` has less bias where a sharp observation leaves few particles: 300 choose
         about as well as 1,000 with ``nearest_neighbor``. A mixture takes few particles for
@@ -184,6 +194,8 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
     method: Method = "path_entropy"
     sensing_action: NonNegativeCount = 0
+    sensing_is_optional: bool = False
+    nats_per_cost: Annotated[float, msgspec.Meta(ge=0.0, le=1e150)] = 0.0
     estimator: Estimator | None = None
     actions: Literal["commanded", "executed"] = "commanded"
     resolution: Resolution | Resolutions | None = None
@@ -293,6 +305,25 @@ class RecoverySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     journal_survives: Literal["process_crash", "power_cut"] = "process_crash"
 
 
+class LostSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``lost``: when the robot counts as lost, and what it does then.
+
+    The robot's own: services see only a recorded reinitialisation.
+
+    Attributes
+    ----------
+    false_alarm_rate : float
+        For each observation: within n of them a false alarm, of a lost robot or a dead sensor, has
+        a probability of at most n times this (:mod:`holdfast.lost` says for which beliefs).
+    on_lost : {"continue", "hold", "reinitialise"}
+        Report it only; hold still and end the run, which can be resumed; or begin the belief anew,
+        from the problem's ``reinitial_states`` or else its initial belief.
+    """
+
+    false_alarm_rate: Annotated[float, msgspec.Meta(ge=1e-12, le=0.1)] = 1e-4
+    on_lost: OnLost = "continue"
+
+
 class EnvironmentSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The section ``environment``: the world that the robot acts on.
 
@@ -310,12 +341,16 @@ class EnvironmentSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
         Plain data, passed to the class as keyword arguments.
     timeout_ms : float
         Any call of the environment that takes longer has failed.
+    sense_in_background : bool
+        Whether the robot goes on while it senses; ``perform_sensing`` and ``perform`` then run at
+        the same time.
     """
 
     object: Text | None = None
     directory: Text | None = None
     arguments: dict[str, Any] = msgspec.field(default_factory=dict)
     timeout_ms: Milliseconds = 60_000.0
+    sense_in_background: bool = False
 
 
 class PlanningSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -48,7 +48,9 @@ __all__ = [
     "KnownStateReturnProblem",
     "Problem",
     "ProblemBase",
+    "ReinitialisedProblem",
     "Scene",
+    "ShownMovesProblem",
 ]
 
 
@@ -162,8 +164,9 @@ class Problem(Protocol):
 
     It may have ``sensing_costs``, the price of each sensing action in units of reward, numbers
     from 0 to 1e150. A trial's reward is less by it at each sensing, and ``expected_return`` weighs
-    it against what sensing gains. Without this attribute sensing costs nothing. "Not looking" is a
-    sensing action like any other: one of price 0 whose observation says nothing (a huge variance).
+    it against what sensing gains; methods that minimise an entropy do with a rate,
+    ``selector.nats_per_cost``. Without this attribute sensing costs nothing. Not to sense is no
+    sensing action: ``selector.sensing_is_optional`` makes it a choice, of price 0.
     """
 
     name: str
@@ -233,6 +236,12 @@ class GeneralObservationProblem(Protocol):
     With them ``observation_mean`` and ``observation_variance`` are not used and need not be there.
     Sensing costs more: the likelihood is evaluated in Python, once for each hypothetical
     observation.
+
+    A robot is found lost (:mod:`holdfast.lost`) by observations that no particle can have made. A
+    likelihood that is zero nowhere has none of these. An attribute ``rank_test = True`` asks for
+    the test by :func:`holdfast.validation_gate.is_typical` instead: each observation is compared
+    with up to 19 drawn ones, which takes as many evaluations of the likelihood, 3.5 on average. It
+    is right if what is left out of the likelihood does not depend on the observation.
     """
 
     def log_likelihood(
@@ -296,6 +305,54 @@ class BatchedMotionProblem(Protocol):
         bits of ``move`` of one belief after the other, for any number of ``threads`` (0: all). One
         that a class inherits is not used if the class itself replaces ``move``.
         """
+        ...
+
+
+class ShownMovesProblem(Protocol):
+    """Methods for moves that show something: a measured motion, an observation. Any of them.
+
+    The robot's environment returns what a move has shown
+    (:class:`~holdfast.outcome.MoveResult`); these say what it means. With the first or the third
+    the next decision waits for what the move shows, so a service is asked at each step.
+    """
+
+    def move_by_measurement(
+        self, states: FloatArray, motion: FloatArray, stream: Stream
+    ) -> FloatArray:
+        """Draw the states after a move whose motion was measured, as ``states``.
+
+        It takes the place of ``move`` in the belief: the noise is that of the measurement.
+        ``motion`` is what the environment returned, shape ``(n,)``.
+        """
+        ...
+
+    def measure_motion(self, before: FloatArray, after: FloatArray, stream: Stream) -> FloatArray:
+        """Draw the measurement of a true move from state to state, shape ``(n,)``; to simulate."""
+        ...
+
+    def move_log_likelihood(
+        self, states: FloatArray, action: FloatArray, observation: FloatArray
+    ) -> FloatArray:
+        """Return log p(observation | state after the move), up to one constant, for each state.
+
+        ``states`` has the shape ``(num_particles, state_size)``, the executed ``action``
+        ``(action_size,)`` and the result ``(num_particles,)``. Minus infinity where a state cannot
+        have shown that; never NaN or plus infinity.
+        """
+        ...
+
+    def sample_move_observation(
+        self, state: FloatArray, action: FloatArray, stream: Stream
+    ) -> FloatArray:
+        """Draw what comes with a move into one state, shape ``(n,)``; to simulate."""
+        ...
+
+
+class ReinitialisedProblem(Protocol):
+    """One more method, for a robot that is lost; without it its belief is the initial one again."""
+
+    def reinitial_states(self, states: FloatArray, stream: Stream) -> FloatArray:
+        """Draw a new belief after the particles ``states``, of the same shape."""
         ...
 
 

@@ -17,10 +17,9 @@ The machine touches nothing. Methods take an event and the time and return effec
 from __future__ import annotations
 
 from holdfast.arrays import FloatArray
-from holdfast.belief import VALIDATION_GATE_SQUARED
-from holdfast.config.settings import SimulatorSettings
+from holdfast.config.settings import LostSettings, SimulatorSettings
 from holdfast.errors import HeldError, HoldfastError, UnknownPerformanceError
-from holdfast.outcome import Done
+from holdfast.outcome import Ending
 from holdfast.planning import ObservationInfo, Planner, PlanningState
 from holdfast.protocol.events import (
     Act,
@@ -42,18 +41,19 @@ from holdfast.protocol.events import (
     WriteRecords,
 )
 from holdfast.protocol.messages import DIGEST_SIZE, encode_floats
+from holdfast.protocol.observation_reports import ObservationReports, held_error
 from holdfast.protocol.question import DecisionSource, Provenance, Question, same_actions
 from holdfast.protocol.records import (
-    DIVERGENCE_RUN,
     ActingRecord,
     LocalTookOverRecord,
-    ObservedRecord,
     PausedRecord,
     PerformedRecord,
     Record,
     TrialHistory,
+    has_shown,
 )
 from holdfast.protocol.status import Status
+from holdfast.tracking import LateObservation
 
 __all__ = ["Robot"]
 
@@ -65,20 +65,15 @@ _TICKS_INTERVAL_S = 1.0
 """Missed ticks are reported at most this often."""
 
 
-_MAX_REPORTS = 10
-"""Bound on reports of each kind about unexplained observations per trial; all are counted."""
-
-
 class Robot:
     """The loop of one robot over the trials of a run.
 
-    Parameters
-    ----------
-    rate_hz : float or None
-        Task actions per second; None for as soon as possible.
+    ``rate_hz`` is task actions per second; None is as soon as possible.
 
     Attributes
     ----------
+    num_performed : int
+        Task actions performed.
     missed_ticks : int
         Ticks of ``rate_hz`` at which the robot was not ready.
     has_decided : bool
@@ -91,16 +86,19 @@ class Robot:
         simulator: SimulatorSettings,
         source: DecisionSource,
         rate_hz: float | None = None,
+        lost: LostSettings | None = None,
     ) -> None:
         self._planner = planner
         self._simulator = simulator
         self._source = source
+        self._lost = LostSettings() if lost is None else lost
+        self.reports = ObservationReports(source.effects, self._lost)
         self._period_s = None if rate_hz is None else 1.0 / rate_hz
         # One list for both, because the order of all effects counts.
         self._effects = source.effects
         self._history: TrialHistory | None = None
         self._trial = 0
-        self._done: Done = False
+        self._ending: Ending | None = None
         self._awaits_environment = False
         self._sensing_action = 0
         self._computed_ms = 0.0
@@ -114,6 +112,7 @@ class Robot:
         self._reported_ticks = 0
         self._report_ticks_at = 0.0
         self.missed_ticks = 0
+        self.num_performed = 0
         self.has_decided = False
 
     @property
@@ -181,16 +180,22 @@ class Robot:
         """
         self._trial = trial
         self._history = history
-        self._done = begun.done
+        self._ending = begun.ending
         self._awaits_environment = False
         self._unwritten = []
         self._next_tick = None
         resumed = history.begun
         if resumed:
             self._effects.report("resumed_trial", trial=trial, step=history.state.step)
+        is_lost = history.alarm is not None and history.alarm.kind == "lost"
         try:
-            again = self._settle_pending_action(begun.steps_performed, resumed, tail_is_certain)
-        except UnknownPerformanceError as error:
+            if is_lost and history.pending is None and self._lost.on_lost == "reinitialise":
+                # The process ended between the observation and this, or held still there.
+                self._reinitialise()
+            again = self._settle_pending_action(begun, resumed, tail_is_certain)
+            for late in begun.late:
+                self._came_late(late)
+        except HoldfastError as error:
             self._stop(error)
             return self._take()
         if again is not None:
@@ -202,10 +207,10 @@ class Robot:
         return self._take()
 
     def _settle_pending_action(
-        self, performed: int | None, resumed: bool, tail_is_certain: bool
+        self, begun: EnvironmentReady, resumed: bool, tail_is_certain: bool
     ) -> FloatArray | None:
         """Return the pending task action if it was not performed and must be performed now."""
-        history = self._current_history
+        history, performed = self._current_history, begun.steps_performed
         known = history.state.step
         where = f"trial {self._trial}, step {history.state.step}"
         if performed is None:
@@ -223,9 +228,8 @@ class Robot:
                 "trial anew in another directory (--out)"
             )
         if history.pending is not None and performed == known + 1:
-            self._unwritten.append(PerformedRecord(known, None))
             self._effects.report("performed_unseen", trial=self._trial, step=known)
-            history.performed(self._planner, None)
+            self._fold_move(begun.last or Acted(known, None, None))
             return None
         if performed != known:
             raise UnknownPerformanceError(
@@ -258,8 +262,7 @@ class Robot:
                 elif isinstance(event, Sensed):
                     self._sensed(event, now)
                 elif isinstance(event, Acted):
-                    self._done = event.done
-                    self._performed(event.reward)
+                    self._performed(event)
                 else:
                     self._failed(event)
         elif not isinstance(event, EnvironmentReady):
@@ -303,68 +306,77 @@ class Robot:
 
     def _sensed(self, event: Sensed, now: float) -> None:
         history = self._current_history
-        state = history.state
+        step, sensing_action = history.state.step, self._sensing_action
         try:
-            after, info = self._planner.observe(state, self._sensing_action, event.observation)
+            info, record = history.observed(sensing_action, event.observation, self._computed_ms)
         except HoldfastError as error:
             self._stop(error)
             return
-        reached = self._planner.digest(after)
-        shown = encode_floats(event.observation)
-        record = ObservedRecord(state.step, self._sensing_action, shown, reached, self._computed_ms)
-        history.observed(record, after, explained=info.explained)
         self._write(record)
-        if not info.explained:
-            self._report_unexplained(state.step, info)
-        if not self._pausing:
-            self._ask(reached, now)
+        self._judge(step, info, sensing_action=sensing_action)
+        if not self._pausing and not self._stopped:
+            self._ask(self._planner.digest(history.state), now)
 
-    def _report_unexplained(self, step: int, info: ObservationInfo) -> None:
-        """Report an observation outside the validation gate, and a run of these."""
+    def _judge(self, step: int, info: ObservationInfo, **of_what: object) -> None:
+        """Report what an observation has shown, and act if the robot is lost."""
         history = self._current_history
-        gate = f"{VALIDATION_GATE_SQUARED**0.5:g} standard deviations"
-        if history.num_unexplained <= _MAX_REPORTS:
-            distance = info.mahalanobis_distance
-            fields: dict[str, object] = {} if distance is None else {"deviations": distance}
-            more = history.num_unexplained == _MAX_REPORTS
-            self._effects.report(
-                "unexplained",
-                trial=self._trial,
-                step=step,
-                sensing_action=self._sensing_action,
-                **fields,
-                reason=(
-                    "no particle can have made it"
-                    if distance is None
-                    else f"outside the validation gate of every particle ({gate})"
-                )
-                + ("; further ones of this trial are counted only" if more else ""),
-            )
-        if (
-            history.unexplained_in_a_row == DIVERGENCE_RUN
-            and history.num_divergences <= _MAX_REPORTS
-        ):
-            self._effects.report(
-                "filter_diverged",
-                trial=self._trial,
-                step=step,
-                reason=f"the last {DIVERGENCE_RUN} observations were unexplained: the belief has "
-                "lost the state, or the problem's model is wrong; the robot goes on",
-            )
+        on_lost = self.reports.observed(history, step, info, **of_what)
+        if on_lost == "hold":
+            self._stop(held_error(history, step))
+        elif on_lost == "reinitialise":
+            self._reinitialise()
 
-    def _performed(self, reward: float | None) -> None:
+    def _reinitialise(self) -> None:
+        """Begin the belief anew, before anything else is decided."""
         history = self._current_history
-        self._unwritten.append(PerformedRecord(history.state.step, reward))
+        self._write(history.reinitialised())
+        self.reports.reinitialised(history)
+
+    def _performed(self, event: Acted) -> None:
+        self._ending = event.ending
         try:
-            history.performed(self._planner, reward)
+            self._fold_move(event)
+            for late in event.late:
+                self._came_late(late)
         except HoldfastError as error:
             self._stop(error)
 
+    def _fold_move(self, event: Acted) -> None:
+        """Fold in what a performed task action has shown."""
+        motion, shown = (
+            b"" if each is None else encode_floats(each)
+            for each in (event.motion, event.observation)
+        )
+        record = PerformedRecord(event.step, event.reward, motion, shown)
+        self._unwritten.append(record)
+        self.num_performed += 1
+        info = self._current_history.performed(record)
+        if info is not None:
+            self._judge(event.step, info, of="move")
+
+    def _came_late(self, late: LateObservation) -> None:
+        """Fold in an observation of an earlier step."""
+        history = self._current_history
+        found = history.came_late(late)
+        if found is None:
+            self._effects.report(
+                "late_unused",
+                trial=self._trial,
+                step=history.state.step,
+                taken=late.step,
+                reason="no observation of that step is awaited: it has come before, was given up, "
+                "or nothing was sensed there",
+            )
+            return
+        info, record = found
+        self._unwritten.append(record)
+        self._judge(late.step, info, of="late")
+
     def _failed(self, event: EnvironmentFailed) -> None:
         where = f"the robot holds still in trial {self._trial}, step {event.step}"
-        if event.performed:
+        if event.performed is not None:
             # What is written down now needs no environment that counts when the run goes on.
-            self._performed(event.reward)
+            self._performed(event.performed)
             if self._stopped:
                 return
             where += ", whose task action was performed"
@@ -398,7 +410,7 @@ class Robot:
                 self._effects.append(Paused())
             return
         state = history.state
-        if self._done or state.step >= self._simulator.max_steps:
+        if self._ending is not None or state.step >= self._simulator.max_steps:
             # Before a pause: that the task is done, and how it ended, is in no other record.
             self._end_trial(now)
             return
@@ -414,7 +426,7 @@ class Robot:
             self._next_action(state, now)
 
     def _next_sensing(self, state: PlanningState, now: float) -> None:
-        question = self._source.question
+        question = self._question()
         if question is None or question.sensing_step != state.step:
             self._ask(self._planner.digest(state), now)
             question = self._source.question
@@ -438,12 +450,16 @@ class Robot:
         self._computed_ms = 1e3 * provenance.computed_s
         self._timed("sensing", question, provenance, now)
         self._sensing_action = answer.sensing_action
+        if answer.sensing_action == self._planner.no_sensing:
+            self._sensed(Sensed(state.step, None), now)
+            self._go_on(now)
+            return
         self._awaits_environment = True
         self._write()
         self._effects.append(Sense(state.step, answer.sensing_action))
 
     def _next_action(self, state: PlanningState, now: float) -> None:
-        question = self._source.question
+        question = self._question()
         offset = -1 if question is None else state.step - question.state.step
         if question is None or question.task_count == 0 or not 0 <= offset < question.task_count:
             self._ask(self._planner.digest(state), now)
@@ -474,12 +490,18 @@ class Robot:
         self._awaits_environment = True
         self._effects.append(Act(state.step, action))
 
+    def _question(self) -> Question | None:
+        """Return the current question, unless something was shown since that it does not know."""
+        question = self._source.question
+        if question is None or question.num_inputs != self._current_history.num_inputs:
+            return None
+        return question
+
     def _ask(self, state_digest: bytes, now: float) -> None:
         history = self._current_history
         self._write()
-        observations, num_observations = history.observations, history.num_observations
         question = Question(
-            self._planner.settings, history.state, state_digest, observations, num_observations
+            self._planner, history.state, state_digest, history.inputs, history.num_inputs
         )
         self._source.ask(question, now)
 
@@ -520,7 +542,9 @@ class Robot:
         history = self._current_history
         self._report_ticks(now)
         self._count_recoveries()
-        result = history.result(self._planner, self._done)
+        if any(has_shown(record) for record in self._unwritten):
+            self._write()
+        result = history.result(self._ending)
         self._history = None
         self._unwritten = []  # the result says all of it
         self._source.drop()

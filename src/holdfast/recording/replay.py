@@ -14,12 +14,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Self
 
 import numpy as np
+import numpy.typing as npt
 
 from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration
@@ -27,11 +28,12 @@ from holdfast.errors import DecidedOtherwiseError, EndOfRecordsError, HoldfastEr
 from holdfast.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
 from holdfast.planning import Planner, PlanningState, digest
 from holdfast.protocol.messages import decode_floats
-from holdfast.protocol.records import ActingRecord, ObservedRecord
+from holdfast.protocol.records import ActingRecord, ObservedRecord, reinitialised_after
 from holdfast.recording.facts import (
     Decider,
     EventFact,
     FactSink,
+    LateFact,
     SensingFact,
     TaskFact,
     TrialBeginFact,
@@ -44,7 +46,7 @@ from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME
 from holdfast.recording.step_times import NS_PER_S, StepClock, TrialTimes, read_events, trial_ends
 from holdfast.recording.timings import rows_by_trial
 from holdfast.robot.environment import Environment, SimulatedEnvironment
-from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
+from holdfast.robot.trial import LateStep, SensingStep, TaskStep, TrialObserver, run_trial
 
 __all__ = ["RecordedRun"]
 
@@ -161,7 +163,7 @@ class RecordedRun:
             _write_decisions(result, decisions, times, output)
         else:
             replay = _Replay(trial, list(decisions), times, output, result, self._planner)
-            self._run_again(trial, world, replay)
+            self._run_again(trial, world, replay, decisions.reinitialised_after())
         return trial
 
     def _replay_unfinished(self, begun: UnfinishedTrial, output: _Output, clock: StepClock) -> int:
@@ -179,7 +181,7 @@ class RecordedRun:
         times = self._times(trial, steps, clock)
         replay = _Replay(trial, expected, times, output, None, self._planner)
         try:
-            self._run_again(trial, world, replay)
+            self._run_again(trial, world, replay, reinitialised_after(begun.records))
         except EndOfRecordsError:
             replay.end_here()
         return trial
@@ -188,7 +190,9 @@ class RecordedRun:
         configuration = self.configuration
         return SimulatedEnvironment(configuration.problem, configuration.simulator.seed, trial)
 
-    def _run_again(self, trial: int, world: Environment, replay: _Replay) -> None:
+    def _run_again(
+        self, trial: int, world: Environment, replay: _Replay, reinitialised_after: Collection[int]
+    ) -> None:
         configuration = self.configuration
         try:
             run_trial(
@@ -198,6 +202,7 @@ class RecordedRun:
                 max_steps=configuration.simulator.max_steps,
                 environment=world,
                 observer=replay,
+                reinitialised_after=reinitialised_after,
             )
         except DecidedOtherwiseError as error:
             # Most likely the code has changed.
@@ -273,7 +278,7 @@ class _Replay(TrialObserver):
             after=after.belief,
             stage=step.before.stage,
             entropies=None if entropies is None else np.array(entropies, dtype=np.float64),
-            observation=np.asarray(step.observation, dtype=np.float64).reshape(-1),
+            observation=step.observation,
             explained=info.explained,
             resampled=info.resampled,
             effective_sample_size=info.effective_sample_size,
@@ -298,12 +303,28 @@ class _Replay(TrialObserver):
             estimate=np.array(step.task_info.estimate, dtype=np.float64),
             true_state=self._true_state,
             reward=None if step.reward is None else float(step.reward),
+            motion=_numbers(step.shown.motion),
+            observation=_numbers(step.shown.observation),
         )
         for sink in self._output.at(fact.time_ns):
             sink.acted(fact)
         self._true_state = _true_state(step.environment)
         self._steps = number + 1
         self._state = None  # the next one is not known before something is done in it
+
+    def observed_late(self, step: LateStep) -> None:
+        number = step.after.step
+        fact = LateFact(
+            trial=self._trial,
+            step=number,
+            time_ns=self._times.at(number - 1, 3),
+            taken=step.late.step,
+            observation=step.late.observation,
+            after=step.after.belief,
+            explained=step.observation_info.explained,
+        )
+        for sink in self._output.at(fact.time_ns):
+            sink.observed_late(fact)
 
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
         if self._result is None or result.decisions != self._result.decisions:
@@ -340,6 +361,10 @@ def _same(one: SensingDecision | TaskDecision, other: SensingDecision | TaskDeci
             np.array(one.action).tobytes() == np.array(other.action).tobytes()
         )
     return type(one) is type(other) and one == other
+
+
+def _numbers(shown: npt.ArrayLike | None) -> FloatArray | None:
+    return None if shown is None else np.array(shown, dtype=np.float64)
 
 
 def _true_state(environment: Environment) -> FloatArray | None:

@@ -42,7 +42,9 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     mean_reward_of_successes : float or None
         Earlier work reports this one.
     unexplained_observations : int
-        Observations outside the validation gate of every particle.
+        Observations that no particle explains.
+    lost, suspect_sensors : int
+        Times that the robot was found lost, and a sensing action suspect.
     recoveries : int
         Times that the local service took over, in all processes of the run.
     sensing_decisions_by_service, task_answers_by_service, longest_wait_ms
@@ -73,6 +75,8 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     mean_steps: float | None
     sensing_decisions: int
     unexplained_observations: int
+    lost: int = 0
+    suspect_sensors: int = 0
     recoveries: int
     sensing_decisions_by_service: dict[str, int] | None = None
     task_answers_by_service: dict[str, int] | None = None
@@ -92,7 +96,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def csv_lines(results: Iterable[TrialResult]) -> Iterator[str]:
-    """Yield the lines of ``trials.csv``, the head first; no value needs quotes.
+    """Yield the lines of ``trials.csv``, the head first; only a reason may need quotes.
 
     Reading a number back gives the same number. None, such as the reward of a trial without one, is
     an empty cell.
@@ -104,7 +108,12 @@ def csv_lines(results: Iterable[TrialResult]) -> Iterator[str]:
             "" if value is None else str(int(value)) if isinstance(value, bool) else str(value)
             for value in values
         )
-        yield ",".join(cells) + "\n"
+        yield ",".join(map(_quoted, cells)) + "\n"
+
+
+def _quoted(cell: str) -> str:
+    """Return a cell as RFC 4180 writes it."""
+    return '"' + cell.replace('"', '""') + '"' if "," in cell or '"' in cell else cell
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
@@ -145,6 +154,8 @@ class SummaryBuilder:
         self._steps = 0
         self._sensing_decisions = 0
         self._unexplained = 0
+        self._lost = 0
+        self._suspect_sensors = 0
         self._recoveries = 0
         self._sensing_ms = array("f")
         self._digest = hashlib.blake2b(digest_size=32)
@@ -160,6 +171,8 @@ class SummaryBuilder:
         self._steps += result.steps
         self._sensing_decisions += result.sensing_decisions
         self._unexplained += result.unexplained_observations
+        self._lost += result.lost
+        self._suspect_sensors += result.suspect_sensors
         self._recoveries += result.recoveries
         self._sensing_ms.extend(result.sensing_ms)
         self._digest.update(bytes.fromhex(result.digest))
@@ -196,6 +209,8 @@ class SummaryBuilder:
             mean_steps=self._steps / count if count else None,
             sensing_decisions=self._sensing_decisions,
             unexplained_observations=self._unexplained,
+            lost=self._lost,
+            suspect_sensors=self._suspect_sensors,
             recoveries=self._recoveries,
             **{} if answers is None else answers._asdict(),
             **{} if verified is None else verified._asdict(),

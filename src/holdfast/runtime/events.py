@@ -9,8 +9,9 @@ retry, hedge, restore, restored, state_diverged, service_appeared, service_vanis
 service_suspected, unreachable, no_datagrams, insecure, credentials,
 late_replies, waiting, holding, resumed, busy, refused, malformed_reply, disagreement,
 wrong_answer, not_deterministic, verification_failed, distrusted,
-limits_unknown, verifying, prefetch_unused, unexplained, filter_diverged,
-resumed_trial, performed_unseen, trial, missed_ticks, stopped, note, interrupted, offers.
+limits_unknown, verifying, prefetch_unused, unexplained, lost, sensor_suspect, reinitialised,
+late_unused, resumed_trial, performed_unseen, trial, missed_ticks, stopped, note, interrupted,
+offers.
 Of a service: ready, session_opened, session_taken_over, restored, state_diverged, refused, busy,
 evicted, robot_connected, robot_disconnected, link_refused, credentials, credentials_reloaded,
 stopping, process_ended, process_started.

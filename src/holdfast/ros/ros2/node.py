@@ -78,7 +78,9 @@ _TOLD_AT_ONCE = frozenset(
         "launch_failed",
         "recovery_exited",
         "unexplained",
-        "filter_diverged",
+        "lost",
+        "sensor_suspect",
+        "reinitialised",
         "service_vanished",
         "service_appeared",
         "wrong_answer",
@@ -88,7 +90,18 @@ _TOLD_AT_ONCE = frozenset(
 )
 """Events that change the diagnostics."""
 
-_LOGGED = frozenset(("status", "holding", "resumed", "filter_diverged", "wrong_answer", "stopped"))
+_LOGGED = frozenset(
+    (
+        "status",
+        "holding",
+        "resumed",
+        "lost",
+        "sensor_suspect",
+        "reinitialised",
+        "wrong_answer",
+        "stopped",
+    )
+)
 
 
 class _Events:
