@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from holdfast.problems.registry import make
     from holdfast.recording.reading import open_run
     from holdfast.robot.environment import LATER, Environment, SimulatedEnvironment
+    from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
     from holdfast.robot.late_sensing import SenseInBackground, SenseLater
     from holdfast.robot.trial import run_trial
 
@@ -37,6 +38,7 @@ __all__ = [
     "Ending",
     "Environment",
     "GaussianMixture",
+    "GymnasiumEnvironment",
     "HoldfastError",
     "LostSettings",
     "MoveResult",
@@ -74,6 +76,7 @@ _PLACES = {
     "SenseInBackground": "robot.late_sensing.SenseInBackground",
     "SenseLater": "robot.late_sensing.SenseLater",
     "GaussianMixture": "estimators.GaussianMixture",
+    "GymnasiumEnvironment": "robot.gymnasium_environment.GymnasiumEnvironment",
     "HoldfastError": "errors.HoldfastError",
     "NearestNeighbor": "estimators.NearestNeighbor",
     "Planner": "planning.Planner",

@@ -71,6 +71,14 @@ def test_what_is_saved(known: Report) -> None:
             assert row["saved_low"] <= row["saved"] <= row["saved_high"]
 
 
+def test_what_choosing_when_saves_alone(known: Report) -> None:
+    """The return takes as many steps of the made-up trials, whether it chooses or not."""
+    alone = known.summary["when_alone"]
+    assert alone["problem"].tolist() == ["dock", "dock", "boat", "boat"]
+    assert (alone["saved_low"] < 0.0).all()
+    assert (alone["saved_high"] > 0.0).all()
+
+
 def test_the_resolution_of_the_boat(known: Report) -> None:
     weak = known.summary["weak_sensor"]
     path = weak[weak["way"] == "path entropy"]
@@ -100,7 +108,8 @@ def test_settings_of_cells() -> None:
             assert selector.nats_per_cost == cell.number in NATS
             assert series.planning.sensing_interval == 0
         problem = problem_of(series.problem, series.model)
-        assert set(problem.sensing_costs) == {cell.price}  # type: ignore[attr-defined]
+        price = 1.0 if cell.way.startswith("nats") else cell.price
+        assert set(problem.sensing_costs) == {price}  # type: ignore[attr-defined]
 
 
 def test_below_its_resolution_the_sharp_sensor_is_worth_nothing() -> None:

@@ -247,7 +247,10 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
             )
         )
     if summary.failures:
-        rows.append(("failed", f"{summary.failures:,} of {counted(summary.finished, 'trial')}"))
+        truncated = summary.finished - summary.successes - summary.failures
+        others = f" ({truncated:,} truncated)" if truncated else ""
+        failed = f"{summary.failures:,} of {counted(summary.finished, 'trial')}{others}"
+        rows.append(("failed", failed))
     if summary.mean_reward is not None:
         value = f"{summary.mean_reward:.4g}"
         if summary.mean_reward_of_successes is not None:

@@ -138,10 +138,11 @@ class Problem(Protocol):
     num_stages : int
         Stages of the task (holes to pass, via points to reach); 1 where there are none.
     resolution : float or array of shape (action_size,)
-        Distance below which two task actions do not differ in practice (of the order of the motion
-        noise's standard deviation), in the actions' unit. An array gives each coordinate its own,
-        in its own unit (0.1 m and 0.05 rad), so distances count in resolutions and the choice of
-        what to sense does not depend on units. One number fits where all coordinates have the same.
+        Distance below which two task actions do not differ in practice, in the actions' unit: of
+        the order of the motion noise's standard deviation, or of what the task tolerates, if that
+        is larger and sensors differ in sharpness. An array gives each coordinate its own, in its
+        own unit (0.1 m and 0.05 rad), so distances count in resolutions and the choice of what to
+        sense does not depend on units. One number fits where all coordinates have the same.
     motion_variance : array of shape (action_size,)
         Variance of the noise on an executed action, for the Gaussian-mixture entropy.
     state_labels : sequence of str
@@ -391,7 +392,7 @@ class ProblemBase:
     motion_variance: FloatArray = np.array([0.01])
     state_labels: Sequence[str] = ()
     pose: Sequence[str | None] = ()
-    """Which coordinates of the state are a pose, for ROS: see :mod:`holdfast.ros.poses`."""
+    """Which coordinates of the state are a pose, for ROS: see :mod:`holdfast.recording.poses`."""
     up: str = "z"
     """Which axis of that pose points up: z, or y for a problem in a vertical plane."""
 

@@ -280,7 +280,7 @@ def _replay_record(planner: Planner, history: TrialHistory, record: Record) -> N
         history.recoveries += record.times
         return
     state = history.state
-    if not isinstance(record, PerformedRecord) and history.pending is not None:
+    if isinstance(record, ObservedRecord | ActingRecord) and history.pending is not None:
         raise RecordError("comes before the action of that step is known to be performed")
     if record.step != state.step:
         raise RecordError(f"is of step {record.step}, where step {state.step} is due")

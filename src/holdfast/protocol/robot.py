@@ -57,7 +57,6 @@ from holdfast.tracking import LateObservation
 
 __all__ = ["Robot"]
 
-
 _FROM_ENVIRONMENT = (Sensed, Acted, EnvironmentFailed)
 """Events that complete an order to the environment."""
 
@@ -72,10 +71,8 @@ class Robot:
 
     Attributes
     ----------
-    num_performed : int
-        Task actions performed.
-    missed_ticks : int
-        Ticks of ``rate_hz`` at which the robot was not ready.
+    num_performed, missed_ticks : int
+        Task actions performed, and ticks of ``rate_hz`` at which the robot was not ready.
     has_decided : bool
         Whether this process has used an answer.
     """
@@ -198,9 +195,10 @@ class Robot:
         except HoldfastError as error:
             self._stop(error)
             return self._take()
-        if again is not None:
+        if again is not None and not self._stopped:
             # It is in the journal already, and the environment says that it was not performed.
             self._awaits_environment = True
+            self._write()
             self._effects.append(Act(history.state.step, again))
         else:
             self._go_on(now)

@@ -28,7 +28,9 @@ import math
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterable, Mapping
-from typing import Protocol, TypeAlias
+from typing import Literal, Protocol, TypeAlias
+
+from holdfast.protocol.status import Status
 
 __all__ = [
     "BoundedEventLog",
@@ -36,14 +38,45 @@ __all__ = [
     "EventRates",
     "EventSink",
     "NullEventLog",
+    "severity",
 ]
 
 _REPEAT_INTERVAL_S = 1.0
 _BURST = 20
 """Events of one kind that pass at once: more than correct peers cause."""
 
+_WARNINGS = frozenset(
+    [
+        "launch_failed",
+        "recovery_exited",
+        "service_vanished",
+        "service_suspected",
+        "unreachable",
+        "holding",
+        "unexplained",
+        "lost",
+        "sensor_suspect",
+        "reinitialised",
+        "malformed_reply",
+        "disagreement",
+        "refused",
+        "verification_failed",
+        "distrusted",
+        "missed_ticks",
+        "performed_unseen",
+        "insecure",
+    ]
+)
+_ERRORS = frozenset(("wrong_answer", "not_deterministic", "state_diverged", "stopped", "error"))
+
 Event: TypeAlias = tuple[str, Mapping[str, object]]
 """A name and its fields; after dropped ones like it with their number."""
+
+
+def severity(name: str, fields: Mapping[str, object]) -> Literal["INFO", "WARN", "ERROR"]:
+    """Return how bad it is that an event has happened."""
+    worse = name == "status" and fields.get("to") == Status.LOCAL_RECOVERY.value
+    return "ERROR" if name in _ERRORS else "WARN" if worse or name in _WARNINGS else "INFO"
 
 
 class EventSink(Protocol):

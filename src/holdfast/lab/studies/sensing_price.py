@@ -85,11 +85,11 @@ class _Posed(NamedTuple):
 _MODULE = "holdfast.lab.studies.priced_problems"
 
 PROBLEMS: Mapping[str, _Posed] = {
-    "dock": _Posed(f"{_MODULE}:Dock", 300),
-    "boat": _Posed(f"{_MODULE}:Boat", 200),
+    "dock": _Posed(f"{_MODULE}:Dock", 300, 1.5),
+    "boat": _Posed(f"{_MODULE}:Boat", 200, 1.5),
     # A trial of expected_return takes seconds here.
     "peg in hole": _Posed(
-        f"{_MODULE}:PricedPeg", 500, 0.4, PRICES[:1], (FIXED, "nats", "nats, executed", "return")
+        f"{_MODULE}:PricedPeg", 500, 0.5, PRICES[:1], (FIXED, "nats", "nats, executed", "return")
     ),
 }
 
@@ -118,36 +118,37 @@ class SensingPrice(JudgedStudy):
     name = "sensing_price"
     title = "When to sense at a price, and what to sense where one sensor is weak"
     columns = ("problem", "way", "number", "price")
-    num_trials: ClassVar = {CHOICE: 20, CLAIM: 60}
+    num_trials: ClassVar = {CHOICE: 20, CLAIM: 40}
 
     def cells(self, scale: Scale) -> Iterator[_Cell]:
         """Return all cells, in the order of the tables."""
+        for way, selector in _OF_BOAT.items():
+            numbers = RESOLUTIONS if _depends_on_resolution(selector) else RESOLUTIONS[:1]
+            for resolution in numbers:
+                yield _Cell(_WEAK, way, resolution, 0.0)
         for problem, posed in list(PROBLEMS.items())[: 1 if scale.quick else None]:
             for way in posed.ways:
                 for number in WAYS[way]:
                     for price in posed.prices if way == "return" else (0.0,):
                         yield _Cell(problem, way, number, price)
-        for way, selector in _OF_BOAT.items():
-            numbers = RESOLUTIONS if _depends_on_resolution(selector) else RESOLUTIONS[:1]
-            for resolution in numbers:
-                yield _Cell(_WEAK, way, resolution, 0.0)
 
     def names(self, cell: _Cell) -> tuple[Cell, ...]:
-        """Return a cell's values of the columns."""
-        return cell
+        """Return a cell's values of the columns, as a file of trials has them."""
+        return (cell.problem, cell.way, float(np.float32(cell.number)), cell.price)
 
     def series(self, cell: _Cell, purpose: str, scale: Scale, num_trials: int) -> TrialSeries:
         """Return the trials of a cell for a purpose."""
         if cell.problem == _WEAK:
             selector, interval = _OF_BOAT[cell.way], 8
             # Cheap, and shares of trials need many.
-            posed = PROBLEMS["boat"]._replace(max_steps=80, share=3.0)
+            posed = PROBLEMS["boat"]._replace(max_steps=80, share=5.0)
             model = {"resolution": cell.number}
             particles = 300
         else:
             selector, interval = _selector_of(cell)
             posed = PROBLEMS[cell.problem]
-            model = {"price": cell.price}
+            # In nats the price of a look is the least gain.
+            model = {"price": 1.0 if cell.way.startswith("nats") else cell.price}
             if cell.problem == "boat" and selector.actions == "commanded":
                 model["resolution"] = _BOAT_RESOLUTION
             particles = 100
@@ -169,8 +170,14 @@ class SensingPrice(JudgedStudy):
         """Return the report on all trials; InvalidValueError if they are not of this study."""
         choosing, cells = self.by_cell(tables[TRIALS]).values()
         when, weak = _when(choosing, cells), _weak_sensor(cells)
+        alone = _when_alone(when, cells)
         return Report(
-            summary={"when_to_sense": when, "weak_sensor": weak, "cells": _all_cells(cells)},
+            summary={
+                "when_to_sense": when,
+                "when_alone": alone,
+                "weak_sensor": weak,
+                "cells": _all_cells(cells),
+            },
             figures={
                 "when_to_sense": drawn("sensing_price_figures:when_to_sense", when),
                 "weak_sensor": drawn("sensing_price_figures:weak_sensor", weak),
@@ -192,7 +199,6 @@ def _selector_of(cell: _Cell) -> tuple[SelectorSettings, int]:
         return returns, int(cell.number)
     if cell.way == "return":
         return _optional(returns), int(cell.number)
-    # The price is the least gain: a look has a cost of 1.
     executed = cell.way == "nats, executed"
     by_nats = SelectorSettings(
         nats_per_cost=cell.number,
@@ -251,6 +257,25 @@ def _when(choosing: _Cells, cells: _Cells) -> pd.DataFrame:
                 )
     found = pd.DataFrame(rows)
     statistics.add_adjusted(found, "p_value", compared=found["way"] != FIXED)
+    return found
+
+
+def _when_alone(when: pd.DataFrame, cells: _Cells) -> pd.DataFrame:
+    """Return what the return saves by choosing when, against itself at fixed intervals."""
+    chosen = when.set_index(["problem", "price", "way"])["number"]
+    rows: list[dict[str, Cell]] = []
+    for problem, price, way in chosen.index:
+        if way == "return, intervals":
+            intervals, free = (
+                _cost(_of(cells, problem, each, price)[chosen[problem, price, each]], price)
+                for each in (way, "return")
+            )
+            saved, p_value = statistics.paired_difference(intervals, free)
+            rows.append(
+                {"problem": problem, "price": price, **cells_of("saved", saved), "p_value": p_value}
+            )
+    found = pd.DataFrame(rows)
+    statistics.add_adjusted(found, "p_value")
     return found
 
 

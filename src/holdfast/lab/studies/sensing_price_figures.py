@@ -52,5 +52,5 @@ def weak_sensor(weak: pd.DataFrame) -> Figure:
         for row in weak.to_dict("records")
     ]
     plots.dot_rows(panel, labels, [plots.dots_of("", weak, "success", 100.0)])
-    panel.set_xlabel("trials in which the boat is in the harbour after 80 steps (%)")
+    panel.set_xlabel("trials in which the boat reaches the harbour within 80 steps (%)")
     return figure

@@ -35,10 +35,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from holdfast.errors import HoldfastError
 from holdfast.planning import PlanningState
 from holdfast.protocol.events import Act, Sense
+from holdfast.recording.poses import PoseLayout, pose_layout
 from holdfast.recording.run_directory import RunDirectory
 from holdfast.robot.links import check_services
 from holdfast.ros.executive import DecideCode, DecideRequest
-from holdfast.ros.poses import PoseLayout, pose_layout
 from holdfast.ros.ros2 import messages
 from holdfast.ros.ros2.diagnostics import Diagnostics
 from holdfast.ros.ros2.parameters import (
