@@ -13,7 +13,7 @@ still ranks them instead of turning every weight into zero.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,9 @@ import numpy.typing as npt
 from holdfast import _kernel, checked, numerics
 from holdfast.arrays import FloatArray, in_brief
 from holdfast.circular import differences, mean_angles
+from holdfast.config.settings import Estimate
 from holdfast.errors import InvalidValueError
+from holdfast.modes import heaviest_mode
 from holdfast.problem_attributes import circular_observation, has_general_observations
 from holdfast.randomness import Stream
 from holdfast.validation_gate import gate, is_typical, is_within
@@ -138,22 +140,26 @@ class ObservationInfo(NamedTuple):
 
 def estimate(
     belief: Belief,
-    kind: Literal["mean", "most_likely"] = "mean",
+    kind: Estimate = "mean",
     circular: Sequence[int] = (),
 ) -> FloatArray:
     """Return a point estimate of the state, shape ``(state_size,)``.
 
-    It is the mean, or the particle of the greatest weight (the first of equals). The mean of a
-    ``circular`` coordinate, an angle in radians, is the mean direction, in (-pi, pi].
+    It is the mean, the mean of the heaviest mode (:mod:`holdfast.modes`), or the particle of the
+    greatest weight (the first of equals). The mean of a ``circular`` coordinate, an angle in
+    radians, is the mean direction, in (-pi, pi].
     """
     if kind == "most_likely":
         # A copy: the belief may be large, and what is returned may outlive it.
         likely: FloatArray = belief.states[int(np.argmax(belief.weights))].copy()
         return likely
-    mean = _kernel.weighted_sums(belief.weights, belief.states)
+    weights = belief.weights
+    if kind == "heaviest_mode":
+        weights = heaviest_mode(belief.states, weights, circular)
+    mean = _kernel.weighted_sums(weights, belief.states)
     if circular:
         angles = list(circular)
-        mean[angles] = mean_angles(belief.states[:, angles], belief.weights)
+        mean[angles] = mean_angles(belief.states[:, angles], weights)
     return mean
 
 

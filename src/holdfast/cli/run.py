@@ -238,6 +238,7 @@ def main(arguments: Sequence[str]) -> int:
 def _run(options: RunOptions) -> int:
     from holdfast.cli.robot_run import RobotFindings, is_robot_run, run_as_robot
     from holdfast.planning import Planner
+    from holdfast.recording.belief_remarks import belief_remarks
     from holdfast.recording.recorder import Recorder
     from holdfast.recording.run_directory import (
         FIGURE_NAME,
@@ -348,6 +349,8 @@ def _run(options: RunOptions) -> int:
             print_files(directory_path)
         if remark is not None:
             notes.note(remark.text)
+        for text in belief_remarks(configuration.problem, configuration.planning, recorder.record):
+            notes.note(f"in trial {recorder.trial}, {text}")
         if summary.unverified_answers:
             notes.note(
                 f"{summary.unverified_answers} questions that were drawn to be answered by the "

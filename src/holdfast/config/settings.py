@@ -88,6 +88,9 @@ NEIGHBOR_ESTIMATORS: frozenset[Estimator] = frozenset({"nearest_neighbor", "prio
 """Those that count nearest neighbours."""
 
 
+Estimate = Literal["mean", "most_likely", "heaviest_mode"]
+"""Which state stands for a belief: ``holdfast.belief.estimate`` has a branch each."""
+
 OnLost = Literal["continue", "hold", "reinitialise"]
 """What a robot that is lost does."""
 
@@ -102,14 +105,16 @@ class ParticleFilterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=
         over several problems (docs/results.md).
     resampling_threshold : float
         Resample when the effective sample size is at most this fraction of the particles.
-    estimate : {"mean", "most_likely"}
-        The state for which the policy is asked. Of equal weights, as all are after resampling, the
-        first particle is the most likely: no more than a draw from the belief.
+    estimate : Estimate
+        The state for which the policy is asked. ``heaviest_mode`` is for beliefs with several
+        modes, between which the mean lies where the robot is not; with one mode it is the mean. Of
+        equal weights, as all are after resampling, the first particle is the most likely: no more
+        than a draw from the belief.
     """
 
     num_particles: Annotated[int, msgspec.Meta(ge=1, le=MAX_PARTICLES)] = 300
     resampling_threshold: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 1.0
-    estimate: Literal["mean", "most_likely"] = "mean"
+    estimate: Estimate = "mean"
 
 
 class ActiveSensingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
