@@ -8,7 +8,9 @@ Evidence is added up as Page's cumulative sum (1954, "Continuous inspection sche
 41). Each observation multiplies a likelihood ratio: of a lost robot, half of whose observations are
 outside the gate, to a sound belief, of whose observations at most one in twenty is. So one outside
 counts times 10, one inside times 10/19, and below 1 the sum begins anew. There is one sum over all
-observations and one for each sensing action. The first that reaches the limit names the cause;
+sensing actions and one for each of them. What comes with moves has a sum of its own alone: it comes
+at each step, and has no gate but that of being possible, so it would drown the others. The first
+that reaches the limit names the cause;
 where both do, the greater one: an explained observation of another sensing action makes that of the
 sensor the greater one. Equal ones say *lost*: nothing else was sensed that could tell.
 
@@ -120,7 +122,8 @@ class LostTest:
         one = self._each.get(sensing_action)
         if one is None:
             one = self._each[sensing_action] = _Evidence()
-        self._all.add(sensing_action, within_gate)
+        if sensing_action != MOVE:
+            self._all.add(sensing_action, within_gate)
         one.add(sensing_action, within_gate)
         if within_gate:
             return None

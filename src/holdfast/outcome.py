@@ -151,6 +151,10 @@ class Decisions(msgspec.Struct, frozen=True):
     action_size: int
     log: bytes
 
+    def __repr__(self) -> str:
+        """Return something short: the log has kilobytes."""
+        return f"Decisions(action_size={self.action_size}, log of {len(self.log)} bytes)"
+
     def digest(self) -> str:
         """Return the BLAKE2b-256 of the log in hexadecimal."""
         return hashlib.blake2b(self.log, digest_size=_DIGEST_SIZE).hexdigest()

@@ -355,7 +355,11 @@ class TestFailures:
             ("perform_sensing", [float("nan")], "returned [nan]; it must return finite numbers"),
             ("perform_sensing", [float("inf")], "returned [inf]; it must return finite numbers"),
             ("perform", float("nan"), "returned nan; it must return a finite number, the reward"),
-            ("perform", "1", "returned '1'; it must return a finite number, the reward, or None"),
+            (
+                "perform",
+                "1",
+                "returned '1'; it must return a finite number, the reward, a MoveResult",
+            ),
             ("perform", [1.0], "returned [1.0]; it must return a finite number"),
             ("perform", True, "returned True; it must return a finite number"),
             ("is_done", None, 'returned None; it must return True, False, "failed" or an Ending'),
@@ -703,7 +707,7 @@ class TestShown:
             (MoveResult(motion=[]), "MoveResult whose motion is an array of 1 to 4096 numbers"),
             (MoveResult(observation=1.0), "MoveResult whose observation is an array"),
             (MoveResult(observation=[np.nan]), "finite numbers"),
-            (MoveResult(reward=np.inf), "a finite number, the reward, or None"),
+            (MoveResult(reward=np.inf), "a finite number, the reward, a MoveResult, or None"),
         ],
     )
     def test_what_a_move_cannot_show(self, shown: Any, message: str, bench: Bench) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
-from holdfast.errors import InvalidValueError
+from holdfast.errors import EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
@@ -140,5 +140,6 @@ def test_what_sensing_raises_is_heard() -> None:
 
     robot = SenseInBackground(Broken())
     robot.perform_sensing(0)
-    with pytest.raises(OSError, match="the camera is unplugged"):
+    message = "perform_sensing, begun at step 0 in the background, raised OSError: the camera is un"
+    with pytest.raises(EnvironmentFailedError, match=message):
         robot.perform_sensing(1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from benchmarks.lost import trials
 
-from holdfast.lost import MAX_OUTSIDE, LostTest, Verdict
+from holdfast.lost import MAX_OUTSIDE, MOVE, LostTest, Verdict
 
 Seen = tuple[int, bool]
 
@@ -55,6 +55,15 @@ def test_a_suspect_does_not_make_the_robot_lost() -> None:
     again = [test.observed(*each) for each in dead]
     assert [found.kind for found in again if found] == ["sensor_suspect"]
     assert (test.num_lost, test.num_suspect) == (0, 2)
+
+
+def test_what_moves_show_does_not_drown_a_sensor() -> None:
+    """Between two looks it comes many times, and is explained if it is possible."""
+    seen = [(MOVE if at % 10 else 0, at % 10 != 0) for at in range(200)]
+    ((at, verdict), *_) = alarms(1e-4, seen)
+    assert (at, verdict) == (41, Verdict("lost", 0, 5, 5))
+    impossible = [(MOVE, False)] * 5
+    assert alarms(1e-4, impossible) == [(5, Verdict("sensor_suspect", MOVE, 5, 5))]
 
 
 def test_evidence_ends_with_explained_observations() -> None:

@@ -18,7 +18,7 @@ from holdfast.planning import Planner
 from holdfast.robot.trial import run_trial
 
 ROOT = Path(__file__).parents[2]
-EXAMPLE = ROOT / "examples" / "cart.py"
+EXAMPLE = ROOT / "examples" / "docking.py"
 PAGE = (ROOT / "docs" / "robots.md").read_text(encoding="utf-8")
 
 
@@ -27,7 +27,7 @@ def forgotten_imports(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Other tests have modules of the example's name."""
     monkeypatch.setattr(sys, "path", list(sys.path))
     yield
-    sys.modules.pop("cart", None)
+    sys.modules.pop("docking", None)
 
 
 def test_what_it_quotes_stands_in_an_example() -> None:
@@ -39,9 +39,9 @@ def test_what_it_quotes_stands_in_an_example() -> None:
 
 
 def outcomes(name: str, trials: int) -> list[str]:
-    configuration = load(ROOT / "examples" / "cart.yaml")
+    configuration = load(ROOT / "examples" / "docking.yaml")
     robot: Any = find_class(
-        f"cart:{name}",
+        f"docking:{name}",
         what="environment.object",
         group="",
         search_directory=EXAMPLE.parent,

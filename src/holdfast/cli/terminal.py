@@ -268,14 +268,11 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
         )
     if summary.unexplained_observations:
         deviations = f"{VALIDATION_GATE_SQUARED**0.5:g}"
-        rows.append(
-            (
-                "unexplained",
-                f"{summary.unexplained_observations:,} of "
-                f"{counted(summary.sensing_decisions, 'observation')} over {deviations} sigma "
-                "from every particle",
-            )
-        )
+        number, looks = summary.unexplained_observations, summary.sensing_decisions
+        # Of the moves that have shown something there is no number here.
+        shown = counted(looks, "observation") if number <= looks else "the looks and moves"
+        far = f"{number:,} of {shown} over {deviations} sigma from every particle"
+        rows.append(("unexplained", far))
         if summary.unexplained_observations * 100 > summary.sensing_decisions:
             remedy = "take more particles (particle_filter.num_particles), or check the model"
             rows.append(("", remedy))

@@ -42,6 +42,7 @@ __all__ = [
     "RememberingEnvironment",
     "SimulatedEnvironment",
     "load_environment",
+    "require_methods",
 ]
 
 
@@ -234,6 +235,16 @@ class SimulatedEnvironment:
         return self.step
 
 
+def require_methods(environment: object, name: str) -> None:
+    """Raise EnvironmentFailedError if an environment lacks one of the three methods."""
+    missing = [method for method in _REQUIRED if not callable(getattr(environment, method, None))]
+    if missing:
+        raise EnvironmentFailedError(
+            f"{name} is no environment: it lacks {' and '.join(missing)}; it needs "
+            "perform_sensing(sensing_action), perform(task_action) and is_done()"
+        )
+
+
 class ObservationSizes(dict[int, "int | None"]):
     """Numbers that a problem expects of each sensing action; None where it does not say."""
 
@@ -349,12 +360,7 @@ class EnvironmentMaker:
             **copy.deepcopy(self._arguments),
             **{name: values[name] for name in self._provided},
         )
-        missing = [name for name in _REQUIRED if not callable(getattr(environment, name, None))]
-        if missing:
-            raise EnvironmentFailedError(
-                f"{self.name} is no environment: it lacks {' and '.join(missing)}; it needs "
-                "perform_sensing(sensing_action), perform(task_action) and is_done()"
-            )
+        require_methods(environment, self.name)
         made: Environment = environment
         if self._sense_in_background:
             from holdfast.robot.late_sensing import SenseInBackground

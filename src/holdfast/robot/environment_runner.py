@@ -253,7 +253,7 @@ class EnvironmentRunner(abc.ABC):
             return None
         number = _numbers(value)
         if number is None or number.ndim != 0 or not np.isfinite(number):
-            raise self._unusable(value, "a finite number, the reward, or None")
+            raise self._unusable(value, "a finite number, the reward, a MoveResult, or None")
         return float(number)
 
     def _ending(self, value: object) -> Ending | None:

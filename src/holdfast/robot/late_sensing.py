@@ -14,7 +14,7 @@ from typing import Any
 import numpy.typing as npt
 
 from holdfast.arrays import FloatArray
-from holdfast.errors import InvalidValueError
+from holdfast.errors import EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import Done, MoveResult
 from holdfast.robot.environment import LATER, Environment, Later
 
@@ -67,7 +67,7 @@ class SenseInBackground(_Around):
         super().__init__(environment)
         self._thread: threading.Thread | None = None
         self._came: deque[tuple[int, npt.ArrayLike]] = deque()
-        self._error: BaseException | None = None
+        self._failed: tuple[int, BaseException] | None = None
 
     def perform_sensing(self, sensing_action: int) -> Later:
         """Begin to sense; wait first for a sensing action that has not ended."""
@@ -90,12 +90,16 @@ class SenseInBackground(_Around):
             shown = self._environment.perform_sensing(sensing_action)
             self._came.append((step, shown))  # type: ignore[arg-type]
         except BaseException as error:  # noqa: BLE001 - raised again where it can be heard
-            self._error = error
+            self._failed = step, error
 
     def _raise(self) -> None:
-        error, self._error = self._error, None
-        if error is not None:
-            raise error
+        failed, self._failed = self._failed, None
+        if failed is not None:
+            step, error = failed
+            what = f"{type(error).__name__}: {error}"
+            raise EnvironmentFailedError(
+                f"perform_sensing, begun at step {step} in the background, raised {what}"
+            ) from error
 
 
 class SenseLater(_Around):

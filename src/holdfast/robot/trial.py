@@ -28,7 +28,12 @@ from holdfast.planning import (
     SensingInfo,
     TaskInfo,
 )
-from holdfast.robot.environment import LATER, Environment, SimulatedEnvironment
+from holdfast.robot.environment import (
+    LATER,
+    Environment,
+    SimulatedEnvironment,
+    require_methods,
+)
 from holdfast.tracking import LateObservation, Trial
 
 __all__ = [
@@ -150,6 +155,7 @@ def run_trial(
         raise InvalidValueError(f"max_steps is {max_steps!r}; allowed are integers from 1")
     if environment is None:
         environment = SimulatedEnvironment(planner.problem, seed, trial)
+    require_methods(environment, type(environment).__name__)
     track = Trial(planner, seed, trial, lost.false_alarm_rate)
     observer.trial_began(environment, track.state)
     late_observations = getattr(environment, "late_observations", None)
