@@ -152,14 +152,25 @@ def run_trial(
         environment = SimulatedEnvironment(planner.problem, seed, trial)
     track = Trial(planner, seed, trial, lost.false_alarm_rate)
     observer.trial_began(environment, track.state)
-    late_observations = getattr(environment, "late_observations", None)
+
+    def take_late(method: str) -> None:
+        ask = getattr(environment, method, None)
+        for step, came in () if ask is None else ask():
+            late = LateObservation(step, np.array(came, dtype=np.float64))
+            found = track.observe_late(late)
+            if found is not None:
+                observer.observed_late(LateStep(late, track.state, found[0]))
+                _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
+
     ending = _ask_done(environment)
     while ending is None and track.state.step < max_steps:
         if planner.needs_sensing(track.state):
             _sense(track, environment, observer)
             _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
+        take_late("late_before_choosing")  # only a recorded world has these two
         before = track.state
         executed, task_info = planner.choose_task_action(before)
+        take_late("late_before_moving")
         shown = environment.perform(executed)
         result = shown if isinstance(shown, MoveResult) else MoveResult(shown)
         reward, motion, observation = result
@@ -176,12 +187,7 @@ def run_trial(
         observer.acted(TaskStep(environment, before, task_info, executed, reward, result, info))
         if info is not None:
             _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
-        for step, came in () if late_observations is None else late_observations():
-            late = LateObservation(step, np.array(came, dtype=np.float64))
-            found = track.observe_late(late)
-            if found is not None:
-                observer.observed_late(LateStep(late, track.state, found[0]))
-                _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
+        take_late("late_observations")
         ending = _ask_done(environment)
     ended = track.result(ending)
     observer.trial_ended(track.state, ended)
