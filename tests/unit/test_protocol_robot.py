@@ -255,6 +255,18 @@ def test_what_came_late_is_written_before_a_pending_action_is_ordered(on_lost: O
     assert isinstance(written.records[0], LateRecord)
 
 
+def test_the_lines_about_what_nobody_awaits_are_bounded() -> None:
+    planner = Planner(PROBLEM, PLANNING)
+    robot = Robot(planner, SimulatorSettings(), InProcessSource())
+    late = (LateObservation(7, np.array([0.0])),) * 1000
+    begun = EnvironmentReady(None, 0, None, late)
+    effects = robot.begin_trial(0, TrialHistory(planner, 11, 0), begun, 0.0, tail_is_certain=True)
+    told = [e.fields for e in effects if isinstance(e, LogEvent) and e.name == "late_unused"]
+    assert len(told) == 10
+    assert str(told[-1]["reason"]).endswith("further ones of this trial are counted only")
+    assert robot.reports.counts["late_unused"] == 1000
+
+
 @pytest.mark.parametrize("lost_by", ["move", "late"])
 def test_what_comes_with_a_move_is_written_before_a_lost_robot_holds_still(lost_by: str) -> None:
     """And it is still lost then for a robot that goes on and begins its belief anew."""

@@ -368,14 +368,7 @@ class Robot:
         history = self._current_history
         found = history.came_late(late)
         if found is None:
-            self._effects.report(
-                "late_unused",
-                trial=self._trial,
-                step=history.state.step,
-                taken=late.step,
-                reason="no observation of that step is awaited: it has come before, was given up, "
-                "or nothing was sensed there",
-            )
+            self.reports.late_unused(history, late.step)
             return
         info, record = found
         self._unwritten.append(record)
