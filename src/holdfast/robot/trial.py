@@ -28,6 +28,7 @@ from holdfast.planning import (
     SensingInfo,
     TaskInfo,
 )
+from holdfast.protocol.messages import MAX_ACTION_SIZE
 from holdfast.robot.environment import LATER, Environment, SimulatedEnvironment
 from holdfast.tracking import LateObservation, Trial
 
@@ -171,7 +172,8 @@ def run_trial(
         before = track.state
         executed, task_info = planner.choose_task_action(before)
         take_late("late_before_moving")
-        shown = environment.perform(executed)
+        # A copy, as of all that it shows: what late observations are folded in with must stay.
+        shown = environment.perform(executed.copy())
         result = shown if isinstance(shown, MoveResult) else MoveResult(shown)
         reward, motion, observation = result
         if reward is not None and not np.isfinite(reward):
@@ -181,8 +183,8 @@ def run_trial(
         info = track.move(
             executed,
             None if reward is None else float(reward),
-            _numbers(motion),
-            _numbers(observation),
+            _numbers(environment, "motion", motion),
+            _numbers(environment, "observation", observation),
         )
         observer.acted(TaskStep(environment, before, task_info, executed, reward, result, info))
         if info is not None:
@@ -203,7 +205,7 @@ def _sense(track: Trial, environment: Environment, observer: TrialObserver) -> N
     if sensing_action != planner.no_sensing:
         shown = environment.perform_sensing(sensing_action)
         if shown is not LATER:
-            observation = np.asarray(shown, dtype=np.float64)
+            observation = np.array(shown, dtype=np.float64)
     info, _ = track.observe(sensing_action, observation, sensing_ms)
     observer.sensed(
         SensingStep(before, sensing_action, sensing_info, observation, track.state, info)
@@ -233,8 +235,21 @@ def _act_if_lost(
         observer.reinitialised(track.state)
 
 
-def _numbers(shown: npt.ArrayLike | None) -> FloatArray | None:
-    return None if shown is None else np.array(shown, dtype=np.float64)
+def _numbers(environment: Environment, what: str, shown: npt.ArrayLike | None) -> FloatArray | None:
+    """Return what a move has shown, checked as for a robot."""
+    if shown is None:
+        return None
+    try:
+        array = np.asarray(shown)
+    except (TypeError, ValueError):  # a list of lists of different lengths
+        array = np.empty(0, dtype=object)
+    if array.dtype.kind not in "fiu" or array.ndim != 1 or not 1 <= array.size <= MAX_ACTION_SIZE:
+        came = " ".join(repr(shown).split())
+        raise EnvironmentFailedError(
+            f"{type(environment).__name__}: perform returned a MoveResult whose {what} is "
+            f"{came:.80}; it must be an array of 1 to {MAX_ACTION_SIZE} numbers"
+        )
+    return np.array(array, dtype=np.float64)
 
 
 def _ask_done(environment: Environment) -> Ending | None:
