@@ -184,13 +184,15 @@ class Trial:
             if at in self._before:
                 again[at] = state
             state = self._folded(state, self._inputs[at])
+        # Then it says nothing of the belief that is.
+        of_old_belief = any(isinstance(each, _Reinitialised) for each in self._inputs[position:])
         self._inputs[position] = _Sensed(sensed.sensing_action, late.observation)
         del self._before[position]
         self._before |= again
         self._drop_settled()
         self.state = state
         self.num_inputs += 1
-        self._judge(sensed.sensing_action, info)
+        self._judge(sensed.sensing_action, info, of_old_belief=of_old_belief)
         reached = self.planner.digest(state)
         self.log.observed_late(late.step, state.step, reached)
         return info, reached
@@ -232,11 +234,15 @@ class Trial:
             decisions=decisions,
         )
 
-    def _judge(self, sensing_action: int, info: ObservationInfo | None) -> None:
+    def _judge(
+        self, sensing_action: int, info: ObservationInfo | None, *, of_old_belief: bool = False
+    ) -> None:
         """Count an observation; None is none."""
         self.alarm = None
-        if info is not None:
-            self.num_unexplained += not info.explained
+        if info is None:
+            return
+        self.num_unexplained += not info.explained
+        if not of_old_belief:
             self.alarm = self.lost_test.observed(sensing_action, info.within_gate)
 
     def _folded(self, state: PlanningState, given: _Input) -> PlanningState:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.errors import EnvironmentFailedError, InvalidValueError
-from holdfast.outcome import TrialResult
+from holdfast.outcome import MoveResult, TrialResult
 from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.robot.environment import LATER, Environment, SimulatedEnvironment
@@ -80,6 +81,59 @@ def test_a_late_robot_gets_there_all_the_same() -> None:
 def test_no_moves_are_no_lateness() -> None:
     with pytest.raises(InvalidValueError, match="moves is 0; it must be at least 1"):
         SenseLater(world(), 0)
+
+
+def test_what_an_environment_keeps_may_change() -> None:
+    """Its arrays are copied: they are folded in again after each late observation."""
+
+    class Kept(SimulatedEnvironment):
+        reuses = False
+
+        def __init__(self) -> None:
+            super().__init__(PegInHole2D(), 5, 0)
+            self.late: dict[int, FloatArray] = {}
+            self.buffer = np.zeros(1)
+
+        def perform_sensing(self, sensing_action: int) -> Any:
+            shown = super().perform_sensing(sensing_action)
+            if self.step % 6 == 0:
+                self.late[self.step + 4] = shown
+                return LATER
+            if not self.reuses:
+                return shown
+            self.buffer[:] = shown
+            return self.buffer
+
+        def perform(self, task_action: FloatArray) -> Any:
+            result = super().perform(task_action)
+            if self.reuses:
+                task_action[:] = 0.0
+            return result
+
+        def late_observations(self) -> list[tuple[int, FloatArray]]:
+            due = self.late.pop(self.step, None)
+            return [] if due is None else [(self.step - 4, due)]
+
+    digests = set()
+    for Kept.reuses in (False, True):
+        digests.add(run_trial(planner_of(), 5, max_steps=20, environment=Kept()).digest)
+    assert len(digests) == 1
+
+
+@pytest.mark.parametrize("what", ["motion", "observation"])
+@pytest.mark.parametrize(
+    "shown", ["abc", [[1], [1, 2]], np.zeros((2, 2)), [], [1j], np.zeros(5000)]
+)
+def test_what_is_no_array_of_numbers_is_named(what: str, shown: Any) -> None:
+    class Odd(SimulatedEnvironment):
+        def perform(self, task_action: FloatArray) -> Any:
+            return MoveResult(**{what: shown})
+
+    with pytest.raises(
+        EnvironmentFailedError,
+        match=f"Odd: perform returned a MoveResult whose {what} is .*of 1 to 4096 numbers",
+    ):
+        run_trial(planner_of(), 5, environment=Odd(PegInHole2D(), 5, 0))
 
 
 class Slow:

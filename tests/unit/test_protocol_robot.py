@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import heapq
 from collections.abc import Callable
 
@@ -252,6 +253,49 @@ def test_what_came_late_is_written_before_a_pending_action_is_ordered(on_lost: O
     written = effects[[type(effect) for effect in effects].index(WriteRecords)]
     assert isinstance(written, WriteRecords)
     assert isinstance(written.records[0], LateRecord)
+
+
+def test_the_lines_about_what_nobody_awaits_are_bounded() -> None:
+    planner = Planner(PROBLEM, PLANNING)
+    robot = Robot(planner, SimulatorSettings(), InProcessSource())
+    late = (LateObservation(7, np.array([0.0])),) * 1000
+    begun = EnvironmentReady(None, 0, None, late)
+    effects = robot.begin_trial(0, TrialHistory(planner, 11, 0), begun, 0.0, tail_is_certain=True)
+    told = [e.fields for e in effects if isinstance(e, LogEvent) and e.name == "late_unused"]
+    assert len(told) == 10
+    assert str(told[-1]["reason"]).endswith("further ones of this trial are counted only")
+    assert robot.reports.counts["late_unused"] == 1000
+
+
+@pytest.mark.parametrize("lost_by", ["move", "late"])
+def test_what_comes_with_a_move_is_written_before_a_lost_robot_holds_still(lost_by: str) -> None:
+    """And it is still lost then for a robot that goes on and begins its belief anew."""
+    settings = msgspec.structs.replace(PLANNING, sensing_interval=0)
+    problem = copy.copy(PROBLEM)
+    problem.move_log_likelihood = lambda states, *_: np.full(  # type: ignore[attr-defined]
+        states.shape[0], -np.inf
+    )
+    planner = Planner(problem, settings)
+    lost = LostSettings(false_alarm_rate=0.1, on_lost="hold")
+    history = TrialHistory(planner, 11, 0, lost.false_alarm_rate)
+    for step in range(3):
+        history.observed(0, np.array([1e3]) if step == 1 else None, 1.0)
+        history.pending, _ = planner.choose_task_action(history.state)
+        history.performed(PerformedRecord(step, None))
+    history.observed(0, np.array([0.0]), 1.0)
+    history.pending, _ = planner.choose_task_action(history.state)
+    robot = Robot(planner, SimulatorSettings(), InProcessSource(), lost=lost)
+    robot.begin_trial(0, history, EnvironmentReady(None, 3), 0.0, tail_is_certain=True)
+    late = (LateObservation(2, np.array([1e3])), LateObservation(0, np.array([0.0])))
+    shown = np.array([0.0]) if lost_by == "move" else None
+    effects = robot.handle(Acted(3, None, None, None, shown, late), 0.0)
+    assert isinstance(effects[-1], Halt)
+    written = [r for effect in effects if isinstance(effect, WriteRecords) for r in effect.records]
+    assert [type(record) for record in written] == [PerformedRecord, LateRecord, LateRecord]
+    assert history.awaited == ()
+    assert history.is_lost
+    history.reinitialised()
+    assert not history.is_lost
 
 
 def test_an_unknown_performance_stops_unless_the_environment_can_tell() -> None:

@@ -10,19 +10,24 @@ import pytest
 from tests.recordings import configuration_of, record_trial
 
 from holdfast.config.loader import Configuration
-from holdfast.errors import RecordError
+from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
+from holdfast.errors import EndOfRecordsError, RecordError
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner, digest
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.protocol.messages import encode_floats
 from holdfast.protocol.records import (
     ActingRecord,
     ObservedRecord,
     PerformedRecord,
     Record,
+    TrialHistory,
 )
 from holdfast.recording.figure import trial_figure
 from holdfast.recording.recorded_environment import RecordedEnvironment
 from holdfast.recording.recorder import Recorder
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
+from holdfast.tracking import LateObservation
 
 
 class _Journalling(TrialObserver):
@@ -108,3 +113,43 @@ class TestRecordedEnvironment:
         for spoilt in ([other, *records[1:]], records[:20], records[1:]):
             with pytest.raises(RecordError, match="trial 1: the decision of step"):
                 self.again(configuration, spoilt, result)
+
+
+@pytest.mark.parametrize("again", [(), ("chosen",), ("moving",), ("chosen", "moving")])
+def test_what_came_when_a_killed_robot_went_on_comes_there_again(again: tuple[str, ...]) -> None:
+    """Before a task action was chosen, or between that and its performance."""
+    settings = PlanningSettings(
+        particle_filter=ParticleFilterSettings(num_particles=30), sensing_interval=0
+    )
+    planner = Planner(PegInHole2D(), settings)
+    history, records = TrialHistory(planner, 3, 0), list[Record]()
+
+    def late(taken: int) -> None:
+        found = history.came_late(LateObservation(taken, np.array([0.1 * taken])))
+        assert found is not None
+        records.append(found[1])
+
+    for step in range(4):
+        sensing_action, _ = planner.choose_sensing_action(history.state)
+        records.append(history.observed(sensing_action, None, 0.0)[1])
+        if step == 2 and "chosen" in again:
+            late(0)
+        history.pending, _ = planner.choose_task_action(history.state)
+        records.append(ActingRecord(step, encode_floats(history.pending)))
+        if step == 2 and "moving" in again:
+            late(1)
+        performed = PerformedRecord(step, None)
+        records.append(performed)
+        history.performed(performed)
+        if step == 2:
+            late(2)
+    result = history.result(None)
+
+    def run(upto: list[Record], result: TrialResult | None) -> TrialResult:
+        world = RecordedEnvironment(0, upto, result)
+        return run_trial(planner, 3, 0, max_steps=4, environment=world)
+
+    assert run(records, result).decisions == result.decisions
+    for count in range(1, len(records) - 1):
+        with pytest.raises(EndOfRecordsError):
+            run(records[:count], None)

@@ -236,6 +236,24 @@ def test_a_new_belief_is_the_initial_one_or_the_problems_own() -> None:
         assert 0.6 < (trial.state.belief.states - offset).std() < 1.4
 
 
+def test_what_was_taken_before_a_new_belief_is_no_evidence_against_it() -> None:
+    """Else a robot whose belief has begun anew would be lost again by its old looks."""
+    late = [LateObservation(step, np.array([1e3])) for step in range(8)]
+    alarms = []
+    for begins_anew in (False, True):
+        trial = Trial(Planner(Cart(), PlanningSettings(sensing_interval=0)), 1, 0)
+        for _ in late:
+            observed(trial, None)
+            acted(trial)
+        if begins_anew:
+            trial.reinitialise()
+        for each in late:
+            assert trial.observe_late(each) is not None
+        assert trial.num_unexplained == len(late)
+        alarms.append(trial.lost_test.num_lost)
+    assert alarms == [1, 0]
+
+
 def test_the_log_has_what_was_shown() -> None:
     plain, shown = (Trial(Planner(Cart(), SETTINGS), 1, 0) for _ in range(2))
     for trial in (plain, shown):

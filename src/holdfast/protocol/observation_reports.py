@@ -42,6 +42,8 @@ class ObservationReports:
         self._effects = effects
         self._lost = lost
         self.counts: Counter[str] = Counter()
+        self._unused_of: int | None = None
+        self._num_unused = 0
 
     def observed(
         self, trial: Trial, step: int, info: ObservationInfo, **of_what: object
@@ -69,6 +71,25 @@ class ObservationReports:
         self.counts[alarm.kind] += 1
         self._raised(trial, step, alarm)
         return self._lost.on_lost if alarm.kind == "lost" else None
+
+    def late_unused(self, trial: Trial, taken: int) -> None:
+        """Report that an observation of an earlier step came and none of that step is awaited."""
+        number = trial.state.trial
+        if number != self._unused_of:
+            self._unused_of, self._num_unused = number, 0
+        self._num_unused += 1
+        self.counts["late_unused"] += 1
+        if self._num_unused <= _MAX_REPORTS:
+            more = self._num_unused == _MAX_REPORTS
+            self._effects.report(
+                "late_unused",
+                trial=number,
+                step=trial.state.step,
+                taken=taken,
+                reason="no observation of that step is awaited: it has come before, was given up, "
+                "or nothing was sensed there"
+                + ("; further ones of this trial are counted only" if more else ""),
+            )
 
     def reinitialised(self, trial: Trial) -> None:
         """Report that the belief of a lost robot has begun anew."""

@@ -165,6 +165,9 @@ class TrialHistory(Trial):
         A task action in the journal that is not known to be performed.
     paused : bool
         Whether the previous process ended in order.
+    is_lost : bool
+        Whether the robot was found lost by the last observation or move, or by what came late since
+        then.
     """
 
     def __init__(
@@ -179,6 +182,7 @@ class TrialHistory(Trial):
         self.actions: list[FloatArray] = []
         self.pending: FloatArray | None = None
         self.paused = False
+        self.is_lost = False
 
     @property
     def begun(self) -> bool:
@@ -191,6 +195,7 @@ class TrialHistory(Trial):
         """Fold in a sensing action; return what was found, and its record."""
         step = self.state.step
         info, reached = self.observe(sensing_action, observation, sensing_ms)
+        self.is_lost = self._raised_lost()
         shown = b"" if observation is None else encode_floats(observation)
         self._add(Observed(step, sensing_action, shown))
         return info, ObservedRecord(step, sensing_action, shown, reached, sensing_ms)
@@ -200,6 +205,7 @@ class TrialHistory(Trial):
         assert self.pending is not None
         action, motion, observation = self.pending, record.motion, record.observation
         info = self.move(action, record.reward, numbers_of(motion), numbers_of(observation))
+        self.is_lost = self._raised_lost()
         if motion or observation:
             self._add(Moved(record.step, motion, observation))
         self.pending = None
@@ -214,6 +220,7 @@ class TrialHistory(Trial):
         if found is None:
             return None
         info, reached = found
+        self.is_lost = self.is_lost or self._raised_lost()
         self._add(None)
         shown = encode_floats(late.observation)
         return info, LateRecord(self.state.step, late.step, shown, reached)
@@ -221,8 +228,12 @@ class TrialHistory(Trial):
     def reinitialised(self) -> ReinitialisedRecord:
         """Begin the belief anew; return the record."""
         reached = self.reinitialise()
+        self.is_lost = False
         self._add(None)
         return ReinitialisedRecord(self.state.step, reached)
+
+    def _raised_lost(self) -> bool:
+        return self.alarm is not None and self.alarm.kind == "lost"
 
     def _add(self, given: Input | None) -> None:
         """Keep an input; None is one that no service can fold in: it needs the state after it."""

@@ -96,6 +96,7 @@ class Robot:
         self._history: TrialHistory | None = None
         self._trial = 0
         self._ending: Ending | None = None
+        self._lost_at: int | None = None
         self._awaits_environment = False
         self._sensing_action = 0
         self._computed_ms = 0.0
@@ -178,20 +179,21 @@ class Robot:
         self._trial = trial
         self._history = history
         self._ending = begun.ending
+        self._lost_at = None
         self._awaits_environment = False
         self._unwritten = []
         self._next_tick = None
         resumed = history.begun
         if resumed:
             self._effects.report("resumed_trial", trial=trial, step=history.state.step)
-        is_lost = history.alarm is not None and history.alarm.kind == "lost"
         try:
-            if is_lost and history.pending is None and self._lost.on_lost == "reinitialise":
+            if history.is_lost and history.pending is None and self._lost.on_lost == "reinitialise":
                 # The process ended between the observation and this, or held still there.
                 self._reinitialise()
             again = self._settle_pending_action(begun, resumed, tail_is_certain)
             for late in begun.late:
                 self._came_late(late)
+            self._hold_if_lost()
         except HoldfastError as error:
             self._stop(error)
             return self._take()
@@ -312,6 +314,7 @@ class Robot:
             return
         self._write(record)
         self._judge(step, info, sensing_action=sensing_action)
+        self._hold_if_lost()
         if not self._pausing and not self._stopped:
             self._ask(self._planner.digest(history.state), now)
 
@@ -320,9 +323,14 @@ class Robot:
         history = self._current_history
         on_lost = self.reports.observed(history, step, info, **of_what)
         if on_lost == "hold":
-            self._stop(held_error(history, step))
+            self._lost_at = step
         elif on_lost == "reinitialise":
             self._reinitialise()
+
+    def _hold_if_lost(self) -> None:
+        """Hold still if that is to be done: after all that has come at once is written down."""
+        if self._lost_at is not None:
+            self._stop(held_error(self._current_history, self._lost_at))
 
     def _reinitialise(self) -> None:
         """Begin the belief anew, before anything else is decided."""
@@ -336,6 +344,7 @@ class Robot:
             self._fold_move(event)
             for late in event.late:
                 self._came_late(late)
+            self._hold_if_lost()
         except HoldfastError as error:
             self._stop(error)
 
@@ -357,14 +366,7 @@ class Robot:
         history = self._current_history
         found = history.came_late(late)
         if found is None:
-            self._effects.report(
-                "late_unused",
-                trial=self._trial,
-                step=history.state.step,
-                taken=late.step,
-                reason="no observation of that step is awaited: it has come before, was given up, "
-                "or nothing was sensed there",
-            )
+            self.reports.late_unused(history, late.step)
             return
         info, record = found
         self._unwritten.append(record)

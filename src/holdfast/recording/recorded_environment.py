@@ -2,6 +2,9 @@
 
 A robot's own world cannot be run again. But all that the planner had of it is in the journal: the
 same observations, given to the same planner, lead to the same beliefs.
+
+A late observation comes with a task action, or when a robot that was killed goes on: then it may
+come before the task action that is next, chosen or not.
 """
 
 from __future__ import annotations
@@ -48,7 +51,16 @@ class RecordedEnvironment:
         self._trial = trial
         self._simulated = simulated
         kinds = ObservedRecord | ActingRecord | PerformedRecord | LateRecord
-        self._records = [record for record in records if isinstance(record, kinds)]
+        self._records: list[Record] = []
+        # Those that came when a task action was written down and not performed, by its step.
+        self._before_moving: dict[int, list[LateRecord]] = {}
+        pending = False
+        for record in records:
+            if pending and isinstance(record, LateRecord):
+                self._before_moving.setdefault(record.step, []).append(record)
+            elif isinstance(record, kinds):
+                self._records.append(record)
+                pending = isinstance(record, ActingRecord)
         self._next = 0
         self._step = 0
 
@@ -68,8 +80,6 @@ class RecordedEnvironment:
     def perform(self, task_action: FloatArray) -> MoveResult:
         """Return what the record has shown; DecidedOtherwiseError if it is of another action."""
         record = self._take()
-        while isinstance(record, ObservedRecord) and not record.observation:
-            record = self._take()  # the choice was not to sense
         if not isinstance(record, ActingRecord) or record.action != encode_floats(task_action):
             raise self._otherwise(record)
         self._step += 1
@@ -83,6 +93,18 @@ class RecordedEnvironment:
                 return MoveResult(performed.reward, *shown)
         return MoveResult()
 
+    def late_before_choosing(self) -> list[tuple[int, FloatArray]]:
+        """Return the observations of earlier steps that came before a task action was chosen."""
+        if self._next < len(self._records):
+            record = self._records[self._next]
+            if isinstance(record, ObservedRecord) and not record.observation:
+                self._next += 1  # the choice was not to sense
+        return self.late_observations()
+
+    def late_before_moving(self) -> list[tuple[int, FloatArray]]:
+        """Return those that came between the choice of a task action and its performance."""
+        return [_late(record) for record in self._before_moving.pop(self._step, ())]
+
     def late_observations(self) -> list[tuple[int, FloatArray]]:
         """Return the observations of earlier steps that came next."""
         late = []
@@ -90,9 +112,7 @@ class RecordedEnvironment:
             record = self._records[self._next]
             if not isinstance(record, LateRecord):
                 break
-            late.append(
-                (record.taken, decode_floats(record.observation, len(record.observation) // 8))
-            )
+            late.append(_late(record))
             self._next += 1
         return late
 
@@ -118,3 +138,7 @@ class RecordedEnvironment:
         kinds = {ObservedRecord: "sensing", ActingRecord: "task"}
         kind = None if record is None else kinds.get(type(record))
         return DecidedOtherwiseError(self._trial, self._step, kind)
+
+
+def _late(record: LateRecord) -> tuple[int, FloatArray]:
+    return record.taken, decode_floats(record.observation, len(record.observation) // 8)

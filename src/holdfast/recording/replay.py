@@ -250,6 +250,7 @@ class _Replay(TrialObserver):
         self._result = result
         self._compared = 0
         self._steps = 0
+        self._sensed_step = -1
         self._state: PlanningState | None = None
         self._true_state: FloatArray | None = None
 
@@ -287,6 +288,7 @@ class _Replay(TrialObserver):
         for sink in self._output.at(fact.decided_ns):
             sink.sensed(fact)
         self._state = after
+        self._sensed_step = number
 
     def acted(self, step: TaskStep) -> None:
         number = step.state.step
@@ -314,10 +316,14 @@ class _Replay(TrialObserver):
 
     def observed_late(self, step: LateStep) -> None:
         number = step.after.step
+        # With the move before, or, if the robot was killed meanwhile, after it has sensed again.
+        moment = (number, 1) if self._sensed_step == number else (number - 1, 3)
+        if self._state is not None:
+            self._state = step.after
         fact = LateFact(
             trial=self._trial,
             step=number,
-            time_ns=self._times.at(number - 1, 3),
+            time_ns=self._times.at(*moment),
             taken=step.late.step,
             observation=step.late.observation,
             after=step.after.belief,
@@ -325,6 +331,10 @@ class _Replay(TrialObserver):
         )
         for sink in self._output.at(fact.time_ns):
             sink.observed_late(fact)
+
+    def reinitialised(self, state: PlanningState) -> None:
+        if self._state is not None:
+            self._state = state
 
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
         if self._result is None or result.decisions != self._result.decisions:

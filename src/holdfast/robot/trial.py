@@ -28,6 +28,7 @@ from holdfast.planning import (
     SensingInfo,
     TaskInfo,
 )
+from holdfast.protocol.messages import MAX_ACTION_SIZE
 from holdfast.robot.environment import (
     LATER,
     Environment,
@@ -158,15 +159,27 @@ def run_trial(
     require_methods(environment, type(environment).__name__)
     track = Trial(planner, seed, trial, lost.false_alarm_rate)
     observer.trial_began(environment, track.state)
-    late_observations = getattr(environment, "late_observations", None)
+
+    def take_late(method: str) -> None:
+        ask = getattr(environment, method, None)
+        for step, came in () if ask is None else ask():
+            late = LateObservation(step, np.array(came, dtype=np.float64))
+            found = track.observe_late(late)
+            if found is not None:
+                observer.observed_late(LateStep(late, track.state, found[0]))
+                _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
+
     ending = _ask_done(environment)
     while ending is None and track.state.step < max_steps:
         if planner.needs_sensing(track.state):
             _sense(track, environment, observer)
             _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
+        take_late("late_before_choosing")  # only a recorded world has these two
         before = track.state
         executed, task_info = planner.choose_task_action(before)
-        shown = environment.perform(executed)
+        take_late("late_before_moving")
+        # A copy, as of all that it shows: what late observations are folded in with must stay.
+        shown = environment.perform(executed.copy())
         result = shown if isinstance(shown, MoveResult) else MoveResult(shown)
         reward, motion, observation = result
         if reward is not None and not np.isfinite(reward):
@@ -176,18 +189,13 @@ def run_trial(
         info = track.move(
             executed,
             None if reward is None else float(reward),
-            _numbers(motion),
-            _numbers(observation),
+            _numbers(environment, "motion", motion),
+            _numbers(environment, "observation", observation),
         )
         observer.acted(TaskStep(environment, before, task_info, executed, reward, result, info))
         if info is not None:
             _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
-        for step, came in () if late_observations is None else late_observations():
-            late = LateObservation(step, np.array(came, dtype=np.float64))
-            found = track.observe_late(late)
-            if found is not None:
-                observer.observed_late(LateStep(late, track.state, found[0]))
-                _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
+        take_late("late_observations")
         ending = _ask_done(environment)
     ended = track.result(ending)
     observer.trial_ended(track.state, ended)
@@ -203,7 +211,7 @@ def _sense(track: Trial, environment: Environment, observer: TrialObserver) -> N
     if sensing_action != planner.no_sensing:
         shown = environment.perform_sensing(sensing_action)
         if shown is not LATER:
-            observation = np.asarray(shown, dtype=np.float64)
+            observation = np.array(shown, dtype=np.float64)
     info, _ = track.observe(sensing_action, observation, sensing_ms)
     observer.sensed(
         SensingStep(before, sensing_action, sensing_info, observation, track.state, info)
@@ -233,8 +241,21 @@ def _act_if_lost(
         observer.reinitialised(track.state)
 
 
-def _numbers(shown: npt.ArrayLike | None) -> FloatArray | None:
-    return None if shown is None else np.array(shown, dtype=np.float64)
+def _numbers(environment: Environment, what: str, shown: npt.ArrayLike | None) -> FloatArray | None:
+    """Return what a move has shown, checked as for a robot."""
+    if shown is None:
+        return None
+    try:
+        array = np.asarray(shown)
+    except (TypeError, ValueError):  # a list of lists of different lengths
+        array = np.empty(0, dtype=object)
+    if array.dtype.kind not in "fiu" or array.ndim != 1 or not 1 <= array.size <= MAX_ACTION_SIZE:
+        came = " ".join(repr(shown).split())
+        raise EnvironmentFailedError(
+            f"{type(environment).__name__}: perform returned a MoveResult whose {what} is "
+            f"{came:.80}; it must be an array of 1 to {MAX_ACTION_SIZE} numbers"
+        )
+    return np.array(array, dtype=np.float64)
 
 
 def _ask_done(environment: Environment) -> Ending | None:

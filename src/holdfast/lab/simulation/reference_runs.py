@@ -252,17 +252,18 @@ class _Run:
                 if isinstance(entry, _Sensed) and entry.step == taken
             )
             _, info = self._after(self._folded(self._entries[:at]), came)
+            of_old_belief = any(entry is None for entry in self._entries[at:])
             self._entries[at] = came
             self._state = self._folded(self._entries)
             self._log.observed_late(taken, step, self._planner.digest(self._state))
-            self._judge(info)
+            self._judge(info, of_old_belief=of_old_belief)
 
-    def _judge(self, info: ObservationInfo | None) -> None:
+    def _judge(self, info: ObservationInfo | None, *, of_old_belief: bool = False) -> None:
         """Count what an observation has shown, and begin the belief anew if that is to be done."""
         if info is None:
             return
         self._unexplained += not info.explained
-        if self._reinitialises and not info.within_gate:
+        if self._reinitialises and not info.within_gate and not of_old_belief:
             self._lost += 1
             self._entries.append(None)
             self._state, _ = self._after(self._state, None)
