@@ -59,7 +59,7 @@ def questions_of(configuration: Configuration, session: bytes) -> list[Request]:
             shown = environment.perform_sensing(action)
             observed = Observed(state.step, action, encode_floats(shown))
             state, _ = planner.observe(state, action, shown)
-            found.append(request_of(state, session, len(found) + 1, observations=(observed,)))
+            found.append(request_of(state, session, len(found) + 1, inputs=(observed,)))
         task, _ = planner.choose_task_action(state)
         environment.perform(task)
         state = planner.advance(state, task)

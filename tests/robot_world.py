@@ -16,7 +16,7 @@ from holdfast.config.settings import (
     RecoverySettings,
     SimulatorSettings,
 )
-from holdfast.outcome import TrialResult
+from holdfast.outcome import MoveResult, TrialResult, ending_of
 from holdfast.planning import Planner, PlanningState, decode_checkpoint, digest
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.dispatcher import Dispatcher
@@ -49,6 +49,7 @@ from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_TASK_ACTIONS,
     NeedState,
+    Observed,
     Progress,
     Reply,
     Request,
@@ -127,7 +128,8 @@ class SmallService:
             if kept is None or kept.trial != request.trial:
                 kept = planner.init(SIMULATOR.seed, request.trial)
             state = kept
-            for item in request.observations:
+            for item in request.inputs:
+                assert isinstance(item, Observed)
                 while state.step < item.step:
                     action, _ = planner.choose_task_action(state)
                     state = planner.advance(state, action)
@@ -284,7 +286,8 @@ class World:
         self.environment = self.environment_class(PROBLEM, self.simulator.seed, trial)
         for action in history.actions:
             self.environment.perform(action)
-        begun = EnvironmentReady(self.environment.is_done(), self.environment.step)
+        ending = ending_of(self.environment.is_done())
+        begun = EnvironmentReady(ending, self.environment.step)
         self.carry_out(
             self.robot.begin_trial(trial, history, begun, self.now, tail_is_certain=True)
         )
@@ -355,9 +358,16 @@ class World:
         assert isinstance(last, ActingRecord), "acted without having written it down"
         assert last.step == effect.step
         self.acted.append((effect.step, effect.action))
-        reward = self.environment.perform(effect.action)
+        shown = self.environment.perform(effect.action)
+        result = shown if isinstance(shown, MoveResult) else MoveResult(shown)
         self.on_act(effect.step)
-        self.after(0.01, self.later(Acted(effect.step, reward, self.environment.is_done())))
+        ending = ending_of(self.environment.is_done())
+        motion, observation = (
+            None if each is None else np.asarray(each)
+            for each in (result.motion, result.observation)
+        )
+        acted = Acted(effect.step, result.reward, ending, motion, observation)
+        self.after(0.01, self.later(acted))
 
     def launch(self, effect: Launch) -> None:
         self.kill(LOCAL)

@@ -31,6 +31,7 @@ __all__ = [
     "resample",
     "standard_deviation",
     "update",
+    "update_by_move",
 ]
 
 
@@ -172,11 +173,7 @@ def update(
     ProblemError
         If the problem violates its contract.
     """
-    observed = np.ascontiguousarray(observation, dtype=np.float64).reshape(-1)
-    if not numerics.all_finite(observed):
-        raise InvalidValueError(
-            f"observation {in_brief(observed)}: every coordinate must be finite"
-        )
+    observed = _finite(observation)
     if not has_general_observations(problem):
         mean, variance = checked.prediction(problem, belief.states, sensing_action)
         if mean.shape[-1] != observed.shape[0]:
@@ -194,6 +191,35 @@ def update(
         distance = None
         log_likelihood = checked.log_likelihood(problem, belief.states, sensing_action, observed)
         explained = bool(((log_likelihood > -np.inf) & (belief.weights > 0.0)).any())
+    return _reweighted(belief, log_likelihood, explained, distance)
+
+
+def update_by_move(
+    problem: Any, belief: Belief, task_action: FloatArray, observation: npt.ArrayLike
+) -> tuple[Belief, ObservationInfo]:
+    """Multiply the weights by the likelihood of what came with a move; do not resample.
+
+    ``belief`` is the one after the move. Raises as :func:`update`, and ProblemError if the problem
+    has no ``move_log_likelihood``.
+    """
+    observed = _finite(observation)
+    log_likelihood = checked.move_log_likelihood(problem, belief.states, task_action, observed)
+    explained = bool(((log_likelihood > -np.inf) & (belief.weights > 0.0)).any())
+    return _reweighted(belief, log_likelihood, explained, None)
+
+
+def _finite(observation: npt.ArrayLike) -> FloatArray:
+    observed = np.ascontiguousarray(observation, dtype=np.float64).reshape(-1)
+    if not numerics.all_finite(observed):
+        raise InvalidValueError(
+            f"observation {in_brief(observed)}: every coordinate must be finite"
+        )
+    return observed
+
+
+def _reweighted(
+    belief: Belief, log_likelihood: FloatArray, explained: bool, distance: float | None
+) -> tuple[Belief, ObservationInfo]:
     weights, survivors = _kernel.normalize(numerics.log(belief.weights) + log_likelihood, False)
     if survivors == 0:
         return belief, ObservationInfo(effective_sample_size(belief), False, False, distance)

@@ -12,10 +12,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from holdfast import _kernel
 from holdfast.arrays import BoolArray, FloatArray, IntArray, in_brief
-from holdfast.errors import ProblemError
+from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.problem_attributes import has_own, name_of
 
 __all__ = [
@@ -26,6 +27,8 @@ __all__ = [
     "known_state_return",
     "log_likelihood",
     "move_each",
+    "move_log_likelihood",
+    "moved_by_measurement",
     "next_stage",
     "next_stages",
     "policy",
@@ -35,6 +38,7 @@ __all__ = [
     "sample_observation",
     "scalar",
     "scene",
+    "shown",
     "states_of",
     "truth",
 ]
@@ -92,20 +96,8 @@ def sample_observation(
     problem: Any, state: FloatArray, sensing_action: int, stream: object
 ) -> FloatArray:
     """Return an observation that was drawn in one state, shape ``(observation_size,)``."""
-    drawn: FloatArray = problem.sample_observation(state, sensing_action, stream)
-    if not isinstance(drawn, np.ndarray) or drawn.dtype.kind not in "fiu" or drawn.ndim != 1:
-        raise _misfit(
-            problem,
-            f"sample_observation of sensing action {sensing_action}",
-            drawn,
-            "(observation_size,)",
-        )
-    if not 1 <= drawn.size <= MAX_OBSERVATION_SIZE or not np.isfinite(drawn).all():
-        raise ProblemError(
-            f"sample_observation of {name_of(problem)} returned {in_brief(drawn)} of "
-            f"{drawn.size} coordinates: need 1 to {MAX_OBSERVATION_SIZE}, all of them finite"
-        )
-    return drawn
+    drawn = problem.sample_observation(state, sensing_action, stream)
+    return shown(problem, f"sample_observation of sensing action {sensing_action}", drawn)
 
 
 def log_likelihood(
@@ -113,13 +105,69 @@ def log_likelihood(
 ) -> FloatArray:
     """Return the log-likelihoods of an observation, shape ``(num_particles,)``."""
     found = problem.log_likelihood(states, sensing_action, observation)
-    values = _array(problem, "log_likelihood", found, states.shape[:-1])
+    under = f"under sensing action {sensing_action}"
+    return _likelihoods(problem, "log_likelihood", found, states, observation, under)
+
+
+def move_log_likelihood(
+    problem: Any, states: FloatArray, task_action: FloatArray, observation: FloatArray
+) -> FloatArray:
+    """Return the log-likelihoods of what came with a move, shape ``(num_particles,)``."""
+    function = "move_log_likelihood"
+    if not hasattr(problem, function):
+        raise ProblemError(
+            f"a move has shown {in_brief(observation)}, but {name_of(problem)} has no "
+            f"{function}(states, action, observation) that could fold it in"
+        )
+    found = problem.move_log_likelihood(states, task_action, observation)
+    return _likelihoods(problem, function, found, states, observation, "after a move")
+
+
+def _likelihoods(
+    problem: Any,
+    function: str,
+    found: FloatArray,
+    states: FloatArray,
+    observation: FloatArray,
+    where: str,
+) -> FloatArray:
+    values = _array(problem, function, found, states.shape[:-1])
     if np.isnan(values).any() or (values == np.inf).any():
         raise ProblemError(
-            f"log_likelihood of {name_of(problem)}, observation {in_brief(observation)} under "
-            f"sensing action {sensing_action}, is NaN or plus infinity for a particle"
+            f"{function} of {name_of(problem)}, observation {in_brief(observation)} {where}, "
+            "is NaN or plus infinity for a particle"
         )
     return values
+
+
+def moved_by_measurement(
+    problem: Any, states: FloatArray, motion: npt.ArrayLike, stream: object
+) -> FloatArray:
+    """Return states moved by a measured motion, with the noise of the measurement, read-only."""
+    measured = np.array(motion, dtype=np.float64).reshape(-1)
+    if not _kernel.all_finite(measured):
+        raise InvalidValueError(f"motion {in_brief(measured)}: every coordinate must be finite")
+    function = "move_by_measurement"
+    if not hasattr(problem, function):
+        raise ProblemError(
+            f"a move has the measured motion {in_brief(measured)}, but {name_of(problem)} has no "
+            f"{function}(states, motion, stream) that could move the belief by it"
+        )
+    measured.setflags(write=False)
+    moved = problem.move_by_measurement(states, measured, stream)
+    return states_of(problem, function, moved, states.shape)
+
+
+def shown(problem: Any, function: str, value: object) -> FloatArray:
+    """Return what a function of the problem says that the world shows, shape ``(n,)``."""
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu" or value.ndim != 1:
+        raise _misfit(problem, function, value, "(n,)")
+    if not 1 <= value.size <= MAX_OBSERVATION_SIZE or not np.isfinite(value).all():
+        raise ProblemError(
+            f"{function} of {name_of(problem)} returned {in_brief(value)} of {value.size} "
+            f"coordinates: need 1 to {MAX_OBSERVATION_SIZE}, all of them finite"
+        )
+    return value
 
 
 def policy(problem: Any, states: FloatArray, stage: int | IntArray) -> FloatArray:

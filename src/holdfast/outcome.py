@@ -1,4 +1,4 @@
-"""The outcome of a trial, and its decisions as bytes, by which runs are compared.
+"""The outcome of a trial and of a move, and decisions as bytes, by which runs are compared.
 
 Every decision is noted in order, in a few bytes, and the hash of these bytes is the trial's digest.
 Two runs decided the same exactly if their digests are equal, on whatever machine they were made,
@@ -14,9 +14,11 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from holdfast.arrays import FloatArray
 from holdfast.errors import InvalidValueError
+from holdfast.printable import printable
 from holdfast.problem_attributes import sensing_costs
 
 __all__ = [
@@ -24,24 +26,92 @@ __all__ = [
     "DecisionLog",
     "Decisions",
     "Done",
+    "Ending",
+    "MoveResult",
     "Outcome",
     "RewardAccount",
     "SensingDecision",
     "TaskDecision",
     "TrialResult",
+    "ending_of",
 ]
 
 
-Done: TypeAlias = bool | Literal["failed"]
-"""The state of an environment's task: it goes on, it has succeeded, or it has failed."""
-
 Outcome: TypeAlias = Literal["succeeded", "failed", "truncated"]
-"""How a trial ended: the environment terminated it, or it ran out of steps (truncated)."""
+"""How a trial ended: the environment terminated it, or it was cut off, by a limit (truncated)."""
+
+MAX_REASON = 200
+"""Bound on the characters of a reason."""
+
+
+class Ending(NamedTuple):
+    """How an environment's task has ended.
+
+    Attributes
+    ----------
+    outcome : {"succeeded", "failed", "truncated"}
+        ``truncated``: cut off by a limit of the environment's own, neither success nor failure.
+    reason : str
+        One line for people, at most 200 characters of it are kept: "hit the wall at 2 m/s".
+    """
+
+    outcome: Outcome
+    reason: str = ""
+
+
+Done: TypeAlias = bool | Literal["failed"] | Ending
+"""What ``is_done`` of an environment returns: False while the task goes on."""
+
+DONE_VALUES = 'True, False, "failed" or an Ending'
+"""The same in words, for messages."""
+
+
+def ending_of(done: object) -> Ending | None:
+    """Return how the task has ended, from what ``is_done`` has returned; None while it goes on.
+
+    Raises
+    ------
+    InvalidValueError
+        If it must not return that.
+    """
+    if isinstance(done, bool | np.bool_):
+        return Ending("succeeded") if done else None
+    if isinstance(done, str) and done == "failed":
+        return Ending("failed")
+    if isinstance(done, Ending) and isinstance(done.reason, str) and done.outcome in _OUTCOMES:
+        reason = printable(" ".join(done.reason.split()), keep="")
+        return Ending(done.outcome, reason[:MAX_REASON])
+    raise InvalidValueError(f"returned {done!r:.80}; it must return {DONE_VALUES}")
+
+
+_OUTCOMES = ("succeeded", "failed", "truncated")
+
+
+class MoveResult(NamedTuple):
+    """What the performance of a task action has shown.
+
+    Attributes
+    ----------
+    reward : float or None
+        None where there is none.
+    motion : array or None
+        The measured motion (of encoders, say), as the problem's ``move_by_measurement`` takes it.
+    observation : array or None
+        What came with the move (a contact force, say), for the problem's ``move_log_likelihood``.
+    """
+
+    reward: float | None = None
+    motion: npt.ArrayLike | None = None
+    observation: npt.ArrayLike | None = None
+
 
 _DIGEST_SIZE = 32
 _SENSING = struct.Struct(f"<cQI{_DIGEST_SIZE}s")
 _TASK = struct.Struct("<cQ")
+_LATE = struct.Struct(f"<cQQ{_DIGEST_SIZE}s")
 _END = struct.Struct(f"<cQ{_DIGEST_SIZE}s")
+_OTHERS = {b"M": _END, b"L": _LATE, b"R": _END, b"E": _END}
+"""Records that are no decision, but lead to the states in which later ones are taken."""
 
 
 class SensingDecision(NamedTuple):
@@ -70,8 +140,11 @@ class Decisions(msgspec.Struct, frozen=True):
         Coordinates of a task action.
     log : bytes
         The records: ``S`` step, sensing action, state digest; ``A`` step, executed action;
-        ``E`` steps, digest of the last state. Numbers are little-endian; steps have 8 bytes,
-        sensing actions 4, coordinates are float64. The trial's digest is the hash of these bytes.
+        ``E`` steps, digest of the last state. Where there is something of the kind: ``M`` step of a
+        move that has shown something, state digest; ``L`` step at which a late observation was
+        taken, step at which it came, state digest; ``R`` step of a reinitialisation, state digest.
+        Numbers are little-endian; steps have 8 bytes, sensing actions 4, coordinates are float64.
+        The trial's digest is the hash of these bytes.
     """
 
     action_size: int
@@ -95,12 +168,12 @@ class Decisions(msgspec.Struct, frozen=True):
                     _, step = _TASK.unpack_from(self.log, position)
                     yield TaskDecision(step, action.unpack_from(self.log, position + _TASK.size))
                     position += _TASK.size + action.size
-                elif kind == b"E":
-                    _END.unpack_from(self.log, position)
-                    position += _END.size
+                elif kind in _OTHERS:
+                    _OTHERS[kind].unpack_from(self.log, position)
+                    position += _OTHERS[kind].size
                 else:
                     raise InvalidValueError(
-                        f"decision log: byte {position} is {kind!r}, not b'S', b'A' or b'E'"
+                        f"decision log: byte {position} is {kind!r}, which begins no record"
                     )
             except struct.error as error:
                 raise InvalidValueError(
@@ -124,6 +197,18 @@ class DecisionLog:
         self._log += _TASK.pack(b"A", step)
         self._log += np.asarray(action, dtype="<f8").tobytes()
 
+    def moved(self, step: int, state_digest: bytes) -> None:
+        """Note that a move has shown something, and the digest of the state that it led to."""
+        self._log += _END.pack(b"M", step, state_digest)
+
+    def observed_late(self, taken: int, step: int, state_digest: bytes) -> None:
+        """Note an observation of an earlier step, and the digest of the state that it led to."""
+        self._log += _LATE.pack(b"L", taken, step, state_digest)
+
+    def reinitialised(self, step: int, state_digest: bytes) -> None:
+        """Note that the belief was begun anew."""
+        self._log += _END.pack(b"R", step, state_digest)
+
     def ended(self, steps: int, state_digest: bytes) -> None:
         """Note the number of steps and the digest of the last state."""
         self._log += _END.pack(b"E", steps, state_digest)
@@ -145,7 +230,9 @@ class RewardAccount:
         self.total: float | None = 0.0 if has_costs else None
 
     def sensed(self, sensing_action: int) -> None:
-        """Subtract the cost of a sensing action."""
+        """Subtract the cost of a sensing action; not to sense costs nothing."""
+        if sensing_action == len(self._costs):
+            return
         cost = float(self._costs[sensing_action])
         if cost > 0.0:
             self.acted(-cost)
@@ -170,6 +257,8 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     success, failed : bool
         Whether the goal was reached, and whether the task ended in failure. If neither, the trial
         ran out of steps.
+    reason : str
+        Why it ended, in the environment's words; empty where it said nothing.
     steps, sensing_decisions : int
         Task actions performed, and sensing actions chosen.
     reward : float or None
@@ -195,6 +284,7 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     success: bool
     # Journals that do not have it are of trials that could not fail.
     failed: bool = False
+    reason: str = ""
     steps: int
     reward: float | None
     sensing_decisions: int
@@ -207,7 +297,7 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def outcome(self) -> Outcome:
-        """How the trial ended: success and failure are the environment's word."""
+        """How the trial ended: in its environment's words, or out of steps."""
         if self.success:
             return "succeeded"
         return "failed" if self.failed else "truncated"
@@ -217,8 +307,9 @@ TRIAL_COLUMNS = (
     *(
         name
         for name in TrialResult.__struct_fields__
-        if name not in ("failed", "sensing_ms", "decisions")
+        if name not in ("failed", "reason", "sensing_ms", "decisions")
     ),
     "outcome",  # instead of "failed"
+    "reason",
 )
 """The columns of ``trials.csv``."""

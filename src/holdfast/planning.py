@@ -15,6 +15,9 @@ One step of the loop::
     task_action, info = planner.choose_task_action(state)
     environment.perform(task_action)
     state = planner.advance(state, task_action)
+
+An observation may also come with a move (:meth:`Planner.observe_move`), or late
+(:mod:`holdfast.tracking`).
 """
 
 from __future__ import annotations
@@ -32,14 +35,16 @@ from holdfast.arrays import FloatArray, in_brief
 from holdfast.belief import (
     Belief,
     ObservationInfo,
+    effective_sample_size,
     estimate,
     resample,
     uniform_weights,
     update,
+    update_by_move,
 )
 from holdfast.config.settings import MAX_PARTICLES, Method, PlanningSettings, check_settings
 from holdfast.errors import CheckpointError, InvalidValueError, ProblemError
-from holdfast.problem_attributes import check_problem
+from holdfast.problem_attributes import check_problem, moves_show
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
 from holdfast.sensing import SensingInfo
@@ -194,12 +199,29 @@ class Planner:
                 f"state of {size} coordinates: {self.problem.name} has {self.problem.state_size}"
             )
 
+    @property
+    def no_sensing(self) -> int:
+        """The choice not to sense: one more than the last sensing action."""
+        return len(self.problem.sensing_actions)
+
+    @property
+    def num_choices(self) -> int:
+        """Sensing actions, and one more if the robot may choose not to sense."""
+        return self.no_sensing + self.settings.selector.sensing_is_optional
+
+    @property
+    def moves_show(self) -> bool:
+        """Whether a move may show something, so that the next decision has to wait for it."""
+        return moves_show(self.problem)
+
     def needs_sensing(self, state: PlanningState) -> bool:
         """Tell whether the next decision is a sensing action (else it is a task action)."""
         return needs_sensing(self.settings, state)
 
     def choose_sensing_action(self, state: PlanningState) -> tuple[int, SensingInfo]:
         """Choose the next sensing action, an index into ``problem.sensing_actions``.
+
+        It may be :attr:`no_sensing` if ``selector.sensing_is_optional`` is set.
 
         Raises
         ------
@@ -217,9 +239,11 @@ class Planner:
         )
 
     def observe(
-        self, state: PlanningState, sensing_action: int, observation: npt.ArrayLike
+        self, state: PlanningState, sensing_action: int, observation: npt.ArrayLike | None
     ) -> tuple[PlanningState, ObservationInfo]:
         """Update the belief by an observation, shape ``(observation_size,)``, and set ``sensed``.
+
+        Without one (None: it comes later, or the choice was :attr:`no_sensing`) the belief stays.
 
         Raises
         ------
@@ -229,25 +253,75 @@ class Planner:
         """
         problem = self.problem
         self._require_size(state)
-        if not (
-            isinstance(sensing_action, int | np.integer)
-            and 0 <= sensing_action < len(problem.sensing_actions)
-        ):
+        known = len(problem.sensing_actions) + (observation is None)
+        if not (isinstance(sensing_action, int | np.integer) and 0 <= sensing_action < known):
             raise InvalidValueError(
                 f"sensing action {sensing_action!r:.80}: {problem.name} has 0 to "
                 f"{len(problem.sensing_actions) - 1}"
             )
-        belief, found = update(problem, state.belief, sensing_action, observation)
+        if observation is None:
+            size = effective_sample_size(state.belief)
+            return state._replace(sensed=True), ObservationInfo(size, True, False)
+        updated = update(problem, state.belief, sensing_action, observation)
+        after, info = self._resampled(state, *updated, Purpose.RESAMPLING)
+        return after._replace(sensed=True), info
+
+    def observe_move(
+        self, state: PlanningState, task_action: FloatArray, observation: npt.ArrayLike
+    ) -> tuple[PlanningState, ObservationInfo]:
+        """Update the belief by an observation that came with a move, shape ``(n,)``.
+
+        The state is the one after the move, from :meth:`advance`. The likelihood is the problem's
+        ``move_log_likelihood``.
+
+        Raises
+        ------
+        InvalidValueError
+            If the observation is not finite or the state is another problem's.
+        ProblemError
+            If the problem has no ``move_log_likelihood``, or it breaks its contract.
+        """
+        self._require_size(state)
+        updated = update_by_move(self.problem, state.belief, task_action, observation)
+        return self._resampled(state, *updated, Purpose.MOVE_RESAMPLING)
+
+    def _resampled(
+        self, state: PlanningState, belief: Belief, found: ObservationInfo, purpose: Purpose
+    ) -> tuple[PlanningState, ObservationInfo]:
+        """Return the state with an updated belief, resampled if its effective size asks for it."""
         count = belief.weights.shape[0]
         threshold = self.settings.particle_filter.resampling_threshold * count
         # Rounding may leave the size of equal weights a little above their number.
         resampled = threshold == count or found.effective_sample_size <= threshold
         if resampled:
-            offset = stream(state.seed, state.trial, state.step, Purpose.RESAMPLING)
-            belief = resample(belief, offset)
-        return state._replace(sensed=True, belief=belief), ObservationInfo(
+            belief = resample(belief, stream(state.seed, state.trial, state.step, purpose))
+        return state._replace(belief=belief), ObservationInfo(
             found.effective_sample_size, found.explained, resampled, found.mahalanobis_distance
         )
+
+    def reinitialise(self, state: PlanningState) -> PlanningState:
+        """Return the state with a new belief, for a robot that is lost.
+
+        Its particles are the problem's ``reinitial_states(states, stream)``, else drawn from the
+        initial belief. Weights are equal; step, stage and ``sensed`` stay.
+
+        Raises
+        ------
+        ProblemError
+            If the problem breaks its contract.
+        """
+        self._require_size(state)
+        problem, shape = self.problem, state.belief.states.shape
+        random = stream(state.seed, state.trial, state.step, Purpose.REINITIALISATION)
+        own = getattr(problem, "reinitial_states", None)
+        if own is not None:
+            states = checked.states_of(
+                problem, "reinitial_states", own(state.belief.states, random), shape
+            )
+        else:
+            drawn = problem.initial_states(random, shape[0])
+            states = checked.states_of(problem, "initial_states", drawn, shape)
+        return state._replace(belief=Belief(states, uniform_weights(shape[0])))
 
     def choose_task_action(self, state: PlanningState) -> tuple[FloatArray, TaskInfo]:
         """Choose the next task action: the policy's for the estimate, within the limits of a step.
@@ -271,15 +345,27 @@ class Planner:
             )
         return action, TaskInfo(estimated, commanded, stage)
 
-    def advance(self, state: PlanningState, task_action: FloatArray) -> PlanningState:
+    def advance(
+        self,
+        state: PlanningState,
+        task_action: FloatArray,
+        motion: npt.ArrayLike | None = None,
+    ) -> PlanningState:
         """Predict the belief by a performed task action and go to the next step.
+
+        Parameters
+        ----------
+        motion : array of shape (n,), optional
+            The measured motion. The problem's ``move_by_measurement`` then takes the place of its
+            ``move``: it knows the noise of the measurement.
 
         Raises
         ------
         InvalidValueError
-            If the action is not finite or of the wrong size.
+            If the action or the motion is not finite, or the action of the wrong size.
         ProblemError
-            If the problem moves a particle to a state that is not finite.
+            If the problem moves a particle to a state that is not finite, or has no
+            ``move_by_measurement``.
         """
         problem = self.problem
         action = np.asarray(task_action, dtype=np.float64)
@@ -291,9 +377,14 @@ class Planner:
         # Computed again, not taken from the caller: the action may come from another machine.
         _, stage = self._estimate(state)
         states, weights = state.belief
-        motion = stream(state.seed, state.trial, state.step, Purpose.PREDICTION)
-        moved = problem.move(states, action, motion)
-        belief = Belief(checked.states_of(problem, "move", moved, states.shape), weights)
+        random = stream(state.seed, state.trial, state.step, Purpose.PREDICTION)
+        if motion is None:
+            moved = checked.states_of(
+                problem, "move", problem.move(states, action, random), states.shape
+            )
+        else:
+            moved = checked.moved_by_measurement(problem, states, motion, random)
+        belief = Belief(moved, weights)
         return PlanningState(state.seed, state.trial, state.step + 1, stage, False, belief)
 
     def plan_until_sensing(
@@ -302,9 +393,11 @@ class Planner:
         """Choose the task actions up to the next sensing step: no observation comes between them.
 
         Return at most ``max_actions`` executed actions, none if the state has to sense first, and
-        the state that they lead to.
+        the state that they lead to. Only one, if a move may show something.
         """
         actions: list[FloatArray] = []
+        if self.moves_show:
+            max_actions = min(max_actions, 1)
         while len(actions) < max_actions and not self.needs_sensing(state):
             action, _ = self.choose_task_action(state)
             state = self.advance(state, action)
@@ -315,7 +408,7 @@ class Planner:
         """Make all decisions that no further observation can change."""
         actions, ahead = self.plan_until_sensing(state, max_actions)
         sensing_action = None
-        if self.needs_sensing(ahead):
+        if self.needs_sensing(ahead) and not (actions and self.moves_show):
             sensing_action, _ = self.choose_sensing_action(ahead)
         return Decision(tuple(actions), sensing_action, ahead)
 

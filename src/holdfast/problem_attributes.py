@@ -24,6 +24,7 @@ __all__ = [
     "check_sizes",
     "has_general_observations",
     "has_own",
+    "moves_show",
     "name_of",
     "resolution_of",
     "sensing_costs",
@@ -50,6 +51,11 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "sample_observation": ("state", "sensing_action", "stream"),
     "known_state_return": ("states", "stages"),
     "move_each": ("states", "actions", "streams", "threads"),
+    "move_by_measurement": ("states", "motion", "stream"),
+    "measure_motion": ("before", "after", "stream"),
+    "move_log_likelihood": ("states", "action", "observation"),
+    "sample_move_observation": ("state", "action", "stream"),
+    "reinitial_states": ("states", "stream"),
 }
 """Arguments of a problem's functions, by position."""
 
@@ -234,6 +240,11 @@ def sensing_costs(problem: Any) -> FloatArray:
 def has_general_observations(problem: object) -> bool:
     """Tell whether a problem gives a likelihood of its own instead of a Gaussian one."""
     return hasattr(problem, "log_likelihood")
+
+
+def moves_show(problem: object) -> bool:
+    """Tell whether a problem can fold in what a move shows: a measured motion, an observation."""
+    return hasattr(problem, "move_by_measurement") or hasattr(problem, "move_log_likelihood")
 
 
 def has_own(problem: Any, function: str, stands_for: tuple[str, ...]) -> bool:

@@ -142,7 +142,7 @@ def requests(session: bytes = b"s" * 16, epoch: int = 1) -> list[Request]:
                         session,
                         len(found) + 1,
                         epoch=epoch,
-                        observations=() if restored else turn.observed,
+                        inputs=() if restored else turn.observed,
                         session_configuration=session_configuration if told else None,
                         checkpoint=encode_checkpoint(state) if restored else None,
                     )

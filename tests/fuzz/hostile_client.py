@@ -28,7 +28,7 @@ from tests.wire import CALL, END, LAST, REPLY, Frame, RawClient, frame_of, hello
 from holdfast.config.settings import ActiveSensingSettings, ParticleFilterSettings, PlanningSettings
 from holdfast.errors import MessageError
 from holdfast.protocol.messages import (
-    MAX_OBSERVATIONS,
+    MAX_INPUTS,
     Observed,
     Refused,
     Request,
@@ -130,11 +130,11 @@ class HostileMessages:
         if field == "observations" and request.checkpoint is None:
             shown = chance.choice((b"", b"\0" * 8, b"\xff" * 8, bytes(8 * 4096)))
             false = Observed(chance.choice(_WORDS), chance.choice((0, 1, 99)), shown)
-            count = chance.choice((1, 2, MAX_OBSERVATIONS - len(request.observations)))
+            count = chance.choice((1, 2, MAX_INPUTS - len(request.inputs)))
             if len(shown) > 100:
                 count = 1
-            observations = (*request.observations, *[false] * count)
-            return encode(msgspec.structs.replace(request, observations=observations))
+            observations = (*request.inputs, *[false] * count)
+            return encode(msgspec.structs.replace(request, inputs=observations))
         field = "step" if field == "observations" else field
         return encode(msgspec.structs.replace(request, **{field: chance.choice(_WORDS)}))
 

@@ -19,7 +19,7 @@ from holdfast.config.settings import (
 from holdfast.planning import PlanningState
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
-    MAX_OBSERVATIONS,
+    MAX_INPUTS,
     MAX_TASK_ACTIONS,
     PROTOCOL_VERSION,
     Busy,
@@ -106,7 +106,7 @@ _asked = {
 requests: st.SearchStrategy[Request] = st.builds(
     Request,
     **_asked,
-    observations=st.lists(observed, max_size=MAX_OBSERVATIONS).map(tuple),
+    inputs=st.lists(observed, max_size=MAX_INPUTS).map(tuple),
 ) | st.builds(Request, **_asked, checkpoint=st.binary(max_size=500))
 """With and without an opening, observations and a checkpoint."""
 

@@ -27,7 +27,7 @@ from holdfast.errors import (
 from holdfast.planning import Planner, decode_checkpoint, digest, encode_checkpoint
 from holdfast.problems.problem import Problem
 from holdfast.protocol.messages import (
-    MAX_OBSERVATIONS,
+    MAX_INPUTS,
     MAX_TASK_ACTIONS,
     PROTOCOL_VERSION,
     decode_reply,
@@ -57,8 +57,8 @@ def check_request(data: bytes) -> None:
         return
     assert decoded.version == PROTOCOL_VERSION
     assert len(decoded.session) == 16
-    assert len(decoded.observations) <= MAX_OBSERVATIONS
-    assert not (decoded.observations and decoded.checkpoint is not None)
+    assert len(decoded.inputs) <= MAX_INPUTS
+    assert not (decoded.inputs and decoded.checkpoint is not None)
     again = encode(decoded)
     assert encode(decode_request(again)) == again
 

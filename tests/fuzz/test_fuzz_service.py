@@ -130,11 +130,11 @@ class HostileRobots(RuleBasedStateMachine):
                 case "digest":
                     request = msgspec.structs.replace(request, digest=chance.randbytes(16))
                 case "observed" if request.checkpoint is None:
-                    kept = list(request.observations)
+                    kept = list(request.inputs)
                     chance.shuffle(kept)
                     shown = chance.choice((b"", b"\0" * 8, b"\xff" * 8, bytes(8 * 4096)))
                     kept.append(Observed(chance.choice(words), chance.choice((0, 1, 99)), shown))
-                    request = msgspec.structs.replace(request, observations=tuple(kept))
+                    request = msgspec.structs.replace(request, inputs=tuple(kept))
                 case "own":
                     planning = planning_of(chance.choice((0, 5, 10**6)), chance.choice((1, 4, 150)))
                     session_configuration = SessionConfiguration(

@@ -76,7 +76,7 @@ def main() -> None:
                 state,
                 session,
                 number + 1,
-                observations=() if restored else turn.observed,
+                inputs=() if restored else turn.observed,
                 session_configuration=session_configuration,
                 checkpoint=encode_checkpoint(state) if restored else None,
             )

@@ -26,7 +26,7 @@ from tests.ports import free_port
 
 from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration, load
-from holdfast.outcome import Done
+from holdfast.outcome import Done, MoveResult
 from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.events import (
@@ -36,7 +36,7 @@ from holdfast.protocol.events import (
     EnvironmentReady,
     Sensed,
 )
-from holdfast.robot.environment import Environment, EnvironmentMaker, load_environment
+from holdfast.robot.environment import Environment, EnvironmentMaker, Later, load_environment
 from holdfast.robot.environment_runner import EnvironmentRunner, make_runner
 from holdfast.robot.trial import run_trial
 
@@ -227,10 +227,10 @@ class Meddling:
         self._controller = controller
         self._step = 0
 
-    def perform_sensing(self, sensing_action: int) -> FloatArray:
+    def perform_sensing(self, sensing_action: int) -> FloatArray | Later:
         return self._environment.perform_sensing(sensing_action)
 
-    def perform(self, task_action: FloatArray) -> float | None:
+    def perform(self, task_action: FloatArray) -> float | MoveResult | None:
         self._step += 1
         if self._step == 10:  # between two moves
             self._controller.kill()
@@ -353,7 +353,7 @@ class TestFailures:
         controller.start("--silent-at", "2", "--silent-s", "3")
         maker = load_environment(configuration_for(controller, timeout_ms=1000.0))
         first = Watched(maker)
-        assert first.begin() == EnvironmentReady(False, None)
+        assert first.begin() == EnvironmentReady(None, None)
         assert isinstance(first.perform(0), Acted)
         assert isinstance(first.perform(1), Acted)
         failed = first.perform(2)
@@ -367,7 +367,7 @@ class TestFailures:
         # A new process of the robot would do this; the controller answers once it speaks again.
         patient = load_environment(configuration_for(controller))
         again = Watched(patient, resumed=True)
-        assert again.begin() == EnvironmentReady(False, 3)
+        assert again.begin() == EnvironmentReady(None, 3)
         assert isinstance(again.perform(3), Acted)
         assert [move["step"] for move in controller.moves()] == [0, 1, 2, 3]
         assert not [move for move in controller.moves() if "error" in move]
@@ -498,6 +498,7 @@ def test_sensing_through_the_runner(controller: Controller) -> None:
     assert isinstance(watched.begin(), EnvironmentReady)
     sensed = watched.sense(0, 1)
     assert isinstance(sensed, Sensed)
+    assert sensed.observation is not None
     assert sensed.observation.shape == (1,)
     watched.close()
     operator = controller.connect()

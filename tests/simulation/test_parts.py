@@ -297,7 +297,9 @@ class TestMemory:
         class Impure(Planner):
             calls = 0
 
-            def advance(self, state: PlanningState, task_action: object) -> PlanningState:
+            def advance(
+                self, state: PlanningState, task_action: object, motion: object = None
+            ) -> PlanningState:
                 self.calls += 1
                 return state._replace(step=state.step + (2 if self.calls > 1 else 1))
 

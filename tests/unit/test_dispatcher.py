@@ -65,7 +65,7 @@ def test_without_faults_it_decides_as_in_process_with_one_request_per_sensing_st
     assert len(asked) == decisions + len(world.results)
     assert [request.session_configuration is not None for request in asked].count(True) == 1
     assert all(request.checkpoint is None for request in asked)
-    assert all(len(request.observations) <= 1 for request in asked)
+    assert all(len(request.inputs) <= 1 for request in asked)
 
 
 def test_the_prefetched_sensing_action_is_there_before_it_is_needed() -> None:

@@ -20,6 +20,7 @@ from holdfast.errors import (
     InvalidValueError,
     ProblemError,
 )
+from holdfast.outcome import MoveResult
 from holdfast.problems import registry
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem
@@ -66,7 +67,9 @@ def test_the_same_is_done_the_same_happens(problem: Problem) -> None:
         seen = [environment.state.tobytes()]
         for step in range(6):
             seen.append(environment.perform_sensing(step % 2).tobytes())
-            seen.append(np.float64(environment.perform(small_action(problem))).tobytes())
+            reward = environment.perform(small_action(problem))
+            assert not isinstance(reward, MoveResult)
+            seen.append(np.float64(reward).tobytes())
             seen.append(environment.state.tobytes())
         return seen
 

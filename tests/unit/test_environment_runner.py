@@ -14,6 +14,7 @@ import pytest
 
 from holdfast.arrays import FloatArray
 from holdfast.errors import EnvironmentFailedError, InvalidValueError
+from holdfast.outcome import Ending, MoveResult, ending_of
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.events import (
@@ -186,21 +187,22 @@ class TestEvents:
         robot = Robot()
         runner = bench.open(robot)
         runner.begin()
-        assert bench.event() == EnvironmentReady(False, None)
+        assert bench.event() == EnvironmentReady(None, None)
         runner.sense(0, 2)
         sensed = bench.event()
         assert isinstance(sensed, Sensed)
+        assert sensed.observation is not None
         assert sensed.step == 0
         assert sensed.observation.tolist() == [0.5]
         assert sensed.observation.dtype == np.float64
         runner.perform(0, ACTION)
-        assert bench.event() == Acted(0, -1.0, False)
+        assert bench.event() == Acted(0, -1.0, None)
         robot.answers.update(perform=None, is_done=np.True_)
         runner.perform(1, ACTION)
         acted = bench.event()
-        assert acted == Acted(1, None, True)
+        assert acted == Acted(1, None, Ending("succeeded"))
         assert isinstance(acted, Acted)
-        assert acted.done is True
+        assert type(acted.ending) is Ending
         assert [method for method, _ in robot.calls] == [
             "is_done",
             "perform_sensing",
@@ -217,24 +219,24 @@ class TestEvents:
         robot = Robot(is_done=failed)
         runner = bench.open(robot)
         runner.begin()
-        assert bench.event() == EnvironmentReady("failed", None)
+        assert bench.event() == EnvironmentReady(Ending("failed"), None)
         runner.perform(0, ACTION)
         acted = bench.event()
-        assert acted == Acted(0, -1.0, "failed")
+        assert acted == Acted(0, -1.0, Ending("failed"))
         assert isinstance(acted, Acted)
-        assert type(acted.done) is str
+        assert type(acted.ending) is Ending
 
     def test_the_count_is_asked_for_after_a_crash_alone(self, bench: Bench) -> None:
         robot = Robot(is_done=True)
         bench.open(robot, resumed=True).begin(4)
-        assert bench.event() == EnvironmentReady(True, 4)
+        assert bench.event() == EnvironmentReady(Ending("succeeded"), 4)
         assert [method for method, _ in robot.calls] == ["steps_performed", "is_done"]
 
     def test_an_environment_need_not_count(self, bench: Bench) -> None:
         robot = Robot()
         robot.steps_performed = None  # type: ignore[assignment, method-assign]
         bench.open(robot, resumed=True).begin()
-        assert bench.event() == EnvironmentReady(False, None)
+        assert bench.event() == EnvironmentReady(None, None)
 
     def test_what_was_handed_over_stays_what_it_was(self, bench: Bench) -> None:
         shown = np.array([1.0])
@@ -243,6 +245,7 @@ class TestEvents:
         runner.sense(0, 0)
         sensed = bench.event()
         assert isinstance(sensed, Sensed)
+        assert sensed.observation is not None
         shown[0] = 7.0
         assert sensed.observation.tolist() == [1.0]
         with pytest.raises(ValueError, match="read-only"):
@@ -262,10 +265,14 @@ class TestEvents:
             runner.sense(0, sensing_action)
             sensed = bench.event()
             assert isinstance(sensed, Sensed)
-            assert (sensed.observation == world.perform_sensing(sensing_action)).all()
+            np.testing.assert_array_equal(
+                np.asarray(sensed.observation), np.asarray(world.perform_sensing(sensing_action))
+            )
         action = problem.execute(np.full(problem.action_size, -0.05))
         runner.perform(0, action)
-        assert bench.event() == Acted(0, world.perform(action), world.is_done())
+        reward = world.perform(action)
+        assert not isinstance(reward, MoveResult)
+        assert bench.event() == Acted(0, reward, ending_of(world.is_done()))
 
 
 class TestFailures:
@@ -300,7 +307,7 @@ class TestFailures:
             runner.begin(5)
         else:
             runner.begin(5)
-            assert bench.event() == EnvironmentReady(False, 4)
+            assert bench.event() == EnvironmentReady(None, 4)
             robot.answers[method] = fail
             if method == "perform_sensing":
                 runner.sense(5, 0)
@@ -308,7 +315,7 @@ class TestFailures:
                 runner.perform(5, ACTION)
         failed = bench.failure()
         assert (failed.step, failed.what, failed.action_in_doubt) == (5, method, unknown)
-        assert (failed.performed, failed.reward) == (performed, -1.0 if performed else None)
+        assert failed.performed == (Acted(5, -1.0, None) if performed else None)
         assert failed.text.startswith(
             f"robot: {method} raised ValueError: the motor is hot\n  File"
         )
@@ -382,7 +389,7 @@ class TestFailures:
         assert expected in failed.text
         # What perform returned may mean that it was not performed; what is_done did does not.
         assert failed.action_in_doubt == (method == "perform")
-        assert failed.performed == (method == "is_done")
+        assert (failed.performed is not None) == (method == "is_done")
 
     def test_numbers_of_other_kinds_will_do(self, bench: Bench) -> None:
         robot = Robot(
@@ -393,14 +400,15 @@ class TestFailures:
         )
         runner = bench.open(robot, resumed=True)
         runner.begin()
-        assert bench.event() == EnvironmentReady(False, 2**40)
+        assert bench.event() == EnvironmentReady(None, 2**40)
         runner.sense(0, 0)
         sensed = bench.event()
         assert isinstance(sensed, Sensed)
+        assert sensed.observation is not None
         assert sensed.observation.tolist() == [2.0]
         runner.perform(0, ACTION)
         acted = bench.event()
-        assert acted == Acted(0, 0.5, False)
+        assert acted == Acted(0, 0.5, None)
         assert isinstance(acted, Acted)
         assert type(acted.reward) is float
 
@@ -466,7 +474,7 @@ class TestThreads:
         assert moving.wait(PATIENCE_S)
         assert threaded.queue.empty()
         arrived.set()
-        assert threaded.event() == Acted(0, -1.0, False)
+        assert threaded.event() == Acted(0, -1.0, None)
 
     def test_one_call_at_a_time(self, threaded: Bench) -> None:
         arrived = threading.Event()
@@ -478,7 +486,7 @@ class TestThreads:
         ):
             runner.sense(1, 0)
         arrived.set()
-        assert threaded.event() == Acted(0, None, False)
+        assert threaded.event() == Acted(0, None, None)
         assert "perform_sensing" not in [method for method, _ in robot.calls]
 
     def test_it_is_made_called_and_closed_on_one_thread(self, threaded: Bench) -> None:
@@ -515,7 +523,7 @@ class TestThreads:
         assert runner.environment is robot
         with pytest.raises(KeyboardInterrupt):
             runner.perform(0, ACTION)
-        assert events == [EnvironmentReady(False, None)]
+        assert events == [EnvironmentReady(None, None)]
 
 
 class TestStalls:
@@ -587,7 +595,7 @@ class TestStalls:
         runner = threaded.begin(robot, timeout_ms=1000.0)
         for step in range(25):
             runner.perform(step, ACTION)
-            assert threaded.event() == Acted(step, 0.0, False)
+            assert threaded.event() == Acted(step, 0.0, None)
 
 
 class TestMakePerformer:
@@ -606,7 +614,7 @@ class TestMakePerformer:
             performed=[ACTION, ACTION],
         )
         runner.begin(2)
-        assert events == [EnvironmentReady(False, 2)]
+        assert events == [EnvironmentReady(None, 2)]
         assert isinstance(runner, InlineRunner)
         assert isinstance(runner.environment, SimulatedEnvironment)
         assert runner.environment.state.tobytes() == lived.state.tobytes()
@@ -620,7 +628,7 @@ class TestMakePerformer:
         runner = make_runner(maker, 6, threaded.deliver, resumed=True)
         assert isinstance(runner, ThreadedRunner)
         threaded.drive(runner).begin()
-        assert threaded.event() == EnvironmentReady(True, 6)
+        assert threaded.event() == EnvironmentReady(Ending("succeeded"), 6)
 
     def test_what_is_no_robot_names_what_it_lacks(self, threaded: Bench) -> None:
         maker = EnvironmentMaker("own:Int", PegInHole2D(), 3, 1e3 * PATIENCE_S, int)

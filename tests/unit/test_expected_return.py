@@ -26,7 +26,7 @@ from holdfast.outcome import SensingDecision
 from holdfast.planning import Planner
 from holdfast.problem_attributes import sensing_costs
 from holdfast.problems.problem import ProblemBase
-from holdfast.protocol.records import ObservedRecord, TrialHistory
+from holdfast.protocol.records import TrialHistory
 from holdfast.randomness import Purpose, Stream, stream
 from holdfast.robot.trial import run_trial
 from holdfast.sensing import SensingInfo, choose_sensing_action
@@ -436,15 +436,7 @@ class TestSensingCosts:
         history = TrialHistory(planner, 0, 0)
         observation = np.array([0.5])
         for sensing_action, total in ((0, -0.5), (1, -0.75), (2, -0.75)):
-            after, info = planner.observe(history.state, sensing_action, observation)
-            record = ObservedRecord(
-                step=0,
-                sensing_action=sensing_action,
-                observation=observation.tobytes(),
-                digest=planner.digest(after),
-                sensing_ms=0.0,
-            )
-            history.observed(record, after, explained=info.explained)
+            history.observed(sensing_action, observation, 0.0)
             assert history.rewards.total == total
 
     def test_a_price_alone_is_a_reward(self) -> None:

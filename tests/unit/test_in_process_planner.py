@@ -28,7 +28,7 @@ def configuration(tmp_path: Path) -> Configuration:
 def question(configuration: Configuration) -> tuple[Planner, Question]:
     planner = Planner(configuration.problem, configuration.planning)
     state = planner.init(3, 0)
-    return planner, Question(configuration.planning, state, planner.digest(state), (), 0)
+    return planner, Question(planner, state, planner.digest(state), (), 0)
 
 
 def test_the_source_asks_for_the_second_part_when_the_first_has_come(

@@ -98,7 +98,7 @@ class TestRestartPolicy:
 def awaited_since(needed_at: float | None) -> Question:
     planner = Planner(PegInHole2D(), PlanningSettings())
     state = planner.init(1)
-    question = Question(planner.settings, state, planner.digest(state), (), 0)
+    question = Question(planner, state, planner.digest(state), (), 0)
     question.needed_at = needed_at
     return question
 

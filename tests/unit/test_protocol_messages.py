@@ -19,7 +19,7 @@ from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_CONFIGURATION_BYTES,
     MAX_CONFIGURATION_VALUES,
-    MAX_OBSERVATIONS,
+    MAX_INPUTS,
     MAX_TASK_ACTIONS,
     PROTOCOL_VERSION,
     Busy,
@@ -88,7 +88,7 @@ def test_another_version_is_named_even_if_its_fields_are_unknown() -> None:
         {"epoch": -1},
         {"step": 2**32},
         {"digest": b"d" * 32},
-        {"observations": (Observed(1, 0, b""),) * (MAX_OBSERVATIONS + 1)},
+        {"observations": (Observed(1, 0, b""),) * (MAX_INPUTS + 1)},
         {"checkpoint": b"a checkpoint and observations"},
     ],
 )
@@ -283,7 +283,7 @@ def test_a_session_configuration_has_a_bounded_size() -> None:
 
 def test_a_checkpoint_is_not_copied() -> None:
     """To copy a large one would hold up all other threads."""
-    request = msgspec.structs.replace(REQUEST, observations=(), checkpoint=bytes(100_000))
+    request = msgspec.structs.replace(REQUEST, inputs=(), checkpoint=bytes(100_000))
     payload = bytearray(encode(request))
     decoded = decode_request(cast(bytes, payload))
     assert decoded == request

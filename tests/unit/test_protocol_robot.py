@@ -22,6 +22,7 @@ from holdfast.config.settings import (
     SimulatorSettings,
 )
 from holdfast.errors import HeldError, UnknownPerformanceError
+from holdfast.outcome import ending_of
 from holdfast.planning import Planner
 from holdfast.protocol.events import (
     Act,
@@ -110,7 +111,7 @@ def test_resumed_from_any_moment(performed: bool) -> None:
             world.environment.perform(pending)
         world.carry_out(world.robot.start(0.0))
         world.bring_up("cloud")
-        begun = EnvironmentReady(world.environment.is_done(), world.environment.step)
+        begun = EnvironmentReady(ending_of(world.environment.is_done()), world.environment.step)
         world.carry_out(world.robot.begin_trial(0, history, begun, 0.0, tail_is_certain=False))
         world.run()
         (result,) = world.results
@@ -215,7 +216,7 @@ def begin_after(
         world.robot.begin_trial(
             0,
             history,
-            EnvironmentReady(False, steps_performed),
+            EnvironmentReady(None, steps_performed),
             0.0,
             tail_is_certain=tail_is_certain,
         )
@@ -291,7 +292,7 @@ def test_what_fails_after_an_action_was_performed_leaves_it_in_the_journal(count
     def act_and_fail(effect: Act) -> None:
         act(effect)
         if effect.step == 5:
-            failure = EnvironmentFailed(5, "is_done", "returned None", False, True, -2.5)
+            failure = EnvironmentFailed(5, "is_done", "returned None", False, Acted(5, -2.5, None))
             world.heap = []
             world.after(0.1, lambda: world.robot.handle(failure, world.now))
 
@@ -367,7 +368,7 @@ class TestFailedTask:
         resumed = self.world()
         resumed.carry_out(resumed.robot.start(0.0))
         history = replay(resumed.planner, 11, 0, killed.journal)
-        begun = EnvironmentReady(killed.environment.is_done(), killed.environment.step)
+        begun = EnvironmentReady(ending_of(killed.environment.is_done()), killed.environment.step)
         resumed.carry_out(resumed.robot.begin_trial(0, history, begun, 0.0, tail_is_certain=True))
         self.assert_failed(resumed)
 

@@ -198,14 +198,14 @@ class Robot:
             self.session,
             self.number,
             epoch=self.epoch,
-            observations=tuple(self.observed[since:]),
+            inputs=tuple(self.observed[since:]),
             session_configuration=self.session_configuration if session_configuration else None,
         )
         return msgspec.structs.replace(request, **changes)
 
     def restore(self, **changes: Any) -> Request:
         changes = {"checkpoint": encode_checkpoint(self.state), **changes}
-        return self.request(observations=(), **changes)
+        return self.request(inputs=(), **changes)
 
     def sense(self) -> None:
         planner = Planner(self.problem, self.planning)
@@ -434,7 +434,7 @@ class TestRollingForward:
         last = robot.observed[-1]
         other = decode_floats(last.observation, len(last.observation) // 8) + 0.5
         changed = msgspec.structs.replace(last, observation=encode_floats(other))
-        request = robot.request(session_configuration=False, observations=(changed,))
+        request = robot.request(session_configuration=False, inputs=(changed,))
         assert bench.ask(request) == [NeedState(request.number, True, diverged=True)]
         assert bench.service.statistics.states_diverged == 1
         told = [note.fields for note in bench.notes if note.name == "state_diverged"]
@@ -902,7 +902,7 @@ class TestRefusals:
         bench, robot = Bench(), Robot()
         robot.sense()
         wrong = Observed(0, 0, encode_floats(np.zeros(7)))
-        assert refused(bench.ask(robot.request(observations=(wrong,)))).code == "invalid"
+        assert refused(bench.ask(robot.request(inputs=(wrong,)))).code == "invalid"
 
     @pytest.mark.parametrize(
         ("observed", "code"),
@@ -915,7 +915,7 @@ class TestRefusals:
     def test_observation_that_is_none(self, observed: Observed, code: str) -> None:
         bench, robot = Bench(), Robot()
         robot.sense()
-        assert refused(bench.ask(robot.request(observations=(observed,)))).code == code
+        assert refused(bench.ask(robot.request(inputs=(observed,)))).code == code
 
     def test_other_version(self) -> None:
         bench, robot = Bench(), Robot()

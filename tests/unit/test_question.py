@@ -26,7 +26,7 @@ def question(step: int = 0, *, sensed: bool = False, interval: int = 2) -> Quest
     planning = PlanningSettings(sensing_interval=interval)
     planner = Planner(PegInHole2D(), planning)
     state = planner.init(1)._replace(step=step, sensed=sensed)
-    return Question(planning, state, planner.digest(state), (), 0)
+    return Question(planner, state, planner.digest(state), (), 0)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from holdfast.protocol.messages import MAX_OBSERVATIONS
+from holdfast.protocol.messages import MAX_INPUTS
 from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
 
 
@@ -16,7 +16,7 @@ def test_each_service_counts_its_own_refusals() -> None:
 
 def test_a_request_of_the_largest_size_is_within_the_limits() -> None:
     limits = ServiceLimits()
-    assert limits.max_steps >= MAX_OBSERVATIONS
+    assert limits.max_steps >= MAX_INPUTS
     assert 2 * limits.max_waiting_per_robot <= limits.max_waiting
     with pytest.raises(AttributeError):
         limits.max_steps = 0  # type: ignore[misc]

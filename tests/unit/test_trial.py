@@ -11,7 +11,7 @@ import pytest
 from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import EnvironmentFailedError, InvalidValueError
-from holdfast.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
+from holdfast.outcome import Decisions, MoveResult, SensingDecision, TaskDecision, TrialResult
 from holdfast.planning import Planner
 from holdfast.recording.recorder import Recorder
 from holdfast.robot.environment import SimulatedEnvironment
@@ -142,7 +142,7 @@ class TestOneTrial:
                 self.sensed.append(sensing_action)
                 return super().perform_sensing(sensing_action)
 
-            def perform(self, task_action: FloatArray) -> float | None:
+            def perform(self, task_action: FloatArray) -> float | MoveResult | None:
                 self.performed.append(tuple(task_action.tolist()))
                 return super().perform(task_action)
 

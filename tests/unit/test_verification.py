@@ -196,7 +196,7 @@ def test_the_share_is_kept_and_no_service_can_tell_which() -> None:
 def question_of(number: int) -> Question:
     world = World()
     state = world.planner.init(number, 0)
-    return Question(world.planner.settings, state, number.to_bytes(16, "big"), (), 0)
+    return Question(world.planner, state, number.to_bytes(16, "big"), (), 0)
 
 
 def answer(verification: Verification, question: Question) -> None:

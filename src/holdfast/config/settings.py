@@ -142,6 +142,8 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         policy leads each particle without noise.
     sensing_action : int
         What ``fixed`` chooses.
+    sensing_is_optional : bool
+        Whether the choice may be not to sense, at no price.
     estimator : Estimator or None
         ``prior_neighbors`` has less bias where a sharp observation leaves few particles: 300 choose
         about as well as 1,000 with ``nearest_neighbor``. A mixture takes few particles for
@@ -178,6 +180,7 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
     method: Method = "path_entropy"
     sensing_action: NonNegativeCount = 0
+    sensing_is_optional: bool = False
     estimator: Estimator | None = None
     actions: Literal["commanded", "executed"] = "commanded"
     resolution: Resolution | Resolutions | None = None

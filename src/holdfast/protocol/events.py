@@ -16,9 +16,10 @@ from typing import Generic, NamedTuple, TypeAlias, TypeVar
 
 from holdfast.arrays import FloatArray
 from holdfast.errors import HoldfastError
-from holdfast.outcome import Done, TrialResult
+from holdfast.outcome import Ending, TrialResult
 from holdfast.planning import PlanningState
 from holdfast.protocol.records import Record
+from holdfast.tracking import LateObservation
 
 __all__ = [
     "Abandon",
@@ -88,27 +89,45 @@ class EnvironmentReady(NamedTuple):
 
     Attributes
     ----------
+    ending : Ending or None
+        How its task has ended; None if it goes on.
     steps_performed : int or None
         Task actions performed in this trial, counted by the environment; None if it does not count.
     """
 
-    done: Done
+    ending: Ending | None
     steps_performed: int | None
 
 
 class Sensed(NamedTuple):
-    """A sensing action was performed; the observation is finite and read-only."""
+    """A sensing action was performed; the observation is finite and read-only.
+
+    None if it comes later: with a task action.
+    """
 
     step: int
-    observation: FloatArray
+    observation: FloatArray | None
 
 
 class Acted(NamedTuple):
-    """A task action was performed; the reward is finite, or None if the environment gives none."""
+    """A task action was performed; all numbers are finite.
+
+    Attributes
+    ----------
+    reward : float or None
+        None if the environment gives none.
+    motion, observation : array or None
+        What the move has shown.
+    late : tuple of LateObservation
+        Observations of earlier steps that have come meanwhile.
+    """
 
     step: int
     reward: float | None
-    done: Done
+    ending: Ending | None
+    motion: FloatArray | None = None
+    observation: FloatArray | None = None
+    late: tuple[LateObservation, ...] = ()
 
 
 class EnvironmentFailed(NamedTuple):
@@ -120,8 +139,8 @@ class EnvironmentFailed(NamedTuple):
         The method, or the environment's name if it could not be made.
     action_in_doubt : bool
         Whether the step's task action was begun without an :class:`Acted`.
-    performed : bool
-        Whether the step's task action was performed, with ``reward``, and what came after failed.
+    performed : Acted or None
+        The step's task action, if it was performed and what came after failed.
     counts_steps : bool
         Whether the environment counts its steps, so that it can be asked later.
     """
@@ -130,8 +149,7 @@ class EnvironmentFailed(NamedTuple):
     what: str
     text: str
     action_in_doubt: bool
-    performed: bool = False
-    reward: float | None = None
+    performed: Acted | None = None
     counts_steps: bool = True
 
 

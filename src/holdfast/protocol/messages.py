@@ -36,12 +36,14 @@ __all__ = [
     "MAX_ACTION_SIZE",
     "MAX_CONFIGURATION_BYTES",
     "MAX_CONFIGURATION_VALUES",
-    "MAX_OBSERVATIONS",
+    "MAX_INPUTS",
     "MAX_TASK_ACTIONS",
     "MAX_TEXT",
     "MAX_WORD",
     "PROTOCOL_VERSION",
     "Busy",
+    "Input",
+    "Moved",
     "NeedState",
     "Observed",
     "Progress",
@@ -56,6 +58,7 @@ __all__ = [
     "decode_request",
     "encode",
     "encode_floats",
+    "numbers_of",
     "pack_configuration",
     "settings_digest",
     "unpack_configuration",
@@ -63,7 +66,7 @@ __all__ = [
 ]
 
 
-PROTOCOL_VERSION = 4
+PROTOCOL_VERSION = 5
 """Raised when a message changes its form or meaning. All versions have the same checksum."""
 
 CHECKSUM_SIZE = 4
@@ -81,8 +84,8 @@ MAX_WORD = 2**32 - 1
 MAX_TEXT = 4000
 """Bound on the characters of a refusal's text."""
 
-MAX_OBSERVATIONS = 64
-"""Bound on the observations of one request; a service further behind is sent the state."""
+MAX_INPUTS = 64
+"""Bound on the inputs of one request; a service further behind is sent the state."""
 
 MAX_CONFIGURATION_BYTES = 256 * 1024
 """Bound on a session configuration, encoded."""
@@ -102,12 +105,34 @@ PackedConfiguration = Annotated[bytes, msgspec.Meta(max_length=16 * MAX_CONFIGUR
 Numbers = Annotated[bytes, msgspec.Meta(max_length=8 * MAX_ACTION_SIZE * MAX_TASK_ACTIONS)]
 
 
-class Observed(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True):
-    """An observation (little-endian float64) of the state of a step, before its task action."""
+Observation = Annotated[bytes, msgspec.Meta(max_length=8 * MAX_ACTION_SIZE)]
+
+
+class Observed(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True, tag=1):
+    """An observation (little-endian float64) of the state of a step, before its task action.
+
+    It is empty if it comes later, or if the choice was not to sense.
+    """
 
     step: Word
     sensing_action: Word
-    observation: Annotated[bytes, msgspec.Meta(max_length=8 * MAX_ACTION_SIZE)]
+    observation: Observation
+
+
+class Moved(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True, tag=2):
+    """What the task action of a step has shown (little-endian float64); empty for nothing."""
+
+    step: Word
+    motion: Observation
+    observation: Observation
+
+
+Input: TypeAlias = Observed | Moved
+"""What a robot's belief rests on, besides the task actions, which follow from it.
+
+A late observation changes what is past, and a reinitialisation forgets it: after these a robot
+sends its state.
+"""
 
 
 class SessionConfiguration(msgspec.Struct, array_like=True, frozen=True):
@@ -150,13 +175,13 @@ class Request(msgspec.Struct, array_like=True, frozen=True):
         Increases within an epoch, and is unique among epochs. Every reply repeats it.
     trial, step, sensed, digest
         Of the state; ``sensed`` says whether the step's observation is part of it.
-    observations : tuple of Observed
+    inputs : tuple of Input
         Of this trial, in order, since the state that this service acknowledged last; all of them if
         it acknowledged none.
     session_configuration : SessionConfiguration or None
         For a service that may not know the session.
     checkpoint : bytes, memoryview or None
-        The state (:func:`holdfast.planning.encode_checkpoint`); then ``observations`` is empty. A
+        The state (:func:`holdfast.planning.encode_checkpoint`); then ``inputs`` is empty. A
         decoded one is a view of the message.
     """
 
@@ -168,7 +193,7 @@ class Request(msgspec.Struct, array_like=True, frozen=True):
     step: Word
     sensed: bool
     digest: Digest
-    observations: Annotated[tuple[Observed, ...], msgspec.Meta(max_length=MAX_OBSERVATIONS)] = ()
+    inputs: Annotated[tuple[Input, ...], msgspec.Meta(max_length=MAX_INPUTS)] = ()
     session_configuration: SessionConfiguration | None = None
     checkpoint: bytes | memoryview | None = None
 
@@ -368,8 +393,8 @@ def decode_request(payload: bytes) -> Request:
         raise MessageError("malformed", f"{len(payload)} bytes are no request: {error}") from error
     if sent.version != PROTOCOL_VERSION:
         raise _other_version(sent.version)
-    if sent.checkpoint is not None and sent.observations:
-        raise MessageError("malformed", "a request has a checkpoint and observations as well")
+    if sent.checkpoint is not None and sent.inputs:
+        raise MessageError("malformed", "a request has a checkpoint and inputs as well")
     fields = msgspec.structs.asdict(sent) | {"session_configuration": session_configuration}
     del fields["settings"]
     return Request(**fields)
@@ -388,6 +413,11 @@ def decode_reply(payload: bytes) -> Reply:
         return _REPLY_DECODER.decode(content)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
         raise MessageError("malformed", f"{len(payload)} bytes are no reply: {error}") from error
+
+
+def numbers_of(data: bytes) -> FloatArray | None:
+    """Decode as many numbers as there are; None for none. Raise as :func:`decode_floats`."""
+    return decode_floats(data, len(data) // 8) if data else None
 
 
 def encode_floats(array: npt.ArrayLike) -> bytes:

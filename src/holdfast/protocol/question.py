@@ -14,9 +14,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from holdfast.arrays import FloatArray
-from holdfast.config.settings import PlanningSettings
 from holdfast.errors import HoldfastError, MessageError
-from holdfast.planning import PlanningState, encode_checkpoint, needs_sensing
+from holdfast.planning import Planner, PlanningState, encode_checkpoint
 from holdfast.protocol.events import (
     Effects,
     Halt,
@@ -30,7 +29,7 @@ from holdfast.protocol.events import (
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_TASK_ACTIONS,
-    Observed,
+    Input,
     SensingAnswer,
     TaskAnswer,
     decode_floats,
@@ -116,7 +115,7 @@ class Question:
 
     Attributes
     ----------
-    observations, num_observations
+    inputs, num_inputs
         The latest of this trial, and how many there were.
     task_count : int
         Task actions in the answer.
@@ -142,16 +141,16 @@ class Question:
 
     def __init__(
         self,
-        settings: PlanningSettings,
+        planner: Planner,
         state: PlanningState,
         digest: bytes,
-        observations: tuple[Observed, ...],
-        num_observations: int,
+        inputs: tuple[Input, ...],
+        num_inputs: int,
     ) -> None:
         self.state = state
         self.digest = digest[:DIGEST_SIZE]
-        self.observations = observations
-        self.num_observations = num_observations
+        self.inputs = inputs
+        self.num_inputs = num_inputs
         self.needed_at: float | None = None
         self.num_ordered = 0
         self.task_actions: Sequence[FloatArray] | None = None
@@ -164,11 +163,15 @@ class Question:
         self.own: OwnAnswer | None = None
         self.own_is_certain: bool | None = None
         self._checkpoint: bytes | None = None
-        if needs_sensing(settings, state):
+        self.sensing_step: int | None
+        if planner.needs_sensing(state):
             self.task_count = 0
-            self.sensing_step: int | None = state.step
+            self.sensing_step = state.step
+        elif planner.moves_show:
+            self.task_count = 1
+            self.sensing_step = None
         else:
-            interval = settings.sensing_interval + 1
+            interval = planner.settings.sensing_interval + 1
             following = (state.step // interval + 1) * interval
             self.task_count = min(following - state.step, MAX_TASK_ACTIONS)
             within = following - state.step <= MAX_TASK_ACTIONS
@@ -184,7 +187,7 @@ class Question:
     @property
     def is_first(self) -> bool:
         """Whether its trial has only begun, so that a service needs nothing to reach its state."""
-        return self.state.step == 0 and self.num_observations == 0
+        return self.state.step == 0 and self.num_inputs == 0
 
     def checkpoint(self) -> bytes:
         """Return the encoded state (computed once)."""
@@ -212,9 +215,7 @@ class Question:
         numbers = decode_floats(reply.actions, reply.count * action_size)
         return AnswerPart(service, list(numbers.reshape(reply.count, action_size)), None)
 
-    def read_sensing(
-        self, reply: SensingAnswer, num_sensing_actions: int, service: str
-    ) -> AnswerPart:
+    def read_sensing(self, reply: SensingAnswer, num_choices: int, service: str) -> AnswerPart:
         """Return the sensing action of a reply.
 
         Raises
@@ -229,7 +230,7 @@ class Question:
             )
         if self.task_count == 0 and reply.digest != self.digest:
             raise MessageError("malformed", "a sensing action for another state than was asked")
-        if reply.sensing_action >= num_sensing_actions:
+        if reply.sensing_action >= num_choices:
             raise MessageError("malformed", f"there is no sensing action {reply.sensing_action}")
         return AnswerPart(service, None, reply)
 

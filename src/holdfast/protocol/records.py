@@ -14,18 +14,28 @@ import msgspec
 
 from holdfast.arrays import FloatArray
 from holdfast.errors import InvalidValueError, MessageError, RecordError
-from holdfast.outcome import DecisionLog, Done, RewardAccount, TrialResult
-from holdfast.planning import Planner, PlanningState
-from holdfast.protocol.messages import MAX_OBSERVATIONS, Observed, decode_floats
+from holdfast.planning import ObservationInfo, Planner
+from holdfast.protocol.messages import (
+    MAX_INPUTS,
+    Input,
+    Moved,
+    Observed,
+    decode_floats,
+    encode_floats,
+    numbers_of,
+)
+from holdfast.tracking import LateObservation, Trial
 
 __all__ = [
     "DIVERGENCE_RUN",
     "ActingRecord",
+    "LateRecord",
     "LocalTookOverRecord",
     "ObservedRecord",
     "PausedRecord",
     "PerformedRecord",
     "Record",
+    "ReinitialisedRecord",
     "TrialHistory",
     "decode_record",
     "encode_record",
@@ -38,6 +48,8 @@ class ObservedRecord(msgspec.Struct, array_like=True, frozen=True, tag=1):
 
     Attributes
     ----------
+    observation : bytes
+        Empty if it comes later, or if the choice was not to sense.
     digest : bytes
         32 bytes, of the state that it led to; checked by :func:`replay`.
     sensing_ms : float
@@ -59,10 +71,16 @@ class ActingRecord(msgspec.Struct, array_like=True, frozen=True, tag=2):
 
 
 class PerformedRecord(msgspec.Struct, array_like=True, frozen=True, tag=3):
-    """The task action was performed. Written before anything else is ordered."""
+    """The task action was performed. Written before anything else is ordered.
+
+    ``motion`` and ``observation`` (little-endian float64) are what the move has shown; empty for
+    nothing.
+    """
 
     step: int
     reward: float | None
+    motion: bytes = b""
+    observation: bytes = b""
 
 
 class PausedRecord(msgspec.Struct, array_like=True, frozen=True, tag=4):
@@ -75,8 +93,38 @@ class LocalTookOverRecord(msgspec.Struct, array_like=True, frozen=True, tag=5):
     times: int
 
 
+class LateRecord(msgspec.Struct, array_like=True, frozen=True, tag=6):
+    """An observation of an earlier step came.
+
+    Attributes
+    ----------
+    taken : int
+        The step at which it was taken.
+    digest : bytes
+        32 bytes, of the state that it led to.
+    """
+
+    step: int
+    taken: int
+    observation: bytes
+    digest: bytes
+
+
+class ReinitialisedRecord(msgspec.Struct, array_like=True, frozen=True, tag=7):
+    """The belief was begun anew; ``digest`` is that of the state that this led to."""
+
+    step: int
+    digest: bytes
+
+
 Record: TypeAlias = (
-    ObservedRecord | ActingRecord | PerformedRecord | PausedRecord | LocalTookOverRecord
+    ObservedRecord
+    | ActingRecord
+    | PerformedRecord
+    | PausedRecord
+    | LocalTookOverRecord
+    | LateRecord
+    | ReinitialisedRecord
 )
 
 _ENCODER = msgspec.msgpack.Encoder()
@@ -107,93 +155,95 @@ DIVERGENCE_RUN = 5
 diverged. (A sensor with 1 % outliers shows five in a row once in 10^10 observations.)"""
 
 
-class TrialHistory:
+class TrialHistory(Trial):
     """An unfinished trial: what its records fold to.
 
     Attributes
     ----------
-    state : PlanningState
-        After everything that is known to be performed.
-    observations : tuple of Observed
-        The latest, as many as fit into a request.
+    inputs : tuple of Input
+        The latest from which a service can fold the state, as many as fit into a request.
+    num_inputs : int
+        Of this trial, each late observation and reinitialisation counted.
     actions : list of array
         Replayed task actions in order.
     pending : array or None
         A task action in the journal that is not known to be performed.
     paused : bool
         Whether the previous process ended in order.
-    num_unexplained : int
-        Observations outside the validation gate of every particle.
     unexplained_in_a_row : int
-        Length of the current run of these.
+        Length of the current run of observations outside the validation gate.
     num_divergences : int
         Times that such a run reached :data:`DIVERGENCE_RUN`.
-    recoveries : int
-        Times that the cloud was lost.
     """
 
     def __init__(self, planner: Planner, seed: int, trial: int) -> None:
-        self.state = planner.init(seed, trial)
-        self.observations: tuple[Observed, ...] = ()
-        self.num_observations = 0
-        self.log = DecisionLog(planner.problem.action_size)
+        super().__init__(planner, seed, trial)
+        self.inputs: tuple[Input, ...] = ()
+        self.num_inputs = 0
         self.actions: list[FloatArray] = []
-        self.rewards = RewardAccount(planner.problem)
         self.pending: FloatArray | None = None
         self.paused = False
-        self.num_unexplained = 0
         self.unexplained_in_a_row = 0
         self.num_divergences = 0
-        self.sensing_ms: list[float] = []
-        self.recoveries = 0
 
     @property
     def begun(self) -> bool:
         """Whether anything has happened."""
-        return self.num_observations > 0 or self.state.step > 0 or self.pending is not None
+        return self.num_inputs > 0 or self.state.step > 0 or self.pending is not None
 
-    def observed(self, record: ObservedRecord, after: PlanningState, *, explained: bool) -> None:
-        """Fold in an observation that led to the state ``after``."""
-        kept = Observed(record.step, record.sensing_action, record.observation)
-        self.observations = (*self.observations, kept)[-MAX_OBSERVATIONS:]
-        self.num_observations += 1
-        self.num_unexplained += not explained
-        self.unexplained_in_a_row = 0 if explained else self.unexplained_in_a_row + 1
-        self.num_divergences += self.unexplained_in_a_row == DIVERGENCE_RUN
-        self.sensing_ms.append(record.sensing_ms)
-        self.log.sensed(record.step, record.sensing_action, record.digest)
-        self.rewards.sensed(record.sensing_action)
-        self.state = after
+    def observed(
+        self, sensing_action: int, observation: FloatArray | None, sensing_ms: float
+    ) -> tuple[ObservationInfo, ObservedRecord]:
+        """Fold in a sensing action; return what was found, and its record."""
+        step = self.state.step
+        info, reached = self.observe(sensing_action, observation, sensing_ms)
+        if observation is not None:
+            self._count(info)
+        shown = b"" if observation is None else encode_floats(observation)
+        self._add(Observed(step, sensing_action, shown))
+        return info, ObservedRecord(step, sensing_action, shown, reached, sensing_ms)
 
-    def result(self, planner: Planner, done: Done) -> TrialResult:
-        """End the trial and return its result."""
-        state = self.state
-        self.log.ended(state.step, planner.digest(state))
-        decisions = self.log.decisions()
-        sensing_ms = tuple(self.sensing_ms)
-        return TrialResult(
-            trial=state.trial,
-            seed=state.seed,
-            success=done is True,
-            failed=done == "failed",
-            steps=state.step,
-            reward=self.rewards.total if state.step else 0.0,
-            sensing_decisions=self.num_observations,
-            mean_sensing_ms=sum(sensing_ms) / len(sensing_ms) if sensing_ms else 0.0,
-            recoveries=self.recoveries,
-            unexplained_observations=self.num_unexplained,
-            digest=decisions.digest(),
-            sensing_ms=sensing_ms,
-            decisions=decisions,
-        )
-
-    def performed(self, planner: Planner, reward: float | None) -> None:
-        """Fold in that the pending task action was performed."""
+    def performed(self, record: PerformedRecord) -> ObservationInfo | None:
+        """Fold in that the pending task action was performed; return what was found, if any was."""
         assert self.pending is not None
-        self.log.acted(self.state.step, self.pending)
-        self.state = planner.advance(self.state, self.pending)
-        self.rewards.acted(reward)
+        action, motion, observation = self.pending, record.motion, record.observation
+        info = self.move(action, record.reward, numbers_of(motion), numbers_of(observation))
+        if info is not None:
+            self._count(info)
+        if motion or observation:
+            self._add(Moved(record.step, motion, observation))
         self.pending = None
+        return info
+
+    def came_late(self, late: LateObservation) -> tuple[ObservationInfo, LateRecord] | None:
+        """Fold in a late observation; return what was found, and its record.
+
+        None if none of its step is awaited.
+        """
+        found = self.observe_late(late)
+        if found is None:
+            return None
+        info, reached = found
+        self._count(info)
+        self._add(None)
+        shown = encode_floats(late.observation)
+        return info, LateRecord(self.state.step, late.step, shown, reached)
+
+    def reinitialised(self) -> ReinitialisedRecord:
+        """Begin the belief anew; return the record."""
+        reached = self.reinitialise()
+        self._add(None)
+        self.unexplained_in_a_row = 0
+        return ReinitialisedRecord(self.state.step, reached)
+
+    def _count(self, info: ObservationInfo) -> None:
+        self.unexplained_in_a_row = 0 if info.explained else self.unexplained_in_a_row + 1
+        self.num_divergences += self.unexplained_in_a_row == DIVERGENCE_RUN
+
+    def _add(self, given: Input | None) -> None:
+        """Keep an input; None is one that no service can fold in: it needs the state after it."""
+        self.num_inputs += 1
+        self.inputs = () if given is None else (*self.inputs, given)[-MAX_INPUTS:]
 
 
 def replay(planner: Planner, seed: int, trial: int, records: Sequence[Record]) -> TrialHistory:
@@ -226,7 +276,19 @@ def _replay_record(planner: Planner, history: TrialHistory, record: Record) -> N
     if record.step != state.step:
         raise RecordError(f"is of step {record.step}, where step {state.step} is due")
     if isinstance(record, ObservedRecord):
-        _replay_observation(planner, history, record)
+        if not planner.needs_sensing(state):
+            raise RecordError("is an observation where a task action is due")
+        observation = numbers_of(record.observation)
+        _, again = history.observed(record.sensing_action, observation, record.sensing_ms)
+        _require_same_state(record.digest, again.digest)
+    elif isinstance(record, LateRecord):
+        observation = decode_floats(record.observation, len(record.observation) // 8)
+        found = history.came_late(LateObservation(record.taken, observation))
+        if found is None:
+            raise RecordError(f"is an observation of step {record.taken}, where none is awaited")
+        _require_same_state(record.digest, found[1].digest)
+    elif isinstance(record, ReinitialisedRecord):
+        _require_same_state(record.digest, history.reinitialised().digest)
     elif isinstance(record, ActingRecord):
         if planner.needs_sensing(state):
             raise RecordError("is a task action where an observation is due")
@@ -235,19 +297,12 @@ def _replay_record(planner: Planner, history: TrialHistory, record: Record) -> N
         raise RecordError("is of a performance of which no action was written down")
     else:
         history.actions.append(history.pending)
-        history.performed(planner, record.reward)
+        history.performed(record)
 
 
-def _replay_observation(planner: Planner, history: TrialHistory, record: ObservedRecord) -> None:
-    state = history.state
-    if not planner.needs_sensing(state):
-        raise RecordError("is an observation where a task action is due")
-    observation = decode_floats(record.observation, len(record.observation) // 8)
-    after, info = planner.observe(state, record.sensing_action, observation)
-    reached = planner.digest(after)
-    if reached != record.digest:
+def _require_same_state(recorded: bytes, reached: bytes) -> None:
+    if reached != recorded:
         raise RecordError(
             "leads to another state than it did when it was written: the problem is not "
             "deterministic, its code has changed, or the journal is damaged"
         )
-    history.observed(record, after, explained=info.explained)

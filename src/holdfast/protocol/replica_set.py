@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Sequence
 
-from holdfast.protocol.messages import Observed
+from holdfast.protocol.messages import Input
 from holdfast.protocol.question import Question
 
 __all__ = ["FailureDetector", "Replica", "ReplicaSet"]
@@ -192,7 +192,7 @@ class Replica:
     opened : bool
         Whether it knows the session.
     acknowledged : tuple of int or None
-        Trial and number of observations of the latest state that it is known to hold.
+        Trial and number of inputs of the latest state that it is known to hold.
     num_diverged : int
         Times in a row that it came to another state than the robot from the same observations.
     num_refusals : list of int
@@ -290,7 +290,7 @@ class Replica:
             self.complaint = None
         if not restored:
             self.num_diverged = 0
-        holds = (question.state.trial, question.num_observations)
+        holds = (question.state.trial, question.num_inputs)
         self.acknowledged = max(self.acknowledged or holds, holds)
 
     def note_busy(self, retry_after_s: float, now: float) -> float:
@@ -337,7 +337,7 @@ class Replica:
 
     def catch_up(
         self, question: Question, *, whole_state: bool
-    ) -> tuple[tuple[Observed, ...], bytes | None]:
+    ) -> tuple[tuple[Input, ...], bytes | None]:
         """Return what a request must carry for the service to reach the question's state.
 
         Parameters
@@ -347,7 +347,7 @@ class Replica:
 
         Returns
         -------
-        observations : tuple of Observed
+        inputs : tuple of Input
             From the state that it holds to the question's.
         checkpoint : bytes or None
             The whole state, where that is better.
@@ -355,7 +355,7 @@ class Replica:
         state = question.state
         known = self.acknowledged
         start = known[1] if known is not None and known[0] == state.trial else 0
-        missing = question.num_observations - start
+        missing = question.num_inputs - start
         if missing > 1 or not (self.opened or question.is_first):
             # It knows nothing, or others have decided since. Replaying takes time that other robots
             # need, so it is sent the state, unless that is large.
@@ -363,11 +363,11 @@ class Replica:
                 8 * state.belief.states.size <= _LARGE_CHECKPOINT
                 or state.step > _MAX_REPLAYED_STEPS
             )
-        if self.num_diverged >= _MAX_DIVERGED or missing > len(question.observations):
+        if self.num_diverged >= _MAX_DIVERGED or missing > len(question.inputs):
             whole_state = True
         if whole_state:
             return (), question.checkpoint()
-        return question.observations[-missing:] if missing > 0 else (), None
+        return question.inputs[-missing:] if missing > 0 else (), None
 
 
 class ReplicaSet:

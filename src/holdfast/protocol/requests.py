@@ -130,7 +130,8 @@ class OpenRequests:
     ) -> None:
         self._timeout_s = timeout_s
         self._action_size = problem.action_size
-        self._num_sensing_actions = len(problem.sensing_actions)
+        optional = session_configuration.planning.selector.sensing_is_optional
+        self._num_choices = len(problem.sensing_actions) + optional
         self._verification = verification
         self._session = session
         self._epoch = epoch
@@ -222,7 +223,7 @@ class OpenRequests:
             self.abandon(call)
         state = question.state
         opens = not replica.opened
-        observations, checkpoint = replica.catch_up(question, whole_state=whole_state)
+        inputs, checkpoint = replica.catch_up(question, whole_state=whole_state)
         self._number += 1
         call_number = self._number
         number = self._first_request + call_number
@@ -235,7 +236,7 @@ class OpenRequests:
             state.step,
             state.sensed,
             question.digest,
-            observations,
+            inputs,
             self._session_configuration if opens else None,
             checkpoint,
         )
@@ -346,7 +347,7 @@ class OpenRequests:
         first = not call.answered
         sensing = isinstance(reply, SensingAnswer)
         if isinstance(reply, SensingAnswer):
-            part = question.read_sensing(reply, self._num_sensing_actions, replica.name)
+            part = question.read_sensing(reply, self._num_choices, replica.name)
         else:
             part = question.read_tasks(reply, self._action_size, replica.name)
         provenance = Provenance(replica.name, now - call.sent_at, 1e-6 * reply.computed_us)

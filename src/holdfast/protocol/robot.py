@@ -20,7 +20,7 @@ from holdfast.arrays import FloatArray
 from holdfast.belief import VALIDATION_GATE_SQUARED
 from holdfast.config.settings import SimulatorSettings
 from holdfast.errors import HeldError, HoldfastError, UnknownPerformanceError
-from holdfast.outcome import Done
+from holdfast.outcome import Ending
 from holdfast.planning import ObservationInfo, Planner, PlanningState
 from holdfast.protocol.events import (
     Act,
@@ -47,13 +47,13 @@ from holdfast.protocol.records import (
     DIVERGENCE_RUN,
     ActingRecord,
     LocalTookOverRecord,
-    ObservedRecord,
     PausedRecord,
     PerformedRecord,
     Record,
     TrialHistory,
 )
 from holdfast.protocol.status import Status
+from holdfast.tracking import LateObservation
 
 __all__ = ["Robot"]
 
@@ -100,7 +100,7 @@ class Robot:
         self._effects = source.effects
         self._history: TrialHistory | None = None
         self._trial = 0
-        self._done: Done = False
+        self._ending: Ending | None = None
         self._awaits_environment = False
         self._sensing_action = 0
         self._computed_ms = 0.0
@@ -181,7 +181,7 @@ class Robot:
         """
         self._trial = trial
         self._history = history
-        self._done = begun.done
+        self._ending = begun.ending
         self._awaits_environment = False
         self._unwritten = []
         self._next_tick = None
@@ -223,9 +223,10 @@ class Robot:
                 "trial anew in another directory (--out)"
             )
         if history.pending is not None and performed == known + 1:
-            self._unwritten.append(PerformedRecord(known, None))
+            record = PerformedRecord(known, None)
+            self._unwritten.append(record)
             self._effects.report("performed_unseen", trial=self._trial, step=known)
-            history.performed(self._planner, None)
+            history.performed(record)
             return None
         if performed != known:
             raise UnknownPerformanceError(
@@ -258,8 +259,7 @@ class Robot:
                 elif isinstance(event, Sensed):
                     self._sensed(event, now)
                 elif isinstance(event, Acted):
-                    self._done = event.done
-                    self._performed(event.reward)
+                    self._performed(event)
                 else:
                     self._failed(event)
         elif not isinstance(event, EnvironmentReady):
@@ -303,24 +303,21 @@ class Robot:
 
     def _sensed(self, event: Sensed, now: float) -> None:
         history = self._current_history
-        state = history.state
+        step, sensing_action = history.state.step, self._sensing_action
         try:
-            after, info = self._planner.observe(state, self._sensing_action, event.observation)
+            info, record = history.observed(sensing_action, event.observation, self._computed_ms)
         except HoldfastError as error:
             self._stop(error)
             return
-        reached = self._planner.digest(after)
-        shown = encode_floats(event.observation)
-        record = ObservedRecord(state.step, self._sensing_action, shown, reached, self._computed_ms)
-        history.observed(record, after, explained=info.explained)
         self._write(record)
-        if not info.explained:
-            self._report_unexplained(state.step, info)
+        self._judge(step, info, sensing_action=sensing_action)
         if not self._pausing:
-            self._ask(reached, now)
+            self._ask(record.digest, now)
 
-    def _report_unexplained(self, step: int, info: ObservationInfo) -> None:
+    def _judge(self, step: int, info: ObservationInfo, **of_what: object) -> None:
         """Report an observation outside the validation gate, and a run of these."""
+        if info.explained:
+            return
         history = self._current_history
         gate = f"{VALIDATION_GATE_SQUARED**0.5:g} standard deviations"
         if history.num_unexplained <= _MAX_REPORTS:
@@ -331,7 +328,7 @@ class Robot:
                 "unexplained",
                 trial=self._trial,
                 step=step,
-                sensing_action=self._sensing_action,
+                **of_what,
                 **fields,
                 reason=(
                     "no particle can have made it"
@@ -352,19 +349,47 @@ class Robot:
                 "lost the state, or the problem's model is wrong; the robot goes on",
             )
 
-    def _performed(self, reward: float | None) -> None:
+    def _performed(self, event: Acted) -> None:
         history = self._current_history
-        self._unwritten.append(PerformedRecord(history.state.step, reward))
+        self._ending = event.ending
+        motion, shown = (
+            b"" if each is None else encode_floats(each)
+            for each in (event.motion, event.observation)
+        )
+        record = PerformedRecord(event.step, event.reward, motion, shown)
+        self._unwritten.append(record)
         try:
-            history.performed(self._planner, reward)
+            info = history.performed(record)
+            if info is not None:
+                self._judge(event.step, info, of="move")
+            for late in event.late:
+                self._came_late(late)
         except HoldfastError as error:
             self._stop(error)
 
+    def _came_late(self, late: LateObservation) -> None:
+        """Fold in an observation of an earlier step."""
+        history = self._current_history
+        found = history.came_late(late)
+        if found is None:
+            self._effects.report(
+                "late_unused",
+                trial=self._trial,
+                step=history.state.step,
+                taken=late.step,
+                reason="no observation of that step is awaited: it has come before, was given up, "
+                "or nothing was sensed there",
+            )
+            return
+        info, record = found
+        self._unwritten.append(record)
+        self._judge(late.step, info, of="late")
+
     def _failed(self, event: EnvironmentFailed) -> None:
         where = f"the robot holds still in trial {self._trial}, step {event.step}"
-        if event.performed:
+        if event.performed is not None:
             # What is written down now needs no environment that counts when the run goes on.
-            self._performed(event.reward)
+            self._performed(event.performed)
             if self._stopped:
                 return
             where += ", whose task action was performed"
@@ -398,7 +423,7 @@ class Robot:
                 self._effects.append(Paused())
             return
         state = history.state
-        if self._done or state.step >= self._simulator.max_steps:
+        if self._ending is not None or state.step >= self._simulator.max_steps:
             # Before a pause: that the task is done, and how it ended, is in no other record.
             self._end_trial(now)
             return
@@ -414,7 +439,7 @@ class Robot:
             self._next_action(state, now)
 
     def _next_sensing(self, state: PlanningState, now: float) -> None:
-        question = self._source.question
+        question = self._question()
         if question is None or question.sensing_step != state.step:
             self._ask(self._planner.digest(state), now)
             question = self._source.question
@@ -438,12 +463,16 @@ class Robot:
         self._computed_ms = 1e3 * provenance.computed_s
         self._timed("sensing", question, provenance, now)
         self._sensing_action = answer.sensing_action
+        if answer.sensing_action == self._planner.no_sensing:
+            self._sensed(Sensed(state.step, None), now)
+            self._go_on(now)
+            return
         self._awaits_environment = True
         self._write()
         self._effects.append(Sense(state.step, answer.sensing_action))
 
     def _next_action(self, state: PlanningState, now: float) -> None:
-        question = self._source.question
+        question = self._question()
         offset = -1 if question is None else state.step - question.state.step
         if question is None or question.task_count == 0 or not 0 <= offset < question.task_count:
             self._ask(self._planner.digest(state), now)
@@ -474,12 +503,18 @@ class Robot:
         self._awaits_environment = True
         self._effects.append(Act(state.step, action))
 
+    def _question(self) -> Question | None:
+        """Return the current question, unless something was shown since that it does not know."""
+        question = self._source.question
+        if question is None or question.num_inputs != self._current_history.num_inputs:
+            return None
+        return question
+
     def _ask(self, state_digest: bytes, now: float) -> None:
         history = self._current_history
         self._write()
-        observations, num_observations = history.observations, history.num_observations
         question = Question(
-            self._planner.settings, history.state, state_digest, observations, num_observations
+            self._planner, history.state, state_digest, history.inputs, history.num_inputs
         )
         self._source.ask(question, now)
 
@@ -520,7 +555,7 @@ class Robot:
         history = self._current_history
         self._report_ticks(now)
         self._count_recoveries()
-        result = history.result(self._planner, self._done)
+        result = history.result(self._ending)
         self._history = None
         self._unwritten = []  # the result says all of it
         self._source.drop()

@@ -492,9 +492,9 @@ class Service:
             self._send_sensing(task, task.digest, answer)
         else:
             statistics.task_parts += 1
-            ahead = outcome.ahead
-            assert ahead is not None
-            following = outcome.ahead_digest if needs_sensing(session.planning, ahead) else None
+            ahead, following = outcome.ahead, None
+            if ahead is not None and needs_sensing(session.planning, ahead):
+                following = outcome.ahead_digest
             answer = CachedAnswer(*where, outcome.num_actions, outcome.actions, following)
             session.remember(task.digest, answer, most)
             self._send_task(task, answer, now)

@@ -32,10 +32,13 @@ from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_ACTION_SIZE,
     MAX_TASK_ACTIONS,
+    Input,
+    Moved,
+    Observed,
     Request,
     SessionConfiguration,
-    decode_floats,
     encode_floats,
+    numbers_of,
     unpack_configuration,
 )
 from holdfast.protocol.service_limits import ServiceLimits
@@ -68,7 +71,8 @@ class JobResult(NamedTuple):
     state : PlanningState or None
         The requested state, verified; ``restored`` if it came from a checkpoint.
     ahead, ahead_digest
-        The state to which the ``num_actions`` actions lead, and its digest as it is sent.
+        The state to which the ``num_actions`` actions lead, and its digest as it is sent; None
+        where it depends on what a move will show.
     sensing_action : int
         The chosen one; -1 if none was to be chosen.
     """
@@ -147,7 +151,7 @@ class Job:
                 request.step,
                 request.sensed,
                 request.digest,
-                request.observations,
+                request.inputs,
                 request.checkpoint,
             )
         return self.kind, self._seed, named
@@ -195,15 +199,17 @@ class Job:
             index, _ = planner.choose_sensing_action(state)
             return JobResult(problem=problem, state=state, restored=restored, sensing_action=index)
         actions, ahead = planner.plan_until_sensing(state, MAX_TASK_ACTIONS)
-        return JobResult(
+        reached = JobResult(
             problem=problem,
             state=state,
             restored=restored,
             num_actions=len(actions),
             actions=encode_floats(actions),
-            ahead=ahead,
-            ahead_digest=planner.digest(ahead)[:DIGEST_SIZE],
         )
+        if planner.moves_show:
+            # The state ahead depends on what the move will show.
+            return reached
+        return reached._replace(ahead=ahead, ahead_digest=planner.digest(ahead)[:DIGEST_SIZE])
 
     def _reached(self, planner: Planner, request: Request) -> PlanningState:
         """Return the requested state."""
@@ -213,14 +219,12 @@ class Job:
         if state is None:
             state = planner.init(self._seed, request.trial)
         most = state.step + self._limits.max_steps
-        for observed in request.observations:
-            if (observed.step, True) <= (state.step, state.sensed):
+        for given in request.inputs:
+            before = (given.step, isinstance(given, Moved))
+            if before < (state.step, state.sensed):
                 continue  # part of the state already
-            state = self._rolled(planner, state, observed.step, most)
-            if not planner.needs_sensing(state):
-                raise _LacksStateError
-            observation = decode_floats(observed.observation, len(observed.observation) // 8)
-            state, _ = planner.observe(state, observed.sensing_action, observation)
+            state = self._rolled(planner, state, given.step, most)
+            state = _with_input(planner, state, given)
         state = self._rolled(planner, state, request.step, most)
         if state.sensed != request.sensed:
             raise _LacksStateError(differs=True)
@@ -255,6 +259,20 @@ class Job:
         if planner.digest(state)[:DIGEST_SIZE] != request.digest:
             raise CheckpointError("checkpoint of a state that has another digest than the request")
         return state
+
+
+def _with_input(planner: Planner, state: PlanningState, given: Input) -> PlanningState:
+    """Return the state after an input of its step."""
+    if planner.needs_sensing(state) != isinstance(given, Observed):
+        raise _LacksStateError
+    observation = numbers_of(given.observation)
+    if isinstance(given, Observed):
+        return planner.observe(state, given.sensing_action, observation)[0]
+    action, _ = planner.choose_task_action(state)
+    state = planner.advance(state, action, numbers_of(given.motion))
+    if observation is None:
+        return state
+    return planner.observe_move(state, action, observation)[0]
 
 
 def _check_work(problem: Problem, planning: PlanningSettings, limits: ServiceLimits) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from holdfast.protocol.messages import MAX_OBSERVATIONS
+from holdfast.protocol.messages import MAX_INPUTS
 
 __all__ = ["ServiceLimits", "ServiceStatistics"]
 
@@ -63,7 +63,7 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
     prefetch_patience_ms: float = 20.0
     max_particles: int = 1_000_000
     max_work: int = 10**9
-    max_steps: int = 16 * MAX_OBSERVATIONS
+    max_steps: int = 16 * MAX_INPUTS
     max_problems: int = 32
     answers_per_session: int = 8
 

@@ -157,7 +157,7 @@ class PendingTask:
             return False
         if request is None:
             return True
-        if request.checkpoint is not None or len(request.observations) > 1:
+        if request.checkpoint is not None or len(request.inputs) > 1:
             return False
         num_steps = request.step - (0 if state is None else state.step)
         if not self.sensing:

@@ -10,10 +10,17 @@ from collections.abc import Sequence
 
 from holdfast.arrays import FloatArray
 from holdfast.errors import DecidedOtherwiseError, EndOfRecordsError
-from holdfast.outcome import Done, TrialResult
-from holdfast.protocol.messages import decode_floats, encode_floats
-from holdfast.protocol.records import ActingRecord, ObservedRecord, PerformedRecord, Record
-from holdfast.robot.environment import SimulatedEnvironment
+from holdfast.outcome import Done, Ending, MoveResult, TrialResult
+from holdfast.protocol.messages import decode_floats, encode_floats, numbers_of
+from holdfast.protocol.records import (
+    ActingRecord,
+    LateRecord,
+    ObservedRecord,
+    PerformedRecord,
+    Record,
+    ReinitialisedRecord,
+)
+from holdfast.robot.environment import LATER, Later, SimulatedEnvironment
 
 __all__ = ["RecordedEnvironment"]
 
@@ -41,7 +48,7 @@ class RecordedEnvironment:
         self._result = result
         self._trial = trial
         self._simulated = simulated
-        kinds = ObservedRecord | ActingRecord | PerformedRecord
+        kinds = ObservedRecord | ActingRecord | PerformedRecord | LateRecord | ReinitialisedRecord
         self._records = [record for record in records if isinstance(record, kinds)]
         self._next = 0
         self._step = 0
@@ -51,16 +58,19 @@ class RecordedEnvironment:
         """The true state, where the world is simulated."""
         return None if self._simulated is None else self._simulated.state
 
-    def perform_sensing(self, sensing_action: int) -> FloatArray:
+    def perform_sensing(self, sensing_action: int) -> FloatArray | Later:
         """Return the recorded observation; DecidedOtherwiseError if it is of another action."""
         record = self._take()
         if not isinstance(record, ObservedRecord) or record.sensing_action != sensing_action:
             raise self._otherwise(record)
-        return decode_floats(record.observation, len(record.observation) // 8)
+        observation = numbers_of(record.observation)
+        return LATER if observation is None else observation
 
-    def perform(self, task_action: FloatArray) -> float | None:
-        """Return the recorded reward; DecidedOtherwiseError if it is of another action."""
+    def perform(self, task_action: FloatArray) -> MoveResult:
+        """Return what the record has shown; DecidedOtherwiseError if it is of another action."""
         record = self._take()
+        while isinstance(record, ObservedRecord) and not record.observation:
+            record = self._take()  # the choice was not to sense
         if not isinstance(record, ActingRecord) or record.action != encode_floats(task_action):
             raise self._otherwise(record)
         self._step += 1
@@ -70,18 +80,32 @@ class RecordedEnvironment:
             performed = self._records[self._next]
             if isinstance(performed, PerformedRecord):
                 self._next += 1
-                return performed.reward
-        return None
+                shown = numbers_of(performed.motion), numbers_of(performed.observation)
+                return MoveResult(performed.reward, *shown)
+        return MoveResult()
+
+    def late_observations(self) -> list[tuple[int, FloatArray]]:
+        """Return the observations of earlier steps that came next."""
+        late = []
+        while self._next < len(self._records):
+            record = self._records[self._next]
+            if not isinstance(record, LateRecord):
+                break
+            late.append(
+                (record.taken, decode_floats(record.observation, len(record.observation) // 8))
+            )
+            self._next += 1
+        return late
 
     def is_done(self) -> Done:
-        """Return whether the task was done, or had failed."""
+        """Return how the task had ended, or False."""
         if self._result is None:
             if self._next == len(self._records) and self._step:
                 raise EndOfRecordsError(self._trial)
             return False
         if self._step < self._result.steps:
             return False
-        return "failed" if self._result.failed else self._result.success
+        return Ending(self._result.outcome, self._result.reason)
 
     def _take(self) -> Record | None:
         if self._next == len(self._records):

@@ -10,18 +10,20 @@ counts its task actions answers that, with a fourth method.
 from __future__ import annotations
 
 import copy
+import enum
 import inspect
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
 
 import numpy as np
+import numpy.typing as npt
 
 from holdfast import checked
 from holdfast.arrays import FloatArray
 from holdfast.config.user_code import find_class
 from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
-from holdfast.outcome import Done
+from holdfast.outcome import Done, MoveResult
 from holdfast.problem_attributes import check_sizes, has_general_observations
 from holdfast.problems.problem import Problem, ProblemBase
 from holdfast.randomness import Purpose, Stream, stream
@@ -30,13 +32,14 @@ if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
 
 __all__ = [
-    "DONE_VALUES",
+    "LATER",
     "CountingEnvironment",
     "Environment",
     "EnvironmentMaker",
+    "LateSensingEnvironment",
+    "Later",
     "ObservationSizes",
     "SimulatedEnvironment",
-    "as_done",
     "load_environment",
 ]
 
@@ -44,31 +47,59 @@ __all__ = [
 GROUP = "holdfast.environments"
 """Entry points by which packages register their environments."""
 
-DONE_VALUES = 'True, False or "failed"'
-"""What ``is_done`` may return, for messages."""
-
 _REQUIRED = ("perform_sensing", "perform", "is_done")
 
 _PROVIDED = ("problem", "seed", "trial", "resumed")
+
+
+class Later(enum.Enum):
+    """The type of :data:`LATER`."""
+
+    LATER = "later"
+
+
+LATER = Later.LATER
+"""What ``perform_sensing`` returns if the observation comes later."""
 
 
 @runtime_checkable
 class Environment(Protocol):
     """A world that can be sensed and moved."""
 
-    def perform_sensing(self, sensing_action: int) -> FloatArray:
-        """Perform a sensing action and return the observation, shape ``(observation_size,)``."""
+    def perform_sensing(self, sensing_action: int) -> FloatArray | Later:
+        """Perform a sensing action and return the observation, shape ``(observation_size,)``.
+
+        Or :data:`LATER`: the robot goes on, and :meth:`LateSensingEnvironment.late_observations`
+        returns it when it is there.
+        """
         ...
 
-    def perform(self, task_action: FloatArray) -> float | None:
-        """Perform a task action and return its reward, or None where there is none."""
+    def perform(self, task_action: FloatArray) -> float | MoveResult | None:
+        """Perform a task action and return its reward, or None where there is none.
+
+        A :class:`~holdfast.outcome.MoveResult` also says what the move has shown.
+        """
         ...
 
     def is_done(self) -> Done:
         """Return True if the task has succeeded, False if it goes on, or ``"failed"``.
 
         ``"failed"`` ends the trial as well, but in failure: the robot has crashed, say, or broken
-        what it was to handle.
+        what it was to handle. An :class:`~holdfast.outcome.Ending` also says why, and may say that
+        the trial was cut off.
+        """
+        ...
+
+
+@runtime_checkable
+class LateSensingEnvironment(Environment, Protocol):
+    """An environment whose sensing takes time: it returns :data:`LATER`."""
+
+    def late_observations(self) -> Sequence[tuple[int, npt.ArrayLike]]:
+        """Return what has come since the last call; asked after each task action.
+
+        Each entry is a step and an observation. The step says when the sensing action was
+        performed: it is the number of task actions that this trial had had then.
         """
         ...
 
@@ -111,6 +142,9 @@ class SimulatedEnvironment:
         self._trial = trial
         self.step = 0
         check_sizes(problem)
+        self._moves_show = any(
+            hasattr(problem, name) for name in ("measure_motion", "sample_move_observation")
+        )
         initial = stream(seed, trial, 0, Purpose.WORLD_INITIAL_STATE)
         self.state = _initial_state(problem, initial)
 
@@ -146,19 +180,32 @@ class SimulatedEnvironment:
             checked.require_usable(problem, sensing_action, mean, variance)
         return shown
 
-    def perform(self, task_action: FloatArray) -> float | None:
+    def perform(self, task_action: FloatArray) -> float | MoveResult | None:
         """Move the true state by an executed task action and return the reward.
 
-        None if the problem defines no reward.
+        None if the problem defines no reward. A problem that has ``measure_motion`` or
+        ``sample_move_observation`` says what else the move shows.
         """
-        motion = stream(self._seed, self._trial, self.step, Purpose.WORLD_MOTION)
-        problem = self._problem
-        moved = problem.move(self.state, task_action, motion)
-        self.state = checked.states_of(problem, "move", moved, self.state.shape)
+        seed, trial, step, problem = self._seed, self._trial, self.step, self._problem
+        before = self.state
+        moved = problem.move(before, task_action, stream(seed, trial, step, Purpose.WORLD_MOTION))
+        self.state = checked.states_of(problem, "move", moved, before.shape)
         self.step += 1
-        if getattr(type(problem), "reward", None) is ProblemBase.reward:
-            return None
-        return checked.scalar(problem, "reward", problem.reward(self.state, task_action))
+        reward = None
+        if getattr(type(problem), "reward", None) is not ProblemBase.reward:
+            reward = checked.scalar(problem, "reward", problem.reward(self.state, task_action))
+        if not self._moves_show:
+            return reward
+        motion = observation = None
+        if hasattr(problem, "measure_motion"):
+            noise = stream(seed, trial, step, Purpose.WORLD_MEASURED_MOTION)
+            measured = problem.measure_motion(before, self.state, noise)
+            motion = checked.shown(problem, "measure_motion", measured)
+        if hasattr(problem, "sample_move_observation"):
+            noise = stream(seed, trial, step, Purpose.WORLD_MOVE_OBSERVATION)
+            drawn = problem.sample_move_observation(self.state, task_action, noise)
+            observation = checked.shown(problem, "sample_move_observation", drawn)
+        return MoveResult(reward, motion, observation)
 
     def is_done(self) -> bool:
         """Return whether the true state is a goal."""
@@ -168,13 +215,6 @@ class SimulatedEnvironment:
     def steps_performed(self) -> int:
         """Return the number of task actions performed, those of :meth:`after` included."""
         return self.step
-
-
-def as_done(value: object) -> Done | None:
-    """Return what ``is_done`` of an environment has returned; None if it must not return that."""
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    return "failed" if isinstance(value, str) and value == "failed" else None
 
 
 class ObservationSizes(dict[int, "int | None"]):

@@ -25,7 +25,7 @@ import numpy.typing as npt
 from holdfast.arrays import FloatArray
 from holdfast.config.user_code import account_of_user_error
 from holdfast.errors import EnvironmentFailedError, HoldfastError, InvalidValueError
-from holdfast.outcome import Done
+from holdfast.outcome import Ending, MoveResult, ending_of
 from holdfast.problems.problem import Problem
 from holdfast.protocol.events import (
     Acted,
@@ -34,14 +34,10 @@ from holdfast.protocol.events import (
     EnvironmentReady,
     Sensed,
 )
-from holdfast.robot.environment import (
-    DONE_VALUES,
-    Environment,
-    EnvironmentMaker,
-    ObservationSizes,
-    as_done,
-)
+from holdfast.protocol.messages import MAX_ACTION_SIZE
+from holdfast.robot.environment import LATER, Environment, EnvironmentMaker, ObservationSizes
 from holdfast.runtime.pool import ThreadPool
+from holdfast.tracking import LateObservation
 
 __all__ = ["EnvironmentRunner", "InlineRunner", "ThreadedRunner", "make_runner"]
 
@@ -108,10 +104,10 @@ class EnvironmentRunner(abc.ABC):
         self._resumed = resumed
         self._sizes = ObservationSizes(problem)
         # They are read when a call takes too long, too: the environment, its current method, and
-        # the reward of the task action that the current call has performed.
+        # what the task action that the current call has performed has shown.
         self.environment: Environment | None = None
         self._method = name
-        self._performed: tuple[float | None] | None = None
+        self._performed: Acted | None = None
         self._failed: EnvironmentFailed | None = None
         self._closed = False
 
@@ -146,13 +142,23 @@ class EnvironmentRunner(abc.ABC):
             self._method = "steps_performed"
             count = self._count(ask())
         self._method = "is_done"
-        return EnvironmentReady(self._done(environment.is_done()), count)
+        return EnvironmentReady(self._ending(environment.is_done()), count)
 
     def _sensed(self, step: int, sensing_action: int) -> EnvironmentEvent:
         assert self.environment is not None
         self._method = "perform_sensing"
         shown = self.environment.perform_sensing(sensing_action)
+        if shown is LATER:
+            self._require_late_observations()
+            return Sensed(step, None)
         return Sensed(step, self._observation(sensing_action, shown))
+
+    def _require_late_observations(self) -> None:
+        if not callable(getattr(self.environment, "late_observations", None)):
+            raise EnvironmentFailedError(
+                f"{self._called('perform_sensing')} returned LATER, but there is no "
+                "late_observations() that could return the observation when it is there"
+            )
 
     def _acted(self, step: int, task_action: FloatArray) -> EnvironmentEvent:
         assert self.environment is not None
@@ -160,10 +166,25 @@ class EnvironmentRunner(abc.ABC):
         self._method = "perform"
         # A copy: the robot's own record of the action must stay what it is.
         action = np.array(task_action, dtype=np.float64)
-        reward = self._reward(self.environment.perform(action))
-        self._performed = (reward,)
+        shown = self.environment.perform(action)
+        if isinstance(shown, MoveResult):
+            reward, motion, observation = shown
+            acted = Acted(
+                step,
+                self._reward(reward),
+                None,
+                self._shown(motion, "motion"),
+                self._shown(observation, "observation"),
+            )
+        else:
+            acted = Acted(step, self._reward(shown), None)
+        self._performed = acted
+        late = getattr(self.environment, "late_observations", None)
+        if late is not None:
+            self._method = "late_observations"
+            acted = self._performed = acted._replace(late=self._late(late()))
         self._method = "is_done"
-        return Acted(step, reward, self._done(self.environment.is_done()))
+        return acted._replace(ending=self._ending(self.environment.is_done()))
 
     def _event_of(self, call: _Call) -> EnvironmentEvent:
         """Call the environment; an exception is an event, too."""
@@ -188,8 +209,8 @@ class EnvironmentRunner(abc.ABC):
         if performed is None:
             counts = callable(getattr(self.environment, "steps_performed", None))
             return EnvironmentFailed(call.step, method, text, True, counts_steps=counts)
-        # Only is_done has failed: the result of ``perform`` is known.
-        return EnvironmentFailed(call.step, method, text, False, True, *performed)
+        # Only what came after it has failed: the result of ``perform`` is known.
+        return EnvironmentFailed(call.step, method, text, False, performed)
 
     def _refused(self, call: _Call) -> bool:
         """Return whether no call is made any more; deliver the earlier failure, if there is one."""
@@ -224,11 +245,7 @@ class EnvironmentRunner(abc.ABC):
         array = _numbers(value)
         if array is None or array.ndim != 1 or array.size < 1 or size not in (None, array.size):
             raise self._unusable(value, f"an array of shape ({size or 'n'},)")
-        observation = np.array(array, dtype=np.float64)
-        if not np.isfinite(observation).all():
-            raise self._unusable(value, "finite numbers")
-        observation.setflags(write=False)
-        return observation
+        return self._finite(array, value)
 
     def _reward(self, value: object) -> float | None:
         if value is None:
@@ -238,11 +255,44 @@ class EnvironmentRunner(abc.ABC):
             raise self._unusable(value, "a finite number, the reward, or None")
         return float(number)
 
-    def _done(self, value: object) -> Done:
-        done = as_done(value)
-        if done is None:
-            raise self._unusable(value, DONE_VALUES)
-        return done
+    def _ending(self, value: object) -> Ending | None:
+        try:
+            return ending_of(value)
+        except InvalidValueError as error:
+            raise EnvironmentFailedError(f"{self._called(self._method)} {error}") from error
+
+    def _shown(self, value: object, what: str) -> FloatArray | None:
+        """Return what a move has shown."""
+        if value is None:
+            return None
+        array = _numbers(value)
+        if array is None or array.ndim != 1 or not 1 <= array.size <= MAX_ACTION_SIZE:
+            need = f"a MoveResult whose {what} is an array of 1 to {MAX_ACTION_SIZE} numbers"
+            raise self._unusable(value, need)
+        return self._finite(array, value)
+
+    def _late(self, value: object) -> tuple[LateObservation, ...]:
+        """Return observations of earlier steps."""
+        need = "a list of (step, observation)"
+        if not isinstance(value, Sequence) or isinstance(value, str):
+            raise self._unusable(value, need)
+        late = []
+        for entry in value:
+            if not isinstance(entry, tuple | list) or len(entry) != 2:
+                raise self._unusable(value, need)
+            step = self._count(entry[0])
+            array = _numbers(entry[1])
+            if array is None or array.ndim != 1 or not 1 <= array.size <= MAX_ACTION_SIZE:
+                raise self._unusable(value, f"{need} with observations of shape (n,)")
+            late.append(LateObservation(step, self._finite(array, value)))
+        return tuple(late)
+
+    def _finite(self, array: npt.NDArray[Any], value: object) -> FloatArray:
+        finite = np.array(array, dtype=np.float64)
+        if not np.isfinite(finite).all():
+            raise self._unusable(value, "finite numbers")
+        finite.setflags(write=False)
+        return finite
 
     def _count(self, value: object) -> int:
         number = _numbers(value)

@@ -72,18 +72,27 @@ class MemoizingPlanner(Planner):
         return self._once(("initial", seed, trial), None, partial(super().init, seed, trial))
 
     def observe(
-        self, state: PlanningState, sensing_action: int, observation: npt.ArrayLike
+        self, state: PlanningState, sensing_action: int, observation: npt.ArrayLike | None
     ) -> tuple[PlanningState, ObservationInfo]:
         """Fold an observation into the belief."""
-        shown = np.asarray(observation, dtype=np.float64)
-        key = id(state), sensing_action, shown.tobytes()
-        return self._once(key, state, partial(super().observe, state, sensing_action, shown))
+        key = id(state), sensing_action, bytes_of(observation)
+        return self._once(key, state, partial(super().observe, state, sensing_action, observation))
 
-    def advance(self, state: PlanningState, task_action: FloatArray) -> PlanningState:
+    def advance(
+        self,
+        state: PlanningState,
+        task_action: FloatArray,
+        motion: npt.ArrayLike | None = None,
+    ) -> PlanningState:
         """Predict the belief and go to the next step."""
-        key = id(state), task_action.tobytes()
-        return self._once(key, state, partial(super().advance, state, task_action))
+        key = id(state), task_action.tobytes(), bytes_of(motion)
+        return self._once(key, state, partial(super().advance, state, task_action, motion))
 
     def digest(self, state: PlanningState) -> bytes:
         """Return 32 bytes that are equal for equal states only."""
         return self._once(id(state), state, partial(super().digest, state))
+
+
+def bytes_of(shown: npt.ArrayLike | None) -> bytes:
+    """Return the bits of what was shown; empty for nothing."""
+    return b"" if shown is None else np.asarray(shown, dtype=np.float64).tobytes()

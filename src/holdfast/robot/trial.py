@@ -14,28 +14,25 @@ from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import SimulatorSettings
 from holdfast.errors import EnvironmentFailedError, InvalidValueError, ProblemError
-from holdfast.outcome import DecisionLog, Done, RewardAccount, TrialResult
+from holdfast.outcome import Ending, MoveResult, TrialResult, ending_of
 from holdfast.planning import (
     ObservationInfo,
     Planner,
     PlanningState,
     SensingInfo,
     TaskInfo,
-    digest,
 )
-from holdfast.robot.environment import (
-    DONE_VALUES,
-    Environment,
-    SimulatedEnvironment,
-    as_done,
-)
+from holdfast.robot.environment import LATER, Environment, SimulatedEnvironment
+from holdfast.tracking import LateObservation, Trial
 
 __all__ = [
     "NULL_OBSERVER",
+    "LateStep",
     "SensingStep",
     "TaskStep",
     "TrialObserver",
@@ -44,24 +41,41 @@ __all__ = [
 
 
 class SensingStep(NamedTuple):
-    """A sensing action, its observation, and the states before and after it."""
+    """A sensing action, its observation, and the states before and after it.
+
+    There is no observation if it comes later, or if the choice was not to sense
+    (``planner.no_sensing``).
+    """
 
     before: PlanningState
     sensing_action: int
     sensing_info: SensingInfo
-    observation: FloatArray
+    observation: FloatArray | None
     after: PlanningState
     observation_info: ObservationInfo
 
 
 class TaskStep(NamedTuple):
-    """A task action that was performed, and the state in which it was chosen."""
+    """A task action that was performed, and the state in which it was chosen.
+
+    ``shown`` is what the environment returned, ``observation_info`` what its observation led to.
+    """
 
     environment: Environment
     state: PlanningState
     task_info: TaskInfo
     executed: FloatArray
     reward: float | None
+    shown: MoveResult = MoveResult()
+    observation_info: ObservationInfo | None = None
+
+
+class LateStep(NamedTuple):
+    """A late observation, and the state after it was folded in at its step."""
+
+    late: LateObservation
+    after: PlanningState
+    observation_info: ObservationInfo
 
 
 class TrialObserver:
@@ -78,6 +92,9 @@ class TrialObserver:
 
     def acted(self, step: TaskStep) -> None:
         """Take note of a task action."""
+
+    def observed_late(self, step: LateStep) -> None:
+        """Take note of an observation that came late."""
 
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
         """Take note of the last state and of the outcome."""
@@ -117,76 +134,64 @@ def run_trial(
     """
     if not (isinstance(max_steps, int) and max_steps >= 1):
         raise InvalidValueError(f"max_steps is {max_steps!r}; allowed are integers from 1")
-    problem = planner.problem
     if environment is None:
-        environment = SimulatedEnvironment(problem, seed, trial)
-    state = planner.init(seed, trial)
-    observer.trial_began(environment, state)
-
-    log = DecisionLog(problem.action_size)
-    sensing_ms: list[float] = []
-    rewards = RewardAccount(problem)
-    unexplained = 0
-    steps = 0
-    done = _ask_done(environment)
-    while not done and steps < max_steps:
-        if planner.needs_sensing(state):
-            started = perf_counter()
-            sensing_action, sensing_info = planner.choose_sensing_action(state)
-            sensing_ms.append((perf_counter() - started) * 1e3)
-            observation = environment.perform_sensing(sensing_action)
-            before = state
-            state, observation_info = planner.observe(state, sensing_action, observation)
-            if not observation_info.explained:
-                unexplained += 1
-            log.sensed(steps, sensing_action, digest(state))
-            rewards.sensed(sensing_action)
-            observer.sensed(
-                SensingStep(
-                    before, sensing_action, sensing_info, observation, state, observation_info
-                )
+        environment = SimulatedEnvironment(planner.problem, seed, trial)
+    track = Trial(planner, seed, trial)
+    observer.trial_began(environment, track.state)
+    late_observations = getattr(environment, "late_observations", None)
+    ending = _ask_done(environment)
+    while ending is None and track.state.step < max_steps:
+        if planner.needs_sensing(track.state):
+            _sense(track, environment, observer)
+        before = track.state
+        executed, task_info = planner.choose_task_action(before)
+        shown = environment.perform(executed)
+        result = shown if isinstance(shown, MoveResult) else MoveResult(shown)
+        reward, motion, observation = result
+        if reward is not None and not np.isfinite(reward):
+            raise ProblemError(
+                f"the reward of step {before.step} is {float(reward)}; it must be a finite number"
             )
-        executed, task_info = planner.choose_task_action(state)
-        reward = environment.perform(executed)
-        if reward is not None:
-            if not np.isfinite(reward):
-                raise ProblemError(
-                    f"the reward of step {steps} is {float(reward)}; it must be a finite number"
-                )
-            rewards.acted(float(reward))
-        log.acted(steps, executed)
-        observer.acted(TaskStep(environment, state, task_info, executed, reward))
-        state = planner.advance(state, executed)
-        steps += 1
-        done = _ask_done(environment)
-    log.ended(steps, digest(state))
-
-    decisions = log.decisions()
-    result = TrialResult(
-        trial=trial,
-        seed=seed,
-        success=done is True,
-        failed=done == "failed",
-        steps=steps,
-        reward=rewards.total if steps else 0.0,
-        sensing_decisions=len(sensing_ms),
-        mean_sensing_ms=sum(sensing_ms) / len(sensing_ms) if sensing_ms else 0.0,
-        recoveries=0,
-        unexplained_observations=unexplained,
-        digest=decisions.digest(),
-        sensing_ms=tuple(sensing_ms),
-        decisions=decisions,
-    )
-    observer.trial_ended(state, result)
-    return result
-
-
-def _ask_done(environment: Environment) -> Done:
-    value = environment.is_done()
-    done = as_done(value)
-    if done is None:
-        raise EnvironmentFailedError(
-            f"{type(environment).__name__}: is_done returned {value!r:.80}; it must return "
-            f"{DONE_VALUES}"
+        info = track.move(
+            executed,
+            None if reward is None else float(reward),
+            _numbers(motion),
+            _numbers(observation),
         )
-    return done
+        observer.acted(TaskStep(environment, before, task_info, executed, reward, result, info))
+        for step, came in () if late_observations is None else late_observations():
+            late = LateObservation(step, np.array(came, dtype=np.float64))
+            found = track.observe_late(late)
+            if found is not None:
+                observer.observed_late(LateStep(late, track.state, found[0]))
+        ending = _ask_done(environment)
+    ended = track.result(ending)
+    observer.trial_ended(track.state, ended)
+    return ended
+
+
+def _sense(track: Trial, environment: Environment, observer: TrialObserver) -> None:
+    planner, before = track.planner, track.state
+    started = perf_counter()
+    sensing_action, sensing_info = planner.choose_sensing_action(before)
+    sensing_ms = (perf_counter() - started) * 1e3
+    observation = None
+    if sensing_action != planner.no_sensing:
+        shown = environment.perform_sensing(sensing_action)
+        if shown is not LATER:
+            observation = np.asarray(shown, dtype=np.float64)
+    info, _ = track.observe(sensing_action, observation, sensing_ms)
+    observer.sensed(
+        SensingStep(before, sensing_action, sensing_info, observation, track.state, info)
+    )
+
+
+def _numbers(shown: npt.ArrayLike | None) -> FloatArray | None:
+    return None if shown is None else np.array(shown, dtype=np.float64)
+
+
+def _ask_done(environment: Environment) -> Ending | None:
+    try:
+        return ending_of(environment.is_done())
+    except InvalidValueError as error:
+        raise EnvironmentFailedError(f"{type(environment).__name__}: is_done {error}") from error

@@ -16,7 +16,7 @@ from holdfast.arrays import FloatArray
 from holdfast.config.settings import PlanningSettings, SimulatorSettings
 from holdfast.lab.errors import Violation
 from holdfast.lab.simulation.memo_cache import Memo
-from holdfast.outcome import TrialResult
+from holdfast.outcome import MoveResult, TrialResult
 from holdfast.planning import Planner
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import SimulatedEnvironment
@@ -89,6 +89,7 @@ class _Recorder:
 
     def perform(self, task_action: FloatArray) -> float | None:
         reward = self._environment.perform(task_action)
+        assert not isinstance(reward, MoveResult)
         sensing_action, shown = self._sensed or (None, None)
         written = np.asarray(task_action, dtype="<f8").tobytes()
         done = self._environment.is_done()

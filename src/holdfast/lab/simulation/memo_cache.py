@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-import numpy as np
 import numpy.typing as npt
 
 from holdfast.arrays import FloatArray
 from holdfast.lab.errors import Violation
 from holdfast.planning import Decision, ObservationInfo, Planner, PlanningState, digest
 from holdfast.protocol.service_jobs import Job, JobResult
+from holdfast.robot.memo_cache import bytes_of
 
 __all__ = ["JobCache", "Memo", "MemoizingPlanner"]
 
@@ -99,7 +99,7 @@ class MemoizingPlanner(Planner):
         self._observed: Memo[
             tuple[int, int, bytes], tuple[PlanningState, PlanningState, ObservationInfo]
         ] = Memo(check=lambda known, now: _check_states(known[1], now[1]))
-        self._advanced: Memo[tuple[int, bytes], tuple[PlanningState, PlanningState]] = Memo(
+        self._advanced: Memo[tuple[int, bytes, bytes], tuple[PlanningState, PlanningState]] = Memo(
             check=lambda known, now: _check_states(known[1], now[1])
         )
         self._decided: Memo[int, tuple[PlanningState, Decision]] = Memo()
@@ -109,21 +109,25 @@ class MemoizingPlanner(Planner):
         return self._initial.get((seed, trial), lambda: self._planner.init(seed, trial))
 
     def observe(
-        self, state: PlanningState, sensing_action: int, observation: npt.ArrayLike
+        self, state: PlanningState, sensing_action: int, observation: npt.ArrayLike | None
     ) -> tuple[PlanningState, ObservationInfo]:
         """Fold an observation into the belief."""
-        shown = np.asarray(observation, dtype=np.float64)
         _, after, info = self._observed.get(
-            (id(state), sensing_action, shown.tobytes()),
-            lambda: (state, *self._planner.observe(state, sensing_action, shown)),
+            (id(state), sensing_action, bytes_of(observation)),
+            lambda: (state, *self._planner.observe(state, sensing_action, observation)),
         )
         return after, info
 
-    def advance(self, state: PlanningState, task_action: FloatArray) -> PlanningState:
+    def advance(
+        self,
+        state: PlanningState,
+        task_action: FloatArray,
+        motion: npt.ArrayLike | None = None,
+    ) -> PlanningState:
         """Predict the belief and go to the next step."""
         return self._advanced.get(
-            (id(state), task_action.tobytes()),
-            lambda: (state, self._planner.advance(state, task_action)),
+            (id(state), task_action.tobytes(), bytes_of(motion)),
+            lambda: (state, self._planner.advance(state, task_action, motion)),
         )[1]
 
     def decide(self, state: PlanningState, max_actions: int) -> Decision:

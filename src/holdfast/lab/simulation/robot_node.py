@@ -24,6 +24,7 @@ from holdfast.lab.simulation.disk import Disk
 from holdfast.lab.simulation.environment_model import EnvironmentModel
 from holdfast.lab.simulation.event_queue import Clock
 from holdfast.lab.simulation.schedule import LOCAL_SERVICE
+from holdfast.outcome import Ending
 from holdfast.planning import Planner
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.events import (
@@ -441,7 +442,8 @@ class RobotNode:
         )
         self._may_doubt = False
         performed = environment.performed if counts else None
-        begun = EnvironmentReady(environment.done, performed)
+        ending = Ending("succeeded") if environment.done else None
+        begun = EnvironmentReady(ending, performed)
         self._world.note("robot", "begins trial %s at step %s", trial, known)
         self._carry_out(
             robot.begin_trial(trial, history, begun, self._now(), tail_is_certain=is_complete)
@@ -467,5 +469,5 @@ class RobotNode:
             return
         assert self._environment is not None
         reward, done = self._environment.act(step, action)
-        event = Acted(step, reward, done)
+        event = Acted(step, reward, Ending("succeeded") if done else None)
         self._queue.after(self._run.act_s, self._happens, process, self._heard, event)

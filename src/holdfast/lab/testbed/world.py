@@ -21,6 +21,7 @@ import numpy as np
 
 from holdfast.arrays import FloatArray
 from holdfast.errors import EnvironmentFailedError
+from holdfast.outcome import MoveResult
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import SimulatedEnvironment
 
@@ -83,7 +84,7 @@ class WitnessedWorld:
         """Draw an observation of the true state; that changes nothing, so it leaves no line."""
         return self._world.perform_sensing(sensing_action)
 
-    def perform(self, task_action: FloatArray) -> float | None:
+    def perform(self, task_action: FloatArray) -> float | MoveResult | None:
         """Append the action's line; now it is performed."""
         action = np.ascontiguousarray(task_action, dtype=np.float64)
         line = (
