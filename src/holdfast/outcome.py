@@ -22,6 +22,7 @@ from holdfast.printable import printable
 from holdfast.problem_attributes import sensing_costs
 
 __all__ = [
+    "DONE_VALUES",
     "TRIAL_COLUMNS",
     "DecisionLog",
     "Decisions",

@@ -17,6 +17,7 @@ from typing import Any
 from tests.processes.faults import COMMAND, PATIENCE_S, events_of
 
 from holdfast import __version__
+from holdfast.outcome import DONE_VALUES
 from holdfast.recording.journal import Journal
 
 BEFORE_OUTCOMES = Path(__file__).parents[1] / "unit" / "data" / "journal_before_outcomes.sqlite"
@@ -191,9 +192,8 @@ def test_asked_to_end_in_the_step_that_ended_the_trial(tmp_path: Path) -> None:
 def test_anything_else_is_an_error_that_names_it(tmp_path: Path) -> None:
     ended = Command(tmp_path, "Wrong").run()
     assert ended.returncode == 4
-    assert (
-        "lander:Wrong: is_done returned 'crashed'; it must return True, False or \"failed\""
-        in " ".join(ended.stderr.split())
+    assert f"lander:Wrong: is_done returned 'crashed'; it must return {DONE_VALUES}" in " ".join(
+        ended.stderr.split()
     )
 
 
@@ -249,7 +249,7 @@ def test_an_answer_that_is_none_after_a_move_is_mended_and_the_move_is_not_made_
     done = command.run()
     assert done.returncode == 4
     assert "trial 1, step 4, whose task action was performed" in done.stderr
-    assert 'is_done returned None; it must return True, False or "failed"' in done.stderr
+    assert 'is_done returned None; it must return True, False, "failed" or an Ending' in done.stderr
     assert "--resume" in done.stderr
     (tmp_path / "mended").touch()
     done = command.run("--resume")

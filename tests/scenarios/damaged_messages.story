@@ -12,7 +12,7 @@ message service=cloud-1 direction=from number=4 what=corrupt bit=199
    0.0150  robot    hears of call 1: its end
    0.0160  robot    asks cloud-1, call 2
    0.0180  robot    hears of call 2: Refused
-   0.0180  robot    damaged_request service=cloud-1 reason=67 bytes do not have the checksum that they end with
+   0.0180  robot    damaged_request service=cloud-1 reason=68 bytes do not have the checksum that they end with
    0.0380  robot    retry service=cloud-1 step=0 attempt=2 waited_ms=22
    0.0380  robot    asks cloud-1, call 3
    0.0410  robot    hears of call 3: damaged

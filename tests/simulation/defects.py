@@ -433,7 +433,7 @@ _defect(
     Edit(
         Robot,
         "_performed",
-        "self._unwritten.append(PerformedRecord(history.state.step, reward))",
+        "self._unwritten.append(record)",
         "pass",
     ),
 )

@@ -358,11 +358,15 @@ class TestFailures:
             ("perform", "1", "returned '1'; it must return a finite number, the reward, or None"),
             ("perform", [1.0], "returned [1.0]; it must return a finite number"),
             ("perform", True, "returned True; it must return a finite number"),
-            ("is_done", None, 'returned None; it must return True, False or "failed"'),
-            ("is_done", 1, 'returned 1; it must return True, False or "failed"'),
-            ("is_done", "", """returned ''; it must return True, False or "failed\""""),
-            ("is_done", "done", """returned 'done'; it must return True, False or "failed\""""),
-            ("is_done", np.array([True]), 'it must return True, False or "failed"'),
+            ("is_done", None, 'returned None; it must return True, False, "failed" or an Ending'),
+            ("is_done", 1, 'returned 1; it must return True, False, "failed" or an Ending'),
+            ("is_done", "", """returned ''; it must return True, False, "failed" or an Ending"""),
+            (
+                "is_done",
+                "done",
+                """returned 'done'; it must return True, False, "failed" or an Ending""",
+            ),
+            ("is_done", np.array([True]), 'it must return True, False, "failed" or an Ending'),
             ("steps_performed", -1, "returned -1; it must return a whole number >= 0"),
             ("steps_performed", 3.0, "returned 3.0; it must return a whole number >= 0"),
             ("steps_performed", True, "returned True; it must return a whole number >= 0"),
@@ -550,7 +554,7 @@ class TestStalls:
             method,
             f"robot: {method} has not returned within 1000 ms, which is environment.timeout_ms",
             unknown,
-            *((True, -1.0) if method == "is_done" else ()),
+            *((Acted(7, -1.0, None),) if method == "is_done" else ()),
         )
         runner.perform(8, ACTION)
         assert threaded.failure()[:2] == (8, method)

@@ -18,6 +18,8 @@ from holdfast.problems.problem import (
     GeneralObservationProblem,
     KnownStateReturnProblem,
     Problem,
+    ReinitialisedProblem,
+    ShownMovesProblem,
 )
 
 
@@ -161,6 +163,8 @@ def test_the_parameters_are_those_of_the_contract() -> None:
         ExpectedMotionProblem,
         KnownStateReturnProblem,
         BatchedMotionProblem,
+        ShownMovesProblem,
+        ReinitialisedProblem,
     )
     members = {name: own for protocol in protocols for name, own in vars(protocol).items()}
     functions = {

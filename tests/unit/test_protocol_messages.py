@@ -88,7 +88,7 @@ def test_another_version_is_named_even_if_its_fields_are_unknown() -> None:
         {"epoch": -1},
         {"step": 2**32},
         {"digest": b"d" * 32},
-        {"observations": (Observed(1, 0, b""),) * (MAX_INPUTS + 1)},
+        {"inputs": (Observed(1, 0, b""),) * (MAX_INPUTS + 1)},
         {"checkpoint": b"a checkpoint and observations"},
     ],
 )

@@ -35,9 +35,13 @@ class TestNames:
             "RESAMPLING": 3,
             "HYPOTHESES": 4,
             "SELECTION": 5,
+            "MOVE_RESAMPLING": 6,
+            "REINITIALISATION": 7,
             "WORLD_INITIAL_STATE": 16,
             "WORLD_MOTION": 17,
             "WORLD_OBSERVATION": 18,
+            "WORLD_MEASURED_MOTION": 19,
+            "WORLD_MOVE_OBSERVATION": 20,
         }
 
     def test_a_substream_is_keyed_by_a_block_that_no_draw_uses(self) -> None:

@@ -49,6 +49,7 @@ class TestTables:
             "unexplained_observations",
             "digest",
             "outcome",
+            "reason",
         )
         for row, result in zip(rows, results, strict=True):
             assert float(row["reward"]) == result.reward

@@ -13,11 +13,13 @@ from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.messages import encode_floats
 from holdfast.protocol.records import (
     ActingRecord,
+    LateRecord,
     LocalTookOverRecord,
     ObservedRecord,
     PausedRecord,
     PerformedRecord,
     Record,
+    ReinitialisedRecord,
     decode_record,
     encode_record,
     replay,
@@ -33,6 +35,9 @@ RECORDS: list[Record] = [
     PerformedRecord(8, None),
     PausedRecord(),
     LocalTookOverRecord(2),
+    PerformedRecord(8, -1.0, encode_floats([0.5]), encode_floats([1.0, 2.0])),
+    LateRecord(9, 8, encode_floats([0.5]), bytes(32)),
+    ReinitialisedRecord(9, bytes(32)),
 ]
 
 
@@ -60,12 +65,11 @@ def first_record(**changes: object) -> ObservedRecord:
         (first_record(sensing_action=99), "sensing action 99"),
         (first_record(sensing_action=-1), "sensing action -1"),
         (first_record(observation=encode_floats(np.zeros(7))), "observation"),
-        (first_record(observation=b""), "observation"),
         (first_record(observation=b"short"), "5 bytes are not 0 numbers"),
         (first_record(), "another state"),
         (first_record(step=1), "of step 1"),
     ],
-    ids=["too high", "too low", "too long", "empty", "half a number", "digest", "step"],
+    ids=["too high", "too low", "too long", "half a number", "digest", "step"],
 )
 def test_a_record_that_does_not_follow_is_named(record: Record, why: str) -> None:
     with pytest.raises(RecordError, match=rf"trial 4: record 1 of its journal .*{why}"):

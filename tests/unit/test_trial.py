@@ -11,7 +11,14 @@ import pytest
 from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import EnvironmentFailedError, InvalidValueError
-from holdfast.outcome import Decisions, MoveResult, SensingDecision, TaskDecision, TrialResult
+from holdfast.outcome import (
+    DONE_VALUES,
+    Decisions,
+    MoveResult,
+    SensingDecision,
+    TaskDecision,
+    TrialResult,
+)
 from holdfast.planning import Planner
 from holdfast.recording.recorder import Recorder
 from holdfast.robot.environment import SimulatedEnvironment
@@ -93,7 +100,7 @@ class TestOneTrial:
         for wrong, says in (("crashed", "'crashed'"), (1, "1"), (None, "None")):
             world = Failing(problem, simulator.seed, 0)
             world.says = wrong
-            message = f'Failing: is_done returned {says}; it must return True, False or "failed"'
+            message = f"Failing: is_done returned {says}; it must return {DONE_VALUES}"
             with pytest.raises(EnvironmentFailedError, match=f"^{message}$"):
                 run_trial(
                     Planner(problem, configuration.planning),

@@ -48,7 +48,9 @@ __all__ = [
     "KnownStateReturnProblem",
     "Problem",
     "ProblemBase",
+    "ReinitialisedProblem",
     "Scene",
+    "ShownMovesProblem",
 ]
 
 
@@ -154,8 +156,7 @@ class Problem(Protocol):
 
     It may have ``sensing_costs``, the price of each sensing action in units of reward, numbers
     from 0 to 1e150. A trial's reward is less by it at each sensing, and ``expected_return`` weighs
-    it against what sensing gains. Without this attribute sensing costs nothing. "Not looking" is a
-    sensing action like any other: one of price 0 whose observation says nothing (a huge variance).
+    it against what sensing gains. Without this attribute sensing costs nothing.
     """
 
     name: str
@@ -288,6 +289,54 @@ class BatchedMotionProblem(Protocol):
         bits of ``move`` of one belief after the other, for any number of ``threads`` (0: all). One
         that a class inherits is not used if the class itself replaces ``move``.
         """
+        ...
+
+
+class ShownMovesProblem(Protocol):
+    """Methods for moves that show something: a measured motion, an observation. Any of them.
+
+    The robot's environment returns what a move has shown
+    (:class:`~holdfast.outcome.MoveResult`); these say what it means. With the first or the third
+    the next decision waits for what the move shows, so a service is asked at each step.
+    """
+
+    def move_by_measurement(
+        self, states: FloatArray, motion: FloatArray, stream: Stream
+    ) -> FloatArray:
+        """Draw the states after a move whose motion was measured, as ``states``.
+
+        It takes the place of ``move`` in the belief: the noise is that of the measurement.
+        ``motion`` is what the environment returned, shape ``(n,)``.
+        """
+        ...
+
+    def measure_motion(self, before: FloatArray, after: FloatArray, stream: Stream) -> FloatArray:
+        """Draw the measurement of a true move from state to state, shape ``(n,)``; to simulate."""
+        ...
+
+    def move_log_likelihood(
+        self, states: FloatArray, action: FloatArray, observation: FloatArray
+    ) -> FloatArray:
+        """Return log p(observation | state after the move), up to one constant, for each state.
+
+        ``states`` has the shape ``(num_particles, state_size)``, the executed ``action``
+        ``(action_size,)`` and the result ``(num_particles,)``. Minus infinity where a state cannot
+        have shown that; never NaN or plus infinity.
+        """
+        ...
+
+    def sample_move_observation(
+        self, state: FloatArray, action: FloatArray, stream: Stream
+    ) -> FloatArray:
+        """Draw what comes with a move into one state, shape ``(n,)``; to simulate."""
+        ...
+
+
+class ReinitialisedProblem(Protocol):
+    """One more method, for a robot that is lost; without it its belief is the initial one again."""
+
+    def reinitial_states(self, states: FloatArray, stream: Stream) -> FloatArray:
+        """Draw a new belief after the particles ``states``, of the same shape."""
         ...
 
 

@@ -92,7 +92,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def csv_lines(results: Iterable[TrialResult]) -> Iterator[str]:
-    """Yield the lines of ``trials.csv``, the head first; no value needs quotes.
+    """Yield the lines of ``trials.csv``, the head first; only a reason may need quotes.
 
     Reading a number back gives the same number. None, such as the reward of a trial without one, is
     an empty cell.
@@ -104,7 +104,12 @@ def csv_lines(results: Iterable[TrialResult]) -> Iterator[str]:
             "" if value is None else str(int(value)) if isinstance(value, bool) else str(value)
             for value in values
         )
-        yield ",".join(cells) + "\n"
+        yield ",".join(map(_quoted, cells)) + "\n"
+
+
+def _quoted(cell: str) -> str:
+    """Return a cell as RFC 4180 writes it."""
+    return '"' + cell.replace('"', '""') + '"' if "," in cell or '"' in cell else cell
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:

@@ -1,0 +1,254 @@
+"""A trial as it goes: late observations, what moves show, and beginning the belief anew."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from holdfast import numerics
+from holdfast import tracking as module
+from holdfast.arrays import FloatArray
+from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
+from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.outcome import Ending
+from holdfast.planning import Planner
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.problems.problem import ProblemBase
+from holdfast.randomness import Stream
+from holdfast.tracking import LateObservation, Trial
+
+SETTINGS = PlanningSettings(
+    particle_filter=ParticleFilterSettings(num_particles=50), sensing_interval=2
+)
+
+
+class Cart(ProblemBase):
+    """A cart on a line with an encoder and a bumper."""
+
+    name = "cart"
+    state_size = 1
+    action_size = 1
+    sensing_actions = ("look",)
+    motion_variance = np.array([0.01])
+
+    def initial_states(self, stream: Stream, count: int) -> FloatArray:
+        return stream.normal((count, 1))
+
+    def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
+        moved: FloatArray = states + actions + 0.5 * stream.normal(states.shape)
+        return moved
+
+    def move_by_measurement(
+        self, states: FloatArray, motion: FloatArray, stream: Stream
+    ) -> FloatArray:
+        moved: FloatArray = states + motion + 0.001 * stream.normal(states.shape)
+        return moved
+
+    def move_log_likelihood(
+        self, states: FloatArray, action: FloatArray, observation: FloatArray
+    ) -> FloatArray:
+        touches = (states[..., 0] > 0.0) == (observation[0] > 0.5)
+        return numerics.log(np.where(touches, 0.9, 0.1))
+
+    def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray:
+        return states.copy()
+
+    def observation_variance(self, states: FloatArray, sensing_action: int) -> FloatArray:
+        return np.array([0.04])
+
+    def policy(self, states: FloatArray, stage: Any) -> FloatArray:
+        return np.clip(-states, -0.2, 0.2)
+
+    def is_goal(self, states: FloatArray) -> Any:
+        return np.abs(states[..., 0]) < 0.1
+
+
+def acted(trial: Trial, **shown: FloatArray) -> None:
+    trial.move(trial.planner.choose_task_action(trial.state)[0], None, **shown)
+
+
+def observed(trial: Trial, observation: FloatArray | None) -> None:
+    action, _ = trial.planner.choose_sensing_action(trial.state)
+    trial.observe(action, observation, 0.0)
+
+
+def bits(trial: Trial) -> bytes:
+    return trial.planner.digest(trial.state)
+
+
+@pytest.mark.parametrize("shows", [False, True])
+@pytest.mark.parametrize("delays", [(1, 3), (5, 1), (6, 2)])
+def test_a_late_observation_is_folded_in_at_its_step(delays: tuple[int, int], shows: bool) -> None:
+    """In whatever order they come, the state is the one of observations that were on time.
+
+    The actions are those that the late robot chose.
+    """
+    planner = Planner(Cart(), SETTINGS)
+    late, actions = Trial(planner, 3, 0), []
+    taken = {0: np.array([0.3]), 3: np.array([-0.1])}
+    motions = {step: np.array([-0.05 * step]) for step in range(8)}
+    due = {step + delay: step for step, delay in zip(taken, delays, strict=True)}
+    for step in range(8):
+        if step in taken:
+            observed(late, None)
+        action, _ = planner.choose_task_action(late.state)
+        actions.append(action)
+        shown = {"motion": motions[step], "observation": np.array([1.0])} if shows else {}
+        late.move(action, None, **shown)
+        if step + 1 in due:
+            came = due[step + 1]
+            assert late.observe_late(LateObservation(came, taken[came])) is not None
+        elif step == 7:
+            assert late.awaited == ()
+    state = planner.init(3, 0)
+    for step, action in enumerate(actions):
+        if step in taken:
+            state, _ = planner.observe(state, 0, taken[step])
+        elif planner.needs_sensing(state):
+            state, _ = planner.observe(state, 0, None)
+        state = planner.advance(state, action, motions[step] if shows else None)
+        if shows:
+            state, _ = planner.observe_move(state, action, np.array([1.0]))
+    assert bits(late) == planner.digest(state)
+
+
+def test_what_is_not_awaited_changes_nothing() -> None:
+    trial = Trial(Planner(Cart(), SETTINGS), 1, 0)
+    observed(trial, np.array([0.2]))
+    acted(trial)
+    before = bits(trial)
+    for step in (0, 1, 7):
+        assert trial.observe_late(LateObservation(step, np.array([0.2]))) is None
+    assert bits(trial) == before
+
+
+def test_it_comes_once() -> None:
+    trial = Trial(Planner(Cart(), SETTINGS), 1, 0)
+    observed(trial, None)
+    assert trial.awaited == (0,)
+    acted(trial)
+    late = LateObservation(0, np.array([0.2]))
+    assert trial.observe_late(late) is not None
+    assert trial.observe_late(late) is None
+
+
+def test_an_observation_of_the_wrong_size_changes_nothing() -> None:
+    trial = Trial(Planner(Cart(), SETTINGS), 1, 0)
+    observed(trial, None)
+    acted(trial)
+    before = bits(trial)
+    with pytest.raises(InvalidValueError, match="observation of 2 coordinates"):
+        trial.observe_late(LateObservation(0, np.zeros(2)))
+    assert bits(trial) == before
+    assert trial.awaited == (0,)
+
+
+def test_what_is_awaited_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MAX_AWAITED", 2)
+    monkeypatch.setattr(module, "MAX_INPUTS_SINCE", 6)
+    trial = Trial(Planner(Cart(), SETTINGS), 1, 0)
+    for step in range(9):
+        if step % 3 == 0:
+            observed(trial, None)
+        acted(trial)
+    assert trial.awaited == (6,)
+    assert trial.observe_late(LateObservation(0, np.array([0.2]))) is None
+    assert trial.observe_late(LateObservation(6, np.array([0.2]))) is not None
+
+
+def test_not_to_sense_awaits_nothing() -> None:
+    planner = Planner(Cart(), SETTINGS)
+    trial = Trial(planner, 1, 0)
+    before = trial.state.belief
+    info, _ = trial.observe(planner.no_sensing, None, 0.5)
+    assert info.explained
+    assert not info.resampled
+    assert trial.state.sensed
+    assert trial.state.belief is before
+    assert trial.awaited == ()
+    assert (trial.num_observations, trial.num_sensed) == (1, 0)
+    with pytest.raises(InvalidValueError, match="sensing action 1: cart has 0 to 0"):
+        trial.observe(planner.no_sensing, np.zeros(1), 0.0)
+
+
+def test_a_measured_motion_takes_the_place_of_the_model() -> None:
+    planner = Planner(Cart(), SETTINGS)
+    state = planner.observe(planner.init(1), planner.no_sensing, None)[0]
+    modelled = planner.advance(state, np.array([0.1]))
+    measured = planner.advance(state, np.array([0.1]), np.array([0.7]))
+    states = state.belief.states
+    np.testing.assert_allclose(measured.belief.states, states + 0.7, atol=0.006)
+    assert np.abs(modelled.belief.states - states - 0.1).max() > 0.5
+
+
+def test_what_came_with_a_move_weighs_the_particles() -> None:
+    settings = PlanningSettings(
+        particle_filter=ParticleFilterSettings(num_particles=50, resampling_threshold=0.0)
+    )
+    planner = Planner(Cart(), settings)
+    state = planner.init(1)
+    after, info = planner.observe_move(state, np.zeros(1), np.array([1.0]))
+    touches = state.belief.states[:, 0] > 0.0
+    expected = np.where(touches, 0.9, 0.1)
+    np.testing.assert_allclose(after.belief.weights, expected / expected.sum(), rtol=1e-12)
+    assert info.explained
+    assert not after.sensed
+
+
+@pytest.mark.parametrize(
+    ("motion", "observation", "message"),
+    [
+        (np.zeros(3), None, "a move has the measured motion .* but peg_in_hole_2d has no "),
+        (None, np.zeros(3), "a move has shown .* has no move_log_likelihood"),
+        (np.array([np.nan]), None, r"motion \[nan\]: every coordinate must be finite"),
+    ],
+)
+def test_a_problem_that_cannot_fold_it_in_is_named(
+    motion: FloatArray | None, observation: FloatArray | None, message: str
+) -> None:
+    trial = Trial(Planner(PegInHole2D(), SETTINGS), 1, 0)
+    trial.observe(0, np.zeros(1), 0.0)
+    before = bits(trial)
+    action, _ = trial.planner.choose_task_action(trial.state)
+    with pytest.raises((InvalidValueError, ProblemError), match=message):
+        trial.move(action, None, motion, observation)
+    assert bits(trial) == before
+
+
+def test_a_new_belief_is_the_initial_one_or_the_problems_own() -> None:
+    class Near(Cart):
+        def reinitial_states(self, states: FloatArray, stream: Stream) -> FloatArray:
+            return states + stream.normal(states.shape)
+
+    for problem in (Cart(), Near()):
+        trial = Trial(Planner(problem, SETTINGS), 1, 0)
+        observed(trial, np.array([0.2]))
+        acted(trial)
+        before = trial.state
+        assert trial.reinitialise() == bits(trial)
+        assert trial.state._replace(belief=before.belief) == before
+        assert (trial.state.belief.weights == 1 / 50).all()
+        # Of 50 normal deviates: outside 0.6 and 1.4 with a probability below 1e-4.
+        offset = before.belief.states if isinstance(problem, Near) else 0.0
+        assert 0.6 < (trial.state.belief.states - offset).std() < 1.4
+
+
+def test_the_log_has_what_was_shown() -> None:
+    plain, shown = (Trial(Planner(Cart(), SETTINGS), 1, 0) for _ in range(2))
+    for trial in (plain, shown):
+        observed(trial, np.array([0.2]))
+    acted(plain)
+    acted(shown, motion=np.array([0.1]))
+    assert [len(trial.log.decisions().log) for trial in (plain, shown)] == [45 + 17, 45 + 17 + 41]
+    assert plain.result(None).digest != shown.result(None).digest
+    assert len(list(shown.log.decisions())) == 2
+
+
+@pytest.mark.parametrize("outcome", ["succeeded", "failed", "truncated"])
+def test_the_result_has_the_ending(outcome: Any) -> None:
+    trial = Trial(Planner(Cart(), SETTINGS), 1, 0)
+    result = trial.result(Ending(outcome, "hit the wall"))
+    assert (result.outcome, result.reason) == (outcome, "hit the wall")
+    assert Trial(trial.planner, 1, 0).result(None).outcome == "truncated"
