@@ -66,9 +66,7 @@ def _run(configuration: Any, trial: int) -> Mapping[str, Any]:
         max_steps=simulator.max_steps,
         environment=load_environment(configuration)(trial),
     )
-    return dict(
-        zip(COLUMNS, (result.outcome, result.steps, result.sensing_decisions), strict=True)
-    )
+    return dict(zip(COLUMNS, (result.outcome, result.steps, result.sensing_decisions), strict=True))
 
 
 def tables(path: Path) -> str:

@@ -94,8 +94,10 @@ def compare(own: pd.DataFrame, other: pd.DataFrame, column: str) -> tuple[Interv
     others = (pairs["outcome_other"] == "succeeded").to_numpy()
     gain, _ = statistics.paired_rates(succeeded, others)
     both = pairs[succeeded & others]
-    logs = [statistics.log_steps(both[name].to_numpy(float)) for name in (column, f"{column}_other")]
-    ratio, _ = statistics.paired_difference(*logs)
+    own_steps, other_steps = (
+        statistics.log_steps(both[name].to_numpy(float)) for name in (column, f"{column}_other")
+    )
+    ratio, _ = statistics.paired_difference(own_steps, other_steps)
     return Interval(*(100.0 * end for end in gain)), statistics.ratio_of(ratio)
 
 
