@@ -1,4 +1,4 @@
-"""The peg in MuJoCo with its cloud killed: motions and forces are the same inputs wherever it is decided."""
+"""The peg in MuJoCo with its cloud killed: motions and forces lead to the same decisions."""
 
 from __future__ import annotations
 
