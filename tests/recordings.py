@@ -77,9 +77,10 @@ def without_decisions(result: TrialResult) -> TrialResult:
 
 def record_trial(configuration: Configuration, trial: int = 1) -> Recorder:
     """Run a trial and record it."""
-    recorder = Recorder(trial)
+    planner = Planner(configuration.problem, configuration.planning)
+    recorder = Recorder(trial, planner)
     run_trial(
-        Planner(configuration.problem, configuration.planning),
+        planner,
         configuration.simulator.seed,
         trial,
         max_steps=configuration.simulator.max_steps,

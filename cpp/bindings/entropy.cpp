@@ -49,10 +49,19 @@ Estimator to_estimator(int number) {
 
 HypothesisInput make_input(const Input<1>& weights, const std::vector<std::uint32_t>& sizes,
                            const Input<2>& predicted, const Input<2>& variance, std::size_t samples,
-                           const StreamWords& stream, bool drop_negligible) {
-    return {weights.shape(0),  weights.data(),  sizes.size(),           sizes.data(),
-            predicted.data(),  variance.data(), variance.shape(1) != 1, samples,
-            to_stream(stream), drop_negligible};
+                           const StreamWords& stream, bool drop_negligible,
+                           const std::vector<std::uint8_t>& circular) {
+    return {weights.shape(0),
+            weights.data(),
+            sizes.size(),
+            sizes.data(),
+            predicted.data(),
+            variance.data(),
+            variance.shape(1) != 1,
+            samples,
+            to_stream(stream),
+            drop_negligible,
+            circular.empty() ? nullptr : circular.data()};
 }
 
 /// The sets stand one below the other; each has a point for every particle.
@@ -142,9 +151,10 @@ void holdfast::bind_entropy(nb::module_& module) {
     define(module, "hypothetical_entropies",
            [](const Input<1>& weights, const std::vector<std::uint32_t>& sizes,
               const Input<2>& predicted, const Input<2>& variance, std::size_t samples,
-              const StreamWords& stream, const Input<2>& points, int number,
-              std::uint32_t neighbors, double resolution, double exponent, double offset,
-              int threads, const std::vector<double>& factors, const Input<1>& prior) {
+              const StreamWords& stream, const std::vector<std::uint8_t>& circular,
+              const Input<2>& points, int number, std::uint32_t neighbors, double resolution,
+              double exponent, double offset, int threads, const std::vector<double>& factors,
+              const Input<1>& prior) {
                const PointSets sets = make_sets(points, weights.shape(0), factors);
                double* out;
                auto result = make_array<double>({sizes.size(), samples}, out);
@@ -158,7 +168,7 @@ void holdfast::bind_entropy(nb::module_& module) {
                {
                    WithoutInterpreter released;
                    hypothetical_entropies(make_input(weights, sizes, predicted, variance, samples,
-                                                     stream, drops_negligible(estimator)),
+                                                     stream, drops_negligible(estimator), circular),
                                           sets, settings, out, counts);
                    for (std::size_t j = 0; j < sizes.size(); ++j) {
                        double total = 0.0;
@@ -172,12 +182,13 @@ void holdfast::bind_entropy(nb::module_& module) {
     define(module, "hypothetical_weights",
            [](const Input<1>& weights, const std::vector<std::uint32_t>& sizes,
               const Input<2>& predicted, const Input<2>& variance, std::size_t samples,
-              const StreamWords& stream, bool drop_negligible) {
+              const StreamWords& stream, const std::vector<std::uint8_t>& circular,
+              bool drop_negligible) {
                double* out;
                auto result = make_array<double>({sizes.size(), samples, weights.shape(0)}, out);
                WithoutInterpreter released;
                hypothetical_weights(make_input(weights, sizes, predicted, variance, samples, stream,
-                                               drop_negligible),
+                                               drop_negligible, circular),
                                     out);
                return result;
            });

@@ -40,6 +40,13 @@ void holdfast::bind_numerics(nb::module_& module) {
     define(module, "log", &elementwise<&VectorKernels::log>);
     define(module, "sin", &elementwise<&VectorKernels::sin>);
     define(module, "cos", &elementwise<&VectorKernels::cos>);
+    define(module, "arctan2", [](const Input<1>& y, const Input<1>& x) {
+        if (y.shape(0) != x.shape(0)) throw nb::value_error("y and x do not fit");
+        double* out;
+        auto result = make_array<double>({y.shape(0)}, out);
+        vector_kernels().arctan2(y.data(), x.data(), out, y.shape(0));
+        return result;
+    });
     define(module, "arcsin", [](double x) { return arcsin(x); });
     define(module, "sum",
            [](const Input<1>& in) { return vector_kernels().sum(in.data(), in.shape(0)); });

@@ -1,4 +1,4 @@
-// exp, log, sin, cos and arcsin with the same bits on every machine.
+// exp, log, sin, cos, arctan2 and arcsin with the same bits on every machine.
 //
 // A C library may choose its algorithm by processor and may round differently from the next one.
 // These functions use only + - * / and integer operations, all exact in IEEE 754, in one order, on
@@ -187,6 +187,48 @@ HOLDFAST_INLINE detail::SineCosine<T> sine_cosine_of(T x) {
     const auto sensible = size <= 1073741824.0;
     return {select(sensible, select(negate_sine, -s, s), nan),
             select(sensible, select(negate_cosine, -c, c), nan)};
+}
+
+/// The angle of the vector (x, y) in (-pi, pi]; 0 for the zero vector, NaN where an argument is.
+///
+/// The smaller size over the larger is a tangent of at most 45 degrees, and 22.5 degrees more or
+/// less are a tangent of at most sqrt 2 - 1, whose series is short.
+template <class T>
+HOLDFAST_INLINE T arctan2_of(T y, T x) {
+    constexpr double pi = 3.14159265358979323846;
+    constexpr double pi_low = 1.2246467991473531772e-16;
+    constexpr double tan_eighth = 0.41421356237309504880;
+    constexpr double series[] = {-1.0 / 3,  1.0 / 5,   -1.0 / 7,  1.0 / 9,   -1.0 / 11,
+                                 1.0 / 13,  -1.0 / 15, 1.0 / 17,  -1.0 / 19, 1.0 / 21,
+                                 -1.0 / 23, 1.0 / 25,  -1.0 / 27, 1.0 / 29,  -1.0 / 31,
+                                 1.0 / 33,  -1.0 / 35, 1.0 / 37,  -1.0 / 39, 1.0 / 41};
+    const T zero = detail::constant<T>(0.0);
+    const T width = select(x < 0.0, -x, x);
+    const T height = select(y < 0.0, -y, y);
+    const auto steep = width < height;
+    const T smaller = select(steep, width, height);
+    const T larger = select(steep, height, width);
+    const auto beyond = smaller > larger * tan_eighth;
+    const T numerator = select(beyond, smaller - larger, smaller);
+    const T denominator = select(beyond, smaller + larger, larger);
+    const T t = select(larger == 0.0, zero, numerator / denominator);
+    const T t2 = t * t;
+    const T rest = t * (t2 * detail::horner(t2, series));
+    // The multiple of 45 degrees that is to be added, in two parts.
+    const T base = select(beyond, detail::constant<T>(0.25 * pi), zero);
+    const T base_low = select(beyond, detail::constant<T>(0.25 * pi_low), zero);
+    T angle = base + (t + (rest + base_low));
+    angle = select(steep, 0.5 * pi - (angle - 0.5 * pi_low), angle);
+    angle = select(x < 0.0, pi - (angle - pi_low), angle);
+    return select(y < 0.0, -angle, angle);
+}
+
+/// An angle brought near zero: less the nearest whole number of turns.
+template <class T>
+HOLDFAST_INLINE T wrapped(T angle) {
+    constexpr double turn = 6.28318530717958647693;
+    const T turns = (angle * (1.0 / turn) + detail::rounding_shift) - detail::rounding_shift;
+    return angle - turns * turn;
 }
 
 inline double exp(double x) {

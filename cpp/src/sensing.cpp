@@ -85,7 +85,7 @@ class Hypotheses {
              input_.predicted + row * input_.count, inverse_variance_.data() + variance_row,
              input_.varying_variance ? log_normalizer_.data() + j * input_.count : nullptr,
              observations_.data() + row * input_.samples + i * input_.observation_size[j],
-             input_.drop_negligible},
+             input_.drop_negligible, input_.circular == nullptr ? nullptr : input_.circular + row},
             weights);
     }
 

@@ -30,7 +30,8 @@ struct HypothesisInput {
     bool varying_variance;
     std::size_t samples;  // M
     Stream stream;
-    bool drop_negligible;  // weights of the posteriors
+    bool drop_negligible;          // weights of the posteriors
+    const std::uint8_t* circular;  // null, or [total]: 1 where an observation is an angle
 };
 
 /// Entropies of the J x M hypothetical posteriors, row by row; NaN where an observation explains

@@ -20,19 +20,24 @@ if TYPE_CHECKING:
     )
     from holdfast.errors import HoldfastError
     from holdfast.estimators import GaussianMixture, NearestNeighbor, PriorNeighbors, entropy
+    from holdfast.outcome import Ending, MoveResult
     from holdfast.planning import Planner, PlanningState
     from holdfast.problems.problem import Problem, ProblemBase, Scene
     from holdfast.problems.registry import make
     from holdfast.recording.reading import open_run
-    from holdfast.robot.environment import Environment, SimulatedEnvironment
+    from holdfast.robot.environment import LATER, Environment, SimulatedEnvironment
+    from holdfast.robot.late_sensing import SenseInBackground, SenseLater
     from holdfast.robot.trial import run_trial
 
 __all__ = [
+    "LATER",
     "ActiveSensingSettings",
     "Belief",
+    "Ending",
     "Environment",
     "GaussianMixture",
     "HoldfastError",
+    "MoveResult",
     "NearestNeighbor",
     "ParticleFilterSettings",
     "Planner",
@@ -43,6 +48,8 @@ __all__ = [
     "ProblemBase",
     "Scene",
     "SelectorSettings",
+    "SenseInBackground",
+    "SenseLater",
     "SimulatedEnvironment",
     "entropy",
     "load_configuration",
@@ -57,7 +64,12 @@ _PLACES = {
     "ActiveSensingSettings": "config.settings.ActiveSensingSettings",
     "ParticleFilterSettings": "config.settings.ParticleFilterSettings",
     "Belief": "belief.Belief",
+    "Ending": "outcome.Ending",
     "Environment": "robot.environment.Environment",
+    "LATER": "robot.environment.LATER",
+    "MoveResult": "outcome.MoveResult",
+    "SenseInBackground": "robot.late_sensing.SenseInBackground",
+    "SenseLater": "robot.late_sensing.SenseLater",
     "GaussianMixture": "estimators.GaussianMixture",
     "HoldfastError": "errors.HoldfastError",
     "NearestNeighbor": "estimators.NearestNeighbor",

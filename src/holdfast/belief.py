@@ -12,6 +12,7 @@ still ranks them instead of turning every weight into zero.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -19,8 +20,9 @@ import numpy.typing as npt
 
 from holdfast import _kernel, checked, numerics
 from holdfast.arrays import FloatArray, in_brief
+from holdfast.circular import differences, mean_angles
 from holdfast.errors import InvalidValueError
-from holdfast.problem_attributes import has_general_observations
+from holdfast.problem_attributes import circular_observation, has_general_observations
 from holdfast.randomness import Stream
 
 __all__ = [
@@ -129,21 +131,34 @@ class ObservationInfo(NamedTuple):
     mahalanobis_distance: float | None = None
 
 
-def estimate(belief: Belief, kind: Literal["mean", "most_likely"] = "mean") -> FloatArray:
+def estimate(
+    belief: Belief,
+    kind: Literal["mean", "most_likely"] = "mean",
+    circular: Sequence[int] = (),
+) -> FloatArray:
     """Return a point estimate of the state, shape ``(state_size,)``.
 
-    It is the mean, or the particle of the greatest weight (the first of equals).
+    It is the mean, or the particle of the greatest weight (the first of equals). The mean of a
+    ``circular`` coordinate, an angle in radians, is the mean direction, in (-pi, pi].
     """
     if kind == "most_likely":
         # A copy: the belief may be large, and what is returned may outlive it.
         likely: FloatArray = belief.states[int(np.argmax(belief.weights))].copy()
         return likely
-    return _kernel.weighted_sums(belief.weights, belief.states)
+    mean = _kernel.weighted_sums(belief.weights, belief.states)
+    if circular:
+        angles = list(circular)
+        mean[angles] = mean_angles(belief.states[:, angles], belief.weights)
+    return mean
 
 
-def standard_deviation(belief: Belief) -> FloatArray:
-    """Return the standard deviation of each coordinate, shape ``(state_size,)``."""
-    difference = belief.states - estimate(belief)
+def standard_deviation(belief: Belief, circular: Sequence[int] = ()) -> FloatArray:
+    """Return the standard deviation of each coordinate, shape ``(state_size,)``.
+
+    Of a ``circular`` coordinate it is that of the shorter ways round from the mean direction to the
+    particles: at most pi, and 1.81 for a heading of which nothing is known.
+    """
+    difference = differences(belief.states, estimate(belief, circular=circular), circular)
     return np.sqrt(_kernel.weighted_sums(belief.weights, difference * difference))
 
 
@@ -182,8 +197,9 @@ def update(
                 f"gives {mean.shape[-1]}"
             )
         checked.require_usable(problem, sensing_action, mean, variance)
+        angles = circular_observation(problem, sensing_action, mean.shape[-1])
         log_likelihood, squared_distance = _gaussian_log_likelihood(
-            observed, mean, variance, belief.weights
+            observed, mean, variance, belief.weights, angles
         )
         explained = squared_distance <= VALIDATION_GATE_SQUARED
         distance = float(np.sqrt(squared_distance))
@@ -229,7 +245,11 @@ def _reweighted(
 
 
 def _gaussian_log_likelihood(
-    observed: FloatArray, mean: FloatArray, variance: FloatArray, weights: FloatArray
+    observed: FloatArray,
+    mean: FloatArray,
+    variance: FloatArray,
+    weights: FloatArray,
+    angles: Sequence[int],
 ) -> tuple[FloatArray, float]:
     """Return log p(observed | state) up to a constant, and the least squared distance.
 
@@ -238,7 +258,7 @@ def _gaussian_log_likelihood(
     """
     # An overflow to infinity is correct: the observation is outside every validation gate.
     with np.errstate(over="ignore"):
-        difference = observed - mean
+        difference = differences(observed, mean, angles)
         squares = difference * difference / variance
         # Added column by column: np.sum may add in another order on another machine.
         distance = squares[..., 0].copy()

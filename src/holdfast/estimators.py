@@ -12,6 +12,7 @@ Entropies are in nats. Those of continuous quantities may be negative.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ import numpy.typing as npt
 
 from holdfast import _kernel, numerics
 from holdfast.arrays import FloatArray, in_brief
+from holdfast.circular import unwrapped
 from holdfast.config.settings import MAX_PRIOR_NEIGHBORS_POINTS
 from holdfast.errors import InvalidValueError
 
@@ -287,6 +289,7 @@ def entropy(
     weights: npt.ArrayLike | None = None,
     estimator: NearestNeighbor | PriorNeighbors | GaussianMixture | None = None,
     *,
+    circular: Sequence[int] = (),
     threads: int = 0,
 ) -> float | FloatArray:
     """Estimate the differential entropy of weighted points.
@@ -300,6 +303,9 @@ def entropy(
         points under different weights, much faster than one by one. Default: equal weights.
     estimator : NearestNeighbor, PriorNeighbors or GaussianMixture, optional
         Default: ``NearestNeighbor()``.
+    circular : sequence of int
+        Which coordinates are angles in radians, of which pi is -pi. Distances across the widest gap
+        between neighbouring angles are not seen.
     threads : int
         At most so many; 0 means all cores. The result does not depend on it.
 
@@ -347,7 +353,7 @@ def entropy(
     if not (rows > 0.0).any(axis=1).all():
         bad = int(np.argmin((rows > 0.0).any(axis=1)))
         raise InvalidValueError(f"weights[{bad}] are all zero: one must be positive")
-    array = scaled(array, kernel)
+    array = scaled(unwrapped(array, circular) if circular else array, kernel)
     result, _, _, _ = _kernel.entropies(
         array,
         rows,

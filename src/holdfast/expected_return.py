@@ -39,9 +39,10 @@ import numpy as np
 from holdfast import checked, numerics
 from holdfast.arrays import BoolArray, FloatArray, IntArray
 from holdfast.belief import Belief, estimate
+from holdfast.circular import differences
 from holdfast.config.settings import PlanningSettings
 from holdfast.errors import ProblemError
-from holdfast.problem_attributes import sensing_costs
+from holdfast.problem_attributes import circular_states, sensing_costs
 from holdfast.problems.problem import Problem, ProblemBase
 from holdfast.randomness import Stream
 
@@ -94,12 +95,13 @@ def expected_returns(
     hypotheses: Stream,
     posteriors: Posteriors,
 ) -> Returns:
-    """Return the expected return after each sensing action.
+    """Return the expected return after each sensing action; if sensing is optional, without one.
 
+    Not to sense comes last, has no price, and ``posteriors`` is asked for it as for the others.
     ProblemError says if a function of the problem breaks its contract, or a hypothetical
     observation has no likelihood under any particle.
     """
-    costs = sensing_costs(problem)
+    costs = sensing_costs(problem, optional=settings.selector.sensing_is_optional)
     count = costs.shape[0]
     size = settings.active_sensing.num_observation_samples
     limit = max(size, settings.selector.max_observation_samples)
@@ -139,7 +141,7 @@ def _sampled_returns(
 ) -> FloatArray:
     """Return the return after each hypothetical observation, shape ``(actions, samples)``."""
     actions, samples, _ = weights.shape
-    kind = settings.particle_filter.estimate
+    kind, circular = settings.particle_filter.estimate, circular_states(problem)
     states = belief.states
     estimates = np.empty((actions, samples, states.shape[1]))
     clouds = np.empty((actions, samples, _CLOUD, states.shape[1]))
@@ -152,7 +154,7 @@ def _sampled_returns(
                     f"a hypothetical observation of {problem.name} had no likelihood under any "
                     "particle"
                 )
-            estimates[j, i] = estimate(Belief(states, own), kind)
+            estimates[j, i] = estimate(Belief(states, own), kind, circular)
             # np.cumsum adds one by one, in order, unlike np.sum.
             drawn = np.searchsorted(np.cumsum(own), at[i], side="right")
             clouds[j, i] = states[np.minimum(drawn, int(np.flatnonzero(own)[-1]))]
@@ -199,7 +201,7 @@ def rollout_returns(
     rollouts = _Rollouts(problem, settings, true_states, estimates, clouds, stage)
     interval = settings.sensing_interval + 1
     looks = settings.selector.rollout_looks
-    costs = sensing_costs(problem)
+    costs = sensing_costs(problem, optional=settings.selector.sensing_is_optional)
     price = numerics.sum(costs) / costs.shape[0]
     for step in range(settings.selector.rollout_steps):
         later, between = divmod(step, interval)
@@ -241,7 +243,8 @@ class _Rollouts:
         self._unknown = samples
         self._states = np.broadcast_to(true_states, (actions, samples, size))
         self._clouds = clouds
-        self._offsets = estimates - _means(clouds)
+        self._circular = list(circular_states(problem))
+        self._offsets = differences(estimates, self._means(), self._circular)
         self._stages: IntArray = np.full((actions, samples), stage, dtype=np.int64)
         self._origins = np.arange(samples)
         # The probability of the branch; 0 where the goal is reached.
@@ -278,7 +281,7 @@ class _Rollouts:
             return False
         problem = self._problem
         believed = np.concatenate(
-            [_means(self._clouds) + self._offsets, self._states[:, unknown:]], axis=1
+            [self._means() + self._offsets, self._states[:, unknown:]], axis=1
         )
         shape, size, cloud = believed.shape[:2], believed.shape[2], self._clouds.shape[2]
         rows = believed.reshape(-1, size)
@@ -310,6 +313,17 @@ class _Rollouts:
         self._factor *= self._discount
         self._end_at_goals()
         return True
+
+    def _means(self) -> FloatArray:
+        """Return the mean of each cloud; of angles, the mean direction."""
+        means = _means(self._clouds)
+        if angles := self._circular:
+            sines, cosines = (
+                _means(function(self._clouds[..., angles]))
+                for function in (numerics.sin, numerics.cos)
+            )
+            means[..., angles] = numerics.arctan2(sines, cosines)
+        return means
 
     def _end_at_goals(self) -> None:
         rows = self._states.reshape(-1, self._states.shape[2])

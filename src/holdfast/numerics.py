@@ -16,7 +16,20 @@ from holdfast import _kernel
 from holdfast.arrays import FloatArray
 from holdfast.errors import ConfigurationError, InvalidValueError
 
-__all__ = ["all_finite", "arcsin", "cos", "exp", "log", "sin", "sum", "weighted_mean"]
+__all__ = [
+    "all_finite",
+    "arcsin",
+    "arctan2",
+    "cos",
+    "exp",
+    "log",
+    "sin",
+    "sum",
+    "weighted_mean",
+    "wrapped",
+]
+
+_TURN = 2.0 * np.pi
 
 
 try:
@@ -53,6 +66,27 @@ def cos(values: npt.ArrayLike) -> FloatArray:
 def arcsin(value: float) -> float:
     """Return the angle in [-pi/2, pi/2] whose sine is ``value``; NaN outside [-1, 1]."""
     return _kernel.arcsin(float(value))
+
+
+def arctan2(y: npt.ArrayLike, x: npt.ArrayLike) -> FloatArray:
+    """Return the angles of vectors (x, y), in (-pi, pi]; 0 for a zero vector.
+
+    The two arrays broadcast against each other.
+    """
+    ys, xs = np.broadcast_arrays(np.asarray(y, np.float64), np.asarray(x, np.float64))
+    rows = (np.ascontiguousarray(each).reshape(-1) for each in (ys, xs))
+    return _kernel.arctan2(*rows).reshape(ys.shape)
+
+
+def wrapped(angles: npt.ArrayLike) -> FloatArray:
+    """Return angles in radians less the nearest whole number of turns, in [-pi, pi].
+
+    Of a difference of two angles it is the shorter way round. Above some thousand turns the
+    rounding of a turn shows.
+    """
+    array = np.asarray(angles, dtype=np.float64)
+    nearest: FloatArray = array - _TURN * np.rint(array / _TURN)
+    return nearest
 
 
 def sum(values: npt.ArrayLike) -> float:  # noqa: A001 - always used as numerics.sum

@@ -44,7 +44,7 @@ from holdfast.belief import (
 )
 from holdfast.config.settings import MAX_PARTICLES, Method, PlanningSettings, check_settings
 from holdfast.errors import CheckpointError, InvalidValueError, ProblemError
-from holdfast.problem_attributes import check_problem, moves_show
+from holdfast.problem_attributes import check_problem, circular_states, moves_show
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
 from holdfast.sensing import SensingInfo
@@ -434,10 +434,16 @@ class Planner:
         self.check(state)
         return state
 
+    def estimate(self, state: PlanningState) -> FloatArray:
+        """Return the state that stands for the belief, shape ``(state_size,)``."""
+        return self._estimate(state)[0]
+
     def _estimate(self, state: PlanningState) -> tuple[FloatArray, int]:
         """Return the state that stands for the belief, and the stage that follows from it."""
         self._require_size(state)
-        estimated = estimate(state.belief, self.settings.particle_filter.estimate)
+        estimated = estimate(
+            state.belief, self.settings.particle_filter.estimate, circular_states(self.problem)
+        )
         return estimated, checked.next_stage(self.problem, estimated, state.stage)
 
 

@@ -22,6 +22,11 @@ from holdfast.errors import InvalidValueError, ProblemError
 __all__ = [
     "check_problem",
     "check_sizes",
+    "choice_labels",
+    "circular_actions",
+    "circular_observation",
+    "circular_states",
+    "has_circular_observations",
     "has_general_observations",
     "has_own",
     "moves_show",
@@ -83,6 +88,7 @@ def check_problem(problem: Any) -> None:
         if not isinstance(label, str):
             raise ProblemError(f"sensing_actions of {name} has {label!r:.80}: labels must be text")
     sensing_costs(problem)
+    _check_circular(problem)
     labels = getattr(problem, "state_labels", ())
     if labels and len(labels) != problem.state_size:
         raise ProblemError(
@@ -151,6 +157,77 @@ def _numbers(value: object) -> npt.NDArray[Any] | None:
     return numbers if numbers.dtype.kind in "fiu" else None
 
 
+def _check_circular(problem: Any) -> None:
+    name = problem.name
+    for attribute, size in (("circular", "state_size"), ("circular_actions", "action_size")):
+        _require_indices(name, attribute, getattr(problem, attribute, ()), getattr(problem, size))
+    given = getattr(problem, "circular_observations", ())
+    if isinstance(given, Sequence) and not given:
+        return
+    count = len(problem.sensing_actions)
+    if has_general_observations(problem):
+        raise ProblemError(
+            f"circular_observations of {name} is {given!r:.80}: it has no effect beside "
+            "log_likelihood, which has to know itself what is an angle; leave it out"
+        )
+    if isinstance(given, str) or not isinstance(given, Sequence) or len(given) != count:
+        raise ProblemError(
+            f"circular_observations of {name} is {given!r:.80}: must be {count} sequences, one for "
+            "each sensing action, of the coordinates of its observation that are angles"
+        )
+    for action, own in enumerate(given):
+        _require_indices(name, f"circular_observations[{action}]", own, None)
+
+
+def _require_indices(name: str, attribute: str, given: Any, size: int | None) -> None:
+    numbers = _numbers(given)
+    usable = numbers is not None and numbers.ndim == 1
+    if numbers is not None and usable and numbers.size:
+        usable = (
+            numbers.dtype.kind in "iu"
+            and numbers.min() >= 0
+            and (size is None or numbers.max() < size)
+            and np.unique(numbers).size == numbers.size
+        )
+    if not usable:
+        limit = "" if size is None else f" to {size - 1}"
+        raise ProblemError(
+            f"{attribute} of {name} is {given!r:.80}: must be different indices of coordinates "
+            f"that are angles in radians, from 0{limit}, such as (0,)"
+        )
+
+
+def circular_states(problem: Any) -> Sequence[int]:
+    """Return which coordinates of a state are angles."""
+    return getattr(problem, "circular", ())
+
+
+def circular_actions(problem: Any) -> Sequence[int]:
+    """Return which coordinates of a task action are angles."""
+    return getattr(problem, "circular_actions", ())
+
+
+def has_circular_observations(problem: Any) -> bool:
+    """Tell whether a problem says which coordinates of an observation are angles."""
+    return bool(getattr(problem, "circular_observations", ()))
+
+
+def circular_observation(problem: Any, sensing_action: int, size: int) -> Sequence[int]:
+    """Return which of the ``size`` coordinates that a sensing action shows are angles.
+
+    Raises ProblemError if there is no such coordinate.
+    """
+    if not has_circular_observations(problem):
+        return ()
+    own: Sequence[int] = problem.circular_observations[sensing_action]
+    if any(coordinate >= size for coordinate in own):
+        raise ProblemError(
+            f"circular_observations[{sensing_action}] of {name_of(problem)} is {own!r:.80}: "
+            f"sensing action {sensing_action} shows {size} coordinates, 0 to {size - 1}"
+        )
+    return own
+
+
 def resolution_of(
     problem: Any, given: float | Sequence[float] | None, *, of_states: bool
 ) -> float | FloatArray:
@@ -217,12 +294,21 @@ def _takes(function: Any, arguments: tuple[str | None, ...]) -> str | None:
     return None
 
 
-def sensing_costs(problem: Any) -> FloatArray:
-    """Return the checked price of each sensing action, shape ``(J,)``; zeros if there is none."""
+def sensing_costs(problem: Any, *, otherwise: float = 0.0, optional: bool = False) -> FloatArray:
+    """Return the checked price of each sensing action, shape ``(J,)``.
+
+    ``otherwise`` is that of each where the problem has no prices. With ``optional`` a last entry of
+    zero stands for not sensing.
+    """
+    costs = _costs_of_actions(problem, otherwise)
+    return np.append(costs, 0.0) if optional else costs
+
+
+def _costs_of_actions(problem: Any, otherwise: float) -> FloatArray:
     count = len(problem.sensing_actions)
     given = getattr(problem, "sensing_costs", None)
     if given is None:
-        return np.zeros(count)
+        return np.full(count, otherwise)
     costs = _numbers(given)
     # A comparison with NaN is false.
     if (
@@ -240,6 +326,11 @@ def sensing_costs(problem: Any) -> FloatArray:
 def has_general_observations(problem: object) -> bool:
     """Tell whether a problem gives a likelihood of its own instead of a Gaussian one."""
     return hasattr(problem, "log_likelihood")
+
+
+def choice_labels(problem: Any) -> list[str]:
+    """Return a label for each choice: the sensing actions, and not to sense."""
+    return [*map(str, problem.sensing_actions), "no sensing"]
 
 
 def moves_show(problem: object) -> bool:

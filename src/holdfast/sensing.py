@@ -8,6 +8,12 @@ task actions (*action covariance*, the trace of their covariance) is simpler, an
 different actions are from each other, which entropy does not. Two methods that look ahead at
 nothing, *random* and *fixed*, are there to compare with.
 
+Sensing may have a price, and not to sense may be a choice, with the entropy of the belief as it is
+and without a price. What wins then has the least sum of entropy and price: a sensing action is
+performed only if it is expected to gain more than it costs. A weighted sum of uncertainties and
+costs is the criterion of Mihaylova, Lefebvre, Bruyninckx, Gadeyne and De Schutter, "Active sensing
+for robotics - a survey", NM&A 2002 (docs/decisions/sensing_price.md has the others).
+
 Source: Greigarn, Branicky and Çavuşoğlu, "Task-oriented active sensing via action entropy
 minimization", IEEE Access, 2019; Algorithm 2 of the thesis that the configuration files come from.
 """
@@ -22,6 +28,7 @@ import numpy as np
 from holdfast import _kernel, checked, numerics
 from holdfast.arrays import FloatArray, in_brief
 from holdfast.belief import Belief, estimate
+from holdfast.circular import embedded, unwrapped
 from holdfast.config.settings import NEIGHBOR_ESTIMATORS, PlanningSettings, estimator_of
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.estimators import (
@@ -38,7 +45,15 @@ from holdfast.estimators import (
 )
 from holdfast.expected_return import expected_returns
 from holdfast.policy_path import path_points
-from holdfast.problem_attributes import has_general_observations, resolution_of
+from holdfast.problem_attributes import (
+    circular_actions,
+    circular_observation,
+    circular_states,
+    has_circular_observations,
+    has_general_observations,
+    resolution_of,
+    sensing_costs,
+)
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Stream, Words
 
@@ -48,6 +63,9 @@ __all__ = ["SensingInfo", "choose_sensing_action"]
 # Substreams of the stream of hypotheses; 1 is the kernel's own, for the observation noise.
 _HORIZON_MOTION = 2
 _GENERAL_OBSERVATIONS = 3
+
+_ROUNDING = 2.0**-40
+"""Relative difference below which two scores differ by rounding alone."""
 
 _LARGEST_BLOCK = 2**20
 """Coordinates of the beliefs that are predicted at the same time: 8 MB."""
@@ -63,17 +81,23 @@ class SensingInfo(NamedTuple):
         ``action_covariance`` the trace of the covariance, in the actions' units squared, or in
         resolutions squared where there is one for each coordinate; for ``expected_return`` the
         return less the price of sensing, negated and up to a constant; None for ``random`` and
-        ``fixed``.
+        ``fixed``. If sensing is optional, a last entry stands for not sensing: J is one more.
     samples : array of shape (J, M) or None
-        The entropies of the single hypothetical observations, whose means ``entropies`` are.
+        The entropies of the single hypothetical observations, whose means ``entropies`` are. Those
+        of not sensing differ by the motion of later steps alone (``horizon`` above 1).
     likelihoods, visits : int
         Work done: likelihoods evaluated and distances between points computed.
+    prices : array of shape (J,) or None
+        ``selector.nats_per_cost`` times the costs, in the unit of the entropies: what was chosen
+        has the least sum of both. None if no cost counts, and for ``expected_return``, whose
+        returns are less by the prices.
     """
 
     entropies: FloatArray | None
     samples: FloatArray | None
     likelihoods: int
     visits: int
+    prices: FloatArray | None = None
 
 
 def choose_sensing_action(
@@ -85,6 +109,10 @@ def choose_sensing_action(
     selection: Stream,
 ) -> tuple[int, SensingInfo]:
     """Choose a sensing action for a belief: an index, the lowest of equally good ones.
+
+    If ``selector.sensing_is_optional``, the index ``len(problem.sensing_actions)`` is the choice
+    not to sense. It wins where nothing gains more than its price: of equally good choices it is the
+    one without effort.
 
     The stream ``hypotheses`` has the random numbers of the hypothetical observations, ``selection``
     the one of the method ``random``.
@@ -98,15 +126,21 @@ def choose_sensing_action(
     """
     selector = settings.selector
     count = len(problem.sensing_actions)
+    choices = count + 1 if selector.sensing_is_optional else count
     if selector.method == "fixed":
-        if selector.sensing_action >= count:
+        if selector.sensing_action >= choices:
+            not_sensing = (
+                f" (and {count}, not to sense, if selector.sensing_is_optional is true)"
+                if selector.sensing_action == count
+                else ""
+            )
             raise InvalidValueError(
                 f"selector.sensing_action {selector.sensing_action}: {problem.name} has sensing "
-                f"actions 0 to {count - 1}"
+                f"actions 0 to {count - 1}{not_sensing}"
             )
         return selector.sensing_action, SensingInfo(None, None, 0, 0)
     if selector.method == "random":
-        return int(float(selection.uniform()) * count), SensingInfo(None, None, 0, 0)
+        return int(float(selection.uniform()) * choices), SensingInfo(None, None, 0, 0)
 
     if selector.method == "expected_return":
         return _greatest_return(problem, settings, belief, stage, hypotheses)
@@ -117,22 +151,33 @@ def choose_sensing_action(
     else:
         sets, factors = points_of(belief.states, stage)[np.newaxis], (1.0,)
     estimator = _estimator(problem, settings, belief, sets[0])
+    sets = _on_a_line(problem, settings, sets)
     points = sets.reshape(-1, sets.shape[-1])
     threads = settings.active_sensing.num_cores
     size = settings.active_sensing.num_observation_samples
     hypothetical = _hypotheses(problem, belief, range(count), size, hypotheses)
+    kernel_points = scaled(points, estimator)
     entropies, samples, likelihoods, visits = hypothetical.entropies(
-        scaled(points, estimator), estimator, threads, factors
+        kernel_points, estimator, threads, factors
     )
+    if selector.sensing_is_optional:
+        unchanged, more_visits = _entropy_now(belief, kernel_points, estimator, threads, factors)
+        entropies = np.append(entropies, unchanged)
+        samples = np.vstack([samples, np.full(size, unchanged)])
+        visits += more_visits
     if settings.active_sensing.horizon > 1 and not np.isnan(entropies).any():
         weights = hypothetical.weights(estimator.drops_negligible)
+        if selector.sensing_is_optional:
+            same = _kernel.normalize(numerics.log(belief.weights), estimator.drops_negligible)[0]
+            weights = _with_unchanged(weights, same)
         later = _later_entropies(
             problem, settings, belief.states, weights, stage, hypotheses, estimator, points_of
         )
         samples = samples + later
         entropies = _row_means(samples)
-    index = int(entropies.argmin())
-    # argmin finds a NaN, if there is one.
+    prices = _prices(problem, settings)
+    scores = entropies if prices is None else entropies + prices
+    index = _least(scores, optional=selector.sensing_is_optional)
     if entropies[index] != entropies[index]:
         raise ProblemError(
             f"the entropy after sensing action {index} of {problem.name} is not a number: a "
@@ -142,7 +187,55 @@ def choose_sensing_action(
         # After the choice: what is the same for all must not decide it by its rounding.
         volume = estimator.log_volume * sum(factors) * _total_factor(settings)
         entropies, samples = entropies + volume, samples + volume
-    return index, SensingInfo(entropies, samples, likelihoods, visits)
+    return index, SensingInfo(entropies, samples, likelihoods, visits, prices)
+
+
+def _least(scores: FloatArray, *, optional: bool) -> int:
+    """Return the choice with the least score; a NaN, if there is one.
+
+    If sensing is optional, the last choice is not to sense. It also wins if it is worse by no more
+    than rounding, as where all actions are alike already.
+    """
+    index = int(scores.argmin())
+    # A comparison with NaN is false.
+    if optional and scores[-1] - scores[index] <= _ROUNDING * abs(scores[-1]):
+        return len(scores) - 1
+    return index
+
+
+def _prices(problem: Problem, settings: PlanningSettings) -> FloatArray | None:
+    """Return what the entropy of each choice is raised by; None if no cost counts."""
+    rate = settings.selector.nats_per_cost
+    if rate == 0.0:
+        return None
+    optional = settings.selector.sensing_is_optional
+    return rate * sensing_costs(problem, otherwise=1.0, optional=optional)
+
+
+def _entropy_now(
+    belief: Belief,
+    points: FloatArray,
+    estimator: KernelEstimator,
+    threads: int,
+    factors: tuple[float, ...],
+) -> tuple[float, int]:
+    """Return the entropy of the belief as it is, and the visits."""
+    found, _, visits, _ = _kernel.entropies(
+        np.ascontiguousarray(points),
+        numerics.log(belief.weights)[np.newaxis],
+        True,
+        *estimator.parameters,
+        threads,
+        factors,
+        estimator.prior,
+    )
+    return float(found[0]), visits
+
+
+def _with_unchanged(weights: FloatArray, same: FloatArray) -> FloatArray:
+    """Append to posteriors, shape (J, M, N), those of not sensing: M times the same weights."""
+    rows = np.broadcast_to(same, (1, *weights.shape[1:]))
+    return np.concatenate([weights, rows])
 
 
 def _total_factor(settings: PlanningSettings) -> float:
@@ -158,19 +251,24 @@ def _greatest_return(
     problem: Problem, settings: PlanningSettings, belief: Belief, stage: int, hypotheses: Stream
 ) -> tuple[int, SensingInfo]:
     likelihoods = 0
+    not_sensing = len(problem.sensing_actions)
 
     def posteriors(
         actions: Sequence[int], samples: int, stream: Stream
     ) -> tuple[list[int], FloatArray]:
         nonlocal likelihoods
-        likelihoods += len(actions) * samples * belief.weights.shape[0]
-        hypothetical = _hypotheses(problem, belief, actions, samples, stream)
-        return _stratified(belief.weights, samples, stream), hypothetical.weights(False)
+        sensing = [action for action in actions if action != not_sensing]
+        likelihoods += len(sensing) * samples * belief.weights.shape[0]
+        weights = _hypotheses(problem, belief, sensing, samples, stream).weights(False)
+        if len(sensing) < len(actions):
+            weights = _with_unchanged(weights, belief.weights)
+        return _stratified(belief.weights, samples, stream), weights
 
     returns = expected_returns(problem, settings, belief, stage, hypotheses, posteriors)
     # What is least: as for the other methods.
     losses = -returns.means
-    return int(losses.argmin()), SensingInfo(losses, -returns.samples, likelihoods, 0)
+    index = _least(losses, optional=settings.selector.sensing_is_optional)
+    return index, SensingInfo(losses, -returns.samples, likelihoods, 0)
 
 
 def _points_of(
@@ -186,6 +284,15 @@ def _points_of(
     return lambda states, stage: checked.policy(problem, states, stage)
 
 
+def _on_a_line(problem: Problem, settings: PlanningSettings, sets: FloatArray) -> FloatArray:
+    """Return sets of points, shape (..., n, d), as the kernel takes them, which knows no angles."""
+    method = settings.selector.method
+    angles = circular_states if method == "state_entropy" else circular_actions
+    if not (circular := angles(problem)):
+        return sets
+    return (embedded if method == "action_covariance" else unwrapped)(sets, circular)
+
+
 def _estimator(
     problem: Problem, settings: PlanningSettings, belief: Belief, points: FloatArray
 ) -> KernelEstimator:
@@ -198,7 +305,10 @@ def _estimator(
     if selector.method == "action_covariance":
         if not each_its_own:
             return TOTAL_VARIANCE
-        return TOTAL_VARIANCE._replace(scale=scale_of(np.asarray(resolution), dimension)[0])
+        scale, _ = scale_of(np.asarray(resolution), dimension)
+        # An angle has two coordinates there.
+        scale = np.concatenate([scale, scale[list(circular_actions(problem))]])
+        return TOTAL_VARIANCE._replace(scale=scale)
     kind = estimator_of(selector, points.shape[0])
     if kind in NEIGHBOR_ESTIMATORS:
         neighbors = settings.active_sensing.num_nearest_neighbors
@@ -239,10 +349,11 @@ class _GaussianHypotheses(NamedTuple):
 
     ``arguments`` are what its functions take: the particles' weights, N; the sizes of the
     observations, D in all; their means in each particle's state, (D, N); their variances, (D, N),
-    or (D, 1) where none depends on the state; M; and the words of the stream.
+    or (D, 1) where none depends on the state; M; the words of the stream; and, unless none is an
+    angle, whether each of the D is one.
     """
 
-    arguments: tuple[FloatArray, list[int], FloatArray, FloatArray, int, Words]
+    arguments: tuple[FloatArray, list[int], FloatArray, FloatArray, int, Words, list[int]]
 
     def entropies(
         self,
@@ -264,7 +375,7 @@ class _GaussianHypotheses(NamedTuple):
     def weights(self, drop_negligible: bool) -> FloatArray:
         """Return the posteriors' weights, shape (J, M, N)."""
         weights = _kernel.hypothetical_weights(*self.arguments, drop_negligible)
-        _, sizes, _, _, samples, _ = self.arguments
+        _, sizes, _, _, samples, _, _ = self.arguments
         return weights.reshape(len(sizes), samples, -1)
 
 
@@ -322,7 +433,14 @@ def _hypotheses(
     if not usable or not numerics.all_finite(predicted):
         for action, (mean, variance) in zip(actions, found, strict=True):
             checked.require_usable(problem, action, mean, variance)
-    return _GaussianHypotheses((belief.weights, sizes, predicted, variances, samples, stream.words))
+    angles = [
+        int(coordinate in circular_observation(problem, action, size))
+        for action, size in zip(actions, sizes, strict=True)
+        for coordinate in range(size if has_circular_observations(problem) else 0)
+    ]
+    return _GaussianHypotheses(
+        (belief.weights, sizes, predicted, variances, samples, stream.words, angles)
+    )
 
 
 def _general_hypotheses(
@@ -385,7 +503,11 @@ def _later_entropies(
             for row, each in enumerate(own):
                 # One by one, as in planning: the policy of a user who does not keep to exact
                 # operations may have other bits for many estimates at once.
-                estimated = estimate(Belief(states[row], each), settings.particle_filter.estimate)
+                estimated = estimate(
+                    Belief(states[row], each),
+                    settings.particle_filter.estimate,
+                    circular_states(problem),
+                )
                 stages[row] = checked.next_stage(problem, estimated, stages[row])
                 commanded = checked.policy(problem, estimated, stages[row])
                 actions[row] = checked.executed_action(problem, commanded)
@@ -395,8 +517,10 @@ def _later_entropies(
             points = _points_by_stage(points_of, states, stages)
             flat_states = states.reshape(-1, states.shape[-1])
             _require_bounded(problem, points, flat_states, "the predicted state")
+            sets = _on_a_line(problem, settings, points.reshape(len(own), -1, points.shape[1]))
+            rows_of_points = scaled(sets.reshape(-1, sets.shape[-1]), estimator)
             later[block] += factor * _kernel.entropies_of_each(
-                scaled(points, estimator).reshape(len(own), -1, points.shape[1]),
+                rows_of_points.reshape(sets.shape),
                 own,
                 *estimator.parameters,
                 sensing.num_cores,

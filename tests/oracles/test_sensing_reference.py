@@ -564,6 +564,7 @@ def test_both_paths_imagine_from_the_same_particles(kind: str, samples: int) -> 
             np.full((1, 1), 1e-8),
             samples,
             hypotheses.words,
+            [],
             True,
         ).reshape(samples, count)
         assert (posteriors.max(axis=1) == 1.0).all()

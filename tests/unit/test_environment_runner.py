@@ -25,7 +25,7 @@ from holdfast.protocol.events import (
     Sensed,
 )
 from holdfast.randomness import Stream
-from holdfast.robot.environment import Environment, EnvironmentMaker, SimulatedEnvironment
+from holdfast.robot.environment import LATER, Environment, EnvironmentMaker, SimulatedEnvironment
 from holdfast.robot.environment_runner import (
     EnvironmentRunner,
     InlineRunner,
@@ -642,3 +642,94 @@ class TestMakePerformer:
         )
         with pytest.raises(EnvironmentFailedError):
             maker(0)
+
+
+class TestShown:
+    """What moves show, and observations that come later."""
+
+    @staticmethod
+    def late_robot(late: Any = (), **answers: Any) -> Robot:
+        robot = Robot(perform_sensing=LATER, **answers)
+        robot.late_observations = lambda: late  # type: ignore[attr-defined]
+        return robot
+
+    def test_a_move_shows_its_motion_and_an_observation(self, bench: Bench) -> None:
+        shown = MoveResult(-2.0, [0.1, 0.2], np.array([3], dtype=np.int32))
+        runner = bench.begin(Robot(perform=shown))
+        runner.perform(0, ACTION)
+        acted = bench.event()
+        assert isinstance(acted, Acted)
+        assert acted.reward == -2.0
+        for came, expected in ((acted.motion, [0.1, 0.2]), (acted.observation, [3.0])):
+            assert came is not None
+            assert came.tolist() == expected
+            assert came.dtype == np.float64
+            assert not came.flags.writeable
+        assert acted.ending is None
+
+    def test_an_ending_has_a_reason_of_one_line(self, bench: Bench) -> None:
+        ending = Ending("failed", "hit\n  the \x1b[2Jwall " + 300 * "!")
+        runner = bench.begin(Robot(is_done=False))
+        robot = bench.opened[-1].runner.environment
+        assert isinstance(robot, Robot)
+        robot.answers["is_done"] = ending
+        runner.perform(0, ACTION)
+        acted = bench.event()
+        assert isinstance(acted, Acted)
+        assert acted.ending is not None
+        assert acted.ending.outcome == "failed"
+        assert acted.ending.reason.startswith("hit the \\x1b[2Jwall !!!")
+        assert len(acted.ending.reason) == 200
+
+    def test_an_observation_comes_with_a_later_move(self, bench: Bench) -> None:
+        runner = bench.begin(self.late_robot([(0, [1.5])]))
+        runner.sense(0, 1)
+        assert bench.event() == Sensed(0, None)
+        runner.perform(0, ACTION)
+        acted = bench.event()
+        assert isinstance(acted, Acted)
+        ((step, observation),) = acted.late
+        assert (step, observation.tolist()) == (0, [1.5])
+
+    def test_later_needs_a_way_to_come(self, bench: Bench) -> None:
+        runner = bench.begin(Robot(perform_sensing=LATER))
+        runner.sense(0, 1)
+        assert "there is no late_observations() that could return" in bench.failure().text
+
+    @pytest.mark.parametrize(
+        ("shown", "message"),
+        [
+            (MoveResult(motion="far"), "MoveResult whose motion is an array of 1 to 4096 numbers"),
+            (MoveResult(motion=[]), "MoveResult whose motion is an array of 1 to 4096 numbers"),
+            (MoveResult(observation=1.0), "MoveResult whose observation is an array"),
+            (MoveResult(observation=[np.nan]), "finite numbers"),
+            (MoveResult(reward=np.inf), "a finite number, the reward, or None"),
+        ],
+    )
+    def test_what_a_move_cannot_show(self, shown: Any, message: str, bench: Bench) -> None:
+        runner = bench.begin(Robot(perform=shown))
+        runner.perform(0, ACTION)
+        failed = bench.failure()
+        assert message in failed.text
+        assert failed.action_in_doubt
+
+    @pytest.mark.parametrize(
+        ("late", "message"),
+        [
+            (None, "returned None; it must return a list of (step, observation)"),
+            ("late", "a list of (step, observation)"),
+            ([3.0], "a list of (step, observation)"),
+            ([(0.5, [1.0])], "a whole number >= 0"),
+            ([(0, "far")], "a list of (step, observation) with observations of shape (n,)"),
+            ([(0, [np.nan])], "finite numbers"),
+        ],
+    )
+    def test_what_cannot_come_late(self, late: Any, message: str, bench: Bench) -> None:
+        """The move itself is known: its reward is not lost."""
+        runner = bench.begin(self.late_robot(late))
+        runner.perform(0, ACTION)
+        failed = bench.failure()
+        assert message in failed.text
+        assert failed.what == "late_observations"
+        assert not failed.action_in_doubt
+        assert failed.performed == Acted(0, -1.0, None)

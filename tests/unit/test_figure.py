@@ -11,13 +11,21 @@ from matplotlib.image import imread
 from tests.recordings import record_trial
 
 from holdfast.config.loader import load
-from holdfast.recording.figure import _draw_entropies, _draw_workspace, trial_figure
+from holdfast.numerics import wrapped
+from holdfast.recording.figure import (
+    _draw_entropies,
+    _draw_workspace,
+    _follow_turns,
+    trial_figure,
+)
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 class TestFigure:
-    @pytest.mark.parametrize("example", ["light_dark_room", "capsule_robot", "peg_in_hole_3d"])
+    @pytest.mark.parametrize(
+        "example", ["light_dark_room", "capsule_robot", "peg_in_hole_3d", "wrapping_heading"]
+    )
     def test_nothing_is_cut_off(self, tmp_path: Path, example: str) -> None:
         configuration = load(EXAMPLES / f"{example}.yaml")
         recorder = record_trial(configuration, trial=0)
@@ -110,3 +118,19 @@ class TestFigure:
             # The whole of the mark, not its edge.
             assert x_min < x < x_max
             assert y_min < y < y_max
+
+
+class TestTurns:
+    """A heading is drawn as a line without jumps, the estimate beside the truth."""
+
+    def test_with_a_true_state(self) -> None:
+        heading = np.linspace(3.0, 9.0, 50)
+        truth, estimates = wrapped(heading), wrapped(heading[:-1] + 0.1)
+        _follow_turns(estimates, truth)
+        np.testing.assert_allclose(truth, heading, atol=1e-12)
+        np.testing.assert_allclose(estimates, heading[:-1] + 0.1, atol=1e-12)
+
+    def test_without(self) -> None:
+        estimates = wrapped(np.linspace(3.0, -9.0, 50))
+        _follow_turns(estimates, np.empty(0))
+        np.testing.assert_allclose(estimates, np.linspace(3.0, -9.0, 50), atol=1e-12)

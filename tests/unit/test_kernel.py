@@ -50,6 +50,9 @@ for function, values in (
 ):
     note(function.__name__, *(function(values[n:2 * n + 1]) for n in (0, 1, 5, 9, 300, 3999)),
          function(values[np.isfinite(values)]), function(values[:16]))
+others = np.concatenate([wide[::-1], wide])
+note("arctan2", *(kernel.arctan2(np.tile(wide, 2)[n:2 * n + 1], others[n:2 * n + 1])
+                  for n in (0, 1, 5, 9, 300, 8005)))
 note("specials", *(np.isnan(f(wide)) for f in (kernel.exp, kernel.sin)), kernel.exp(wide[8001:]))
 note("arcsin", np.array([kernel.arcsin(x) for x in np.linspace(-1.0, 1.0, 1001)]))
 note("normals", *(kernel.normals(words, n) for n in (0, 1, 2, 3, 7, 15, 16, 17, 1001)))
@@ -110,11 +113,12 @@ for count in (5, 100, 1001):
     states = draw.normal((count, 3))
     predicted = np.ascontiguousarray(np.concatenate([states.T, states.T[:2]]))
     weights = kernel.normalize(draw.substream(1).normal(count), False)[0]
-    for variance in (np.full((5, 1), 0.1), np.ascontiguousarray(0.1 + predicted**2)):
-        arguments = (weights, [1, 1, 1, 2], predicted, variance, 9, words)
+    for variance, circular in ((np.full((5, 1), 0.1), []), (np.full((5, 1), 0.1), [0, 1, 0, 0, 1]),
+                               (np.ascontiguousarray(0.1 + predicted**2), [])):
+        arguments = (weights, [1, 1, 1, 2], predicted, variance, 9, words, circular)
         found = kernel.hypothetical_entropies(
             *arguments, np.ascontiguousarray(-states), 0, 3, 0.05, 0.0, 0.0, 2, *alone)
-        note(f"hypotheses {count} {variance.shape}", *found[:2],
+        note(f"hypotheses {count} {variance.shape} {circular}", *found[:2],
              kernel.hypothetical_weights(*arguments, True),
              kernel.hypothetical_weights(*arguments, False))
 

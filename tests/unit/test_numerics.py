@@ -51,6 +51,14 @@ class TestAccuracy:
     def test_log(self, low: float, high: float) -> None:
         assert units_in_the_last_place(numerics.log, np.log, uniform(low, high)) < 2.0
 
+    @pytest.mark.parametrize("size", [1.0, 1e-3, 1e3])
+    def test_arctan2(self, size: float) -> None:
+        """All around the circle, in vectors of very different lengths, also beside the axes."""
+        y, x = uniform(-1.0, 1.0), uniform(-size, size, 1)
+        expected = np.arctan2(y.astype(np.longdouble), x.astype(np.longdouble))
+        error = np.abs(numerics.arctan2(y, x).astype(np.longdouble) - expected)
+        assert float((error / np.spacing(np.abs(expected).astype(np.float64))).max()) < 2.0
+
     def test_log_of_every_order_of_magnitude(self) -> None:
         """From the smallest subnormal number to the largest of all."""
         exponents = (STREAM.substream(2).uniform(COUNT) * 2098).astype(np.int64) - 1074
@@ -183,3 +191,24 @@ class TestForm:
             assert not np.shares_memory(function(x), x)
         numerics.sum(x)
         numerics.weighted_mean(x.reshape(-1, 1), x)
+
+
+class TestAngles:
+    def test_the_axes_and_the_origin(self) -> None:
+        found = numerics.arctan2([0.0, 1.0, 0.0, -1.0, 0.0, -0.0], [1.0, 0.0, -1.0, 0.0, 0.0, -1.0])
+        assert found.tolist() == [0.0, np.pi / 2, np.pi, -np.pi / 2, 0.0, np.pi]
+        assert np.isnan(numerics.arctan2([np.nan, 1.0], [1.0, np.nan])).all()
+
+    def test_shapes_broadcast(self) -> None:
+        y = STREAM.normal((4, 1, 3))
+        found = numerics.arctan2(y, 1.0)
+        assert found.shape == y.shape
+        assert numerics.arctan2(y, np.ones((5, 1))).shape == (4, 5, 3)
+        np.testing.assert_allclose(found, np.arctan(y), rtol=1e-15)
+
+    def test_wrapped_is_the_shorter_way_round(self) -> None:
+        angles = uniform(-50.0, 50.0)
+        found = numerics.wrapped(angles)
+        assert np.abs(found).max() <= np.pi
+        np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * angles), atol=1e-13)
+        assert numerics.wrapped([3.0, -3.0, 0.5]).tolist() == [3.0, -3.0, 0.5]

@@ -15,6 +15,7 @@ from holdfast.outcome import TrialResult
 from holdfast.recording.csv_export import CsvSink
 from holdfast.recording.facts import (
     EventFact,
+    LateFact,
     SensingFact,
     TaskFact,
     TrialBeginFact,
@@ -38,6 +39,9 @@ class Collected:
         self.facts.append(fact)
 
     def acted(self, fact: TaskFact) -> None:
+        self.facts.append(fact)
+
+    def observed_late(self, fact: LateFact) -> None:
         self.facts.append(fact)
 
     def trial_ends(self, fact: TrialEndFact) -> None:

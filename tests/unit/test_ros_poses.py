@@ -87,6 +87,21 @@ def test_covariance_is_that_of_the_weighted_particles() -> None:
     )
 
 
+def test_the_covariance_of_a_heading_goes_round_the_circle() -> None:
+    problem = problem_with(("yaw", "x"), state_size=2)
+    turned = RANDOM.normal(size=(200, 2)) * [0.1, 1.0]
+    west = turned + np.array([np.pi, 0.0])
+    west[:, 0] = np.where(west[:, 0] > np.pi, west[:, 0] - 2.0 * np.pi, west[:, 0])
+    problem.circular = (0,)
+    layout = pose_layout(problem)
+    assert layout is not None
+    np.testing.assert_allclose(
+        layout.covariance(Belief.uniform(west)),
+        layout.covariance(Belief.uniform(turned)),
+        atol=1e-12,
+    )
+
+
 def test_a_vertical_plane_stands_upright() -> None:
     layout = pose_layout(problem_class("peg_in_hole_2d")())
     assert layout is not None

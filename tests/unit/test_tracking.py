@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ class Cart(ProblemBase):
     name = "cart"
     state_size = 1
     action_size = 1
-    sensing_actions = ("look",)
+    sensing_actions: Sequence[str] = ("look",)
     motion_variance = np.array([0.01])
 
     def initial_states(self, stream: Stream, count: int) -> FloatArray:

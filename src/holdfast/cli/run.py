@@ -191,6 +191,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def _run(options: RunOptions) -> int:
     from holdfast.cli.robot_run import RobotFindings, is_robot_run, run_as_robot
+    from holdfast.planning import Planner
     from holdfast.recording.recorder import Recorder
     from holdfast.recording.run_directory import (
         FIGURE_NAME,
@@ -231,7 +232,7 @@ def _run(options: RunOptions) -> int:
         before, now = directory.services_before, configuration.offload.services
         if before is not None and before != now:
             notes.note(f"the run had {_listed(before)} before, and goes on with {_listed(now)}")
-        recorder = Recorder(trial=0)
+        recorder = Recorder(0, Planner(configuration.problem, configuration.planning))
         robot = RobotFindings()
         summary: RunSummary | None = None
         started = perf_counter()

@@ -143,7 +143,11 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     sensing_action : int
         What ``fixed`` chooses.
     sensing_is_optional : bool
-        Whether the choice may be not to sense, at no price.
+        Whether not to sense is a choice, too: the one whose number is that of the sensing actions.
+    nats_per_cost : float
+        What a unit of the problem's ``sensing_costs`` is worth in nats of entropy, for the methods
+        that minimise one (for ``action_covariance`` in the unit of its trace). A problem without
+        costs counts 1 for each sensing action. With 0 no cost counts.
     estimator : Estimator or None
         ``prior_neighbors`` has less bias where a sharp observation leaves few particles: 300 choose
         about as well as 1,000 with ``nearest_neighbor``. A mixture takes few particles for
@@ -181,6 +185,7 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     method: Method = "path_entropy"
     sensing_action: NonNegativeCount = 0
     sensing_is_optional: bool = False
+    nats_per_cost: Annotated[float, msgspec.Meta(ge=0.0, le=1e150)] = 0.0
     estimator: Estimator | None = None
     actions: Literal["commanded", "executed"] = "commanded"
     resolution: Resolution | Resolutions | None = None
@@ -307,12 +312,16 @@ class EnvironmentSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
         Plain data, passed to the class as keyword arguments.
     timeout_ms : float
         Any call of the environment that takes longer has failed.
+    sense_in_background : bool
+        Whether the robot goes on while it senses; ``perform_sensing`` and ``perform`` then run at
+        the same time.
     """
 
     object: Text | None = None
     directory: Text | None = None
     arguments: dict[str, Any] = msgspec.field(default_factory=dict)
     timeout_ms: Milliseconds = 60_000.0
+    sense_in_background: bool = False
 
 
 class PlanningSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -154,6 +154,14 @@ class Problem(Protocol):
     states have the actions' resolution, which must then be one number, or an action must have as
     many coordinates as a state.
 
+    It may say which coordinates are angles in radians, so that pi is -pi: ``circular`` of a state,
+    ``circular_actions`` of a task action, both as indices (``(2,)``), and ``circular_observations``
+    of observations, a sequence of indices for each sensing action (``((), (0,))``: the second one
+    shows a bearing). Means, spreads, innovations and entropies then go round the circle the shorter
+    way. The functions of the problem may be given any whole number of turns more or less, and take
+    ``numerics.wrapped(goal - heading)`` for a difference of angles. Noise on an observed angle is
+    that of its shorter way round, so its standard deviation should be below one radian.
+
     It may have ``sensing_costs``, the price of each sensing action in units of reward, numbers
     from 0 to 1e150. A trial's reward is less by it at each sensing, and ``expected_return`` weighs
     it against what sensing gains. Without this attribute sensing costs nothing.
@@ -369,6 +377,9 @@ class ProblemBase:
     num_stages: int = 1
     resolution: float | FloatArray = 0.1
     state_resolution: float | FloatArray | None = None
+    circular: Sequence[int] = ()
+    circular_actions: Sequence[int] = ()
+    circular_observations: Sequence[Sequence[int]] = ()
     motion_variance: FloatArray = np.array([0.01])
     state_labels: Sequence[str] = ()
     pose: Sequence[str | None] = ()

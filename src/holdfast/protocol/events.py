@@ -84,21 +84,6 @@ class CallEnded(NamedTuple):
 TransportEvent: TypeAlias = ServiceAppeared | ServiceVanished | ReplyReceived | CallEnded
 
 
-class EnvironmentReady(NamedTuple):
-    """The environment of a trial was made.
-
-    Attributes
-    ----------
-    ending : Ending or None
-        How its task has ended; None if it goes on.
-    steps_performed : int or None
-        Task actions performed in this trial, counted by the environment; None if it does not count.
-    """
-
-    ending: Ending | None
-    steps_performed: int | None
-
-
 class Sensed(NamedTuple):
     """A sensing action was performed; the observation is finite and read-only.
 
@@ -127,6 +112,27 @@ class Acted(NamedTuple):
     ending: Ending | None
     motion: FloatArray | None = None
     observation: FloatArray | None = None
+    late: tuple[LateObservation, ...] = ()
+
+
+class EnvironmentReady(NamedTuple):
+    """The environment of a trial was made.
+
+    Attributes
+    ----------
+    ending : Ending or None
+        How its task has ended; None if it goes on.
+    steps_performed : int or None
+        Task actions performed in this trial, counted by the environment; None if it does not count.
+    last : Acted or None
+        What the last of these has shown; of a resumed trial, if the environment can still tell.
+    late : tuple of LateObservation
+        Of a resumed trial: observations that have come meanwhile.
+    """
+
+    ending: Ending | None
+    steps_performed: int | None
+    last: Acted | None = None
     late: tuple[LateObservation, ...] = ()
 
 

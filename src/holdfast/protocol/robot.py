@@ -46,10 +46,12 @@ from holdfast.protocol.question import DecisionSource, Provenance, Question, sam
 from holdfast.protocol.records import (
     DIVERGENCE_RUN,
     ActingRecord,
+    LateRecord,
     LocalTookOverRecord,
     PausedRecord,
     PerformedRecord,
     Record,
+    ReinitialisedRecord,
     TrialHistory,
 )
 from holdfast.protocol.status import Status
@@ -67,6 +69,13 @@ _TICKS_INTERVAL_S = 1.0
 
 _MAX_REPORTS = 10
 """Bound on reports of each kind about unexplained observations per trial; all are counted."""
+
+
+def _has_shown(record: Record) -> bool:
+    """Return whether a record has what neither the decisions nor a simulated world can tell."""
+    if isinstance(record, PerformedRecord):
+        return bool(record.motion or record.observation)
+    return isinstance(record, LateRecord | ReinitialisedRecord)
 
 
 class Robot:
@@ -189,8 +198,10 @@ class Robot:
         if resumed:
             self._effects.report("resumed_trial", trial=trial, step=history.state.step)
         try:
-            again = self._settle_pending_action(begun.steps_performed, resumed, tail_is_certain)
-        except UnknownPerformanceError as error:
+            again = self._settle_pending_action(begun, resumed, tail_is_certain)
+            for late in begun.late:
+                self._came_late(late)
+        except HoldfastError as error:
             self._stop(error)
             return self._take()
         if again is not None:
@@ -202,10 +213,10 @@ class Robot:
         return self._take()
 
     def _settle_pending_action(
-        self, performed: int | None, resumed: bool, tail_is_certain: bool
+        self, begun: EnvironmentReady, resumed: bool, tail_is_certain: bool
     ) -> FloatArray | None:
         """Return the pending task action if it was not performed and must be performed now."""
-        history = self._current_history
+        history, performed = self._current_history, begun.steps_performed
         known = history.state.step
         where = f"trial {self._trial}, step {history.state.step}"
         if performed is None:
@@ -223,10 +234,8 @@ class Robot:
                 "trial anew in another directory (--out)"
             )
         if history.pending is not None and performed == known + 1:
-            record = PerformedRecord(known, None)
-            self._unwritten.append(record)
             self._effects.report("performed_unseen", trial=self._trial, step=known)
-            history.performed(record)
+            self._fold_move(begun.last or Acted(known, None, None))
             return None
         if performed != known:
             raise UnknownPerformanceError(
@@ -350,22 +359,25 @@ class Robot:
             )
 
     def _performed(self, event: Acted) -> None:
-        history = self._current_history
         self._ending = event.ending
+        try:
+            self._fold_move(event)
+            for late in event.late:
+                self._came_late(late)
+        except HoldfastError as error:
+            self._stop(error)
+
+    def _fold_move(self, event: Acted) -> None:
+        """Fold in what a performed task action has shown."""
         motion, shown = (
             b"" if each is None else encode_floats(each)
             for each in (event.motion, event.observation)
         )
         record = PerformedRecord(event.step, event.reward, motion, shown)
         self._unwritten.append(record)
-        try:
-            info = history.performed(record)
-            if info is not None:
-                self._judge(event.step, info, of="move")
-            for late in event.late:
-                self._came_late(late)
-        except HoldfastError as error:
-            self._stop(error)
+        info = self._current_history.performed(record)
+        if info is not None:
+            self._judge(event.step, info, of="move")
 
     def _came_late(self, late: LateObservation) -> None:
         """Fold in an observation of an earlier step."""
@@ -555,6 +567,8 @@ class Robot:
         history = self._current_history
         self._report_ticks(now)
         self._count_recoveries()
+        if any(_has_shown(record) for record in self._unwritten):
+            self._write()
         result = history.result(self._ending)
         self._history = None
         self._unwritten = []  # the result says all of it

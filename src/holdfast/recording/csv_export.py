@@ -16,10 +16,12 @@ from typing import Any, Self, TextIO
 
 from holdfast.arrays import FloatArray
 from holdfast.belief import Belief
+from holdfast.problem_attributes import choice_labels
 from holdfast.problems.problem import Problem
 from holdfast.recording.facts import (
     Decider,
     EventFact,
+    LateFact,
     SensingFact,
     TaskFact,
     TrialBeginFact,
@@ -36,7 +38,7 @@ class CsvSink:
     """Writes the facts of a run as tables; to be used in a ``with`` statement."""
 
     def __init__(self, directory: Path, problem: Problem) -> None:
-        self._actions = [str(label) for label in problem.sensing_actions]
+        self._choices = choice_labels(problem)
         self._began_ns = 0
         self._sensing: SensingFact | None = None
         self._labels = state_labels(problem)
@@ -48,7 +50,10 @@ class CsvSink:
             self._trials, _, self._beliefs, self._events = map(_writer, self._files)
             self._close = stack.pop_all()
         self._trials.writerow(
-            ["trial", "began", "ended", "seed", "outcome", "success", "steps", "reward", "digest"]
+            [
+                *("trial", "began", "ended", "seed", "outcome", "success", "steps", "reward"),
+                *("digest", "reason"),
+            ]
         )
         self._steps = csv.DictWriter(
             self._files[1],
@@ -59,7 +64,7 @@ class CsvSink:
                 "sensing_action",
                 "sensing_action_label",
                 "observation",
-                *(f"entropy_{index}" for index in range(len(self._actions))),
+                *(f"entropy_{index}" for index in range(len(self._choices))),
                 "explained",
                 "mahalanobis_distance",
                 "effective_sample_size",
@@ -68,6 +73,8 @@ class CsvSink:
                 *(f"estimate {label}" for label in self._labels),
                 *(f"true {label}" for label in self._labels),
                 *(f"action_{index}" for index in range(problem.action_size)),
+                "motion",
+                "move_observation",
                 "reward",
                 "sensing_time",
                 "observation_time",
@@ -107,6 +114,12 @@ class CsvSink:
         self._write_step(fact.trial, fact.step, fact)
         self._write_belief(fact.trial, fact.step, "acting", fact.belief)
 
+    def observed_late(self, fact: LateFact) -> None:
+        """Write a late observation among the events: the row of its step is written."""
+        shown = {"trial": fact.trial, "step": fact.step, "taken": fact.taken}
+        shown["observation"] = fact.observation.tolist()
+        self.happened(EventFact(fact.time_ns, "late_observation", shown))
+
     def trial_ends(self, fact: TrialEndFact) -> None:
         """Write the row of the trial and the last belief, and a row if it ends in mid-step."""
         if self._sensing is not None:
@@ -119,7 +132,7 @@ class CsvSink:
                 _seconds(self._began_ns),
                 _seconds(fact.time_ns),
                 *(
-                    (None, "unfinished", None, fact.steps, None, None)
+                    (None, "unfinished", None, fact.steps, None, None, None)
                     if result is None
                     else (
                         result.seed,
@@ -128,6 +141,7 @@ class CsvSink:
                         result.steps,
                         result.reward,
                         result.digest,
+                        result.reason,
                     )
                 ),
             ]
@@ -145,7 +159,7 @@ class CsvSink:
             row |= {
                 "stage": sensing.stage,
                 "sensing_action": sensing.sensing_action,
-                "sensing_action_label": self._actions[sensing.sensing_action],
+                "sensing_action_label": self._choices[sensing.sensing_action],
                 "explained": None if sensing.explained is None else int(sensing.explained),
                 "mahalanobis_distance": sensing.mahalanobis_distance,
                 "effective_sample_size": sensing.effective_sample_size,
@@ -156,12 +170,13 @@ class CsvSink:
                 **_cells("entropy_{}", sensing.entropies),
                 **_decider_cells("sensing", sensing.decider),
             }
-            if sensing.observation is not None:
-                row["observation"] = " ".join(map(repr, sensing.observation.tolist()))
+            row["observation"] = _numbers(sensing.observation)
         if fact is not None:
             row |= {
                 "stage": fact.stage,
                 "reward": fact.reward,
+                "motion": _numbers(fact.motion),
+                "move_observation": _numbers(fact.observation),
                 "action_time": _seconds(fact.time_ns),
                 **_cells("estimate {}", fact.estimate, self._labels),
                 **_cells("true {}", fact.true_state, self._labels),
@@ -186,6 +201,10 @@ def state_labels(problem: Problem) -> list[str]:
     if len(set(labels)) == problem.state_size:
         return labels
     return [f"state_{index}" for index in range(problem.state_size)]
+
+
+def _numbers(values: FloatArray | None) -> str | None:
+    return None if values is None else " ".join(map(repr, values.tolist()))
 
 
 def _writer(file: io.TextIOBase) -> Any:

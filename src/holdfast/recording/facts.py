@@ -17,6 +17,7 @@ __all__ = [
     "Decider",
     "EventFact",
     "FactSink",
+    "LateFact",
     "SensingFact",
     "TaskFact",
     "TrialBeginFact",
@@ -53,8 +54,12 @@ class TrialBeginFact(NamedTuple):
 class SensingFact(NamedTuple):
     """A sensing action and its observation.
 
+    ``sensing_action`` may be the choice not to sense, one more than the last.
+
     Attributes
     ----------
+    observation : array or None
+        None too if it comes late, or never.
     decided_ns, observed_ns : int
         When it was chosen, and when its observation was part of the belief.
     state_digest : bytes
@@ -94,6 +99,8 @@ class TaskFact(NamedTuple):
         From which it was chosen, and the state with which the policy was evaluated.
     true_state : array of shape (state_size,) or None
         Before the action.
+    motion, observation : array or None
+        What the move has shown.
     """
 
     trial: int
@@ -106,6 +113,28 @@ class TaskFact(NamedTuple):
     estimate: FloatArray | None = None
     true_state: FloatArray | None = None
     reward: float | None = None
+    motion: FloatArray | None = None
+    observation: FloatArray | None = None
+
+
+class LateFact(NamedTuple):
+    """An observation that came late.
+
+    Attributes
+    ----------
+    step, taken : int
+        Task actions performed when it came, and when it was taken.
+    after : Belief
+        After it was folded in at its step, and all that followed again.
+    """
+
+    trial: int
+    step: int
+    time_ns: int
+    taken: int
+    observation: FloatArray
+    after: Belief
+    explained: bool
 
 
 class TrialEndFact(NamedTuple):
@@ -147,6 +176,9 @@ class FactSink(Protocol):
 
     def acted(self, fact: TaskFact) -> None:
         """Write a task action."""
+
+    def observed_late(self, fact: LateFact) -> None:
+        """Write an observation that came late."""
 
     def trial_ends(self, fact: TrialEndFact) -> None:
         """Write the end of a trial."""

@@ -28,11 +28,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from holdfast import checked
+from holdfast import checked, numerics
 from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration
 from holdfast.files import write_atomically
 from holdfast.outcome import Outcome
+from holdfast.problem_attributes import choice_labels, circular_states
 from holdfast.problems.problem import Problem, Scene
 from holdfast.recording.recorder import SensingRecord, TrialRecord
 
@@ -351,10 +352,21 @@ def _draw_workspace_legend(
     figure.legend(
         handles=handles,
         loc="outside lower center",
-        ncols=4 if max(map(len, problem.sensing_actions), default=0) <= _SHORT_LABEL else 3,
+        ncols=4 if max(map(len, _choices(problem, record))) <= _SHORT_LABEL else 3,
         columnspacing=1.6,
         handletextpad=0.6,
     )
+
+
+def _choices(problem: Problem, record: TrialRecord) -> list[str]:
+    """Return the labels of the sensing actions, and of not to sense where that was a choice."""
+    labels, count = choice_labels(problem), len(problem.sensing_actions)
+    is_optional = any(
+        sensing.sensing_action == count
+        or (sensing.entropies is not None and len(sensing.entropies) > count)
+        for sensing in record.sensing
+    )
+    return labels if is_optional else labels[:-1]
 
 
 def _action_handles(problem: Problem, record: TrialRecord) -> list[Line2D]:
@@ -362,7 +374,7 @@ def _action_handles(problem: Problem, record: TrialRecord) -> list[Line2D]:
     chosen = {sensing.sensing_action for sensing in record.sensing}
     compared = any(sensing.entropies is not None for sensing in record.sensing)
     handles = []
-    for action, name in enumerate(problem.sensing_actions):
+    for action, name in enumerate(_choices(problem, record)):
         if action in chosen:
             handles.append(_dot(*_style_of(action), fill(f"sensed {name}", 30), size=5.5))
         elif compared:
@@ -388,6 +400,8 @@ def _draw_coordinates(
     estimates = _stacked(record.estimates, problem.state_size)
     deviations = _stacked(record.standard_deviations, problem.state_size)
     truth = _stacked(record.true_states, problem.state_size)
+    for index in circular_states(problem):
+        _follow_turns(estimates[:, index], truth[:, index])
     steps = np.arange(len(estimates))
     for index, (panel, label) in enumerate(zip(panels, _labels(problem), strict=True)):
         mean, two = estimates[:, index], 2.0 * deviations[:, index]
@@ -414,6 +428,17 @@ def _draw_coordinates(
     panels[0].legend(handles=handles, columnspacing=1.2, handletextpad=0.5, **above)
 
 
+def _follow_turns(estimates: FloatArray, truth: FloatArray) -> None:
+    """Make a heading a line without jumps, in place; an estimate is as near the truth as it is."""
+    if len(truth):
+        truth[:] = np.unwrap(truth)
+        known = min(len(truth), len(estimates))
+        difference = estimates[:known] - truth[:known]
+        estimates[:known] = truth[:known] + numerics.wrapped(difference)
+    else:
+        estimates[:] = np.unwrap(estimates)
+
+
 def _scatter_sensing(panel: Axes, record: TrialRecord, heights: Sequence[float]) -> None:
     """Mark the sensing steps, one call for each sensing action."""
     height = np.asarray(heights, dtype=np.float64)
@@ -426,7 +451,8 @@ def _scatter_sensing(panel: Axes, record: TrialRecord, heights: Sequence[float])
 
 def _draw_choices(panel: Axes, problem: Problem, record: TrialRecord) -> None:
     """Draw a row for each sensing action, with a mark where it was chosen."""
-    count = len(problem.sensing_actions)
+    choices = _choices(problem, record)
+    count = len(choices)
     _scatter_sensing(panel, record, [float(sensing.sensing_action) for sensing in record.sensing])
     unexplained = [
         (sensing.step, float(sensing.sensing_action))
@@ -437,7 +463,7 @@ def _draw_choices(panel: Axes, problem: Problem, record: TrialRecord) -> None:
         x, y = zip(*unexplained, strict=True)
         size = 3.0 * _marker_size(record)
         panel.scatter(x, y, s=size, marker="x", color=_TRUE, linewidth=0.9, zorder=5)
-    labels = [fill(str(label), _LABEL_WIDTH) for label in problem.sensing_actions]
+    labels = [fill(label, _LABEL_WIDTH) for label in choices]
     size = 9.0 if max(map(len, labels), default=0) <= _LABEL_WIDTH else _SMALLEST
     panel.set_yticks(range(count), labels, fontsize=size)
     panel.set_ylim(count - 0.4, -0.6)
@@ -456,7 +482,6 @@ _SCORES = {
 
 def _draw_entropies(panel: Axes, configuration: Configuration, record: TrialRecord) -> None:
     """Draw every sensing action's score at each sensing step; the lowest was chosen."""
-    problem = configuration.problem
     panel.set_ylabel(_SCORES.get(configuration.planning.selector.method, ""), fontsize=_SMALLEST)
     panel.yaxis.set_major_locator(MaxNLocator(nbins=4))
     known = [sensing for sensing in record.sensing if sensing.entropies is not None]
@@ -487,7 +512,7 @@ def _draw_entropies(panel: Axes, configuration: Configuration, record: TrialReco
         columnspacing=1.2,
         handletextpad=0.3,
     )
-    for action in range(len(problem.sensing_actions)):
+    for action in range(entropies.shape[1]):
         color, marker = _style_of(action)
         won = chosen == action
         # The alternatives are hollow, so that the choice stands out.

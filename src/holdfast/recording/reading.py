@@ -21,8 +21,10 @@ from holdfast.belief import Belief
 from holdfast.config.loader import Configuration
 from holdfast.errors import OutputError
 from holdfast.outcome import TRIAL_COLUMNS, TrialResult
+from holdfast.planning import Planner
 from holdfast.recording.facts import (
     EventFact,
+    LateFact,
     SensingFact,
     TaskFact,
     TrialBeginFact,
@@ -47,9 +49,11 @@ class TrialArrays:
     sensing_steps, sensing_actions : array of shape (S,)
         The steps with a sensing action, and which action it was.
     observations : tuple of S arrays, or None
-        Each of shape ``(observation_size,)``; None, as all below, where they are not known.
-    entropies : array of shape (S, num_sensing_actions) or None
-        What was minimised, expected after each sensing action; NaN where nothing was.
+        Each of shape ``(observation_size,)``; of size 0 if the choice was not to sense, or if it
+        never came. One that came late is here, too. None, as all below, where they are not known.
+    entropies : array of shape (S, num_choices) or None
+        What was minimised, expected after each choice: the sensing actions and, if it may be
+        chosen, not to sense. NaN where nothing was.
     priors : tuple of S beliefs, or None
         Before each observation.
     beliefs : tuple of T + 1 beliefs, or None
@@ -63,6 +67,8 @@ class TrialArrays:
         NaN for a step without one.
     true_states : array of shape (T + 1, state_size) or None
         Of a simulated world.
+    motions, move_observations : tuple of T arrays, or None
+        What each move has shown; of size 0 for nothing.
     """
 
     trial: int
@@ -78,6 +84,8 @@ class TrialArrays:
     stages: IntArray | None
     rewards: FloatArray | None
     true_states: FloatArray | None
+    motions: tuple[FloatArray, ...] | None
+    move_observations: tuple[FloatArray, ...] | None
 
 
 @dataclass(frozen=True)
@@ -118,7 +126,8 @@ class RunArrays:
         if lacking := set(chosen).difference(self.trials):
             raise OutputError(f"{self.path}: has no trial {min(lacking)}")
         with RecordedRun(self.path, "open") as run:
-            sink = _Collector(len(run.configuration.problem.sensing_actions))
+            planner = Planner(run.configuration.problem, run.configuration.planning)
+            sink = _Collector(planner.num_choices)
             for trial in run.replay(chosen, [sink], rate_hz=1.0):
                 yield sink.collected(trial, run.configuration.problem.action_size)
 
@@ -151,17 +160,18 @@ def open_run(path: str | Path) -> RunArrays:
 class _Collector:
     """Collects the facts of one trial at a time."""
 
-    def __init__(self, num_sensing_actions: int) -> None:
-        self._no_entropies = np.full(num_sensing_actions, np.nan)
+    def __init__(self, num_choices: int) -> None:
+        self._no_entropies = np.full(num_choices, np.nan)
         self._beliefs_known = False
         self._sensing: list[SensingFact] = []
+        self._late: dict[int, FloatArray] = {}
         self._tasks: list[TaskFact] = []
         self._end: TrialEndFact | None = None
 
     def trial_begins(self, fact: TrialBeginFact) -> None:
         """Forget the trial before."""
         self._beliefs_known = fact.beliefs_known
-        self._sensing, self._tasks, self._end = [], [], None
+        self._sensing, self._tasks, self._end, self._late = [], [], None, {}
 
     def sensed(self, fact: SensingFact) -> None:
         """Keep a sensing action."""
@@ -170,6 +180,10 @@ class _Collector:
     def acted(self, fact: TaskFact) -> None:
         """Keep a task action."""
         self._tasks.append(fact)
+
+    def observed_late(self, fact: LateFact) -> None:
+        """Keep a late observation."""
+        self._late[fact.taken] = fact.observation
 
     def trial_ends(self, fact: TrialEndFact) -> None:
         """Keep the end."""
@@ -186,7 +200,7 @@ class _Collector:
         steps = np.array([each.step for each in sensing], dtype=np.int64)
         chosen = np.array([each.sensing_action for each in sensing], dtype=np.int64)
         if not self._beliefs_known:
-            return TrialArrays(trial, end.result, actions, steps, chosen, *[None] * 8)
+            return TrialArrays(trial, end.result, actions, steps, chosen, *[None] * 10)
         entropies = [
             self._no_entropies if each.entropies is None else each.entropies for each in sensing
         ]
@@ -200,7 +214,7 @@ class _Collector:
             steps,
             chosen,
             observations=tuple(
-                each.observation for each in sensing if each.observation is not None
+                _shown(self._late.get(each.step, each.observation)) for each in sensing
             ),
             entropies=np.array(entropies).reshape(-1, self._no_entropies.size),
             priors=tuple(each.before for each in sensing if each.before is not None),
@@ -209,4 +223,10 @@ class _Collector:
             stages=np.array([task.stage for task in tasks], dtype=np.int64),
             rewards=np.array(rewards, dtype=np.float64),
             true_states=np.array(true_states) if true_states else None,
+            motions=tuple(_shown(task.motion) for task in tasks),
+            move_observations=tuple(_shown(task.observation) for task in tasks),
         )
+
+
+def _shown(values: FloatArray | None) -> FloatArray:
+    return np.empty(0) if values is None else values

@@ -9,7 +9,8 @@ import numpy as np
 from holdfast.arrays import FloatArray
 from holdfast.belief import Belief, estimate, standard_deviation
 from holdfast.outcome import TrialResult
-from holdfast.planning import PlanningState
+from holdfast.planning import Planner, PlanningState
+from holdfast.problem_attributes import circular_states
 from holdfast.robot.environment import Environment
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver
 
@@ -74,14 +75,18 @@ class TrialRecord:
 class Recorder(TrialObserver):
     """An observer that records one trial and ignores all others.
 
+    A planner says what is estimated, and its problem which coordinates are angles; without one the
+    estimate is the mean.
+
     Attributes
     ----------
     record : TrialRecord
         Complete when ``record.result`` is not None.
     """
 
-    def __init__(self, trial: int) -> None:
+    def __init__(self, trial: int, planner: Planner | None = None) -> None:
         self.trial = trial
+        self._planner = planner
         self.record = TrialRecord()
 
     def trial_began(self, environment: Environment, state: PlanningState) -> None:
@@ -113,7 +118,7 @@ class Recorder(TrialObserver):
         mean = np.array(step.task_info.estimate, dtype=np.float64)
         self._keep_true_state(step.environment)
         self.record.estimates.append(mean)
-        self.record.standard_deviations.append(standard_deviation(step.state.belief))
+        self.record.standard_deviations.append(self._deviation(step.state))
         self.record.actions.append(np.array(step.executed, dtype=np.float64))
         self.record.rewards.append(float("nan") if step.reward is None else float(step.reward))
 
@@ -122,9 +127,16 @@ class Recorder(TrialObserver):
         if state.trial != self.trial:
             return
         if self._keeps(state):
-            self.record.estimates.append(estimate(state.belief))
-            self.record.standard_deviations.append(standard_deviation(state.belief))
+            self.record.estimates.append(self._estimate(state))
+            self.record.standard_deviations.append(self._deviation(state))
         self.record.result = result
+
+    def _deviation(self, state: PlanningState) -> FloatArray:
+        circular = () if self._planner is None else circular_states(self._planner.problem)
+        return standard_deviation(state.belief, circular)
+
+    def _estimate(self, state: PlanningState) -> FloatArray:
+        return estimate(state.belief) if self._planner is None else self._planner.estimate(state)
 
     def _keeps(self, state: PlanningState) -> bool:
         return state.trial == self.trial and state.step < MAX_STEPS_KEPT

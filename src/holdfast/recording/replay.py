@@ -17,12 +17,12 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
+import numpy.typing as npt
 
 from holdfast.arrays import FloatArray
-from holdfast.belief import estimate
 from holdfast.config.loader import Configuration
 from holdfast.errors import DecidedOtherwiseError, EndOfRecordsError, HoldfastError
 from holdfast.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
@@ -33,6 +33,7 @@ from holdfast.recording.facts import (
     Decider,
     EventFact,
     FactSink,
+    LateFact,
     SensingFact,
     TaskFact,
     TrialBeginFact,
@@ -45,7 +46,7 @@ from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME
 from holdfast.recording.step_times import NS_PER_S, StepClock, TrialTimes, read_events, trial_ends
 from holdfast.recording.timings import rows_by_trial
 from holdfast.robot.environment import Environment, SimulatedEnvironment
-from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
+from holdfast.robot.trial import LateStep, SensingStep, TaskStep, TrialObserver, run_trial
 
 __all__ = ["RecordedRun"]
 
@@ -83,7 +84,7 @@ class RecordedRun:
             directory = path.parent
             self._meta = self._journal.meta()
             self.configuration, self.world_is_simulated = _configuration(self._meta, path)
-            self._estimate = self.configuration.planning.particle_filter.estimate
+            self._planner = Planner(self.configuration.problem, self.configuration.planning)
             self._begun = self._journal.unfinished()
             self.unfinished = None if self._begun is None else self._begun.trial
             trials = self._journal.finished()
@@ -161,7 +162,7 @@ class RecordedRun:
         if world is None:
             _write_decisions(result, decisions, times, output)
         else:
-            replay = _Replay(trial, list(decisions), times, output, result, self._estimate)
+            replay = _Replay(trial, list(decisions), times, output, result, self._planner)
             self._run_again(trial, world, replay)
         return trial
 
@@ -178,7 +179,7 @@ class RecordedRun:
         simulated = self._simulated_world(trial) if self.world_is_simulated else None
         world = RecordedEnvironment(trial, begun.records, simulated=simulated)
         times = self._times(trial, steps, clock)
-        replay = _Replay(trial, expected, times, output, None, self._estimate)
+        replay = _Replay(trial, expected, times, output, None, self._planner)
         try:
             self._run_again(trial, world, replay)
         except EndOfRecordsError:
@@ -191,10 +192,9 @@ class RecordedRun:
 
     def _run_again(self, trial: int, world: Environment, replay: _Replay) -> None:
         configuration = self.configuration
-        planner = Planner(configuration.problem, configuration.planning)
         try:
             run_trial(
-                planner,
+                self._planner,
                 configuration.simulator.seed,
                 trial,
                 max_steps=configuration.simulator.max_steps,
@@ -237,10 +237,10 @@ class _Replay(TrialObserver):
         times: TrialTimes,
         output: _Output,
         result: TrialResult | None,
-        estimate_kind: Literal["mean", "most_likely"],
+        planner: Planner,
     ) -> None:
         self._trial = trial
-        self._estimate = estimate_kind
+        self._planner = planner
         self._expected = expected
         self._times = times
         self._output = output
@@ -275,7 +275,7 @@ class _Replay(TrialObserver):
             after=after.belief,
             stage=step.before.stage,
             entropies=None if entropies is None else np.array(entropies, dtype=np.float64),
-            observation=np.asarray(step.observation, dtype=np.float64).reshape(-1),
+            observation=step.observation,
             explained=info.explained,
             resampled=info.resampled,
             effective_sample_size=info.effective_sample_size,
@@ -300,12 +300,28 @@ class _Replay(TrialObserver):
             estimate=np.array(step.task_info.estimate, dtype=np.float64),
             true_state=self._true_state,
             reward=None if step.reward is None else float(step.reward),
+            motion=_numbers(step.shown.motion),
+            observation=_numbers(step.shown.observation),
         )
         for sink in self._output.at(fact.time_ns):
             sink.acted(fact)
         self._true_state = _true_state(step.environment)
         self._steps = number + 1
         self._state = None  # the next one is not known before something is done in it
+
+    def observed_late(self, step: LateStep) -> None:
+        number = step.after.step
+        fact = LateFact(
+            trial=self._trial,
+            step=number,
+            time_ns=self._times.at(number - 1, 3),
+            taken=step.late.step,
+            observation=step.late.observation,
+            after=step.after.belief,
+            explained=step.observation_info.explained,
+        )
+        for sink in self._output.at(fact.time_ns):
+            sink.observed_late(fact)
 
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
         if self._result is None or result.decisions != self._result.decisions:
@@ -321,7 +337,7 @@ class _Replay(TrialObserver):
             steps=self._steps,
             result=self._result,
             belief=belief,
-            estimate=None if belief is None else estimate(belief, self._estimate),
+            estimate=None if self._state is None else self._planner.estimate(self._state),
             true_state=self._true_state,
         )
         for sink in self._output.at(end.time_ns):
@@ -342,6 +358,10 @@ def _same(one: SensingDecision | TaskDecision, other: SensingDecision | TaskDeci
             np.array(one.action).tobytes() == np.array(other.action).tobytes()
         )
     return type(one) is type(other) and one == other
+
+
+def _numbers(shown: npt.ArrayLike | None) -> FloatArray | None:
+    return None if shown is None else np.array(shown, dtype=np.float64)
 
 
 def _true_state(environment: Environment) -> FloatArray | None:

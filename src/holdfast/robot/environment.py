@@ -39,6 +39,7 @@ __all__ = [
     "LateSensingEnvironment",
     "Later",
     "ObservationSizes",
+    "RememberingEnvironment",
     "SimulatedEnvironment",
     "load_environment",
 ]
@@ -113,6 +114,19 @@ class CountingEnvironment(Environment, Protocol):
 
         The count is the environment's own and survives the robot's process. It is right even if
         that process died during a task action.
+        """
+        ...
+
+
+@runtime_checkable
+class RememberingEnvironment(CountingEnvironment, Protocol):
+    """A counting environment that can say again what its last task action has shown."""
+
+    def last_move(self) -> float | MoveResult | None:
+        """Return again what the last ``perform`` of this trial has returned, or would have.
+
+        Asked after a crash of the robot's process in the midst of a move. Without this method what
+        the move has shown is lost then: its reward counts as 0, and its motion is the model's.
         """
         ...
 
@@ -263,6 +277,8 @@ class EnvironmentMaker:
         The user's class; None for a world that is simulated from the problem.
     arguments : mapping, optional
         Keyword arguments for the class.
+    sense_in_background : bool
+        Whether the robot goes on while it senses.
 
     Raises
     ------
@@ -278,8 +294,11 @@ class EnvironmentMaker:
         timeout_ms: float,
         environment_class: type[Any] | None = None,
         arguments: Mapping[str, Any] | None = None,
+        *,
+        sense_in_background: bool = False,
     ) -> None:
         self.name = name
+        self._sense_in_background = sense_in_background
         self.problem = problem
         self.timeout_ms = timeout_ms
         self.simulated = environment_class is None
@@ -331,6 +350,10 @@ class EnvironmentMaker:
                 "perform_sensing(sensing_action), perform(task_action) and is_done()"
             )
         made: Environment = environment
+        if self._sense_in_background:
+            from holdfast.robot.late_sensing import SenseInBackground
+
+            return SenseInBackground(made)
         return made
 
 
@@ -360,7 +383,15 @@ def load_environment(configuration: Configuration) -> EnvironmentMaker:
             search_directory=directory if ":" in name else configuration.path.parent,
             error_type=ConfigurationError,
         )
-        return EnvironmentMaker(name, problem, seed, timeout_ms, found, settings.arguments)
+        return EnvironmentMaker(
+            name,
+            problem,
+            seed,
+            timeout_ms,
+            found,
+            settings.arguments,
+            sense_in_background=settings.sense_in_background,
+        )
     except ConfigurationError as error:
         raise ConfigurationError(f"{configuration.path}: {error}") from error
 

@@ -141,8 +141,16 @@ class EnvironmentRunner(abc.ABC):
         if self._resumed and callable(ask):
             self._method = "steps_performed"
             count = self._count(ask())
+        last: Acted | None = None
+        late: tuple[LateObservation, ...] = ()
+        if self._resumed:
+            ask = getattr(environment, "last_move", None)
+            if count and callable(ask):
+                self._method = "last_move"
+                last = self._moved(count - 1, ask())
+            late = self._late()
         self._method = "is_done"
-        return EnvironmentReady(self._ending(environment.is_done()), count)
+        return EnvironmentReady(self._ending(environment.is_done()), count, last, late)
 
     def _sensed(self, step: int, sensing_action: int) -> EnvironmentEvent:
         assert self.environment is not None
@@ -166,25 +174,18 @@ class EnvironmentRunner(abc.ABC):
         self._method = "perform"
         # A copy: the robot's own record of the action must stay what it is.
         action = np.array(task_action, dtype=np.float64)
-        shown = self.environment.perform(action)
-        if isinstance(shown, MoveResult):
-            reward, motion, observation = shown
-            acted = Acted(
-                step,
-                self._reward(reward),
-                None,
-                self._shown(motion, "motion"),
-                self._shown(observation, "observation"),
-            )
-        else:
-            acted = Acted(step, self._reward(shown), None)
-        self._performed = acted
-        late = getattr(self.environment, "late_observations", None)
-        if late is not None:
-            self._method = "late_observations"
-            acted = self._performed = acted._replace(late=self._late(late()))
+        acted = self._performed = self._moved(step, self.environment.perform(action))
+        acted = self._performed = acted._replace(late=self._late())
         self._method = "is_done"
         return acted._replace(ending=self._ending(self.environment.is_done()))
+
+    def _moved(self, step: int, shown: object) -> Acted:
+        """Return what a task action has shown."""
+        if not isinstance(shown, MoveResult):
+            return Acted(step, self._reward(shown), None)
+        motion = self._shown(shown.motion, "motion")
+        observation = self._shown(shown.observation, "observation")
+        return Acted(step, self._reward(shown.reward), None, motion, observation)
 
     def _event_of(self, call: _Call) -> EnvironmentEvent:
         """Call the environment; an exception is an event, too."""
@@ -271,8 +272,13 @@ class EnvironmentRunner(abc.ABC):
             raise self._unusable(value, need)
         return self._finite(array, value)
 
-    def _late(self, value: object) -> tuple[LateObservation, ...]:
-        """Return observations of earlier steps."""
+    def _late(self) -> tuple[LateObservation, ...]:
+        """Ask for observations of earlier steps."""
+        ask = getattr(self.environment, "late_observations", None)
+        if not callable(ask):
+            return ()
+        self._method = "late_observations"
+        value = ask()
         need = "a list of (step, observation)"
         if not isinstance(value, Sequence) or isinstance(value, str):
             raise self._unusable(value, need)

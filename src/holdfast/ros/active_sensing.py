@@ -199,7 +199,9 @@ class ActiveSensing:
             entropies = _NO_ENTROPIES if info.entropies is None else info.entropies
             return DecisionAnswer(ErrorCode.OK, "", self.configuration, state, chosen, entropies)
         if needs_sensing:
-            state, _ = planner.observe(state, request.sensing_action, request.observation)
+            none = request.sensing_action == planner.no_sensing and not request.observation.size
+            observation = None if none else request.observation
+            state, _ = planner.observe(state, request.sensing_action, observation)
         elif request.observation.size:
             raise InvalidValueError(
                 f"observation of {request.observation.size} values: step {state.step} needs none"

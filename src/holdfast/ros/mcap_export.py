@@ -21,11 +21,13 @@ from holdfast.arrays import FloatArray
 from holdfast.belief import Belief
 from holdfast.config.loader import Configuration
 from holdfast.errors import MissingRosbagsError
+from holdfast.problem_attributes import choice_labels
 from holdfast.protocol.status import Status
 from holdfast.recording.csv_export import state_labels
 from holdfast.recording.facts import (
     Decider,
     EventFact,
+    LateFact,
     SensingFact,
     TaskFact,
     TrialBeginFact,
@@ -111,7 +113,7 @@ class McapSink:
         self._layout = pose_layout(problem)
         self.has_poses = self._layout is not None
         self._labels = state_labels(problem)
-        self._actions = [str(label) for label in problem.sensing_actions]
+        self._choices = choice_labels(problem)
         self._store = get_typestore(Stores.ROS2_HUMBLE)
         self._types: dict[str, Any] = dict(self._store.types)
         self._connections: dict[str, Connection] = {}
@@ -168,12 +170,14 @@ class McapSink:
         now = fact.decided_ns
         self._place(now, fact.trial, fact.step, fact.stage)
         self._belief(now, fact.before)
-        label = self._actions[fact.sensing_action]
+        label = self._choices[fact.sensing_action]
         self._number(now, "/holdfast/sensing_action", "Int32", fact.sensing_action)
         self._write(now, "/holdfast/sensing_action_label", "std_msgs/msg/String", data=label)
         if fact.entropies is not None:
-            self._array(now, "/holdfast/entropies", fact.entropies, "; ".join(self._actions))
-        if self._layout is not None and fact.before is not None:
+            labels = "; ".join(self._choices[: len(fact.entropies)])
+            self._array(now, "/holdfast/entropies", fact.entropies, labels)
+        is_performed = fact.sensing_action < len(self._problem.sensing_actions)
+        if self._layout is not None and fact.before is not None and is_performed:
             markers = sensing_markers(
                 self._problem, self._layout, TASK_FRAME, fact.before, fact.sensing_action
             )
@@ -203,10 +207,20 @@ class McapSink:
         labels = self._labels if len(fact.action) == len(self._labels) else None
         self._array(now, "/holdfast/task_action", fact.action,
                     "action" if labels is None else "; ".join(labels))  # fmt: skip
+        for name, shown in (("motion", fact.motion), ("move_observation", fact.observation)):
+            if shown is not None:
+                self._array(now, f"/holdfast/{name}", shown, name)
         if fact.reward is not None:
             self._number(now, "/holdfast/reward", "Float64", fact.reward)
         values = {} if fact.reward is None else {"reward": fact.reward}
         self._diagnose(now, fact.trial, fact.step, "task", fact.decider, values, None)
+
+    def observed_late(self, fact: LateFact) -> None:
+        """Write a late observation and the belief that it led to."""
+        now = fact.time_ns
+        label = f"taken at step {fact.taken}"
+        self._array(now, "/holdfast/late_observation", fact.observation, label)
+        self._belief(now, fact.after)
 
     def trial_ends(self, fact: TrialEndFact) -> None:
         """Write the last belief, and what the trial came to."""
@@ -218,6 +232,8 @@ class McapSink:
             self._log(now, "INFO", f"trial {fact.trial}: {fact.steps} steps so far; not finished")
             return
         text = f"trial {fact.trial} {result.outcome} after {result.steps} steps"
+        if result.reason:
+            text += f" ({result.reason})"
         if result.reward is not None:
             text += f", reward {result.reward:.6g}"
         level = "INFO" if result.outcome == "succeeded" else "WARN"

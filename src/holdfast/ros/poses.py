@@ -24,7 +24,9 @@ import numpy.typing as npt
 
 from holdfast.arrays import FloatArray
 from holdfast.belief import Belief, estimate
+from holdfast.circular import differences
 from holdfast.errors import ProblemError
+from holdfast.problem_attributes import circular_states
 
 __all__ = ["POSE_COORDINATES", "PoseLayout", "pose_layout"]
 
@@ -44,11 +46,12 @@ class PoseLayout(NamedTuple):
 
     ``indices`` has for each of :data:`POSE_COORDINATES` the state's coordinate, None if there is
     none; ``upright`` is the quaternion (x, y, z, w) by which the problem's frame is turned in a
-    frame whose z points up.
+    frame whose z points up; ``circular`` has the problem's own coordinates that are angles.
     """
 
     indices: tuple[int | None, ...]
     upright: tuple[float, float, float, float]
+    circular: tuple[int, ...] = ()
 
     def poses(self, states: npt.ArrayLike) -> FloatArray:
         """Return the poses of states of shape ``(..., state_size)``, in metres and radians.
@@ -74,10 +77,11 @@ class PoseLayout(NamedTuple):
     def covariance(self, belief: Belief) -> FloatArray:
         """Return the covariance of a belief's poses about its mean, shape ``(6, 6)``.
 
-        Angles are averaged as the belief averages them: as numbers. What the state lacks is known:
-        its rows and columns are 0.
+        Angles are averaged as the belief averages them: those that the problem calls ``circular``
+        as directions, others as numbers. What the state lacks is known: its rows and columns are 0.
         """
-        difference = belief.states - estimate(belief)
+        mean = estimate(belief, circular=self.circular)
+        difference = differences(belief.states, mean, self.circular)
         ours = [target for target, source in enumerate(self.indices) if source is not None]
         theirs = [source for source in self.indices if source is not None]
         part = difference[:, theirs]
@@ -122,4 +126,8 @@ def pose_layout(problem: Any) -> PoseLayout | None:
     up = getattr(problem, "up", "z")
     if not isinstance(up, str) or up not in _UPRIGHT:
         raise ProblemError(f"up of {name} is {up!r:.80}: allowed are y and z")
-    return PoseLayout(tuple(indices.get(word) for word in POSE_COORDINATES), _UPRIGHT[up])
+    return PoseLayout(
+        tuple(indices.get(word) for word in POSE_COORDINATES),
+        _UPRIGHT[up],
+        tuple(circular_states(problem)),
+    )

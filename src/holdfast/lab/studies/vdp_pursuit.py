@@ -289,6 +289,7 @@ class _Decision:
             np.ascontiguousarray(problem.observation_variance(states, 1).T),
             self._by._settings.num_observations,
             self._draw.substream(1).words,
+            [],
             False,
         ).reshape(-1, weights.size)
 

@@ -1,0 +1,129 @@
+"""Sensing that takes time, for environments whose ``perform_sensing`` waits for its observation.
+
+The robot goes on while it senses: ``perform_sensing`` returns :data:`LATER` at once, and each
+observation comes with the task action after which it is there. It belongs to the step at which it
+was taken (:mod:`holdfast.tracking`).
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from typing import Any
+
+import numpy.typing as npt
+
+from holdfast.arrays import FloatArray
+from holdfast.errors import InvalidValueError
+from holdfast.outcome import Done, MoveResult
+from holdfast.robot.environment import LATER, Environment, Later
+
+__all__ = ["SenseInBackground", "SenseLater"]
+
+
+class _Around:
+    """An environment around another one; what it does not know, the other does."""
+
+    def __init__(self, environment: Environment) -> None:
+        self._environment = environment
+        self._count = 0
+
+    def __getattr__(self, name: str) -> Any:
+        # steps_performed, close, state: only if the other one has them.
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(self._environment, name)
+
+    @property
+    def _step(self) -> int:
+        count = getattr(self._environment, "steps_performed", None)
+        return int(count()) if callable(count) else self._count
+
+    def perform(self, task_action: FloatArray) -> float | MoveResult | None:
+        """Perform a task action."""
+        result = self._environment.perform(task_action)
+        self._count += 1
+        return result
+
+    def is_done(self) -> Done:
+        """Return how the task stands."""
+        return self._environment.is_done()
+
+
+class SenseInBackground(_Around):
+    """An environment that senses on a thread while the robot moves.
+
+    Its ``perform_sensing`` and ``perform`` must bear to run at the same time. A sensing action
+    waits for the one before, so one observation at most is to come.
+
+    Parameters
+    ----------
+    environment : Environment
+        It waits in ``perform_sensing`` for its observation. If it has no ``steps_performed``, the
+        steps of a trial are counted from here, so the trial cannot be gone on with after a crash.
+    """
+
+    def __init__(self, environment: Environment) -> None:
+        super().__init__(environment)
+        self._thread: threading.Thread | None = None
+        self._came: deque[tuple[int, npt.ArrayLike]] = deque()
+        self._error: BaseException | None = None
+
+    def perform_sensing(self, sensing_action: int) -> Later:
+        """Begin to sense; wait first for a sensing action that has not ended."""
+        if self._thread is not None:
+            self._thread.join()
+        self._raise()
+        self._thread = threading.Thread(
+            target=self._sense, args=(self._step, sensing_action), name="sensing", daemon=True
+        )
+        self._thread.start()
+        return LATER
+
+    def late_observations(self) -> list[tuple[int, npt.ArrayLike]]:
+        """Return what has come; raise what sensing has raised."""
+        self._raise()
+        return [self._came.popleft() for _ in range(len(self._came))]
+
+    def _sense(self, step: int, sensing_action: int) -> None:
+        try:
+            shown = self._environment.perform_sensing(sensing_action)
+            self._came.append((step, shown))  # type: ignore[arg-type]
+        except BaseException as error:  # noqa: BLE001 - raised again where it can be heard
+            self._error = error
+
+    def _raise(self) -> None:
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+
+class SenseLater(_Around):
+    """An environment that shows each observation so many moves later, to try lateness out.
+
+    Parameters
+    ----------
+    environment : Environment
+    moves : int
+        Task actions from sensing to the observation, at least 1.
+    """
+
+    def __init__(self, environment: Environment, moves: int) -> None:
+        if moves < 1:
+            raise InvalidValueError(f"moves is {moves}; it must be at least 1")
+        super().__init__(environment)
+        self._moves = moves
+        self._due: list[tuple[int, npt.ArrayLike]] = []
+
+    def perform_sensing(self, sensing_action: int) -> Later:
+        """Sense, and keep the observation."""
+        shown = self._environment.perform_sensing(sensing_action)
+        self._due.append((self._step, shown))  # type: ignore[arg-type]
+        return LATER
+
+    def late_observations(self) -> list[tuple[int, npt.ArrayLike]]:
+        """Return what is due."""
+        now = self._step
+        due = [each for each in self._due if each[0] + self._moves <= now]
+        self._due = [each for each in self._due if each[0] + self._moves > now]
+        return due

@@ -1,0 +1,144 @@
+"""Sensing that takes time: on a thread, or shown so many moves later."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from holdfast.arrays import FloatArray
+from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
+from holdfast.errors import InvalidValueError
+from holdfast.outcome import TrialResult
+from holdfast.planning import Planner
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.robot.environment import LATER, Environment, SimulatedEnvironment
+from holdfast.robot.late_sensing import SenseInBackground, SenseLater
+from holdfast.robot.trial import LateStep, SensingStep, TaskStep, TrialObserver, run_trial
+
+PATIENCE_S = 30.0
+"""Longest wait for what is sure to come; nothing is measured by it."""
+
+ACTION = np.array([0.1, 0.0, 0.0])
+
+
+def planner_of(interval: int = 2) -> Planner:
+    settings = PlanningSettings(
+        particle_filter=ParticleFilterSettings(num_particles=50), sensing_interval=interval
+    )
+    return Planner(PegInHole2D(), settings)
+
+
+class Noting(TrialObserver):
+    """Notes what was sensed, done and came late."""
+
+    def __init__(self) -> None:
+        self.sensed_at: list[int] = []
+        self.late: list[tuple[int, int]] = []
+        self.actions: list[bytes] = []
+
+    def sensed(self, step: SensingStep) -> None:
+        assert step.observation is None
+        self.sensed_at.append(step.before.step)
+
+    def acted(self, step: TaskStep) -> None:
+        self.actions.append(step.executed.tobytes())
+
+    def observed_late(self, step: LateStep) -> None:
+        self.late.append((step.late.step, step.after.step))
+
+
+def run(environment: Environment, max_steps: int = 30) -> tuple[TrialResult, Noting]:
+    noting = Noting()
+    result = run_trial(
+        planner_of(), 5, max_steps=max_steps, environment=environment, observer=noting
+    )
+    return result, noting
+
+
+def world() -> SimulatedEnvironment:
+    return SimulatedEnvironment(PegInHole2D(), 5, 0)
+
+
+@pytest.mark.parametrize("moves", [1, 2, 3, 7])
+def test_each_observation_comes_so_many_moves_later(moves: int) -> None:
+    result, noting = run(SenseLater(world(), moves))
+    assert noting.sensed_at == list(range(0, result.steps, 3))
+    assert noting.late == [
+        (step, step + moves) for step in noting.sensed_at if step + moves <= result.steps
+    ]
+    again, _ = run(SenseLater(world(), moves))
+    assert again.digest == result.digest
+
+
+def test_a_late_robot_gets_there_all_the_same() -> None:
+    result, _ = run(SenseLater(world(), 3), 500)
+    assert result.success
+
+
+def test_no_moves_are_no_lateness() -> None:
+    with pytest.raises(InvalidValueError, match="moves is 0; it must be at least 1"):
+        SenseLater(world(), 0)
+
+
+class Slow:
+    """A world whose sensing ends when it is told to."""
+
+    def __init__(self) -> None:
+        self.world = world()
+        self.may_end = threading.Event()
+        self.begun = threading.Semaphore(0)
+
+    def perform_sensing(self, sensing_action: int) -> FloatArray:
+        self.begun.release()
+        assert self.may_end.wait(PATIENCE_S)
+        return np.array([float(sensing_action)])
+
+    def perform(self, task_action: FloatArray) -> float | None:
+        self.world.perform(task_action)
+        return None
+
+    def is_done(self) -> bool:
+        return False
+
+
+def test_the_robot_moves_while_it_senses() -> None:
+    slow = Slow()
+    robot = SenseInBackground(slow)
+    robot.perform(ACTION)
+    assert robot.perform_sensing(1) is LATER
+    for _ in range(3):
+        robot.perform(ACTION)
+        assert robot.late_observations() == []
+    slow.may_end.set()
+    # The next sensing action waits for this one.
+    assert robot.perform_sensing(0) is LATER
+    came: list[tuple[int, object]] = []
+    while len(came) < 2:
+        came += robot.late_observations()
+    assert [(step, np.asarray(shown).tolist()) for step, shown in came] == [(1, [1.0]), (4, [0.0])]
+    assert not hasattr(robot, "steps_performed")
+    assert not robot.is_done()
+
+
+def test_steps_that_the_robot_counts_are_its_own() -> None:
+    inner = SimulatedEnvironment.after(PegInHole2D(), 5, 0, [ACTION] * 4)
+    robot = SenseInBackground(inner)
+    robot.perform_sensing(0)
+    came: list[tuple[int, object]] = []
+    while not came:
+        came += robot.late_observations()
+    assert came[0][0] == 4
+    assert robot.steps_performed() == 4
+
+
+def test_what_sensing_raises_is_heard() -> None:
+    class Broken(Slow):
+        def perform_sensing(self, sensing_action: int) -> FloatArray:
+            raise OSError("the camera is unplugged")
+
+    robot = SenseInBackground(Broken())
+    robot.perform_sensing(0)
+    with pytest.raises(OSError, match="the camera is unplugged"):
+        robot.perform_sensing(1)
