@@ -29,6 +29,8 @@ from holdfast.ros.ros2_environment import make_ros_environment
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_plain(each) for each in value]
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 

@@ -102,6 +102,7 @@ class OddRobot(Node):  # type: ignore[misc]
         response.success = True
         response.steps = self._steps
         response.failed = self._done == "failed"
+        response.message = "the arm has hit the table" if response.failed else ""
         return response
 
     def act(self, goal: Any) -> Any:

@@ -162,7 +162,12 @@ class TestReadyMade:
     def test_failed_is_said(self, driver: Driver, odd: Start) -> None:
         odd(done="failed")
         driver.do("make")
-        assert driver.do("is_done") == "failed"
+        assert driver.do("is_done") == ["failed", ""]
+
+    def test_the_reason_is_a_field(self, driver: Driver, odd: Start) -> None:
+        odd(done="failed")
+        driver.do("make", parameters={"environment.done.reason": "message"})
+        assert driver.do("is_done") == ["failed", "the arm has hit the table"]
 
 
 class TestMapped:
@@ -203,6 +208,19 @@ class TestMapped:
         assert driver.do("perform", ACTION) == -2.5
         assert robot.next_line() == "moving base_link -250 125 0.5\n"
         assert driver.do("steps_performed") == 1
+
+    def test_a_move_may_show_more_than_its_reward(self, driver: Driver, odd: Start) -> None:
+        odd()
+        mapping = {
+            **self.MAPPING,
+            "environment.act.motion": ["plan.poses[0].pose.position.z"],
+            "environment.act.observation": [
+                "plan.poses[0].pose.position.x",
+                "plan.poses[0].pose.position.z",
+            ],
+        }
+        driver.do("make", parameters=mapping)
+        assert driver.do("perform", ACTION) == [-2.5, [-2.5], [0.0, -2.5]]
 
     def test_numbers_of_each_sensing_action(self, driver: Driver, odd: Start) -> None:
         odd()
@@ -349,7 +367,7 @@ class TestDoneAsAMessage:
     def test_the_last_one_counts(self, driver: Driver, odd: Start, done: str) -> None:
         odd(done=done)
         driver.do("make", parameters=self.DONE, resumed=True)
-        assert driver.do("is_done") is (done == "succeeded")
+        assert driver.do("is_done") == (["succeeded", ""] if done == "succeeded" else False)
 
     def test_that_of_the_trial_before_does_not_end_the_next(
         self, driver: Driver, odd: Start

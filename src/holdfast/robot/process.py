@@ -533,6 +533,7 @@ class RobotProcess:
             trial=result.trial,
             success=result.success,
             outcome=result.outcome,
+            reason=result.reason or None,
             steps=result.steps,
             recoveries=result.recoveries,
             unexplained_observations=result.unexplained_observations,

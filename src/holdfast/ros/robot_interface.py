@@ -82,10 +82,13 @@ _OWN: Mapping[str, Mapping[str, tuple[object, str]]] = {
         "action": ([], "Fields of the request that get the task action: one array, or one each."),
         "scale": ([], "What its coordinates are multiplied by, for the robot's units."),
         "reward": ("", "Field of the answer that is the reward; NaN: none."),
+        "motion": ([], "Fields of the answer that are the measured motion, numbers or arrays."),
+        "observation": ([], "Fields of the answer that are an observation, as a contact force."),
     },
     "done": {
         "done": ("", "Field of the answer or message: whether the task has succeeded."),
         "failed": ("", "Field of the answer or message: whether it has failed for good."),
+        "reason": ("", "Text of the answer or message: why it has ended."),
     },
     "steps": {"steps": ("", "Field of the answer that is the count.")},
     "reset": {},
@@ -144,7 +147,9 @@ _PART = 0.45
 _TIMEOUT = "environment.timeout_ms"
 
 _REQUEST_KEYS = frozenset(("trial", "step", "index", "label", "fields", "action"))
-_ANSWER_KEYS = frozenset(("success", "message", "reward", "done", "failed", "steps"))
+_ANSWER_KEYS = frozenset(
+    ("success", "message", "reward", "motion", "done", "failed", "reason", "steps")
+)
 """Parameters that name fields of a request, or of an answer."""
 
 _Positive = Annotated[float, msgspec.Meta(gt=0.0, le=1e300)]
@@ -281,7 +286,7 @@ class RobotInterface:
             if key in _REQUEST_KEYS | _ANSWER_KEYS
         }
         if kind == "msg":
-            if constants or not paths.keys() <= {"done", "failed"}:
+            if constants or not paths.keys() <= {"done", "failed", "reason"}:
                 raise ConfigurationError(
                     f"{section}type is a message, so nothing is requested of it"
                 )

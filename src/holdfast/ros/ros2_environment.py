@@ -19,18 +19,18 @@ import contextlib
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
 
 from holdfast.arrays import FloatArray, in_brief
 from holdfast.errors import EnvironmentFailedError
-from holdfast.outcome import Done
+from holdfast.outcome import Done, Ending, MoveResult
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import ObservationSizes
 from holdfast.ros.deadlines import Absence, Deadline
-from holdfast.ros.field_paths import read_field, read_numbers, write
+from holdfast.ros.field_paths import Path, read_field, read_numbers, write
 from holdfast.ros.robot_interface import RobotCall, RobotInterface, observation_path
 from holdfast.ros.ros2_connections import CallClients, Connections, Instant
 
@@ -183,8 +183,8 @@ class Ros2Environment:
             )
         return observation
 
-    def perform(self, task_action: FloatArray) -> float | None:
-        """Perform a task action and return its reward, or None where there is none.
+    def perform(self, task_action: FloatArray) -> float | MoveResult | None:
+        """Perform a task action and return what it has shown.
 
         Raises EnvironmentFailedError if the robot rejects it, fails, or does not answer in time. It
         may have moved.
@@ -202,6 +202,30 @@ class Ros2Environment:
         answer = self._call(call, request)
         self._check_success(call, answer)
         self._step += 1
+        motion = self._shown(call, answer, "motion", call.paths.get("motion", ()))
+        fields = [observation_path(text, 0, "", "") for text in call.observation]
+        shown = self._shown(call, answer, "observation", fields)
+        reward = self._reward(call, answer)
+        return reward if motion is None and shown is None else MoveResult(reward, motion, shown)
+
+    def _shown(
+        self, call: RobotCall, answer: Any, key: str, paths: Sequence[Path]
+    ) -> FloatArray | None:
+        """Return what fields of the answer have shown; None if there are none."""
+        numbers: list[float] = []
+        for path in paths:
+            with _named(f"{call}: {call.key(key)}"):
+                numbers += read_numbers(answer, path)
+        if not paths:
+            return None
+        if not numbers or not np.isfinite(numbers).all():
+            raise EnvironmentFailedError(
+                f"{call} answered with the {key} {numbers!r:.80} ({call.key(key)}); it must be "
+                "finite numbers"
+            )
+        return np.array(numbers)
+
+    def _reward(self, call: RobotCall, answer: Any) -> float | None:
         reward_path = call.path("reward")
         if reward_path is None:
             return None
@@ -262,7 +286,7 @@ class Ros2Environment:
             self._check_success(call, answer)
         else:
             answer = self._done_topic.messages[-1].message
-        for key, meaning in (("failed", "failed"), ("done", True)):
+        for key, ending in (("failed", Ending("failed")), ("done", Ending("succeeded"))):
             path = call.path(key)
             if path is not None:
                 with _named(f"{call}: {call.key(key)}"):
@@ -272,7 +296,12 @@ class Ros2Environment:
                         f"{call} answered {value!r:.80} ({call.key(key)}); it must be true or false"
                     )
                 if value:
-                    return meaning  # type: ignore[return-value]
+                    told = call.path("reason")
+                    return (
+                        ending
+                        if told is None
+                        else Ending(ending.outcome, str(read_field(answer, told)))
+                    )
         return False
 
     def cancel(self, why: str = "cancelled") -> None:

@@ -80,6 +80,9 @@ def fields_as_text(fields: Mapping[str, object]) -> str:
     rest = {key: value for key, value in fields.items() if value is not None}
     if "outcome" in rest:
         rest.pop("success", None)  # the outcome says it
+        reason = rest.pop("reason", None)
+        if reason is not None:
+            rest["outcome"] = f"{rest['outcome']} ({reason})"
     head = []
     if "from" in rest and "to" in rest:
         head.append(f"{_value(rest.pop('from'))} -> {_value(rest.pop('to'))}")
