@@ -28,10 +28,13 @@ class Cell(NamedTuple):
     ----------
     run : callable
         Gets a trial's number and returns the columns of its row.
+    most_trials : int or None
+        A limit of its own.
     """
 
     names: Mapping[str, str]
     run: Callable[[int], Mapping[str, Any]]
+    most_trials: int | None = None
 
 
 def run(path: Path, cells: Sequence[Cell], trials: int, seed: int, columns: Sequence[str]) -> None:
@@ -54,7 +57,8 @@ def run(path: Path, cells: Sequence[Cell], trials: int, seed: int, columns: Sequ
         (cell, trial)
         for trial in range(trials)
         for cell in cells
-        if (*cell.names.values(), str(seed), str(trial)) not in known
+        if (cell.most_trials is None or trial < cell.most_trials)
+        and (*cell.names.values(), str(seed), str(trial)) not in known
     ]
     started = time.monotonic()
     with path.open("a", newline="") as file:

@@ -11,7 +11,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from holdfast.outcome import Ending, MoveResult
+import holdfast as hf
 
 SUBSTEPS = 50
 """Physics steps of 2 ms in one task action: the servos have 0.1 s to follow."""
@@ -110,7 +110,7 @@ class MujocoPeg:
         self._performed += 1
         before, self._read = self._read, self._encoders()
         force = forces[-AVERAGED:].mean(axis=0) + self._force_noise * self._random.normal(size=3)
-        return MoveResult(
+        return hf.MoveResult(
             motion=self._read - before if self._shows_motion else None,
             observation=self._felt(force) if self._shows_force else None,
         )
@@ -118,11 +118,11 @@ class MujocoPeg:
     def is_done(self):
         """Say how the task has ended, and why."""
         if self._largest_force > self._force_limit:
-            return Ending("failed", f"force {self._largest_force:.0f} N at the wrist")
+            return hf.Ending("failed", f"force {self._largest_force:.0f} N at the wrist")
         if self._tip() < -self._depth:
-            return Ending("succeeded", "the peg is in the hole")
+            return hf.Ending("succeeded", "the peg is in the hole")
         if self._performed >= self._time_limit:
-            return Ending("truncated", f"no time left after {self._performed} moves")
+            return hf.Ending("truncated", f"no time left after {self._performed} moves")
         return False
 
     def steps_performed(self):

@@ -15,19 +15,23 @@ import numpy as np
 from gym_taskboard import boards, control
 from gym_taskboard.env import TaskBoardEnv
 
-from holdfast.outcome import Ending, MoveResult
+import holdfast as hf
 
 STEP_S = 0.05
 """Duration of a step of the package's controller."""
 
-TRAVEL, SIDE, ABOVE = 0.16, 0.062, 0.078
-"""Heights of the fingertip in metres: on its way, at an edge, and before a try."""
+TRAVEL, SIDE, ABOVE, TOP = 0.16, 0.0215, 0.036, 0.029
+"""Heights in metres: of the fingertip on its way, of the peg's tip at an edge and before a try, and
+of the plate's top, which is known."""
 
 PRESSED, PRESSING = 0.006, 6
 """How far below the contact the fingertip is sent in a try, and for how many steps of control."""
 
-HELD = 0.015
-"""How far below the fingertip the middle of the peg is taken."""
+HELD, HALF_LENGTH = 0.015, 0.025
+"""How far below the fingertip the middle of the peg is taken, and half of the peg."""
+
+SLIP = 0.01, 0.025
+"""How far the peg may slip in the hand, across and along."""
 
 PARK = (0.45, 0.06)
 SIDES = ((0.24, 0.5 * np.pi), (0.06, 0.0))
@@ -74,6 +78,8 @@ class TaskBoardArm:
         self._max_contacts = max_contacts
         self._random = np.random.default_rng([seed, trial])
         self.contacts = self.control_steps = 0
+        self._below = HELD + HALF_LENGTH
+        """How far the peg's tip is below the fingertip: each try pushes it up a little."""
         self._environment = _environment_with(peg)
         self._peg = self._environment.active[0]
         self._environment.reset(seed=int(self._random.integers(2**31)))
@@ -90,7 +96,7 @@ class TaskBoardArm:
         begin, yaw = SIDES[axis]
         direction = np.zeros(3)
         direction[axis] = -1.0 if axis else 1.0
-        self._travel([begin, at] if axis == 0 else [at, begin], SIDE, yaw)
+        self._travel([begin, at] if axis == 0 else [at, begin], SIDE + self._below, yaw)
         met = self._creep(direction, 0.002, 0.14, 0.0015, yaw)
         if met is not None:
             self._go(met - 0.006 * direction, 10, yaw)
@@ -104,9 +110,10 @@ class TaskBoardArm:
     def perform(self, task_action):
         """Press the peg down at a place; tell whether it went in."""
         if self.contacts < self._touches_first:
-            return MoveResult()
-        self._travel(task_action, ABOVE, 0.0)
-        self._go(np.array([*task_action, ABOVE]), 20, 0.0, 0.00005)
+            return hf.MoveResult()
+        above = np.array([*task_action, ABOVE + self._below])
+        self._travel(task_action, above[2], 0.0)
+        self._go(above, 20, 0.0, 0.00005)
         self.contacts += 1
         met = self._creep(np.array([0.0, 0.0, -1.0]), 0.001, 0.03, 0.001, 0.0)
         if met is not None:
@@ -114,18 +121,24 @@ class TaskBoardArm:
                 self._control(np.array([*task_action, met[2] - PRESSED]), 0.0)
         inserted = self._inserted()
         if not inserted:
-            self._go(self._tip() + [0.0, 0.0, 0.02], 10, 0.0)
-        return MoveResult(observation=np.array([float(inserted)]))
+            if met is not None:
+                self._below = self._tip()[2] - TOP
+            self._go(self._tip() + np.array([0.0, 0.0, 0.02]), 10, 0.0)
+        return hf.MoveResult(observation=np.array([float(inserted)]))
 
     def is_done(self):
         """Success is what the package says of the peg."""
         if self._inserted():
-            return Ending("succeeded", f"inserted after {self.contacts} contacts")
-        held = self._environment.data.xpos[self._peg.body_id] - self._tip()
-        if np.abs(held + [0.0, 0.0, HELD]).max() > 0.01:
-            return Ending("failed", "the peg has slipped in the hand")
+            return hf.Ending("succeeded", f"inserted after {self.contacts} contacts")
+        slipped = np.abs(
+            self._environment.data.xpos[self._peg.body_id]
+            - self._tip()
+            + np.array([0.0, 0.0, HELD])
+        )
+        if max(slipped[:2]) > SLIP[0] or slipped[2] > SLIP[1]:
+            return hf.Ending("failed", "the peg has slipped in the hand")
         if self.contacts >= self._max_contacts:
-            return Ending("truncated", f"not inserted after {self.contacts} contacts")
+            return hf.Ending("truncated", f"not inserted after {self.contacts} contacts")
         return False
 
     def _inserted(self):

@@ -3,7 +3,7 @@
 The board stands still, but where is not known: within 2 cm and 15 degrees. A touch is a peg's side
 against one of the board's edges, and shows where along its axis they met. One touch says little of
 three unknowns, and which one it says most of depends on what is known. A task action is a try: the
-peg is pressed down where its hole seems to be.
+peg is pressed down where its hole seems to be. One that fails tells where the hole is not.
 
 The particles of a thing that does not move have no noise that keeps them apart, and a sharp touch
 leaves few of them. So each step draws them anew around themselves, as far as they are spread, with
@@ -39,10 +39,10 @@ class TouchedBoard(hf.ProblemBase):
         ``turn`` (rad).
     touch_deviation : float
         Noise of a touch, in metres.
-    search_radius : float
-        How far around its middle a try finds the hole.
-    search_error : float
-        Probability that it does not find a hole that is there.
+    press_reach : float
+        How far beside its hole a peg that is pressed down still goes in.
+    press_error : float
+        Probability that one within that reach does not, and that one beyond it does.
     kernel : float
         Of Liu and West: the share of the spread with which particles are drawn anew, up to 1.
     """
@@ -64,9 +64,9 @@ class TouchedBoard(hf.ProblemBase):
         rays=((0, -0.18), (0, -0.3), (1, 0.42), (1, 0.58)),
         reach=0.02,
         turn=0.2617993877991494,
-        touch_deviation=0.0005,
-        search_radius=0.001,
-        search_error=0.1,
+        touch_deviation=0.0004,
+        press_reach=0.00035,
+        press_error=0.15,
         kernel=0.5,
     ):
         self.edge = half_side + peg_radius
@@ -75,8 +75,8 @@ class TouchedBoard(hf.ProblemBase):
         self.sensing_actions = tuple(f"{'xy'[axis]} at {at:g}" for axis, at in self.rays)
         self.half_extent = np.array([reach, reach, turn])
         self.touch_variance = np.array([touch_deviation * touch_deviation])
-        self.search_radius, self.kernel = search_radius, kernel
-        self.log_missed, self.log_found = numerics.log(np.array([search_error, 1.0 - search_error]))
+        self.press_reach, self.kernel = press_reach, kernel
+        self.log_missed, self.log_found = numerics.log(np.array([press_error, 1.0 - press_error]))
 
     def initial_states(self, stream, count):
         return self.half_extent * (2.0 * stream.uniform((count, 3)) - 1.0)
@@ -84,7 +84,7 @@ class TouchedBoard(hf.ProblemBase):
     def move(self, states, actions, stream):
         """Draw particles anew around themselves: the board has not moved."""
         if isinstance(stream, NoiseFreeStream) or states.ndim == 1:
-            return np.broadcast_to(states, np.broadcast_shapes(states.shape, (*actions.shape[:-1], 3)))
+            return self.expected_move(states, actions)
         keep = np.sqrt(1.0 - self.kernel * self.kernel)
         moved = np.empty(states.shape)
         for index in np.ndindex(states.shape[:-2]):
@@ -99,7 +99,8 @@ class TouchedBoard(hf.ProblemBase):
         return moved
 
     def expected_move(self, states, actions):
-        return np.broadcast_to(states, np.broadcast_shapes(states.shape, (*actions.shape[:-1], 3)))
+        shape = np.broadcast_shapes(states.shape[:-1], actions.shape[:-1])
+        return np.broadcast_to(states, (*shape, 3))
 
     def observation_mean(self, states, sensing_action):
         """Return where the peg's axis is on its ray when its side meets the edge."""
@@ -127,16 +128,16 @@ class TouchedBoard(hf.ProblemBase):
         return self.centre + self.hole_of(states)
 
     def move_log_likelihood(self, states, action, observation):
-        """Weigh a try: 1 if it found the hole, 0 if not."""
+        """Weigh a try: 1 if the peg went in, 0 if not."""
         off = self.centre + self.hole_of(states) - action
         near = off[..., 0] * off[..., 0] + off[..., 1] * off[..., 1]
-        within = near < self.search_radius * self.search_radius
+        within = near < self.press_reach * self.press_reach
         found = observation[0] > 0.5
         return np.where(within == found, self.log_found, self.log_missed)
 
     def sample_move_observation(self, state, action, stream):
         off = self.centre + self.hole_of(state) - action
-        within = off[0] * off[0] + off[1] * off[1] < self.search_radius * self.search_radius
+        within = off[0] * off[0] + off[1] * off[1] < self.press_reach * self.press_reach
         return np.array([float(within)])
 
     def is_goal(self, states):
