@@ -7,6 +7,8 @@ observation, ``sample_observation``; ``observation_mean`` and ``observation_vari
 needed then. Run it with::
 
     holdfast run examples/corridor_doors.yaml
+
+If it may be anywhere at first, its belief has several modes: see corridor_anywhere.yaml.
 """
 
 import numpy as np

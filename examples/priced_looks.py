@@ -1,11 +1,19 @@
-"""A problem of your own with a price for looking: a robot that may also drive on without it.
+r"""A problem of your own with a price for looking: a robot that may also drive on without it.
 
 The robot drives to a dock in the plane. Each step costs 1, each look along an axis as much as four
-steps; not looking is free and shows nothing. Only ``expected_return`` knows about prices: it looks
-where that saves more than it costs. The other ways look along x or y every time. Run it with::
+steps. ``expected_return`` knows what a look saves, so it looks where that is more than the price.
+In ``PricedLooks`` not to look is a sensing action of the problem, which is free and shows nothing;
+in ``OptionalLooks`` it is a choice that the settings offer (``selector.sensing_is_optional``), to
+any problem. Run them with::
 
     holdfast run examples/priced_looks.yaml
-    holdfast run examples/priced_looks.yaml --set selector.method=action_entropy
+    holdfast run examples/optional_looks.yaml
+
+Ways that minimise an entropy ask what a look must gain at least, in nats for each unit of its
+price; without, they look every time::
+
+    holdfast run examples/optional_looks.yaml --set selector.method=path_entropy \
+        --set selector.actions=executed --set selector.nats_per_cost=0.1
 """
 
 import numpy as np
@@ -53,3 +61,14 @@ class PricedLooks(hf.ProblemBase):
 
     def scene(self):
         return hf.Scene((0, 1), (-2.0, -2.0, 4.0, 4.0), goal=(0.0, 0.0))
+
+
+class OptionalLooks(PricedLooks):
+    """The same with the two looks alone: not to look needs no sensing action of the problem."""
+
+    name = "optional_looks"
+    sensing_actions = ("look along x", "look along y")
+
+    def __init__(self, price=4.0, start=(2.0, 1.0), start_variance=0.5):
+        super().__init__(price, start, start_variance)
+        self.sensing_costs = (price, price)

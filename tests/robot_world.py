@@ -10,7 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from holdfast.config.settings import (
+    LostSettings,
     OffloadSettings,
+    OnLost,
     ParticleFilterSettings,
     PlanningSettings,
     RecoverySettings,
@@ -200,8 +202,10 @@ class World:
         simulator: SimulatorSettings = SIMULATOR,
         verify_share: float = 0.05,
         distrusted: tuple[str, ...] = (),
+        on_lost: OnLost = "continue",
     ) -> None:
         self.now = 0.0
+        self.lost = LostSettings(on_lost=on_lost)
         self.offload = OffloadSettings(
             services=services, decision_deadline_ms=deadline_ms, verify_share=verify_share
         )
@@ -229,7 +233,7 @@ class World:
         self.own = self.decide
         self.verified: list[VerificationNoted] = []
         self.planner, self.simulator = Planner(PROBLEM, planning), simulator
-        self.robot = Robot(self.planner, simulator, dispatcher, rate_hz)
+        self.robot = Robot(self.planner, simulator, dispatcher, rate_hz, self.lost)
         self.environment = SimulatedEnvironment(PROBLEM, simulator.seed, 0)
         self.heap: list[tuple[float, int, Callable[[], list[RobotEffect]]]] = []
         self.count = 0
@@ -282,7 +286,8 @@ class World:
         self.begin(0)
 
     def begin(self, trial: int) -> None:
-        history = replay(self.planner, self.simulator.seed, trial, self.journal)
+        rate = self.lost.false_alarm_rate
+        history = replay(self.planner, self.simulator.seed, trial, self.journal, rate)
         self.environment = self.environment_class(PROBLEM, self.simulator.seed, trial)
         for action in history.actions:
             self.environment.perform(action)

@@ -154,12 +154,13 @@ void holdfast::bind_entropy(nb::module_& module) {
               const StreamWords& stream, const std::vector<std::uint8_t>& circular,
               const Input<2>& points, int number, std::uint32_t neighbors, double resolution,
               double exponent, double offset, int threads, const std::vector<double>& factors,
-              const Input<1>& prior) {
+              const Input<1>& prior, bool unchanged) {
                const PointSets sets = make_sets(points, weights.shape(0), factors);
+               const std::size_t rows = sizes.size() + (unchanged ? 1 : 0);
                double* out;
-               auto result = make_array<double>({sizes.size(), samples}, out);
+               auto result = make_array<double>({rows, samples}, out);
                double* mean;
-               auto means = make_array<double>({sizes.size()}, mean);
+               auto means = make_array<double>({rows}, mean);
                EntropyCounts counts;
                const Estimator estimator = to_estimator(number);
                const EntropySettings settings =
@@ -169,7 +170,14 @@ void holdfast::bind_entropy(nb::module_& module) {
                    WithoutInterpreter released;
                    hypothetical_entropies(make_input(weights, sizes, predicted, variance, samples,
                                                      stream, drops_negligible(estimator), circular),
-                                          sets, settings, out, counts);
+                                          sets, settings, unchanged, out, counts);
+                   if (unchanged) {
+                       // All samples of the last row are alike, and their mean is not rounded.
+                       mean[sizes.size()] = out[sizes.size() * samples];
+                       for (std::size_t i = 1; i < samples; ++i) {
+                           out[sizes.size() * samples + i] = mean[sizes.size()];
+                       }
+                   }
                    for (std::size_t j = 0; j < sizes.size(); ++j) {
                        double total = 0.0;
                        for (std::size_t i = 0; i < samples; ++i) total += out[j * samples + i];

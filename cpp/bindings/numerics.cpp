@@ -44,7 +44,7 @@ void holdfast::bind_numerics(nb::module_& module) {
         if (y.shape(0) != x.shape(0)) throw nb::value_error("y and x do not fit");
         double* out;
         auto result = make_array<double>({y.shape(0)}, out);
-        vector_kernels().arctan2(y.data(), x.data(), out, y.shape(0));
+        for (std::size_t i = 0; i < y.shape(0); ++i) out[i] = arctan2(y.data()[i], x.data()[i]);
         return result;
     });
     define(module, "arcsin", [](double x) { return arcsin(x); });

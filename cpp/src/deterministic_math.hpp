@@ -189,48 +189,6 @@ HOLDFAST_INLINE detail::SineCosine<T> sine_cosine_of(T x) {
             select(sensible, select(negate_cosine, -c, c), nan)};
 }
 
-/// The angle of the vector (x, y) in (-pi, pi]; 0 for the zero vector, NaN where an argument is.
-///
-/// The smaller size over the larger is a tangent of at most 45 degrees, and 22.5 degrees more or
-/// less are a tangent of at most sqrt 2 - 1, whose series is short.
-template <class T>
-HOLDFAST_INLINE T arctan2_of(T y, T x) {
-    constexpr double pi = 3.14159265358979323846;
-    constexpr double pi_low = 1.2246467991473531772e-16;
-    constexpr double tan_eighth = 0.41421356237309504880;
-    constexpr double series[] = {-1.0 / 3,  1.0 / 5,   -1.0 / 7,  1.0 / 9,   -1.0 / 11,
-                                 1.0 / 13,  -1.0 / 15, 1.0 / 17,  -1.0 / 19, 1.0 / 21,
-                                 -1.0 / 23, 1.0 / 25,  -1.0 / 27, 1.0 / 29,  -1.0 / 31,
-                                 1.0 / 33,  -1.0 / 35, 1.0 / 37,  -1.0 / 39, 1.0 / 41};
-    const T zero = detail::constant<T>(0.0);
-    const T width = select(x < 0.0, -x, x);
-    const T height = select(y < 0.0, -y, y);
-    const auto steep = width < height;
-    const T smaller = select(steep, width, height);
-    const T larger = select(steep, height, width);
-    const auto beyond = smaller > larger * tan_eighth;
-    const T numerator = select(beyond, smaller - larger, smaller);
-    const T denominator = select(beyond, smaller + larger, larger);
-    const T t = select(larger == 0.0, zero, numerator / denominator);
-    const T t2 = t * t;
-    const T rest = t * (t2 * detail::horner(t2, series));
-    // The multiple of 45 degrees that is to be added, in two parts.
-    const T base = select(beyond, detail::constant<T>(0.25 * pi), zero);
-    const T base_low = select(beyond, detail::constant<T>(0.25 * pi_low), zero);
-    T angle = base + (t + (rest + base_low));
-    angle = select(steep, 0.5 * pi - (angle - 0.5 * pi_low), angle);
-    angle = select(x < 0.0, pi - (angle - pi_low), angle);
-    return select(y < 0.0, -angle, angle);
-}
-
-/// An angle brought near zero: less the nearest whole number of turns.
-template <class T>
-HOLDFAST_INLINE T wrapped(T angle) {
-    constexpr double turn = 6.28318530717958647693;
-    const T turns = (angle * (1.0 / turn) + detail::rounding_shift) - detail::rounding_shift;
-    return angle - turns * turn;
-}
-
 inline double exp(double x) {
     return exp_of(x);
 }
@@ -247,6 +205,40 @@ inline void sincos(double x, double& sine, double& cosine) {
     const auto both = sine_cosine_of(x);
     sine = both.sine;
     cosine = both.cosine;
+}
+
+/// The angle of the vector (x, y) in (-pi, pi]; 0 for the zero vector, NaN where an argument is.
+///
+/// The smaller size over the larger is a tangent of at most 45 degrees, and 45 degrees less leave
+/// one of at most sqrt 2 - 1, whose series is short.
+inline double arctan2(double y, double x) {
+    constexpr double pi = 3.14159265358979323846;
+    constexpr double pi_low = 1.2246467991473531772e-16;
+    constexpr double tan_eighth = 0.41421356237309504880;
+    constexpr double series[] = {-1.0 / 3,  1.0 / 5,   -1.0 / 7,  1.0 / 9,   -1.0 / 11,
+                                 1.0 / 13,  -1.0 / 15, 1.0 / 17,  -1.0 / 19, 1.0 / 21,
+                                 -1.0 / 23, 1.0 / 25,  -1.0 / 27, 1.0 / 29,  -1.0 / 31,
+                                 1.0 / 33,  -1.0 / 35, 1.0 / 37,  -1.0 / 39, 1.0 / 41};
+    const double width = x < 0.0 ? -x : x, height = y < 0.0 ? -y : y;
+    const bool steep = width < height;
+    const double smaller = steep ? width : height, larger = steep ? height : width;
+    if (larger == 0.0) return 0.0;
+    const bool beyond = smaller > larger * tan_eighth;
+    const double t = beyond ? (smaller - larger) / (smaller + larger) : smaller / larger;
+    const double t2 = t * t;
+    const double rest = t * (t2 * detail::horner(t2, series));
+    // 45 degrees are added in two parts.
+    double angle = beyond ? 0.25 * pi + (t + (rest + 0.25 * pi_low)) : t + rest;
+    if (steep) angle = 0.5 * pi - (angle - 0.5 * pi_low);
+    if (x < 0.0) angle = pi - (angle - pi_low);
+    return y < 0.0 ? -angle : angle;
+}
+
+/// An angle brought near zero: less the nearest whole number of turns.
+inline double wrapped(double angle) {
+    constexpr double turn = 6.28318530717958647693;
+    const double turns = (angle * (1.0 / turn) + detail::rounding_shift) - detail::rounding_shift;
+    return angle - turns * turn;
 }
 
 /// The angle in [-pi/2, pi/2] whose sine is x, by Newton's iteration on the sine; NaN for |x| > 1.

@@ -3,6 +3,7 @@
 #include <cmath>
 #include <vector>
 
+#include "deterministic_math.hpp"
 #include "vector_kernels.hpp"
 
 namespace holdfast {
@@ -78,18 +79,44 @@ class Hypotheses {
     /// Weights of posterior `index` = j * M + i.
     std::size_t operator()(std::size_t index, double* weights) const {
         const std::size_t j = index / input_.samples, i = index % input_.samples;
-        const std::size_t row = first_coordinate_[j];
+        const std::size_t row = first_coordinate_[j], size = input_.observation_size[j];
         const std::size_t variance_row = input_.varying_variance ? row * input_.count : row;
+        const double* observation = observations_.data() + row * input_.samples + i * size;
+        const double* predicted = input_.predicted + row * input_.count;
+        std::vector<double> turned;
+        if (input_.circular != nullptr) {
+            turned = nearest_turns(predicted, observation, size, input_.circular + row);
+            predicted = turned.data();
+        }
         return vector_kernels().posterior(
-            {input_.count, log_weights_.data(), input_.observation_size[j],
-             input_.predicted + row * input_.count, inverse_variance_.data() + variance_row,
+            {input_.count, log_weights_.data(), size, predicted,
+             inverse_variance_.data() + variance_row,
              input_.varying_variance ? log_normalizer_.data() + j * input_.count : nullptr,
-             observations_.data() + row * input_.samples + i * input_.observation_size[j],
-             input_.drop_negligible, input_.circular == nullptr ? nullptr : input_.circular + row},
+             observation, input_.drop_negligible},
             weights);
     }
 
+    /// Weights of the belief as it is.
+    std::size_t belief(double* weights) const {
+        return vector_kernels().normalize(log_weights_.data(), input_.count, input_.drop_negligible,
+                                          weights);
+    }
+
   private:
+    /// The predictions, of angles as many turns further as brings them nearest to the observation.
+    std::vector<double> nearest_turns(const double* predicted, const double* observation,
+                                      std::size_t size, const std::uint8_t* circular) const {
+        std::vector<double> turned(predicted, predicted + size * input_.count);
+        for (std::size_t c = 0; c < size; ++c) {
+            if (circular[c] == 0) continue;
+            for (std::size_t n = 0; n < input_.count; ++n) {
+                double& angle = turned[c * input_.count + n];
+                angle = observation[c] - wrapped(observation[c] - angle);
+            }
+        }
+        return turned;
+    }
+
     const HypothesisInput& input_;
     std::vector<double> log_weights_;
     std::vector<std::size_t> first_coordinate_;
@@ -99,12 +126,16 @@ class Hypotheses {
 }  // namespace
 
 void hypothetical_entropies(const HypothesisInput& input, const PointSets& sets,
-                            const EntropySettings& settings, double* out, EntropyCounts& counts) {
+                            const EntropySettings& settings, bool unchanged, double* out,
+                            EntropyCounts& counts) {
     const Hypotheses hypotheses(input);
+    const std::size_t posteriors = input.sensing_actions * input.samples;
     entropies(
-        sets, input.sensing_actions * input.samples,
-        [&](std::size_t index, double* weights) { return hypotheses(index, weights); }, settings,
-        out, counts);
+        sets, posteriors + (unchanged ? 1 : 0),
+        [&](std::size_t index, double* weights) {
+            return index < posteriors ? hypotheses(index, weights) : hypotheses.belief(weights);
+        },
+        settings, out, counts);
 }
 
 void hypothetical_weights(const HypothesisInput& input, double* out) {

@@ -35,9 +35,11 @@ struct HypothesisInput {
 };
 
 /// Entropies of the J x M hypothetical posteriors, row by row; NaN where an observation explains
-/// nothing. All sets of points share the posteriors.
+/// nothing. All sets of points share the posteriors. With `unchanged` one more follows, that of the
+/// belief as it is.
 void hypothetical_entropies(const HypothesisInput& input, const PointSets& sets,
-                            const EntropySettings& settings, double* out, EntropyCounts& counts);
+                            const EntropySettings& settings, bool unchanged, double* out,
+                            EntropyCounts& counts);
 
 /// The posterior weights themselves: out[J][M][count]; for horizons above 1.
 void hypothetical_weights(const HypothesisInput& input, double* out);

@@ -27,7 +27,6 @@ struct PosteriorInput {
     const double* log_normalizer;    // null, or [count]: sum over coordinates of log(variance) / 2
     const double* observation;       // [observation_size]
     bool drop_negligible;
-    const std::uint8_t* circular;  // null, or [observation_size]: 1 where it is an angle
 };
 
 /// Posteriors over the points of one tree, side by side: row = slot of the tree, column =
@@ -68,7 +67,6 @@ struct VectorKernels {
     void (*log)(const double* in, double* out, std::size_t count);
     void (*sin)(const double* in, double* out, std::size_t count);
     void (*cos)(const double* in, double* out, std::size_t count);
-    void (*arctan2)(const double* y, const double* x, double* out, std::size_t count);
     void (*normals)(const Stream&, std::uint64_t first, std::size_t count, double* out);
     double (*sum)(const double* in, std::size_t count);
     void (*weighted_sums)(const double* weights, const double* rows, std::size_t count,

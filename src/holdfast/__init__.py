@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from holdfast.config.loader import load as load_configuration
     from holdfast.config.settings import (
         ActiveSensingSettings,
+        LostSettings,
         ParticleFilterSettings,
         PlanningSettings,
         SelectorSettings,
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from holdfast.problems.registry import make
     from holdfast.recording.reading import open_run
     from holdfast.robot.environment import LATER, Environment, SimulatedEnvironment
+    from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
     from holdfast.robot.late_sensing import SenseInBackground, SenseLater
     from holdfast.robot.trial import run_trial
 
@@ -36,7 +38,9 @@ __all__ = [
     "Ending",
     "Environment",
     "GaussianMixture",
+    "GymnasiumEnvironment",
     "HoldfastError",
+    "LostSettings",
     "MoveResult",
     "NearestNeighbor",
     "ParticleFilterSettings",
@@ -62,6 +66,7 @@ __version__ = "0.1.0"
 
 _PLACES = {
     "ActiveSensingSettings": "config.settings.ActiveSensingSettings",
+    "LostSettings": "config.settings.LostSettings",
     "ParticleFilterSettings": "config.settings.ParticleFilterSettings",
     "Belief": "belief.Belief",
     "Ending": "outcome.Ending",
@@ -71,6 +76,7 @@ _PLACES = {
     "SenseInBackground": "robot.late_sensing.SenseInBackground",
     "SenseLater": "robot.late_sensing.SenseLater",
     "GaussianMixture": "estimators.GaussianMixture",
+    "GymnasiumEnvironment": "robot.gymnasium_environment.GymnasiumEnvironment",
     "HoldfastError": "errors.HoldfastError",
     "NearestNeighbor": "estimators.NearestNeighbor",
     "Planner": "planning.Planner",

@@ -68,6 +68,7 @@ def hypothetical_entropies(
     threads: int,
     factors: Sequence[float],
     prior: _Floats,
+    unchanged: bool,
 ) -> tuple[_Floats, _Floats, int, int]: ...
 def hypothetical_weights(
     weights: _Floats,

@@ -13,7 +13,7 @@ still ranks them instead of turning every weight into zero.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,9 +21,12 @@ import numpy.typing as npt
 from holdfast import _kernel, checked, numerics
 from holdfast.arrays import FloatArray, in_brief
 from holdfast.circular import differences, mean_angles
+from holdfast.config.settings import Estimate
 from holdfast.errors import InvalidValueError
+from holdfast.modes import heaviest_mode
 from holdfast.problem_attributes import circular_observation, has_general_observations
 from holdfast.randomness import Stream
+from holdfast.validation_gate import gate, is_typical, is_within
 
 __all__ = [
     "Belief",
@@ -123,32 +126,40 @@ class ObservationInfo(NamedTuple):
     mahalanobis_distance : float or None
         Distance of the observation from the nearest particle's prediction, in standard deviations;
         None for a general likelihood, which has no such distance.
+    within_gate : bool
+        Whether the observation is one that the belief makes likely: within the gate of
+        :mod:`holdfast.validation_gate` (for a general likelihood: possible for some particle).
     """
 
     effective_sample_size: float
     explained: bool
     resampled: bool
     mahalanobis_distance: float | None = None
+    within_gate: bool = True
 
 
 def estimate(
     belief: Belief,
-    kind: Literal["mean", "most_likely"] = "mean",
+    kind: Estimate = "mean",
     circular: Sequence[int] = (),
 ) -> FloatArray:
     """Return a point estimate of the state, shape ``(state_size,)``.
 
-    It is the mean, or the particle of the greatest weight (the first of equals). The mean of a
-    ``circular`` coordinate, an angle in radians, is the mean direction, in (-pi, pi].
+    It is the mean, the mean of the heaviest mode (:mod:`holdfast.modes`), or the particle of the
+    greatest weight (the first of equals). The mean of a ``circular`` coordinate, an angle in
+    radians, is the mean direction, in (-pi, pi].
     """
     if kind == "most_likely":
         # A copy: the belief may be large, and what is returned may outlive it.
         likely: FloatArray = belief.states[int(np.argmax(belief.weights))].copy()
         return likely
-    mean = _kernel.weighted_sums(belief.weights, belief.states)
+    weights = belief.weights
+    if kind == "heaviest_mode":
+        weights = heaviest_mode(belief.states, weights, circular)
+    mean = _kernel.weighted_sums(weights, belief.states)
     if circular:
         angles = list(circular)
-        mean[angles] = mean_angles(belief.states[:, angles], belief.weights)
+        mean[angles] = mean_angles(belief.states[:, angles], weights)
     return mean
 
 
@@ -168,7 +179,11 @@ def effective_sample_size(belief: Belief) -> float:
 
 
 def update(
-    problem: Any, belief: Belief, sensing_action: int, observation: npt.ArrayLike
+    problem: Any,
+    belief: Belief,
+    sensing_action: int,
+    observation: npt.ArrayLike,
+    rank_stream: Stream | None = None,
 ) -> tuple[Belief, ObservationInfo]:
     """Multiply the weights by the likelihood of an observation (Bayes' rule); do not resample.
 
@@ -180,6 +195,8 @@ def update(
         Has the mean and variance of the observation in each state, or a method
         ``log_likelihood(states, sensing_action, observation)``.
     observation : array of shape (observation_size,)
+    rank_stream : Stream, optional
+        For a general likelihood: draws what the rank test of the validation gate compares with.
 
     Raises
     ------
@@ -203,11 +220,41 @@ def update(
         )
         explained = squared_distance <= VALIDATION_GATE_SQUARED
         distance = float(np.sqrt(squared_distance))
+        # Most observations are near a particle, and cost no more than this comparison.
+        within_gate = squared_distance <= gate(observed.shape[0]) or is_within(
+            observed, mean, variance, belief.weights, angles
+        )
     else:
         distance = None
         log_likelihood = checked.log_likelihood(problem, belief.states, sensing_action, observed)
         explained = bool(((log_likelihood > -np.inf) & (belief.weights > 0.0)).any())
-    return _reweighted(belief, log_likelihood, explained, distance)
+        within_gate = explained
+        if explained and rank_stream is not None:
+            within_gate = _is_typical(problem, belief, sensing_action, log_likelihood, rank_stream)
+    return _reweighted(belief, log_likelihood, explained, distance, within_gate)
+
+
+def _is_typical(
+    problem: Any, belief: Belief, sensing_action: int, log_likelihood: FloatArray, random: Stream
+) -> bool:
+    """Tell whether an observation is as likely as others that the belief makes."""
+    states, weights = belief
+
+    def predictive(log_likelihoods: FloatArray) -> float:
+        peak = float(log_likelihoods.max())
+        if peak == -np.inf:
+            return peak
+        total = numerics.sum(weights * numerics.exp(log_likelihoods - peak))
+        return peak + float(numerics.log(total))
+
+    def draw(number: int) -> float:
+        own = random.substream(number)
+        drawn = _kernel.systematic_resample(weights, float(own.substream(0).uniform()))
+        chosen = states[drawn[int(own.substream(1).uniform() * drawn.shape[0])]]
+        shown = checked.sample_observation(problem, chosen, sensing_action, own.substream(2))
+        return predictive(checked.log_likelihood(problem, states, sensing_action, shown))
+
+    return is_typical(predictive(log_likelihood), draw)
 
 
 def update_by_move(
@@ -221,7 +268,7 @@ def update_by_move(
     observed = _finite(observation)
     log_likelihood = checked.move_log_likelihood(problem, belief.states, task_action, observed)
     explained = bool(((log_likelihood > -np.inf) & (belief.weights > 0.0)).any())
-    return _reweighted(belief, log_likelihood, explained, None)
+    return _reweighted(belief, log_likelihood, explained, None, explained)
 
 
 def _finite(observation: npt.ArrayLike) -> FloatArray:
@@ -234,14 +281,19 @@ def _finite(observation: npt.ArrayLike) -> FloatArray:
 
 
 def _reweighted(
-    belief: Belief, log_likelihood: FloatArray, explained: bool, distance: float | None
+    belief: Belief,
+    log_likelihood: FloatArray,
+    explained: bool,
+    distance: float | None,
+    within_gate: bool,
 ) -> tuple[Belief, ObservationInfo]:
     weights, survivors = _kernel.normalize(numerics.log(belief.weights) + log_likelihood, False)
-    if survivors == 0:
-        return belief, ObservationInfo(effective_sample_size(belief), False, False, distance)
-    weights.setflags(write=False)
-    after = Belief(belief.states, weights)
-    return after, ObservationInfo(effective_sample_size(after), explained, False, distance)
+    after = belief
+    if survivors:
+        weights.setflags(write=False)
+        after = Belief(belief.states, weights)
+    found = effective_sample_size(after), explained and survivors > 0, False
+    return after, ObservationInfo(*found, distance, within_gate)
 
 
 def _gaussian_log_likelihood(

@@ -166,6 +166,10 @@ class MissingRosbagsError(HoldfastError):
     """The library rosbags is not installed."""
 
 
+class ViewError(HoldfastError):
+    """A run cannot be shown: Rerun is not installed, or its viewer cannot be reached."""
+
+
 class DescriptorError(HoldfastError):
     """The process needs more open files and sockets than its limit."""
 

@@ -19,7 +19,8 @@ them lead to the same actions, and a return is the sum of a hundred noisy steps.
   over an interval.
 - Where sensing has prices, the mean price is paid at each later sensing step up to the goal, as by
   a robot that senses at random from then on: a robot that is sooner at the goal pays less often. If
-  knowledge were free later, sensing would be put off for ever.
+  knowledge were free later, sensing would be put off for ever. Not to sense, where it is a choice,
+  counts in that mean, too.
 - True state i is left out of the posterior of its own observation. A robot's true state is not
   among its particles, and a posterior of few particles with it would be too good.
 - A rollout ends at the goal, or as soon as the state is known and the same after every sensing

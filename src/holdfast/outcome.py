@@ -155,31 +155,47 @@ class Decisions(msgspec.Struct, frozen=True):
         """Return the BLAKE2b-256 of the log in hexadecimal."""
         return hashlib.blake2b(self.log, digest_size=_DIGEST_SIZE).hexdigest()
 
+    def reinitialised_after(self) -> frozenset[int]:
+        """Return after how many inputs (of a trial, as tracked) the belief was begun anew."""
+        inputs = 0
+        found = set()
+        for kind, _ in self._records():
+            if kind == b"R":
+                found.add(inputs)
+            inputs += kind in (b"S", b"M", b"L", b"R")
+        return frozenset(found)
+
     def __iter__(self) -> Iterator[SensingDecision | TaskDecision]:
-        action = struct.Struct(f"<{self.action_size}d")
+        for kind, position in self._records():
+            if kind == b"S":
+                _, step, sensing_action, state_digest = _SENSING.unpack_from(self.log, position)
+                yield SensingDecision(step, sensing_action, state_digest)
+            elif kind == b"A":
+                _, step = _TASK.unpack_from(self.log, position)
+                at = position + _TASK.size
+                yield TaskDecision(step, struct.unpack_from(f"<{self.action_size}d", self.log, at))
+
+    def _records(self) -> Iterator[tuple[bytes, int]]:
+        """Yield the kind of each record and where it begins; it lies in the log as a whole."""
+        sizes = {
+            b"S": _SENSING.size,
+            b"A": _TASK.size + 8 * self.action_size,
+            **{kind: record.size for kind, record in _OTHERS.items()},
+        }
         position = 0
         while position < len(self.log):
             kind = self.log[position : position + 1]
-            try:
-                if kind == b"S":
-                    _, step, sensing_action, state_digest = _SENSING.unpack_from(self.log, position)
-                    yield SensingDecision(step, sensing_action, state_digest)
-                    position += _SENSING.size
-                elif kind == b"A":
-                    _, step = _TASK.unpack_from(self.log, position)
-                    yield TaskDecision(step, action.unpack_from(self.log, position + _TASK.size))
-                    position += _TASK.size + action.size
-                elif kind in _OTHERS:
-                    _OTHERS[kind].unpack_from(self.log, position)
-                    position += _OTHERS[kind].size
-                else:
-                    raise InvalidValueError(
-                        f"decision log: byte {position} is {kind!r}, which begins no record"
-                    )
-            except struct.error as error:
+            size = sizes.get(kind)
+            if size is None:
+                raise InvalidValueError(
+                    f"decision log: byte {position} is {kind!r}, which begins no record"
+                )
+            if position + size > len(self.log):
                 raise InvalidValueError(
                     f"decision log: the record at byte {position} of {len(self.log)} is cut short"
-                ) from error
+                )
+            yield kind, position
+            position += size
 
 
 class DecisionLog:
@@ -272,6 +288,8 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
         with the planner in process.
     unexplained_observations : int
         Observations that no particle of the belief explained.
+    lost, suspect_sensors : int
+        Times that the robot was found lost, and a sensing action suspect (:mod:`holdfast.lost`).
     digest : str
         BLAKE2b-256 of the decisions, in hexadecimal.
     sensing_ms : tuple of float
@@ -293,6 +311,8 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     recoveries: int
     unexplained_observations: int
     digest: str
+    lost: int = 0
+    suspect_sensors: int = 0
     sensing_ms: tuple[float, ...]
     decisions: Decisions | None = None
 

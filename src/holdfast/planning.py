@@ -262,9 +262,12 @@ class Planner:
         if observation is None:
             size = effective_sample_size(state.belief)
             return state._replace(sensed=True), ObservationInfo(size, True, False)
-        updated = update(problem, state.belief, sensing_action, observation)
-        after, info = self._resampled(state, *updated, Purpose.RESAMPLING)
-        return after._replace(sensed=True), info
+        ranks = None
+        if getattr(problem, "rank_test", False):
+            ranks = stream(state.seed, state.trial, state.step, Purpose.RANK_TEST)
+        updated = update(problem, state.belief, sensing_action, observation, ranks)
+        belief, info = self._resampled(state, *updated, Purpose.RESAMPLING)
+        return state._replace(sensed=True, belief=belief), info
 
     def observe_move(
         self, state: PlanningState, task_action: FloatArray, observation: npt.ArrayLike
@@ -283,21 +286,21 @@ class Planner:
         """
         self._require_size(state)
         updated = update_by_move(self.problem, state.belief, task_action, observation)
-        return self._resampled(state, *updated, Purpose.MOVE_RESAMPLING)
+        belief, info = self._resampled(state, *updated, Purpose.MOVE_RESAMPLING)
+        return state._replace(belief=belief), info
 
     def _resampled(
         self, state: PlanningState, belief: Belief, found: ObservationInfo, purpose: Purpose
-    ) -> tuple[PlanningState, ObservationInfo]:
-        """Return the state with an updated belief, resampled if its effective size asks for it."""
+    ) -> tuple[Belief, ObservationInfo]:
+        """Return an updated belief of a state, resampled if its effective size asks for it."""
         count = belief.weights.shape[0]
         threshold = self.settings.particle_filter.resampling_threshold * count
         # Rounding may leave the size of equal weights a little above their number.
         resampled = threshold == count or found.effective_sample_size <= threshold
         if resampled:
             belief = resample(belief, stream(state.seed, state.trial, state.step, purpose))
-        return state._replace(belief=belief), ObservationInfo(
-            found.effective_sample_size, found.explained, resampled, found.mahalanobis_distance
-        )
+        size, explained, _, distance, within_gate = found
+        return belief, ObservationInfo(size, explained, resampled, distance, within_gate)
 
     def reinitialise(self, state: PlanningState) -> PlanningState:
         """Return the state with a new belief, for a robot that is lost.

@@ -156,15 +156,9 @@ def choose_sensing_action(
     threads = settings.active_sensing.num_cores
     size = settings.active_sensing.num_observation_samples
     hypothetical = _hypotheses(problem, belief, range(count), size, hypotheses)
-    kernel_points = scaled(points, estimator)
     entropies, samples, likelihoods, visits = hypothetical.entropies(
-        kernel_points, estimator, threads, factors
+        scaled(points, estimator), estimator, threads, factors, selector.sensing_is_optional
     )
-    if selector.sensing_is_optional:
-        unchanged, more_visits = _entropy_now(belief, kernel_points, estimator, threads, factors)
-        entropies = np.append(entropies, unchanged)
-        samples = np.vstack([samples, np.full(size, unchanged)])
-        visits += more_visits
     if settings.active_sensing.horizon > 1 and not np.isnan(entropies).any():
         weights = hypothetical.weights(estimator.drops_negligible)
         if selector.sensing_is_optional:
@@ -210,26 +204,6 @@ def _prices(problem: Problem, settings: PlanningSettings) -> FloatArray | None:
         return None
     optional = settings.selector.sensing_is_optional
     return rate * sensing_costs(problem, otherwise=1.0, optional=optional)
-
-
-def _entropy_now(
-    belief: Belief,
-    points: FloatArray,
-    estimator: KernelEstimator,
-    threads: int,
-    factors: tuple[float, ...],
-) -> tuple[float, int]:
-    """Return the entropy of the belief as it is, and the visits."""
-    found, _, visits, _ = _kernel.entropies(
-        np.ascontiguousarray(points),
-        numerics.log(belief.weights)[np.newaxis],
-        True,
-        *estimator.parameters,
-        threads,
-        factors,
-        estimator.prior,
-    )
-    return float(found[0]), visits
 
 
 def _with_unchanged(weights: FloatArray, same: FloatArray) -> FloatArray:
@@ -361,8 +335,12 @@ class _GaussianHypotheses(NamedTuple):
         estimator: KernelEstimator,
         threads: int,
         factors: tuple[float, ...],
+        unchanged: bool,
     ) -> tuple[FloatArray, FloatArray, int, int]:
-        """Return the mean entropies (J,), the single ones (J, M), likelihoods and visits."""
+        """Return the mean entropies (J,), the single ones (J, M), likelihoods and visits.
+
+        With ``unchanged`` the belief as it is comes last, as if it were one more sensing action.
+        """
         return _kernel.hypothetical_entropies(
             *self.arguments,
             points,
@@ -370,6 +348,7 @@ class _GaussianHypotheses(NamedTuple):
             threads,
             factors,
             estimator.prior,
+            unchanged,
         )
 
     def weights(self, drop_negligible: bool) -> FloatArray:
@@ -382,10 +361,12 @@ class _GaussianHypotheses(NamedTuple):
 class _GeneralHypotheses(NamedTuple):
     """The same for a problem that gives ``log_likelihood`` and ``sample_observation``.
 
-    ``log_weights`` are those of the posteriors, shape (J * M, N).
+    ``log_weights`` are those of the posteriors, shape (J * M, N), and ``log_prior``, (N,), those of
+    the belief.
     """
 
     log_weights: FloatArray
+    log_prior: FloatArray
     samples: int
 
     def entropies(
@@ -394,18 +375,24 @@ class _GeneralHypotheses(NamedTuple):
         estimator: KernelEstimator,
         threads: int,
         factors: tuple[float, ...],
+        unchanged: bool,
     ) -> tuple[FloatArray, FloatArray, int, int]:
+        rows = np.vstack([self.log_weights, self.log_prior]) if unchanged else self.log_weights
         found, likelihoods, visits, _ = _kernel.entropies(
             np.ascontiguousarray(points),
-            self.log_weights,
+            rows,
             True,
             *estimator.parameters,
             threads,
             factors,
             estimator.prior,
         )
-        samples = found.reshape(-1, self.samples)
-        return _row_means(samples), samples, likelihoods, visits
+        samples = found[: len(self.log_weights)].reshape(-1, self.samples)
+        means = _row_means(samples)
+        if unchanged:
+            means = np.append(means, found[-1])
+            samples = np.vstack([samples, np.full(self.samples, found[-1])])
+        return means, samples, likelihoods, visits
 
     def weights(self, drop_negligible: bool) -> FloatArray:
         rows = [_kernel.normalize(row, drop_negligible)[0] for row in self.log_weights]
@@ -458,7 +445,7 @@ def _general_hypotheses(
             rows.append(
                 log_prior + checked.log_likelihood(problem, belief.states, action, observation)
             )
-    return _GeneralHypotheses(np.ascontiguousarray(rows, dtype=np.float64), samples)
+    return _GeneralHypotheses(np.ascontiguousarray(rows, dtype=np.float64), log_prior, samples)
 
 
 def _stratified(weights: FloatArray, samples: int, stream: Stream) -> list[int]:

@@ -11,6 +11,8 @@ from __future__ import annotations
 from typing import NamedTuple, TypeAlias
 
 from holdfast.arrays import FloatArray
+from holdfast.config.settings import LostSettings
+from holdfast.lost import MOVE, LostTest, Verdict
 from holdfast.outcome import DecisionLog, Ending, RewardAccount, TrialResult
 from holdfast.planning import ObservationInfo, Planner, PlanningState
 
@@ -59,6 +61,8 @@ _Input: TypeAlias = _Sensed | _Moved | _Reinitialised
 class Trial:
     """A trial so far.
 
+    ``false_alarm_rate`` is the one of :class:`~holdfast.lost.LostTest`.
+
     Attributes
     ----------
     state : PlanningState
@@ -68,22 +72,37 @@ class Trial:
         Choices of a sensing action so far, those not to sense included.
     num_sensed : int
         Sensing actions that were performed.
+    num_inputs : int
+        What led to the state besides task actions: observations and choices not to sense, moves
+        that have shown something, late observations, reinitialisations.
     num_unexplained : int
-        Observations outside the validation gate of every particle.
+        Observations that no particle explains.
+    lost_test : LostTest
+    alarm : Verdict or None
+        That of the last input or move.
     sensing_ms : list of float
         How long each choice of a sensing action took.
     recoveries : int
         Times that the cloud was lost.
     """
 
-    def __init__(self, planner: Planner, seed: int, trial: int) -> None:
+    def __init__(
+        self,
+        planner: Planner,
+        seed: int,
+        trial: int,
+        false_alarm_rate: float = LostSettings().false_alarm_rate,
+    ) -> None:
         self.planner = planner
         self.state = planner.init(seed, trial)
         self.log = DecisionLog(planner.problem.action_size)
         self.rewards = RewardAccount(planner.problem)
         self.num_observations = 0
         self.num_sensed = 0
+        self.num_inputs = 0
         self.num_unexplained = 0
+        self.lost_test = LostTest(false_alarm_rate)
+        self.alarm: Verdict | None = None
         self.sensing_ms: list[float] = []
         self.recoveries = 0
         # From the oldest awaited observation on: each input and, of an awaited one, the state
@@ -113,7 +132,8 @@ class Trial:
         self.state = after
         self.num_observations += 1
         self.num_sensed += performed
-        self.num_unexplained += not info.explained
+        self.num_inputs += 1
+        self._judge(sensing_action, None if observation is None else info)
         self.sensing_ms.append(sensing_ms)
         reached = planner.digest(after)
         self.log.sensed(before.step, sensing_action, reached)
@@ -141,9 +161,9 @@ class Trial:
         self.log.acted(step, action)
         self.state = state
         if motion is not None or observation is not None:
+            self.num_inputs += 1
             self.log.moved(step, self.planner.digest(state))
-        if info is not None:
-            self.num_unexplained += not info.explained
+        self._judge(MOVE, info)
         self.rewards.acted(reward)
         return info
 
@@ -169,7 +189,8 @@ class Trial:
         self._before |= again
         self._drop_settled()
         self.state = state
-        self.num_unexplained += not info.explained
+        self.num_inputs += 1
+        self._judge(sensed.sensing_action, info)
         reached = self.planner.digest(state)
         self.log.observed_late(late.step, state.step, reached)
         return info, reached
@@ -178,6 +199,9 @@ class Trial:
         """Begin the belief anew; return the digest of the state that this leads to."""
         self.state = self.planner.reinitialise(self.state)
         self._keep(_Reinitialised())
+        self.num_inputs += 1
+        self.lost_test.restart()
+        self.alarm = None
         reached = self.planner.digest(self.state)
         self.log.reinitialised(self.state.step, reached)
         return reached
@@ -201,10 +225,19 @@ class Trial:
             mean_sensing_ms=sum(sensing_ms) / len(sensing_ms) if sensing_ms else 0.0,
             recoveries=self.recoveries,
             unexplained_observations=self.num_unexplained,
+            lost=self.lost_test.num_lost,
+            suspect_sensors=self.lost_test.num_suspect,
             digest=decisions.digest(),
             sensing_ms=sensing_ms,
             decisions=decisions,
         )
+
+    def _judge(self, sensing_action: int, info: ObservationInfo | None) -> None:
+        """Count an observation; None is none."""
+        self.alarm = None
+        if info is not None:
+            self.num_unexplained += not info.explained
+            self.alarm = self.lost_test.observed(sensing_action, info.within_gate)
 
     def _folded(self, state: PlanningState, given: _Input) -> PlanningState:
         if isinstance(given, _Sensed):

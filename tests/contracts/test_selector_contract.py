@@ -181,6 +181,33 @@ class TestEverySelector:
                 assert index == 0
 
 
+@pytest.mark.parametrize("selector", SELECTORS, ids=describe)
+def test_sensing_may_be_left_out(problem: Problem, selector: SelectorSettings) -> None:
+    """One choice more, of which nothing else depends; it wins if sensing is dear enough."""
+    count, belief = len(problem.sensing_actions), belief_of(problem)
+    optional = msgspec.structs.replace(selector, sensing_is_optional=True)
+    results = {
+        as_bytes(choose(problem, settings_of(optional, cores=cores), belief)) for cores in (1, 3)
+    }
+    assert len(results) == 1
+    index, info = choose(problem, settings_of(optional), belief)
+    assert type(index) is int
+    assert 0 <= index <= count
+    if selector.method in UNINFORMED_METHODS:
+        assert info == SensingInfo(None, None, 0, 0)
+        return
+    assert info.samples is not None
+    assert info.samples.shape == (count + 1, 4)
+    assert np.isfinite(info.samples).all()
+    if selector.method == "expected_return":
+        return  # Whose price is the problem's; the mean of later ones is another, too.
+    _, without = choose(problem, settings_of(selector), belief)
+    assert without.samples is not None
+    np.testing.assert_array_equal(info.samples[:count], without.samples)
+    dear = msgspec.structs.replace(optional, nats_per_cost=1e3)
+    assert choose(problem, settings_of(dear), belief)[0] == count
+
+
 @pytest.mark.parametrize("selector", [LOOKING[index] for index in (0, 2, 4, 17)], ids=describe)
 def test_horizon(problem: Problem, selector: SelectorSettings) -> None:
     """A longer horizon adds to what the next step's entropy is."""

@@ -92,9 +92,9 @@ def test_it_holds_the_package_and_nothing_else(wheel: Path) -> None:
     about = f"holdfast-{holdfast.__version__}.dist-info/"
     (kernel,) = (name for name in names if name.endswith(".so"))
     assert kernel.startswith("holdfast/_kernel.")
-    package = {name.removeprefix("src/") for name in _tracked("src/holdfast")}
+    package = {name.removeprefix("src/") for name in _tracked("src")}
     assert {name for name in names if not name.startswith(about)} == package | {kernel}
-    assert "holdfast/py.typed" in names
+    assert {"holdfast/py.typed", "holdfast_env/py.typed"} <= names
     assert {name.removeprefix(about) for name in names if name.startswith(about)} == {
         *("METADATA", "RECORD", "WHEEL", "entry_points.txt"),
         *("licenses/LICENSE", "sboms/kernel.cdx.json"),

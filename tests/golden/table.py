@@ -49,7 +49,10 @@ class Run(NamedTuple):
     def command(self) -> str:
         """Return the command that makes this run, from the root of the repository."""
         problem = [] if self.problem is None else ["--problem", self.problem]
-        changes = [f"--set {shlex.quote(f'{key}={value}')}" for key, value in self.changes.items()]
+        changes = [
+            f"--set {shlex.quote(f'{key}={_written(value)}')}"
+            for key, value in self.changes.items()
+        ]
         words = ["holdfast run", self.file, *problem, "--trials", str(self.trials), *changes]
         return " ".join(words)
 
@@ -74,6 +77,10 @@ class Run(NamedTuple):
         ).digest
 
 
+def _written(value: object) -> str:
+    return "null" if value is None else str(value)
+
+
 def runs() -> list[Run]:
     """Return every run that is pinned; what is new in the product appears here by itself."""
     return [*_examples(), *_problems(), *_selectors(), *_resolutions(), *_estimates()]
@@ -92,7 +99,9 @@ def _examples() -> Iterator[Run]:
         if load(path).environment.object is not None:
             continue  # the command would run that robot, with what it is made of
         short: dict[str, Any] = {"simulator.max_steps": 300}
-        if path.stem == "priced_looks":
+        if load(path).environment.object is not None:  # what is pinned is simulated
+            short["environment.object"] = None
+        if path.stem in ("priced_looks", "optional_looks"):
             yield Run(file, file, 3, short)
             continue
         yield Run(file, file, 3, {**short, **_FIRST_DEFAULTS, **_as_before(path.stem)})

@@ -91,6 +91,16 @@ class Forgetful(Lander):
         return self.ending.get(self.trial, False) if self.landed else False
 
 
+class Killed(Lander):
+    # The robot's process is killed once in each trial, in the step in which it is found lost.
+    def perform(self, task_action):
+        killed = Path(f"killed-{self.trial}")
+        if self.steps_performed() == 4 and not killed.exists():
+            killed.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().perform(task_action)
+
+
 class Wrong(Lander):
     ending = {0: True, 1: "crashed"}
 
@@ -208,12 +218,46 @@ def test_a_filter_that_has_lost_the_robot_is_told(tmp_path: Path) -> None:
         each = [event for event in told if event["event"] == "unexplained"]
         assert [event["step"] for event in each] == list(range(int(row["steps"])))
         assert all(event["deviations"] > 8.0 for event in each)
-        (diverged,) = [event for event in told if event["event"] == "filter_diverged"]
-        assert diverged["step"] == 4
+        (lost,) = [event for event in told if event["event"] == "lost"]
+        assert lost["step"] == 4
+        assert row["lost"] == "1"
     assert command.summary()["unexplained_observations"] == 21
     assert "unexplained" in ended.stdout
     assert "21 of 21 observations" in ended.stdout
-    assert ended.stderr.count("filter diverged") == 3
+    assert ended.stderr.count("lost") == 3
+
+
+def test_a_lost_robot_that_is_killed_begins_its_belief_anew_at_the_same_step(
+    tmp_path: Path,
+) -> None:
+    anew = ("--set", "lost.on_lost=reinitialise")
+    (tmp_path / "a").mkdir()
+    whole = Command(tmp_path / "a", "Lander", shown=1000.0)
+    assert whole.run(*anew).returncode == 0
+    (tmp_path / "b").mkdir()
+    command = Command(tmp_path / "b", "Killed", shown=1000.0)
+    assert command.run(*anew).returncode == -signal.SIGKILL
+    codes = [command.run(*anew, "--resume").returncode for _ in range(3)]
+    assert codes == [-signal.SIGKILL, -signal.SIGKILL, 0]
+    assert [row["digest"] for row in command.rows()] == [row["digest"] for row in whole.rows()]
+    again = [each for each in events_of(command.out) if each["event"] == "reinitialised"]
+    assert [(each["trial"], each["step"]) for each in again] == [(0, 4), (1, 4), (2, 4)]
+    # Whoever replays the record comes to the same beliefs.
+    exported = subprocess.run(
+        [*COMMAND, "export", str(command.out), "--csv", str(tmp_path / "csv")], check=False
+    )
+    assert exported.returncode == 0
+
+
+def test_a_lost_robot_that_holds_still_goes_on_as_it_is_told(tmp_path: Path) -> None:
+    command = Command(tmp_path, "Lander", shown=1000.0)
+    held = command.run("--set", "lost.on_lost=hold")
+    assert held.returncode not in (0, -signal.SIGKILL)
+    said = " ".join(held.stderr.split())
+    assert "the robot is lost in trial 0, step 4, and holds still" in said
+    assert command.run("--resume", "--set", "lost.on_lost=reinitialise").returncode == 0
+    again = [each for each in events_of(command.out) if each["event"] == "reinitialised"]
+    assert [(each["trial"], each["step"]) for each in again] == [(0, 4), (1, 4), (2, 4)]
 
 
 def test_a_run_from_before_trials_could_fail_goes_on(tmp_path: Path) -> None:

@@ -194,6 +194,34 @@ class TestHealth:
         assert "--health 127.0.0.1:0 " in interrupted["resume_command"]
         story.finish(site.run(story.file, *HEALTH, services=[cloud], resume=True))
 
+    def test_metrics_of_a_robot(self, site: Site, references: References) -> None:
+        """One address has health and metrics, and the counts are those of the run."""
+        document = document_of(PEG, max_steps=40, trials=2)
+        cloud = site.service().start()
+        address = f"127.0.0.1:{free_port()}"
+        story = Story(site, references, document)
+        seen: list[str] = []
+
+        def look() -> None:
+            assert page(story.running, "/readyz") == (200, f"{STANDARD}\n")
+            with urllib.request.urlopen(f"http://{address}/metrics", timeout=PATIENCE_S) as answer:
+                assert answer.headers["Content-Type"].startswith("text/plain; version=0.0.4")
+                seen.append(answer.read().decode())
+
+        story.at("perform", 20, look, trial=1)
+        robot = site.run(story.file, "--health", address, "--metrics", address, services=[cloud])
+        assert robot.wait() == 0, robot.account()
+        story.finish(robot)
+        (text,) = seen
+        sensing = sum(step <= 20 for step in sensing_steps(document)) + len(sensing_steps(document))
+        name = cloud.endpoint
+        told = dict(line.rsplit(" ", 1) for line in text.splitlines() if line[:1] != "#")
+        decided = told[f'holdfast_robot_decisions_total{{kind="sensing",service="{name}"}}']
+        assert float(decided) == sensing
+        assert float(told["holdfast_robot_trial"]) == 1.0
+        assert float(told['holdfast_robot_trials_total{outcome="truncated"}']) == 1.0
+        assert float(told["holdfast_robot_step"]) in (20.0, 21.0)
+
     def test_a_port_that_is_taken_leaves_no_run(self, site: Site) -> None:
         document = document_of(PEG)
         service = site.service("--health", "0").start()

@@ -21,8 +21,8 @@ from tests.ros.ros2_processes import ObservedProcess
 
 from holdfast.config.loader import load
 from holdfast.planning import Planner
+from holdfast.recording.poses import pose_layout
 from holdfast.robot.trial import run_trial
-from holdfast.ros.poses import pose_layout
 
 ROOT = Path(__file__).parents[2]
 CONFIGURATION = ROOT / "examples" / "peg_in_hole_2d.yaml"

@@ -50,7 +50,7 @@ crash service=cloud-1 at=0.03 down_s=3600
    0.5364  robot    hears of call 6: its end
    0.5370  robot    performs task actions 30 to 35
    0.5982  robot    performs sensing action 2 of step 36
-   0.5992  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.5992  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.5992  robot    asks local, call 7
    0.6004  robot    hears of call 7: TaskAnswer
    0.6004  robot    performs task actions 36 to 38

@@ -44,7 +44,7 @@ crowd service=cloud-1 at=0.18 robots=60
    0.4210  robot    hears of call 5: its end
    0.4242  robot    performs task actions 33 to 35
    0.4548  robot    performs sensing action 2 of step 36
-   0.4558  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.4558  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.4558  robot    asks cloud-1, call 6
    0.4840  robot    hears of call 6: TaskAnswer
    0.4840  robot    performs task actions 36 to 39

@@ -28,7 +28,7 @@ stop node=cloud-1 at=0.1 for_s=0.6
    0.3618  robot    holding step=9 reason=cloud-1: no sign of progress for 250 ms; local: is being launched
    0.5118  local    starts, process 1
    0.5218  robot    launched launch_ms=160
-   0.5218  robot    restore service=local step=9 bytes=1544
+   0.5218  robot    restore service=local step=9 bytes=1567
    0.5218  robot    retry service=local step=9 attempt=3 waited_ms=410
    0.5218  robot    asks local, call 5
    0.5230  robot    hears of call 5: TaskAnswer
@@ -61,7 +61,7 @@ stop node=cloud-1 at=0.1 for_s=0.6
    0.7158  robot    hears of call 8: its end
    0.7230  robot    performs task actions 28 to 35
    0.8046  robot    performs sensing action 2 of step 36
-   0.8056  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.8056  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.8056  robot    asks cloud-1, call 9
    0.8086  robot    hears of call 9: TaskAnswer
    0.8086  robot    performs task action 36

@@ -45,7 +45,7 @@ crash service=cloud-1 at=0 down_s=3600
    1.4504  robot    hears of call 5: its end
    1.4576  robot    performs task actions 28 to 35
    1.5392  robot    performs sensing action 2 of step 36
-   1.5402  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   1.5402  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    1.5402  robot    asks local, call 6
    1.5414  robot    hears of call 6: TaskAnswer
    1.5414  robot    performs task action 36

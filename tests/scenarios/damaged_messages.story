@@ -46,7 +46,7 @@ message service=cloud-1 direction=from number=4 what=corrupt bit=199
    0.3734  robot    hears of call 7: its end
    0.3806  robot    performs task actions 28 to 35
    0.4622  robot    performs sensing action 2 of step 36
-   0.4632  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.4632  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.4632  robot    asks cloud-1, call 8
    0.4662  robot    hears of call 8: TaskAnswer
    0.4662  robot    performs task action 36

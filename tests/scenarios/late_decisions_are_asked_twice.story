@@ -24,7 +24,7 @@ slow service=cloud-1 at=0.05 for_s=0.25 factor=20
    0.1178  robot    performs sensing action 0 of step 9
    0.1188  robot    asks cloud-1, call 3
    0.1238  robot    hedge step=9 waited_ms=5
-   0.1238  robot    restore service=local step=9 bytes=1544
+   0.1238  robot    restore service=local step=9 bytes=1567
    0.1238  robot    asks local, call 4
    0.1250  robot    hears of call 4: TaskAnswer
    0.1250  robot    restored service=local step=9 restore_ms=1.2
@@ -57,7 +57,7 @@ slow service=cloud-1 at=0.05 for_s=0.25 factor=20
    0.3508  robot    hears of call 7: its end
    0.3606  robot    performs task actions 31 to 35
    0.4116  robot    performs sensing action 2 of step 36
-   0.4126  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.4126  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.4126  robot    asks cloud-1, call 8
    0.4156  robot    hears of call 8: TaskAnswer
    0.4156  robot    performs task action 36

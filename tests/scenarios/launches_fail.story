@@ -31,7 +31,7 @@ launch number=2 what=late seconds=0.3
    0.1118  robot    holding step=9 reason=cloud-1: is not there; local: is being launched
    0.5220  local    starts, process 1
    0.5320  robot    launched launch_ms=460
-   0.5320  robot    restore service=local step=9 bytes=1544
+   0.5320  robot    restore service=local step=9 bytes=1567
    0.5320  robot    asks local, call 3
    0.5332  robot    hears of call 3: TaskAnswer
    0.5332  robot    restored service=local step=9 restore_ms=1.2
@@ -55,7 +55,7 @@ launch number=2 what=late seconds=0.3
    0.7242  robot    hears of call 5: its end
    0.7314  robot    performs task actions 28 to 35
    0.8130  robot    performs sensing action 2 of step 36
-   0.8140  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.8140  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.8140  robot    asks local, call 6
    0.8152  robot    hears of call 6: TaskAnswer
    0.8152  robot    performs task action 36

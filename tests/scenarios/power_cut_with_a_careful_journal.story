@@ -28,7 +28,7 @@ kill_robot boundary=30 power_cut=true lost_appends=2
    0.3362  robot    resumed_trial trial=0 step=10
    0.3362  robot    performed_unseen trial=0 step=10
    0.3452  robot    service_appeared service=cloud-1
-   0.3452  robot    restore service=cloud-1 step=11 bytes=1544
+   0.3452  robot    restore service=cloud-1 step=11 bytes=1567
    0.3452  robot    asks cloud-1, call 1
    0.3482  robot    hears of call 1: TaskAnswer
    0.3482  robot    restored service=cloud-1 step=11 restore_ms=3
@@ -51,7 +51,7 @@ kill_robot boundary=30 power_cut=true lost_appends=2
    0.5224  robot    hears of call 3: its end
    0.5296  robot    performs task actions 28 to 35
    0.6112  robot    performs sensing action 2 of step 36
-   0.6122  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.6122  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.6122  robot    asks cloud-1, call 4
    0.6152  robot    hears of call 4: TaskAnswer
    0.6152  robot    performs task action 36

@@ -22,7 +22,7 @@ kill_robot boundary=19
    0.2914  robot    resumed_trial trial=0 step=7
    0.2914  robot    performs task action 7
    0.3004  robot    service_appeared service=cloud-1
-   0.3016  robot    restore service=cloud-1 step=8 bytes=1544
+   0.3016  robot    restore service=cloud-1 step=8 bytes=1567
    0.3016  robot    asks cloud-1, call 1
    0.3046  robot    hears of call 1: TaskAnswer
    0.3046  robot    restored service=cloud-1 step=8 restore_ms=3
@@ -51,7 +51,7 @@ kill_robot boundary=19
    0.5134  robot    hears of call 4: its end
    0.5206  robot    performs task actions 28 to 35
    0.6022  robot    performs sensing action 2 of step 36
-   0.6032  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.6032  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.6032  robot    asks cloud-1, call 5
    0.6062  robot    hears of call 5: TaskAnswer
    0.6062  robot    performs task action 36

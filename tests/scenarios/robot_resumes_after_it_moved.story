@@ -22,7 +22,7 @@ kill_robot boundary=18
    0.2914  robot    resumed_trial trial=0 step=6
    0.2914  robot    performed_unseen trial=0 step=6
    0.3004  robot    service_appeared service=cloud-1
-   0.3004  robot    restore service=cloud-1 step=7 bytes=1544
+   0.3004  robot    restore service=cloud-1 step=7 bytes=1567
    0.3004  robot    asks cloud-1, call 1
    0.3034  robot    hears of call 1: TaskAnswer
    0.3034  robot    restored service=cloud-1 step=7 restore_ms=3
@@ -52,7 +52,7 @@ kill_robot boundary=18
    0.5224  robot    hears of call 4: its end
    0.5296  robot    performs task actions 28 to 35
    0.6112  robot    performs sensing action 2 of step 36
-   0.6122  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.6122  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.6122  robot    asks cloud-1, call 5
    0.6152  robot    hears of call 5: TaskAnswer
    0.6152  robot    performs task action 36

@@ -15,7 +15,7 @@ stop node=cloud-1 at=0.581716 for_s=0.8
    0.1210  robot    asks cloud-1, call 2
    0.1294  cloud-1  is asked by 20 other robots
    0.2010  robot    hears of call 2: NeedState
-   0.2010  robot    restore service=cloud-1 step=0 bytes=1544
+   0.2010  robot    restore service=cloud-1 step=0 bytes=1567
    0.2010  robot    asks cloud-1, call 3
    0.2904  robot    hears of call 3: TaskAnswer
    0.2904  robot    restored service=cloud-1 step=0 restore_ms=89.405
@@ -30,21 +30,21 @@ stop node=cloud-1 at=0.581716 for_s=0.8
    0.4752  robot    begins trial 0 at step 9
    0.4752  robot    resumed_trial trial=0 step=9
    0.4842  robot    service_appeared service=cloud-1
-   0.4842  robot    restore service=cloud-1 step=9 bytes=1544
+   0.4842  robot    restore service=cloud-1 step=9 bytes=1567
    0.4842  robot    asks cloud-1, call 1
    0.5140  robot    is killed
    0.5640  robot    is started again
    0.5650  robot    begins trial 0 at step 9
    0.5650  robot    resumed_trial trial=0 step=9
    0.5740  robot    service_appeared service=cloud-1
-   0.5740  robot    restore service=cloud-1 step=9 bytes=1544
+   0.5740  robot    restore service=cloud-1 step=9 bytes=1567
    0.5740  robot    asks cloud-1, call 1
    0.5817  cloud-1  is stopped
    0.8240  robot    service_suspected service=cloud-1 reason=no sign of progress for 250 ms
    0.8240  robot    status from=standard to=local_recovery silent_ms=250 reason=cloud-1 no sign of progress for 250 ms
    0.8240  robot    launch service=local
    0.8240  local    is launched
-   0.8240  robot    restore service=cloud-1 step=9 bytes=1544
+   0.8240  robot    restore service=cloud-1 step=9 bytes=1567
    0.8240  robot    retry service=cloud-1 step=9 attempt=2 waited_ms=259
    0.8240  robot    asks cloud-1, call 2
    0.8240  robot    holding step=9 reason=cloud-1: no sign of progress for 250 ms; local: is being launched
@@ -53,7 +53,7 @@ stop node=cloud-1 at=0.581716 for_s=0.8
    0.9817  robot    hears of call 1: its end
    0.9817  robot    hears of call 2: its end
    0.9840  robot    launched launch_ms=160
-   0.9840  robot    restore service=local step=9 bytes=1544
+   0.9840  robot    restore service=local step=9 bytes=1567
    0.9840  robot    retry service=local step=9 attempt=3 waited_ms=419
    0.9840  robot    asks local, call 3
    0.9852  robot    hears of call 3: TaskAnswer
@@ -66,7 +66,7 @@ stop node=cloud-1 at=0.581716 for_s=0.8
    1.1670  robot    performs sensing action 0 of step 18
    1.1680  robot    asks local, call 4
    1.1682  robot    hears of call 4: NeedState
-   1.1682  robot    restore service=local step=18 bytes=1544
+   1.1682  robot    restore service=local step=18 bytes=1567
    1.1682  robot    asks local, call 5
    1.1694  robot    hears of call 5: TaskAnswer
    1.1694  robot    restored service=local step=18 restore_ms=1.2
@@ -77,7 +77,7 @@ stop node=cloud-1 at=0.581716 for_s=0.8
    1.3512  robot    performs sensing action 0 of step 27
    1.3522  robot    asks local, call 6
    1.3524  robot    hears of call 6: NeedState
-   1.3524  robot    restore service=local step=27 bytes=1544
+   1.3524  robot    restore service=local step=27 bytes=1567
    1.3524  robot    asks local, call 7
    1.3536  robot    hears of call 7: TaskAnswer
    1.3536  robot    restored service=local step=27 restore_ms=1.2
@@ -86,7 +86,7 @@ stop node=cloud-1 at=0.581716 for_s=0.8
    1.3836  robot    hears of call 7: SensingAnswer
    1.3836  robot    hears of call 7: its end
    1.3917  robot    service_appeared service=cloud-1
-   1.3917  robot    restore service=cloud-1 step=27 bytes=1544
+   1.3917  robot    restore service=cloud-1 step=27 bytes=1567
    1.3917  robot    asks cloud-1, call 8
    1.3940  robot    performs task actions 29 to 33
    1.4827  robot    hears of call 8: TaskAnswer
@@ -95,7 +95,7 @@ stop node=cloud-1 at=0.581716 for_s=0.8
    1.4950  robot    performs task actions 34 to 35
    1.5327  robot    hears of call 8: Progress
    1.5354  robot    performs sensing action 2 of step 36
-   1.5364  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   1.5364  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    1.5364  robot    asks cloud-1, call 9
    1.6337  robot    hears of call 9: TaskAnswer
    1.6337  robot    performs task actions 36 to 37

@@ -37,7 +37,7 @@ run
    0.3094  robot    hears of call 5: its end
    0.3166  robot    performs task actions 28 to 35
    0.3982  robot    performs sensing action 2 of step 36
-   0.3992  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=outside the validation gate of every particle (8 standard deviations)
+   0.3992  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.3992  robot    asks cloud-1, call 6
    0.4022  robot    hears of call 6: TaskAnswer
    0.4022  robot    performs task action 36

@@ -10,16 +10,13 @@ change of the production code that makes a defect meaningless is an error and no
 """
 
 from __future__ import annotations
-import __future__
 
 import argparse
-import inspect
 import multiprocessing
-import textwrap
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
-from typing import Any, NamedTuple, TypeAlias
-from unittest import mock
+from typing import Any, NamedTuple
+
+from tests.simulation.edits import Change, Defect, Edit, Replacement, applied
+from tests.simulation.late_defects import LATE_DEFECTS
 
 from holdfast.lab.simulation import service_node
 from holdfast.lab.simulation.schedule import RunSettings, SimulationSchedule
@@ -35,62 +32,10 @@ from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import Job
 from holdfast.protocol.service_sessions import SessionTable
 
-__all__ = [
-    "DEFECTS",
-    "LIMIT",
-    "Defect",
-    "Finding",
-    "applied",
-    "seeds_needed",
-    "violation_of",
-    "without_faults",
-]
+__all__ = ["DEFECTS", "LIMIT", "Finding", "seeds_needed", "violation_of", "without_faults"]
 
 LIMIT = 2000
 """Seeds within which each defect is to be found."""
-
-
-class Edit(NamedTuple):
-    """Lines of a function that are replaced.
-
-    Attributes
-    ----------
-    owner : class or module
-        Where the function is looked up when it is called.
-    before, after : str
-        ``before`` stands in its source exactly once. Both are indented as the line is on which
-        that begins.
-    """
-
-    owner: Any
-    function: str
-    before: str
-    after: str
-
-
-class Replacement(NamedTuple):
-    """A name that stands for something else."""
-
-    owner: Any
-    name: str
-    by: object
-
-
-Change: TypeAlias = Edit | Replacement
-
-
-class Defect(NamedTuple):
-    """Something wrong.
-
-    Attributes
-    ----------
-    story : str
-        What a careless engineer would have done.
-    """
-
-    name: str
-    story: str
-    changes: tuple[Change, ...]
 
 
 class Finding(NamedTuple):
@@ -104,53 +49,6 @@ class Finding(NamedTuple):
 
     seed: int
     violation: str
-
-
-@contextmanager
-def applied(defect: Defect) -> Iterator[None]:
-    """Let the production code have a defect for a while.
-
-    Raises
-    ------
-    ValueError
-        If the code to be replaced is not there any more.
-    """
-    sources: dict[tuple[Any, str], str] = {}
-    with ExitStack() as stack:
-        for change in defect.changes:
-            if isinstance(change, Replacement):
-                stack.enter_context(mock.patch.object(change.owner, change.name, change.by))
-                continue
-            key = change.owner, change.function
-            if key not in sources:
-                function = inspect.getattr_static(*key)
-                sources[key] = textwrap.dedent(inspect.getsource(function))
-            try:
-                sources[key] = _edited(sources[key], change.before, change.after)
-            except ValueError as error:
-                raise ValueError(f"{defect.name}: {change.function} {error}") from None
-        for (owner, name), source in sources.items():
-            stack.enter_context(mock.patch.object(owner, name, _compiled(owner, name, source)))
-        yield
-
-
-def _edited(source: str, before: str, after: str) -> str:
-    first = before.splitlines()[0]
-    at = source.find(first)
-    line = source[source.rfind("\n", 0, at) + 1 :]
-    indentation = line[: len(line) - len(line.lstrip())]
-    before, after = (text.replace("\n", f"\n{indentation}") for text in (before, after))
-    if source.count(before) != 1:
-        raise ValueError(f"has {source.count(before)} times, not once: {before!r}")
-    return source.replace(before, after)
-
-
-def _compiled(owner: object, name: str, source: str) -> object:
-    flags = __future__.annotations.compiler_flag
-    code = compile(source, f"<defect in {name}>", "exec", flags)
-    defined: dict[str, object] = {}
-    exec(code, inspect.getattr_static(owner, name).__globals__, defined)
-    return defined[name]
 
 
 def without_faults(defect: Defect, trials: range) -> str | None:
@@ -432,7 +330,7 @@ _defect(
     "The journal does not record that an action was performed; the next action implies it.",
     Edit(
         Robot,
-        "_performed",
+        "_fold_move",
         "self._unwritten.append(record)",
         "pass",
     ),
@@ -590,6 +488,7 @@ _defect(
     "The robot reports the loss of the cloud in every status.",
     Edit(Dispatcher, "_note_lost_cloud", "and not self.tracker.is_recovering", ""),
 )
+DEFECTS |= LATE_DEFECTS
 
 
 def _row(name: str, limit: int) -> str:

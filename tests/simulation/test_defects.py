@@ -1,19 +1,13 @@
 from __future__ import annotations
 
 import pytest
-from tests.simulation.defects import (
-    DEFECTS,
-    Defect,
-    Edit,
-    applied,
-    seeds_needed,
-    violation_of,
-    without_faults,
-)
+from tests.simulation.defects import DEFECTS, seeds_needed, violation_of, without_faults
+from tests.simulation.edits import Defect, Edit, applied
 
 from holdfast.lab.simulation.schedule import parse_schedule
 from holdfast.lab.simulation.world import Simulator
 from holdfast.protocol import requests
+from holdfast.protocol.robot import Robot
 
 # The moments that it takes, as the simulator found them, made small.
 FOUND_AT_ONCE = [
@@ -58,6 +52,34 @@ FOUND_AT_ONCE = [
         "run act_s=0.1\ncrash service=cloud-1 at=0.15 down_s=0.3",
         "local decides (local_recovery), and not cloud-1",
     ),
+    (
+        "late_in_order_only",
+        "run trial=1\nlate step=0 moves=20\nlate step=9 moves=3",
+        "the undisturbed run has",
+    ),
+    (
+        "late_folded_in_twice",
+        "run remembers=true\nlate step=0 moves=5\nkill_robot at=0.1 down_s=0.05",
+        "the undisturbed run has",
+    ),
+    (
+        "late_between_order_and_performance",
+        "run senses_on=true\n"
+        "late step=0 moves=20\n"
+        "kill_robot boundary=10 before=act down_s=0.05\n"
+        "kill_robot at=0.3 down_s=0.05",
+        "comes before the action of that step is known to be performed",
+    ),
+    (
+        "stale_answer_used",
+        "run trial=1\nlate step=9 moves=3",
+        "the undisturbed run has",
+    ),
+    (
+        "motion_not_told",
+        "run moves_show=true",
+        "comes to another state",
+    ),
 ]
 
 
@@ -96,6 +118,44 @@ def test_a_reply_to_another_process_of_the_robot_is_not_taken() -> None:
         violation = Simulator().run(schedule).violation
     assert violation is not None
     assert "the undisturbed run has" in violation
+
+
+# Each takes an end of the robot's process at one moment of a few runs: no seed found it.
+RARE = [
+    (
+        "written_after_the_order",
+        "A resumed robot orders the pending action before it writes down what has come meanwhile: "
+        "the body performs it all the same, and the observation is lost.",
+        Edit(
+            Robot,
+            "begin_trial",
+            "self._write()\nself._effects.append(Act",
+            "self._effects.append(Act",
+        ),
+        "run senses_on=true\n"
+        "late step=0 moves=20\n"
+        "kill_robot boundary=10 before=act\n"
+        "kill_robot boundary=11 before=journal down_s=0.05 body_goes_on=true\n",
+        "the journal lacks the late observation of step 0",
+    ),
+    (
+        "lost_forgotten_in_a_crash",
+        "A robot that was killed when it was found lost goes on with its old belief.",
+        Edit(Robot, "begin_trial", "if is_lost and history.pending is None", "if False"),
+        "run trial=2 on_lost=reinitialise\nkill_robot boundary=25 before=journal down_s=0.05",
+        "the undisturbed run has",
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "story", "edit", "text", "says"), RARE)
+def test_a_rare_defect_is_found(name: str, story: str, edit: Edit, text: str, says: str) -> None:
+    schedule = parse_schedule(text)
+    assert Simulator().run(schedule).violation is None
+    with applied(Defect(name, story, (edit,))):
+        violation = Simulator().run(schedule).violation
+    assert violation is not None
+    assert says in violation
 
 
 @pytest.mark.slow

@@ -10,16 +10,17 @@ from holdfast.config.settings import PlanningSettings
 from holdfast.lab.errors import Violation
 from holdfast.lab.simulation.checkers import StatusChecker, WireChecker, check_size
 from holdfast.lab.simulation.disk import Disk
-from holdfast.lab.simulation.environment_model import (
-    EnvironmentModel,
-    ReferenceRun,
-    ReferenceRuns,
-    ReferenceStep,
-    Repeats,
-)
+from holdfast.lab.simulation.environment_model import EnvironmentModel
 from holdfast.lab.simulation.event_queue import Clock, EventQueue
 from holdfast.lab.simulation.exploration import shrink
 from holdfast.lab.simulation.memo_cache import MemoizingPlanner
+from holdfast.lab.simulation.reference_runs import (
+    UNDISTURBED,
+    Circumstances,
+    ReferenceRun,
+    ReferenceRuns,
+    ReferenceStep,
+)
 from holdfast.lab.simulation.schedule import (
     Crash,
     MessageFault,
@@ -125,8 +126,10 @@ class OneReference(ReferenceRuns):
     def __init__(self) -> None:
         pass
 
-    def get(self, trial: int, max_steps: int, repeats: Repeats = ()) -> ReferenceRun:
-        return reference_run()._replace(digest=f"digest{repeats or ''}")
+    def get(
+        self, trial: int, max_steps: int, circumstances: Circumstances = UNDISTURBED
+    ) -> ReferenceRun:
+        return reference_run()._replace(digest=f"digest{circumstances.repeats or ''}")
 
 
 def environment(*, shows_the_same: bool = False) -> EnvironmentModel:

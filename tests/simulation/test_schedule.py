@@ -31,6 +31,7 @@ def test_all_kinds_of_faults_are_drawn() -> None:
         "cut",
         "disk_stall",
         "kill_robot",
+        "late",
         "launch",
         "message corrupt",
         "message delay",

@@ -7,23 +7,28 @@ from pathlib import Path
 import pytest
 
 from holdfast.cli.robot_run import RobotFindings, is_robot_run
+from holdfast.cli.run import RunOptions
 from holdfast.config.loader import load
 
 
 @pytest.mark.parametrize(
-    ("overrides", "rate_hz", "expected"),
+    ("words", "overrides", "expected"),
     [
-        ({}, None, False),
-        ({}, 10.0, True),
-        ({"offload.services": ["tcp/127.0.0.1:7447"]}, None, True),
-        ({"environment.object": "somebodys_robot"}, None, True),
+        ([], {}, False),
+        (["--rate", "10"], {}, True),
+        (["--view", "rerun=10.0.0.7"], {}, True),
+        (["--view-file", "run.rrd"], {}, True),
+        ([], {"offload.services": ["tcp/127.0.0.1:7447"]}, True),
+        ([], {"environment.object": "somebodys_robot"}, True),
     ],
 )
 def test_a_robots_run(
-    overrides: dict[str, object], rate_hz: float | None, expected: bool, tmp_path: Path
+    words: list[str], overrides: dict[str, object], expected: bool, tmp_path: Path
 ) -> None:
     (tmp_path / "run.yaml").write_text("problem: peg_in_hole_2d")
-    assert is_robot_run(load(tmp_path / "run.yaml", overrides=overrides), rate_hz) is expected
+    options = RunOptions.parse("run", ["run.yaml", *words])
+    configuration = load(tmp_path / "run.yaml", overrides=overrides)
+    assert is_robot_run(options, configuration) is expected
 
 
 def test_reasons_are_the_last_ones() -> None:

@@ -465,6 +465,34 @@ class TestSensingCosts:
             )
             assert TrialHistory(Planner(problem, settings), 0, 0).rewards.total == reward
 
+    @pytest.mark.parametrize("kind", [Dock, Sonar])
+    def test_not_to_sense_is_as_an_observation_that_says_nothing(self, kind: type[Dock]) -> None:
+        problem, belief = kind(), belief_of(0.5, 0.4)
+        problem.sensing_costs = (0.5, 0.25, 0.0)  # type: ignore[attr-defined]
+        _, info = choose(problem, settings_of(sensing_is_optional=True), belief)
+        assert info.samples is not None
+        assert info.samples.shape[0] == 4
+        assert info.prices is None
+        if kind is Dock:  # The sonar's third sensing action shows a little.
+            np.testing.assert_allclose(info.samples[3], info.samples[2], rtol=1e-6)
+
+    def test_sensing_is_left_out_where_it_costs_more_than_it_gains(self) -> None:
+        class Sensing(Dock):
+            sensing_actions = ("x", "y")
+
+        problem, belief = Sensing(), belief_of(0.5, 0.4)
+        for price, left_out in ((0.0, False), (1e3, True)):
+            problem.sensing_costs = (price, price)  # type: ignore[attr-defined]
+            chosen, info = choose(problem, settings_of(sensing_is_optional=True), belief)
+            assert (chosen == 2) is left_out
+            assert info.entropies is not None
+            assert info.entropies.shape == (3,)
+
+    def test_costs_with_the_choice_not_to_sense(self) -> None:
+        assert sensing_costs(Priced(), optional=True).tolist() == [0.5, 0.25, 0.0, 0.0]
+        assert sensing_costs(Dock(), otherwise=1.0).tolist() == [1.0, 1.0, 1.0]
+        assert sensing_costs(Priced(), otherwise=1.0).tolist() == [0.5, 0.25, 0.0]
+
     def test_none_is_free(self) -> None:
         for costs in (None, (0.0, 0.0, 0.0), np.zeros(3), [0, 0, 0]):
             problem = Dock()

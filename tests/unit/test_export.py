@@ -36,8 +36,8 @@ from holdfast.planning import Planner
 from holdfast.problems.registry import BUILT_IN
 from holdfast.protocol.records import ActingRecord, ObservedRecord
 from holdfast.recording.journal import Journal
+from holdfast.recording.poses import PoseLayout, pose_layout
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
-from holdfast.ros.poses import PoseLayout, pose_layout
 
 PEG = """\
 problem: peg_in_hole_2d

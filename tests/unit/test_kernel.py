@@ -117,7 +117,7 @@ for count in (5, 100, 1001):
                                (np.ascontiguousarray(0.1 + predicted**2), [])):
         arguments = (weights, [1, 1, 1, 2], predicted, variance, 9, words, circular)
         found = kernel.hypothetical_entropies(
-            *arguments, np.ascontiguousarray(-states), 0, 3, 0.05, 0.0, 0.0, 2, *alone)
+            *arguments, np.ascontiguousarray(-states), 0, 3, 0.05, 0.0, 0.0, 2, *alone, True)
         note(f"hypotheses {count} {variance.shape} {circular}", *found[:2],
              kernel.hypothetical_weights(*arguments, True),
              kernel.hypothetical_weights(*arguments, False))

@@ -7,8 +7,8 @@ import pytest
 
 from holdfast.belief import Belief
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.ros.markers import scene_markers, sensing_markers
-from holdfast.ros.poses import PoseLayout, pose_layout
+from holdfast.recording.markers import scene_markers, sensing_markers
+from holdfast.recording.poses import PoseLayout, pose_layout
 
 
 @pytest.fixture

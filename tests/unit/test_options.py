@@ -18,6 +18,8 @@ NUMBERS = [
     ["run", "peg.yaml", "-j"],
     ["run", "peg.yaml", "--rate"],
     ["run", "peg.yaml", "--health"],
+    ["run", "peg.yaml", "--view"],
+    ["run", "peg.yaml", "--metrics"],
     ["demo", "--seed"],
     ["chaos", "--trials"],
     ["chaos", "--seed"],
@@ -30,6 +32,8 @@ NUMBERS = [
     ["keys", "mine", "--days"],
     ["export", "run", "--trials"],
     ["export", "run", "--rate"],
+    ["view", "run", "--trials"],
+    ["view", "run", "--rate"],
     ["ros1-guard", "--port"],
     ["ros1-guard", "--silent-s"],
     ["serve", "--workers"],
@@ -46,6 +50,7 @@ PATHS = [
     ["run"],
     ["run", "peg.yaml", "--out"],
     ["run", "peg.yaml", "--tls"],
+    ["run", "peg.yaml", "--view-file"],
     ["demo", "--out"],
     ["chaos", "--out"],
     ["experiment", "all", "--out"],
@@ -57,6 +62,8 @@ PATHS = [
     ["export"],
     ["export", "run", "--mcap"],
     ["export", "run", "--csv"],
+    ["view"],
+    ["view", "run", "--save"],
     ["keys"],
     ["ros1-guard", "--directory"],
     ["serve", "--tls"],
@@ -158,6 +165,7 @@ def test_an_empty_path_is_not_the_current_directory(
             "no option of holdfast run; did you mean --trials?",
         ),
         (["run", "peg.yaml", "--quiet=3"], "--quiet takes no value"),
+        (["view", "run", "--viewer", "a/b"], "--viewer is 'a/b'; allowed are HOST, HOST:PORT or"),
         (["keys", "mine", "--revoke-serial", "xyz"], "--revoke-serial is 'xyz'; allowed are hex"),
     ],
 )
@@ -171,7 +179,7 @@ def test_other_misuse(
 
 
 @pytest.mark.parametrize(
-    "arguments", [[], ["run"], ["compare"], ["export"], ["keys"], ["experiment"]]
+    "arguments", [[], ["run"], ["compare"], ["export"], ["view"], ["keys"], ["experiment"]]
 )
 def test_without_arguments_there_is_help(
     arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

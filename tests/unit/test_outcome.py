@@ -115,3 +115,20 @@ def test_every_column_is_of_a_result() -> None:
     row = {column: getattr(result, column) for column in TRIAL_COLUMNS}
     assert (row["trial"], row["success"], row["outcome"]) == (3, False, "failed")
     assert not {"decisions", "sensing_ms", "failed"} & row.keys()
+
+
+def test_when_a_belief_was_begun_anew_is_in_the_log() -> None:
+    """Moves that have shown nothing are no inputs; those that have, and late observations, are."""
+    log = DecisionLog(1)
+    state = bytes(32)
+    log.sensed(0, 1, state)
+    log.acted(0, np.zeros(1))
+    log.acted(1, np.zeros(1))
+    log.moved(1, state)
+    log.reinitialised(2, state)
+    log.reinitialised(2, state)
+    log.observed_late(0, 2, state)
+    log.reinitialised(2, state)
+    log.ended(2, state)
+    assert log.decisions().reinitialised_after() == {2, 3, 5}
+    assert DecisionLog(1).decisions().reinitialised_after() == frozenset()

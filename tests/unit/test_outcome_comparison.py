@@ -107,6 +107,26 @@ class TestEffects:
         assert steps.interval is not None and steps.interval[0] > 1.0
         assert steps.verdict == verdict
 
+    def test_failed_is_not_what_truncated_is(self) -> None:
+        """Three successes and a truncated trial, against two crashes."""
+        first = [result_of(trial, 10, success=trial > 0) for trial in range(4)]
+        second = [result_of(trial, 10, success=trial > 1) for trial in range(4)]
+        second[:2] = [msgspec.structs.replace(result, failed=True) for result in second[:2]]
+        found = by_measure(effects_of(first, second, step_limit=LIMIT, paired=True))
+        assert found["success_rate"].effect == -0.25
+        failed = found["failure_rate"]
+        assert (failed.baseline, failed.run, failed.effect) == (0.0, 0.5, 0.5)
+
+    @pytest.mark.parametrize(("failing", "verdict"), [(0, "worse"), (1, "better")])
+    def test_fewer_failures_are_better(self, failing: int, verdict: str) -> None:
+        runs = [[result_of(trial, 10, success=False) for trial in range(20)] for _ in range(2)]
+        runs[1 - failing][:15] = [
+            msgspec.structs.replace(result, failed=True) for result in runs[1 - failing][:15]
+        ]
+        found = by_measure(effects_of(*runs, step_limit=LIMIT, paired=True))
+        assert found["failure_rate"].verdict == verdict
+        assert found["success_rate"].verdict == "no difference found"
+
     def test_what_is_not_recorded_is_not_compared(self) -> None:
         runs = [[result_of(trial, 5 + trial) for trial in range(4)] for _ in range(2)]
         found = by_measure(effects_of(*runs, step_limit=LIMIT, paired=True))

@@ -39,6 +39,7 @@ CHOSEN = {
     "environment.arguments": {"port": 7},
     "selector.resolution": 0.25,
     "selector.estimator": "gaussian_mixture_upper",
+    "selector.nats_per_cost": 0.25,
     "selector.path_offsets": [1, 3],
     "model.init_mean": [1, 2, 3],
     "model.init_cov": [1, 2, 3],
@@ -66,7 +67,7 @@ def another_value(section: str, key: str, value: Any) -> Any:
     if isinstance(value, int):
         return value + 1
     assert isinstance(value, float), f"{section}.{key} needs an entry in CHOSEN"
-    return value / 2
+    return value / 2 or 0.5
 
 
 def plain(loaded: loader.Configuration) -> dict[str, Any]:

@@ -37,6 +37,7 @@ class TestNames:
             "SELECTION": 5,
             "MOVE_RESAMPLING": 6,
             "REINITIALISATION": 7,
+            "RANK_TEST": 8,
             "WORLD_INITIAL_STATE": 16,
             "WORLD_MOTION": 17,
             "WORLD_OBSERVATION": 18,

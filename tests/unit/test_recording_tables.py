@@ -48,6 +48,8 @@ class TestTables:
             "recoveries",
             "unexplained_observations",
             "digest",
+            "lost",
+            "suspect_sensors",
             "outcome",
             "reason",
         )
@@ -76,6 +78,16 @@ class TestTables:
         assert json.loads(summary.to_json())["digest"] == summary.digest
         assert summary.failures == 0
         assert "failed" not in dict(_summary_rows(summary))
+        assert "lost" not in dict(_summary_rows(summary))
+
+    def test_lost_robots_and_suspect_sensors_are_told_if_there_are_any(self) -> None:
+        builder = SummaryBuilder()
+        for trial, (lost, suspects) in enumerate([(2, 0), (0, 1), (1, 0)]):
+            result = result_of(trial)
+            builder.add(msgspec.structs.replace(result, lost=lost, suspect_sensors=suspects))
+        summary = builder.build(problem="p", seed=5, version="1", trials=3, wall_time_s=2.0)
+        assert (summary.lost, summary.suspect_sensors) == (3, 1)
+        assert dict(_summary_rows(summary))["lost"].startswith("3 times, 1 suspect sensor (")
 
     def test_failures_are_no_successes_and_told_if_there_are_any(self) -> None:
         builder = SummaryBuilder()
@@ -87,7 +99,7 @@ class TestTables:
         assert (summary.successes, summary.failures, summary.finished) == (1, 2, 4)
         assert summary.success_rate == pytest.approx(0.25)
         assert summary.mean_reward_of_successes == pytest.approx(-1.0)
-        assert dict(_summary_rows(summary))["failed"] == "2 of 4 trials"
+        assert dict(_summary_rows(summary))["failed"] == "2 of 4 trials (1 truncated)"
 
     def test_the_mean_of_rewards_that_are_not_there_is_none(self) -> None:
         """A trial without a reward has not earned 0."""

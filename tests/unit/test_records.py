@@ -20,10 +20,13 @@ from holdfast.protocol.records import (
     PerformedRecord,
     Record,
     ReinitialisedRecord,
+    TrialHistory,
     decode_record,
     encode_record,
+    reinitialised_after,
     replay,
 )
+from holdfast.tracking import LateObservation
 
 PROBLEM = PegInHole2D()
 PLANNING = PlanningSettings(
@@ -74,3 +77,38 @@ def first_record(**changes: object) -> ObservedRecord:
 def test_a_record_that_does_not_follow_is_named(record: Record, why: str) -> None:
     with pytest.raises(RecordError, match=rf"trial 4: record 1 of its journal .*{why}"):
         replay(Planner(PROBLEM, PLANNING), 11, 4, [LocalTookOverRecord(1), record])
+
+
+def test_what_came_late_may_stand_between_an_action_and_its_performance() -> None:
+    """A resumed robot is told of it before it performs the action that its journal ends with."""
+    planner = Planner(PROBLEM, PLANNING)
+    history = TrialHistory(planner, 11, 4)
+    sensed = history.observed(0, None, 1.0)[1]
+    action, _ = planner.choose_task_action(history.state)
+    history.pending = action
+    found = history.came_late(LateObservation(0, np.array([3.5])))
+    assert found is not None
+    performed = PerformedRecord(0, -1.0)
+    history.performed(performed)
+    records: list[Record] = [sensed, ActingRecord(0, encode_floats(action)), found[1], performed]
+    again = replay(planner, 11, 4, records)
+    assert planner.digest(again.state) == planner.digest(history.state)
+    assert again.awaited == ()
+    for record in records[:2]:
+        with pytest.raises(RecordError, match="before the action of that step is known"):
+            replay(planner, 11, 4, [*records[:2], record])
+
+
+def test_when_a_belief_was_begun_anew_is_in_the_records() -> None:
+    """As in the log of decisions, where moves that have shown nothing are no inputs."""
+    records: list[Record] = [
+        first_record(),
+        ActingRecord(0, encode_floats(np.zeros(3))),
+        PerformedRecord(0, None),
+        PerformedRecord(1, None, encode_floats(np.zeros(3))),
+        ReinitialisedRecord(2, bytes(32)),
+        LocalTookOverRecord(1),
+        LateRecord(2, 0, encode_floats(np.zeros(1)), bytes(32)),
+        ReinitialisedRecord(2, bytes(32)),
+    ]
+    assert reinitialised_after(records) == {2, 4}

@@ -14,6 +14,7 @@ from holdfast.arrays import FloatArray, IntArray
 from holdfast.belief import Belief
 from holdfast.config.settings import ActiveSensingSettings, PlanningSettings, SelectorSettings
 from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.estimators import GaussianMixture, NearestNeighbor, PriorNeighbors, entropy
 from holdfast.problems.problem import Problem, ProblemBase
 from holdfast.randomness import Purpose, Stream, stream
 from holdfast.sensing import SensingInfo, choose_sensing_action
@@ -212,6 +213,192 @@ class TestBlindChoices:
     def test_one_particle_will_do(self, method: str) -> None:
         selector = SelectorSettings(method=method)  # type: ignore[arg-type]
         choose(Coordinates(), settings_of(selector), Belief.uniform([[1.0, 2.0]]))
+
+
+def unequal(belief: Belief) -> Belief:
+    """Return the belief with weights that differ, some of them zero."""
+    weights = stream(41, 2, 0, Purpose.INITIAL_BELIEF).uniform(belief.weights.size)
+    weights[::7] = 0.0
+    return Belief.weighted(belief.states, weights)
+
+
+class Nothing(Coordinates):
+    """Its last sensing action shows the same in every state."""
+
+    def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray:
+        shown = super().observation_mean(states, sensing_action)
+        return np.zeros_like(shown) if sensing_action == len(self.rows) - 1 else shown
+
+
+class GeneralNothing(Nothing):
+    """The same with a likelihood of its own."""
+
+    def log_likelihood(
+        self, states: FloatArray, sensing_action: int, observation: FloatArray
+    ) -> FloatArray:
+        away = self.observation_mean(states, sensing_action)[..., 0] - observation[0]
+        return np.asarray(-0.5 * away * away / self.variance[0])
+
+    def sample_observation(
+        self, state: FloatArray, sensing_action: int, stream: Stream
+    ) -> FloatArray:
+        noise = np.sqrt(self.variance) * stream.normal(1)
+        return np.asarray(self.observation_mean(state, sensing_action) + noise)
+
+
+OPTIONAL = [
+    SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
+    SelectorSettings(method="action_entropy", estimator="gaussian_mixture_upper"),
+    SelectorSettings(method="state_entropy", estimator="gaussian_mixture_lower"),
+    SelectorSettings(method="path_entropy", estimator="prior_neighbors"),
+    SelectorSettings(method="action_covariance"),
+]
+
+
+def optional(selector: SelectorSettings, nats_per_cost: float = 0.0) -> SelectorSettings:
+    return msgspec.structs.replace(selector, sensing_is_optional=True, nats_per_cost=nats_per_cost)
+
+
+class TestNotSensing:
+    @pytest.mark.parametrize(
+        ("selector", "estimator"),
+        [
+            (OPTIONAL[0], NearestNeighbor(5, 0.1)),
+            (OPTIONAL[1], GaussianMixture(np.array([0.01, 0.01]))),
+            (
+                SelectorSettings(method="action_entropy", estimator="prior_neighbors"),
+                PriorNeighbors(unequal(belief_of(1.0, 2.0)).weights, 5, 0.1),
+            ),
+        ],
+    )
+    def test_it_has_the_entropy_of_the_belief(
+        self,
+        selector: SelectorSettings,
+        estimator: NearestNeighbor | GaussianMixture | PriorNeighbors,
+    ) -> None:
+        belief = unequal(belief_of(1.0, 2.0))
+        _, info = choose(Coordinates(), settings_of(optional(selector)), belief)
+        assert info.entropies is not None
+        expected = entropy(-belief.states, belief.weights, estimator)
+        np.testing.assert_allclose(info.entropies[2], expected, rtol=1e-13)
+
+    def test_path_entropy_adds_up_those_along_the_path(self) -> None:
+        belief = belief_of(1.0, 2.0)
+        _, info = choose(Coordinates(), settings_of(optional(OPTIONAL[3])), belief)
+        assert info.entropies is not None
+        # Without limits all particles are at the goal after a step, and there every action is 0.
+        estimator = PriorNeighbors(belief.weights, 5, 0.1)
+        now, later = (
+            entropy(points, belief.weights, estimator)
+            for points in (-belief.states, np.zeros((60, 2)))
+        )
+        np.testing.assert_allclose(info.entropies[2], now + 0.5 * later, rtol=1e-13)
+
+    @pytest.mark.parametrize("selector", OPTIONAL)
+    @pytest.mark.parametrize("kind", [Nothing, GeneralNothing])
+    @pytest.mark.parametrize("horizon", [1, 3])
+    def test_it_is_as_an_observation_that_says_nothing(
+        self, selector: SelectorSettings, kind: type[Nothing], horizon: int
+    ) -> None:
+        if selector.method == "path_entropy" and horizon > 1:
+            return  # It looks ahead by offsets.
+        problem, belief = kind([0, 1, 0]), unequal(belief_of(1.0, 2.0))
+        _, info = choose(problem, settings_of(optional(selector), horizon=horizon), belief)
+        _, without = choose(problem, settings_of(selector, horizon=horizon), belief)
+        for own, other in ((info.entropies, without.entropies), (info.samples, without.samples)):
+            assert own is not None
+            assert other is not None
+            np.testing.assert_allclose(own[3], own[2], rtol=1e-11)
+            # Whether sensing is optional changes no bit of what sensing is worth.
+            np.testing.assert_array_equal(own[:3], other)
+
+    def test_it_wins_ties(self) -> None:
+        """Where nothing can be gained, be it that rounding says otherwise, nothing is sensed."""
+        spread, alike = unequal(belief_of(1.0, 2.0)), unequal(belief_of(1e-9, 1e-9))
+        for selector in OPTIONAL:
+            settings = settings_of(optional(selector))
+            assert choose(Nothing([0]), settings, spread)[0] == 1
+            assert choose(GeneralNothing([0]), settings, spread)[0] == 1
+            assert choose(Coordinates([0], variance=0.1), settings, spread)[0] == 0
+        for selector in OPTIONAL[:4]:
+            assert choose(Coordinates([0, 1]), settings_of(optional(selector)), alike)[0] == 2
+
+    def test_random_draws_among_all_choices(self) -> None:
+        """Chi-square at 1e-6 over 6,000 steps."""
+        settings = settings_of(optional(SelectorSettings(method="random")))
+        chosen = [
+            choose_sensing_action(
+                Coordinates(),
+                settings,
+                belief_of(1.0, 1.0),
+                0,
+                HYPOTHESES,
+                stream(43, 0, step, Purpose.SELECTION),
+            )[0]
+            for step in range(6000)
+        ]
+        observed = np.bincount(chosen)
+        assert len(observed) == 3
+        assert stats.chisquare(observed).pvalue > 1e-6
+
+    def test_fixed_may_name_it_only_where_sensing_is_optional(self) -> None:
+        belief = belief_of(1.0, 1.0)
+        never = SelectorSettings(method="fixed", sensing_action=2)
+        assert choose(Coordinates(), settings_of(optional(never)), belief)[0] == 2
+        with pytest.raises(InvalidValueError, match=r"0 to 1 \(and 2, not to sense, if selector\."):
+            choose(Coordinates(), settings_of(never), belief)
+        beyond = optional(SelectorSettings(method="fixed", sensing_action=3))
+        with pytest.raises(InvalidValueError, match=r"sensing_action 3: .* 0 to 1$"):
+            choose(Coordinates(), settings_of(beyond), belief)
+
+
+class TestPrices:
+    @pytest.mark.parametrize("selector", OPTIONAL)
+    def test_a_sensing_action_must_gain_more_than_its_price(
+        self, selector: SelectorSettings
+    ) -> None:
+        problem, belief = Coordinates([0]), belief_of(1.0, 1.0)
+        problem.sensing_costs = (4.0,)  # type: ignore[attr-defined]
+        chosen, info = choose(problem, settings_of(optional(selector)), belief)
+        assert chosen == 0
+        assert info.prices is None
+        assert info.entropies is not None
+        gain = float(info.entropies[1] - info.entropies[0])
+        assert gain > 0.0
+        for factor, expected in ((0.99, 0), (1.01, 1)):
+            rate = factor * gain / 4.0
+            chosen, priced = choose(problem, settings_of(optional(selector, rate)), belief)
+            assert chosen == expected
+            # Entropies stay entropies; what is added stands beside them.
+            assert priced.entropies is not None
+            assert priced.entropies.tolist() == info.entropies.tolist()
+            assert priced.prices is not None
+            assert priced.prices.tolist() == [rate * 4.0, 0.0]
+
+    def test_the_cheaper_of_two_wins_if_it_shows_as_much(self) -> None:
+        problem = Coordinates([0, 0, 0])
+        problem.sensing_costs = (3.0, 1.0, 2.0)  # type: ignore[attr-defined]
+        belief = belief_of(1.0, 1.0)
+        assert choose(problem, settings_of(), belief)[0] == 0
+        cheap = SelectorSettings(
+            method="action_entropy", estimator="nearest_neighbor", nats_per_cost=1e-6
+        )
+        assert choose(problem, settings_of(cheap), belief)[0] == 1
+
+    def test_each_counts_one_where_the_problem_has_no_costs(self) -> None:
+        """The price is then the least gain for which the robot senses."""
+        _, info = choose(
+            Coordinates(), settings_of(optional(OPTIONAL[0], 0.25)), belief_of(1.0, 1.0)
+        )
+        assert info.prices is not None
+        assert info.prices.tolist() == [0.25, 0.25, 0.0]
+
+    def test_the_greatest_price(self) -> None:
+        problem = Coordinates()
+        problem.sensing_costs = (1e150, 1e150)  # type: ignore[attr-defined]
+        with np.errstate(all="raise"):
+            selector = optional(OPTIONAL[0], 1e150)
+            assert choose(problem, settings_of(selector), belief_of(1.0, 1.0))[0] == 2
 
 
 class Broken(Coordinates):

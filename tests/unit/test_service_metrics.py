@@ -13,7 +13,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from holdfast import __version__
 from holdfast.protocol.messages import PROTOCOL_VERSION
 from holdfast.protocol.service_limits import ServiceStatistics
-from holdfast.service.metrics import BUCKETS_S, DecisionTimes, Exposition, ServiceReport, summed
+from holdfast.runtime.exposition import BUCKETS_S
+from holdfast.service.metrics import DecisionTimes, Exposition, ServiceReport, summed
 
 Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
 
@@ -149,7 +150,8 @@ class TestAddingUp:
 def test_without_the_package_the_error_says_how_to_get_it() -> None:
     program = (
         "import sys; sys.modules['prometheus_client'] = None\n"
-        "from holdfast.service.metrics import Exposition, MetricsError\n"
+        "from holdfast.errors import MetricsError\n"
+        "from holdfast.service.metrics import Exposition\n"
         "try:\n    Exposition('x')\n"
         "except MetricsError as error:\n    print(error)\n"
     )

@@ -13,6 +13,7 @@ import pytest
 from holdfast.config.settings import (
     ActiveSensingSettings,
     EnvironmentSettings,
+    LostSettings,
     OffloadSettings,
     ParticleFilterSettings,
     RecoverySettings,
@@ -32,6 +33,7 @@ PAGE = (Path(__file__).parents[2] / "docs" / "settings.md").read_text(encoding="
         ("simulator", SimulatorSettings()),
         ("offload", OffloadSettings()),
         ("recovery", RecoverySettings()),
+        ("lost", LostSettings()),
         ("environment", EnvironmentSettings()),
     ],
 )
@@ -55,6 +57,7 @@ def test_each_key_stands_there_with_its_default(section: str, settings: object) 
         ("rollout_reward", SelectorSettings),
         ("launch", RecoverySettings),
         ("journal_survives", RecoverySettings),
+        ("on_lost", LostSettings),
     ],
 )
 def test_each_choice_stands_in_its_row(key: str, settings: type[msgspec.Struct]) -> None:

@@ -30,18 +30,6 @@ static void cos_array(const double* in, double* out, std::size_t count) {
     map(in, out, count, [](Lanes x) HOLDFAST_LAMBDA { return sine_cosine_of(x).cosine; });
 }
 
-static void arctan2_array(const double* y, const double* x, double* out, std::size_t count) {
-    std::size_t i = 0;
-    for (; i + lane_count <= count; i += lane_count)
-        store(out + i, arctan2_of(load(y + i), load(x + i)));
-    if (i < count) {
-        const std::size_t left = count - i;
-        store_partial(out + i,
-                      arctan2_of(load_partial(y + i, left, 0.0), load_partial(x + i, left, 1.0)),
-                      left);
-    }
-}
-
 /// Sum of count doubles: element i goes to partial sum i mod 8, and these are added in one order.
 static double sum_array(const double* in, std::size_t count) {
     Lanes partial{};

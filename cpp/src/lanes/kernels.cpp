@@ -14,9 +14,9 @@ namespace holdfast::inline HOLDFAST_ISA {
 
 extern const VectorKernels table;
 const VectorKernels table = {
-    HOLDFAST_ISA_NAME, exp_array,       log_array,       sin_array,     cos_array,
-    arctan2_array,     normals_array,   sum_array,       weighted_sums, posterior,
-    normalize,         compact_nearest, compact_mixture, group_nearest, group_mixture,
+    HOLDFAST_ISA_NAME, exp_array,       log_array,     sin_array,     cos_array,
+    normals_array,     sum_array,       weighted_sums, posterior,     normalize,
+    compact_nearest,   compact_mixture, group_nearest, group_mixture,
 };
 
 }  // namespace holdfast::inline HOLDFAST_ISA

@@ -91,10 +91,7 @@ static std::size_t normalize(const double* log_weights, std::size_t count, bool 
 }
 
 /// log w_n - sum over c of ((z_c - h_c(x_n))^2 / (2 R_c) + log(R_c) / 2), then normalised.
-///
-/// Of an angle, z_c - h_c(x_n) is the shorter way round.
-template <bool has_angles>
-static std::size_t posterior_of(const PosteriorInput& in, double* weights) {
+static std::size_t posterior(const PosteriorInput& in, double* weights) {
     const bool varying = in.log_normalizer != nullptr;
     Lanes largest = splat(-__builtin_inf());
     for (std::size_t i = 0; i < in.count; i += lane_count) {
@@ -104,10 +101,8 @@ static std::size_t posterior_of(const PosteriorInput& in, double* weights) {
         };
         Lanes exponent{};
         for (std::size_t c = 0; c < in.observation_size; ++c) {
-            Lanes difference = splat(in.observation[c]) - fetch(in.predicted + c * in.count, 0.0);
-            if constexpr (has_angles) {
-                if (in.circular[c] != 0) difference = wrapped(difference);
-            }
+            const Lanes difference =
+                splat(in.observation[c]) - fetch(in.predicted + c * in.count, 0.0);
             const Lanes inverse = varying ? fetch(in.inverse_variance + c * in.count, 1.0)
                                           : splat(in.inverse_variance[c]);
             exponent += difference * difference * inverse;
@@ -122,11 +117,6 @@ static std::size_t posterior_of(const PosteriorInput& in, double* weights) {
         }
     }
     return normalize_in_place(weights, in.count, maximum_of(largest), in.drop_negligible);
-}
-
-static std::size_t posterior(const PosteriorInput& in, double* weights) {
-    return in.circular == nullptr ? posterior_of<false>(in, weights)
-                                  : posterior_of<true>(in, weights);
 }
 
 }  // namespace holdfast::inline HOLDFAST_ISA

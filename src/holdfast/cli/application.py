@@ -37,6 +37,7 @@ COMMANDS = {
     "experiment": Command("holdfast.lab.studies.command", "Regenerate the tables and figures."),
     "compare": Command("holdfast.cli.compare", "Compare the decisions of two runs."),
     "export": Command("holdfast.cli.export", "Write a run for RViz, Foxglove, or as tables."),
+    "view": Command("holdfast.cli.view", "See a run in Rerun's viewer."),
     "simulate": Command(
         "holdfast.lab.simulation.command", "Search for faults that change a decision."
     ),

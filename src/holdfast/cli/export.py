@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,16 +30,26 @@ if TYPE_CHECKING:
     from holdfast.recording.facts import FactSink
     from holdfast.recording.replay import RecordedRun
 
-__all__ = ["main"]
+__all__ = [
+    "MAX_RATE_HZ",
+    "MIN_RATE_HZ",
+    "chosen_trials",
+    "main",
+    "notes_about",
+    "replay_trials",
+    "size_of",
+    "trial_range",
+]
 
-_MIN_RATE_HZ, _MAX_RATE_HZ = 0.001, 10_000.0
+MIN_RATE_HZ, MAX_RATE_HZ = 0.001, 10_000.0
 _NOTE = "decided as recorded"
 """The note of the progress bar."""
 
 _RANGE = re.compile(r"(\d{1,9}):(\d{1,9})")
 
 
-def _range(text: str) -> range:
+def trial_range(text: str) -> range:
+    """Read ``A:B``."""
     match = _RANGE.fullmatch(text)
     if match is None or int(match[2]) > MAX_TRIALS:
         raise bad_value(text, f"two whole numbers A:B from 0 to {MAX_TRIALS}, such as 0:5")
@@ -75,12 +85,12 @@ class ExportOptions(Options):
     )
     trials: range | None = option(
         metavar="A:B",
-        read=_range,
+        read=trial_range,
         help="Only the trials from A up to, but without, B (default: all).",
     )
     rate: float = option(
         metavar="HZ",
-        read=number(_MIN_RATE_HZ, _MAX_RATE_HZ, "Hz"),
+        read=number(MIN_RATE_HZ, MAX_RATE_HZ, "Hz"),
         default=10.0,
         help="Steps a second, for a run that was recorded without times.",
     )
@@ -111,27 +121,31 @@ def _export(options: ExportOptions) -> None:
     from holdfast.recording.replay import RecordedRun
 
     with RecordedRun(path) as recorded:
-        trials = [trial for trial in recorded.trials if wanted is None or trial in wanted]
-        if not trials:
-            raise OutputError(f"{path}: {_nothing_there(recorded, wanted)}")
+        trials = chosen_trials(recorded, wanted)
         notes = _write(recorded, trials, options)
     for note in () if options.quiet else notes:
         sys.stderr.write(f"note: {printable(note)}\n")
     for place in (mcap, tables):
         if place is not None:
-            sys.stdout.write(printable(f"{place}  {_size_of(place)}\n"))
+            sys.stdout.write(printable(f"{place}  {size_of(place)}\n"))
     sys.stdout.flush()
 
 
-def _nothing_there(recorded: RecordedRun, wanted: range | None) -> str:
+def chosen_trials(recorded: RecordedRun, wanted: range | None) -> list[int]:
+    """Return those of ``--trials`` that are recorded; OutputError if there is none."""
+    trials = [trial for trial in recorded.trials if wanted is None or trial in wanted]
+    if trials:
+        return trials
     if not recorded.trials:
-        return "no trial of that run is finished or begun, so there is nothing to export"
-    assert wanted is not None
-    first, last = recorded.trials[0], recorded.trials[-1]
-    return (
-        f"has no trial from {wanted.start} to {wanted.stop - 1} (--trials); it has "
-        f"{counted(len(recorded.trials), 'trial')} from {first} to {last}"
-    )
+        why = "no trial of that run is finished or begun, so there is nothing to show"
+    else:
+        assert wanted is not None
+        first, last = recorded.trials[0], recorded.trials[-1]
+        why = (
+            f"has no trial from {wanted.start} to {wanted.stop - 1} (--trials); it has "
+            f"{counted(len(recorded.trials), 'trial')} from {first} to {last}"
+        )
+    raise OutputError(f"{recorded.path}: {why}")
 
 
 def _write(recorded: RecordedRun, trials: Sequence[int], options: ExportOptions) -> list[str]:
@@ -139,8 +153,7 @@ def _write(recorded: RecordedRun, trials: Sequence[int], options: ExportOptions)
     from holdfast.recording.csv_export import CsvSink
 
     mcap, tables, rate_hz = options.mcap, options.tables, options.rate
-    notes = _notes(recorded, trials, rate_hz)
-    line = progress_line(len(trials), quiet=options.quiet)
+    notes = notes_about(recorded, trials, rate_hz)
     with contextlib.ExitStack() as stack:
         made: list[tuple[Path, Path]] = []
         sinks: list[FactSink] = []
@@ -167,28 +180,43 @@ def _write(recorded: RecordedRun, trials: Sequence[int], options: ExportOptions)
                     files.enter_context(CsvSink(directory, recorded.configuration.problem))
                 )
                 made.append((directory, tables))
-            line.start(f"{counted(len(trials), 'trial')} of {recorded.path}", 0, _NOTE)
-            try:
-                replayed = recorded.replay(trials, sinks, rate_hz)
-                for finished, _ in enumerate(replayed, start=1):
-                    line.show(finished, _NOTE)
-            except (HoldfastError, KeyboardInterrupt):
-                raise
-            except BaseException as error:
-                account = account_of_user_error(error, recorded.configuration.problem_name)
-                if account is None:
-                    raise
-                raise HoldfastError(account) from error
-            finally:
-                with contextlib.suppress(OSError):
-                    line.stop()
-            recorded.require_unchanged()
+            replay_trials(recorded, trials, sinks, rate_hz, quiet=options.quiet)
         for here, there in made:
             move_into_place(here, there)
     return notes
 
 
-def _notes(recorded: RecordedRun, trials: Sequence[int], rate_hz: float) -> list[str]:
+def replay_trials(
+    recorded: RecordedRun,
+    trials: Sequence[int],
+    sinks: Sequence[FactSink],
+    rate_hz: float,
+    *,
+    quiet: bool,
+    after_each: Callable[[], None] = lambda: None,
+) -> None:
+    """Write the facts of trials to sinks, and show the progress."""
+    line = progress_line(len(trials), quiet=quiet)
+    line.start(f"{counted(len(trials), 'trial')} of {recorded.path}", 0, _NOTE)
+    try:
+        for finished, _ in enumerate(recorded.replay(trials, sinks, rate_hz), start=1):
+            after_each()
+            line.show(finished, _NOTE)
+    except (HoldfastError, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        account = account_of_user_error(error, recorded.configuration.problem_name)
+        if account is None:
+            raise
+        raise HoldfastError(account) from error
+    finally:
+        with contextlib.suppress(OSError):
+            line.stop()
+    recorded.require_unchanged()
+
+
+def notes_about(recorded: RecordedRun, trials: Sequence[int], rate_hz: float) -> list[str]:
+    """Return what a reader of the facts should know."""
     from holdfast.recording.run_directory import TIMINGS_NAME
 
     notes = []
@@ -224,7 +252,8 @@ def _about(recorded: RecordedRun, rate_hz: float) -> dict[str, str]:
     }
 
 
-def _size_of(place: Path) -> str:
+def size_of(place: Path) -> str:
+    """Return the size of a file or directory, for people."""
     files = sorted(place.iterdir()) if place.is_dir() else [place]
     size = sum(file.stat().st_size for file in files)
     return f"{size / 2**20:.1f} MiB" if size >= 2**20 else f"{size / 2**10:.1f} KiB"

@@ -51,12 +51,13 @@ class RobotFindings:
         """Do nothing."""
 
 
-def is_robot_run(configuration: Configuration, rate_hz: float | None) -> bool:
+def is_robot_run(options: RunOptions, configuration: Configuration) -> bool:
     """Return whether a run needs more than a batch of simulated trials does."""
     return (
         bool(configuration.offload.services)
         or configuration.environment.object is not None
-        or rate_hz is not None
+        or options.rate is not None
+        or options.view_target() is not None
     )
 
 
@@ -87,6 +88,11 @@ def run_as_robot(
                 "(recovery.launch) it launches a local service that decides meanwhile"
             )
 
+    view = None
+    if (target := options.view_target()) is not None:
+        from holdfast.recording.live_view import LiveView
+
+        view = LiveView(configuration, target, note)
     findings = RobotFindings(hint)
     sinks: list[EventSink] = [findings]
     if not options.quiet:
@@ -98,6 +104,7 @@ def run_as_robot(
         on_result,
         rate_hz=options.rate,
         sinks=sinks,
-        watch=lambda events: RobotWatch(manager, options.health, events),
+        watch=lambda events: RobotWatch(manager, options.health, options.metrics, events),
+        view=view,
     )
     return findings

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from holdfast.cli.exit_codes import (
     EXIT_CAN_GO_ON,
@@ -21,13 +21,16 @@ from holdfast.cli.overrides import Override, combined, parse_assignment
 from holdfast.cli.run_figure import draw_figure
 from holdfast.cli.terminal import RunDisplay, counted, print_files, print_summary
 from holdfast.errors import HoldfastError, InvalidValueError, RunError
+from holdfast.files import require_free
 from holdfast.printable import printable
+from holdfast.recording.view_target import ViewTarget, require_rerun, viewer_url
 from holdfast.runtime.command_line import (
     MAX_JOBS,
     MAX_SEED,
     MAX_TRIALS,
     Options,
     argument,
+    bad_value,
     flag,
     location,
     number,
@@ -57,6 +60,25 @@ _OF_ENVIRONMENTS = ("environment.directory", "environment.arguments")
 """Keys without effect where no environment is named."""
 
 
+class Viewer(NamedTuple):
+    """The value of ``--view``, and the URL that it means; empty for a viewer of this machine."""
+
+    given: str
+    url: str
+
+    def __str__(self) -> str:
+        return self.given
+
+
+def viewer(text: str) -> Viewer:
+    """Read ``rerun`` or ``rerun=HOST:PORT``."""
+    name, equals, place = text.partition("=")
+    if name == "rerun":
+        with contextlib.suppress(InvalidValueError):
+            return Viewer(text, viewer_url(place) if equals else "")
+    raise bad_value(text, "rerun, or rerun=HOST:PORT of a viewer that runs elsewhere")
+
+
 class RunOptions(Options):
     """Run the trials of CONFIG and write their results into a directory.
 
@@ -64,9 +86,9 @@ class RunOptions(Options):
     in; it can be run again), journal.sqlite (every decision of every trial) and trial.png (a figure
     of trial 0).
 
-    With --service, --environment or --rate the trials are run one after another, as a robot does:
-    every step is in the journal before it is performed, and DIR gets events.jsonl (what happened to
-    the services) and timings.csv (how long each decision took) as well.
+    With --service, --environment, --rate or --view the trials are run one after another, as a robot
+    does: every step is in the journal before it is performed, and DIR gets events.jsonl (what
+    happened to the services) and timings.csv (how long each decision took) as well.
 
     Ctrl-C or a crash loses no trial and no step: the same command with --resume goes on.
     """
@@ -157,11 +179,35 @@ class RunOptions(Options):
         help="Answer http://HOST:PORT/livez, and /readyz while a service or the robot itself "
         "decides; a PORT alone is one of 127.0.0.1.",
     )
+    metrics: HttpAddress | None = option(
+        metavar="HOST:PORT",
+        read=http_address,
+        help="Offer this robot's metrics for Prometheus at http://HOST:PORT/metrics. The address "
+        "may be that of --health.",
+    )
+    view: Viewer | None = option(
+        metavar="rerun",
+        read=viewer,
+        help="Show the run in Rerun's viewer while it goes on (extra view); rerun=HOST:PORT is one "
+        "that runs elsewhere.",
+    )
+    view_file: Path | None = option(
+        metavar="FILE",
+        read=location,
+        help="Write what is shown to FILE (.rrd), with --view or without it.",
+    )
     log: LogFormat = log_option("Format of the events shown: text or json.")
+
+    def view_target(self) -> ViewTarget | None:
+        """Return where to show the run while it goes on, if anywhere."""
+        if self.view is None and self.view_file is None:
+            return None
+        file = None if self.view_file is None else str(self.view_file.absolute())
+        return ViewTarget(None if self.view is None else self.view.url, file)
 
     def resume_command(self, directory: Path) -> str:
         """Return the command that goes on."""
-        words = self.words("out", "resume", "resume_if_begun", "quiet")
+        words = self.words("out", "resume", "resume_if_begun", "quiet", "view_file")
         out = self.table()["out"].words(directory)
         return shlex.join(["holdfast", "run", *words, *out, "--resume"])
 
@@ -192,6 +238,7 @@ def main(arguments: Sequence[str]) -> int:
 def _run(options: RunOptions) -> int:
     from holdfast.cli.robot_run import RobotFindings, is_robot_run, run_as_robot
     from holdfast.planning import Planner
+    from holdfast.recording.belief_remarks import belief_remarks
     from holdfast.recording.recorder import Recorder
     from holdfast.recording.run_directory import (
         FIGURE_NAME,
@@ -206,7 +253,7 @@ def _run(options: RunOptions) -> int:
     manager = ServiceManager()
     configuration = options.load()
     quiet = options.quiet
-    as_robot = is_robot_run(configuration, options.rate)
+    as_robot = is_robot_run(options, configuration)
     _require_effect(options, configuration, as_robot=as_robot)
     # Before a directory is claimed: a module that cannot be imported leaves nothing behind.
     maker = load_environment(configuration) if as_robot else None
@@ -302,6 +349,8 @@ def _run(options: RunOptions) -> int:
             print_files(directory_path)
         if remark is not None:
             notes.note(remark.text)
+        for text in belief_remarks(configuration.problem, configuration.planning, recorder.record):
+            notes.note(f"in trial {recorder.trial}, {text}")
         if summary.unverified_answers:
             notes.note(
                 f"{summary.unverified_answers} questions that were drawn to be answered by the "
@@ -365,14 +414,15 @@ def _require_effect(options: RunOptions, configuration: Configuration, *, as_rob
     if options.jobs is not None and as_robot:
         raise InvalidValueError(
             f"--jobs is {options.jobs}, but a robot runs its trials one after another: leave it "
-            "out, or leave out --service, --environment and --rate (and offload.services and "
-            "environment.object)"
+            "out, or leave out --service, --environment, --rate and --view (and offload.services "
+            "and environment.object)"
         )
-    if options.health is not None and not as_robot:
-        raise InvalidValueError(
-            f"--health {options.health} is for a robot: give --service, --environment or --rate "
-            "(or offload.services or environment.object), without which the trials are a batch"
-        )
+    for name, address in (("--health", options.health), ("--metrics", options.metrics)):
+        if address is not None and not as_robot:
+            raise InvalidValueError(
+                f"{name} {address} is for a robot: give --service, --environment or --rate "
+                "(or offload.services or environment.object), without which the trials are a batch"
+            )
     if configuration.offload.services:
         from holdfast.robot.links import check_services
 
@@ -390,6 +440,11 @@ def _require_effect(options: RunOptions, configuration: Configuration, *, as_rob
                 f"{given.words} needs --environment (or environment.object in "
                 f"{options.configuration}): without an environment it would do nothing"
             )
+    target = options.view_target()
+    if target is not None:
+        require_rerun(target)
+        if options.view_file is not None:
+            require_free(options.view_file, "--view-file", directory=False)
     if options.log == "json" and not as_robot:
         raise InvalidValueError(
             "--log json needs --service, --environment or --rate (or offload.services or "

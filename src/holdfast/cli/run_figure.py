@@ -206,6 +206,7 @@ def repeat(
             max_steps=configuration.simulator.max_steps,
             environment=world,
             observer=NULL_OBSERVER if recorder is None else recorder,
+            reinitialised_after=kept.reinitialised_after(),
         ).decisions
     except DecidedOtherwiseError as error:
         return Repetition(None, Deviation(error.step, error.kind), error)

@@ -247,7 +247,10 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
             )
         )
     if summary.failures:
-        rows.append(("failed", f"{summary.failures:,} of {counted(summary.finished, 'trial')}"))
+        truncated = summary.finished - summary.successes - summary.failures
+        others = f" ({truncated:,} truncated)" if truncated else ""
+        failed = f"{summary.failures:,} of {counted(summary.finished, 'trial')}{others}"
+        rows.append(("failed", failed))
     if summary.mean_reward is not None:
         value = f"{summary.mean_reward:.4g}"
         if summary.mean_reward_of_successes is not None:
@@ -276,6 +279,9 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
         if summary.unexplained_observations * 100 > summary.sensing_decisions:
             remedy = "take more particles (particle_filter.num_particles), or check the model"
             rows.append(("", remedy))
+    if summary.lost or summary.suspect_sensors:
+        suspects = counted(summary.suspect_sensors, "suspect sensor")
+        rows.append(("lost", f"{counted(summary.lost, 'time')}, {suspects} (see trials.csv)"))
     by_service = summary.sensing_decisions_by_service
     if by_service and set(by_service) != {OWN_PLANNER}:
         shares = ", ".join(f"{service} {count:,}" for service, count in by_service.items())

@@ -30,6 +30,7 @@ from holdfast.config.settings import (
     UNINFORMED_METHODS,
     ActiveSensingSettings,
     EnvironmentSettings,
+    LostSettings,
     OffloadSettings,
     ParticleFilterSettings,
     PlanningSettings,
@@ -88,6 +89,7 @@ class Configuration:
     unlisted: tuple[str, ...] = field(default=(), compare=False)
     offload: OffloadSettings = field(default_factory=OffloadSettings)
     recovery: RecoverySettings = field(default_factory=RecoverySettings)
+    lost: LostSettings = field(default_factory=LostSettings)
     environment: EnvironmentSettings = field(default_factory=EnvironmentSettings)
 
     def to_yaml(self) -> str:
@@ -135,6 +137,7 @@ class Configuration:
             "simulator": self.simulator,
             "offload": self.offload,
             "recovery": self.recovery,
+            "lost": self.lost,
             "environment": self.environment,
         }
         directory = self.problem_directory
@@ -222,6 +225,7 @@ def _build(
     simulator = source.section("simulator", SimulatorSettings)
     recovery = source.section("recovery", RecoverySettings)
     offload = _checked_offload(source, source.section("offload", OffloadSettings), recovery)
+    lost = source.section("lost", LostSettings)
     environment = _located_environment(source, source.section("environment", EnvironmentSettings))
     built = build_from(source, name, problem_class)
 
@@ -259,6 +263,7 @@ def _build(
         problem_directory=directory,
         offload=offload,
         recovery=recovery,
+        lost=lost,
         environment=environment,
     )
 

@@ -20,6 +20,7 @@ from holdfast.errors import InvalidValueError
 __all__ = [
     "ActiveSensingSettings",
     "EnvironmentSettings",
+    "LostSettings",
     "OffloadSettings",
     "ParticleFilterSettings",
     "PlanningSettings",
@@ -87,6 +88,13 @@ NEIGHBOR_ESTIMATORS: frozenset[Estimator] = frozenset({"nearest_neighbor", "prio
 """Those that count nearest neighbours."""
 
 
+Estimate = Literal["mean", "most_likely", "heaviest_mode"]
+"""Which state stands for a belief: ``holdfast.belief.estimate`` has a branch each."""
+
+OnLost = Literal["continue", "hold", "reinitialise"]
+"""What a robot that is lost does."""
+
+
 class ParticleFilterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The section ``particle_filter``.
 
@@ -97,14 +105,16 @@ class ParticleFilterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=
         over several problems (docs/results.md).
     resampling_threshold : float
         Resample when the effective sample size is at most this fraction of the particles.
-    estimate : {"mean", "most_likely"}
-        The state for which the policy is asked. Of equal weights, as all are after resampling, the
-        first particle is the most likely: no more than a draw from the belief.
+    estimate : Estimate
+        The state for which the policy is asked. ``heaviest_mode`` is for beliefs with several
+        modes, between which the mean lies where the robot is not; with one mode it is the mean. Of
+        equal weights, as all are after resampling, the first particle is the most likely: no more
+        than a draw from the belief.
     """
 
     num_particles: Annotated[int, msgspec.Meta(ge=1, le=MAX_PARTICLES)] = 300
     resampling_threshold: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 1.0
-    estimate: Literal["mean", "most_likely"] = "mean"
+    estimate: Estimate = "mean"
 
 
 class ActiveSensingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -293,6 +303,25 @@ class RecoverySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     launch_timeout_ms: Milliseconds = 5000.0
     relaunch_delay_ms: Milliseconds = 100.0
     journal_survives: Literal["process_crash", "power_cut"] = "process_crash"
+
+
+class LostSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``lost``: when the robot counts as lost, and what it does then.
+
+    The robot's own: services see only a recorded reinitialisation.
+
+    Attributes
+    ----------
+    false_alarm_rate : float
+        For each observation: within n of them a false alarm, of a lost robot or a dead sensor, has
+        a probability of at most n times this (:mod:`holdfast.lost` says for which beliefs).
+    on_lost : {"continue", "hold", "reinitialise"}
+        Report it only; hold still and end the run, which can be resumed; or begin the belief anew,
+        from the problem's ``reinitial_states`` or else its initial belief.
+    """
+
+    false_alarm_rate: Annotated[float, msgspec.Meta(ge=1e-12, le=0.1)] = 1e-4
+    on_lost: OnLost = "continue"
 
 
 class EnvironmentSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

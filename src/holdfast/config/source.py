@@ -16,6 +16,7 @@ import msgspec
 from holdfast.config.settings import (
     ActiveSensingSettings,
     EnvironmentSettings,
+    LostSettings,
     OffloadSettings,
     ParticleFilterSettings,
     RecoverySettings,
@@ -42,6 +43,7 @@ SETTINGS: Mapping[str, type[msgspec.Struct]] = {
     "selector": SelectorSettings,
     "offload": OffloadSettings,
     "recovery": RecoverySettings,
+    "lost": LostSettings,
     "environment": EnvironmentSettings,
 }
 """The sections whose keys do not depend on the problem, and their types."""
@@ -55,6 +57,7 @@ SECTIONS = (
     "selector",
     "offload",
     "recovery",
+    "lost",
     "environment",
 )
 """In the order in which a resolved configuration lists them."""

@@ -138,10 +138,11 @@ class Problem(Protocol):
     num_stages : int
         Stages of the task (holes to pass, via points to reach); 1 where there are none.
     resolution : float or array of shape (action_size,)
-        Distance below which two task actions do not differ in practice (of the order of the motion
-        noise's standard deviation), in the actions' unit. An array gives each coordinate its own,
-        in its own unit (0.1 m and 0.05 rad), so distances count in resolutions and the choice of
-        what to sense does not depend on units. One number fits where all coordinates have the same.
+        Distance below which two task actions do not differ in practice, in the actions' unit: of
+        the order of the motion noise's standard deviation, or of what the task tolerates, if that
+        is larger and sensors differ in sharpness. An array gives each coordinate its own, in its
+        own unit (0.1 m and 0.05 rad), so distances count in resolutions and the choice of what to
+        sense does not depend on units. One number fits where all coordinates have the same.
     motion_variance : array of shape (action_size,)
         Variance of the noise on an executed action, for the Gaussian-mixture entropy.
     state_labels : sequence of str
@@ -164,7 +165,9 @@ class Problem(Protocol):
 
     It may have ``sensing_costs``, the price of each sensing action in units of reward, numbers
     from 0 to 1e150. A trial's reward is less by it at each sensing, and ``expected_return`` weighs
-    it against what sensing gains. Without this attribute sensing costs nothing.
+    it against what sensing gains; methods that minimise an entropy do with a rate,
+    ``selector.nats_per_cost``. Without this attribute sensing costs nothing. Not to sense is no
+    sensing action: ``selector.sensing_is_optional`` makes it a choice, of price 0.
     """
 
     name: str
@@ -234,6 +237,12 @@ class GeneralObservationProblem(Protocol):
     With them ``observation_mean`` and ``observation_variance`` are not used and need not be there.
     Sensing costs more: the likelihood is evaluated in Python, once for each hypothetical
     observation.
+
+    A robot is found lost (:mod:`holdfast.lost`) by observations that no particle can have made. A
+    likelihood that is zero nowhere has none of these. An attribute ``rank_test = True`` asks for
+    the test by :func:`holdfast.validation_gate.is_typical` instead: each observation is compared
+    with up to 19 drawn ones, which takes as many evaluations of the likelihood, 3.5 on average. It
+    is right if what is left out of the likelihood does not depend on the observation.
     """
 
     def log_likelihood(
@@ -383,7 +392,7 @@ class ProblemBase:
     motion_variance: FloatArray = np.array([0.01])
     state_labels: Sequence[str] = ()
     pose: Sequence[str | None] = ()
-    """Which coordinates of the state are a pose, for ROS: see :mod:`holdfast.ros.poses`."""
+    """Which coordinates of the state are a pose, for ROS: see :mod:`holdfast.recording.poses`."""
     up: str = "z"
     """Which axis of that pose points up: z, or y for a problem in a vertical plane."""
 

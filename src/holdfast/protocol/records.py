@@ -13,6 +13,7 @@ from typing import TypeAlias
 import msgspec
 
 from holdfast.arrays import FloatArray
+from holdfast.config.settings import LostSettings
 from holdfast.errors import InvalidValueError, MessageError, RecordError
 from holdfast.planning import ObservationInfo, Planner
 from holdfast.protocol.messages import (
@@ -27,7 +28,6 @@ from holdfast.protocol.messages import (
 from holdfast.tracking import LateObservation, Trial
 
 __all__ = [
-    "DIVERGENCE_RUN",
     "ActingRecord",
     "LateRecord",
     "LocalTookOverRecord",
@@ -39,6 +39,8 @@ __all__ = [
     "TrialHistory",
     "decode_record",
     "encode_record",
+    "has_shown",
+    "reinitialised_after",
     "replay",
 ]
 
@@ -150,11 +152,6 @@ def decode_record(data: bytes) -> Record:
         raise RecordError(f"{len(data)} bytes are no record of a journal: {error}") from error
 
 
-DIVERGENCE_RUN = 5
-"""So many observations outside the validation gate in a row are no outliers: the filter has
-diverged. (A sensor with 1 % outliers shows five in a row once in 10^10 observations.)"""
-
-
 class TrialHistory(Trial):
     """An unfinished trial: what its records fold to.
 
@@ -162,29 +159,26 @@ class TrialHistory(Trial):
     ----------
     inputs : tuple of Input
         The latest from which a service can fold the state, as many as fit into a request.
-    num_inputs : int
-        Of this trial, each late observation and reinitialisation counted.
     actions : list of array
         Replayed task actions in order.
     pending : array or None
         A task action in the journal that is not known to be performed.
     paused : bool
         Whether the previous process ended in order.
-    unexplained_in_a_row : int
-        Length of the current run of observations outside the validation gate.
-    num_divergences : int
-        Times that such a run reached :data:`DIVERGENCE_RUN`.
     """
 
-    def __init__(self, planner: Planner, seed: int, trial: int) -> None:
-        super().__init__(planner, seed, trial)
+    def __init__(
+        self,
+        planner: Planner,
+        seed: int,
+        trial: int,
+        false_alarm_rate: float = LostSettings().false_alarm_rate,
+    ) -> None:
+        super().__init__(planner, seed, trial, false_alarm_rate)
         self.inputs: tuple[Input, ...] = ()
-        self.num_inputs = 0
         self.actions: list[FloatArray] = []
         self.pending: FloatArray | None = None
         self.paused = False
-        self.unexplained_in_a_row = 0
-        self.num_divergences = 0
 
     @property
     def begun(self) -> bool:
@@ -197,8 +191,6 @@ class TrialHistory(Trial):
         """Fold in a sensing action; return what was found, and its record."""
         step = self.state.step
         info, reached = self.observe(sensing_action, observation, sensing_ms)
-        if observation is not None:
-            self._count(info)
         shown = b"" if observation is None else encode_floats(observation)
         self._add(Observed(step, sensing_action, shown))
         return info, ObservedRecord(step, sensing_action, shown, reached, sensing_ms)
@@ -208,8 +200,6 @@ class TrialHistory(Trial):
         assert self.pending is not None
         action, motion, observation = self.pending, record.motion, record.observation
         info = self.move(action, record.reward, numbers_of(motion), numbers_of(observation))
-        if info is not None:
-            self._count(info)
         if motion or observation:
             self._add(Moved(record.step, motion, observation))
         self.pending = None
@@ -224,7 +214,6 @@ class TrialHistory(Trial):
         if found is None:
             return None
         info, reached = found
-        self._count(info)
         self._add(None)
         shown = encode_floats(late.observation)
         return info, LateRecord(self.state.step, late.step, shown, reached)
@@ -233,20 +222,20 @@ class TrialHistory(Trial):
         """Begin the belief anew; return the record."""
         reached = self.reinitialise()
         self._add(None)
-        self.unexplained_in_a_row = 0
         return ReinitialisedRecord(self.state.step, reached)
-
-    def _count(self, info: ObservationInfo) -> None:
-        self.unexplained_in_a_row = 0 if info.explained else self.unexplained_in_a_row + 1
-        self.num_divergences += self.unexplained_in_a_row == DIVERGENCE_RUN
 
     def _add(self, given: Input | None) -> None:
         """Keep an input; None is one that no service can fold in: it needs the state after it."""
-        self.num_inputs += 1
         self.inputs = () if given is None else (*self.inputs, given)[-MAX_INPUTS:]
 
 
-def replay(planner: Planner, seed: int, trial: int, records: Sequence[Record]) -> TrialHistory:
+def replay(
+    planner: Planner,
+    seed: int,
+    trial: int,
+    records: Sequence[Record],
+    false_alarm_rate: float = LostSettings().false_alarm_rate,
+) -> TrialHistory:
     """Fold the records of an unfinished trial, in the order in which they were written.
 
     Raises
@@ -254,7 +243,7 @@ def replay(planner: Planner, seed: int, trial: int, records: Sequence[Record]) -
     RecordError
         If a record does not follow from those before it, or leads to another state than before.
     """
-    history = TrialHistory(planner, seed, trial)
+    history = TrialHistory(planner, seed, trial, false_alarm_rate)
     for position, record in enumerate(records):
         history.paused = isinstance(record, PausedRecord)
         try:
@@ -264,6 +253,26 @@ def replay(planner: Planner, seed: int, trial: int, records: Sequence[Record]) -
     return history
 
 
+def has_shown(record: Record) -> bool:
+    """Return whether a record has what neither the decisions nor a simulated world can tell."""
+    if isinstance(record, PerformedRecord):
+        return bool(record.motion or record.observation)
+    return isinstance(record, LateRecord)
+
+
+def reinitialised_after(records: Sequence[Record]) -> frozenset[int]:
+    """Return after how many inputs the belief was begun anew (as a ``Trial`` counts them)."""
+    inputs = 0
+    found = set()
+    for record in records:
+        if isinstance(record, ReinitialisedRecord):
+            found.add(inputs)
+        inputs += isinstance(record, ObservedRecord | LateRecord | ReinitialisedRecord) or (
+            isinstance(record, PerformedRecord) and bool(record.motion or record.observation)
+        )
+    return frozenset(found)
+
+
 def _replay_record(planner: Planner, history: TrialHistory, record: Record) -> None:
     if isinstance(record, PausedRecord):
         return
@@ -271,7 +280,7 @@ def _replay_record(planner: Planner, history: TrialHistory, record: Record) -> N
         history.recoveries += record.times
         return
     state = history.state
-    if not isinstance(record, PerformedRecord) and history.pending is not None:
+    if isinstance(record, ObservedRecord | ActingRecord) and history.pending is not None:
         raise RecordError("comes before the action of that step is known to be performed")
     if record.step != state.step:
         raise RecordError(f"is of step {record.step}, where step {state.step} is due")

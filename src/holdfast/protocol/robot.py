@@ -17,8 +17,7 @@ The machine touches nothing. Methods take an event and the time and return effec
 from __future__ import annotations
 
 from holdfast.arrays import FloatArray
-from holdfast.belief import VALIDATION_GATE_SQUARED
-from holdfast.config.settings import SimulatorSettings
+from holdfast.config.settings import LostSettings, SimulatorSettings
 from holdfast.errors import HeldError, HoldfastError, UnknownPerformanceError
 from holdfast.outcome import Ending
 from holdfast.planning import ObservationInfo, Planner, PlanningState
@@ -42,23 +41,21 @@ from holdfast.protocol.events import (
     WriteRecords,
 )
 from holdfast.protocol.messages import DIGEST_SIZE, encode_floats
+from holdfast.protocol.observation_reports import ObservationReports, held_error
 from holdfast.protocol.question import DecisionSource, Provenance, Question, same_actions
 from holdfast.protocol.records import (
-    DIVERGENCE_RUN,
     ActingRecord,
-    LateRecord,
     LocalTookOverRecord,
     PausedRecord,
     PerformedRecord,
     Record,
-    ReinitialisedRecord,
     TrialHistory,
+    has_shown,
 )
 from holdfast.protocol.status import Status
 from holdfast.tracking import LateObservation
 
 __all__ = ["Robot"]
-
 
 _FROM_ENVIRONMENT = (Sensed, Acted, EnvironmentFailed)
 """Events that complete an order to the environment."""
@@ -67,29 +64,15 @@ _TICKS_INTERVAL_S = 1.0
 """Missed ticks are reported at most this often."""
 
 
-_MAX_REPORTS = 10
-"""Bound on reports of each kind about unexplained observations per trial; all are counted."""
-
-
-def _has_shown(record: Record) -> bool:
-    """Return whether a record has what neither the decisions nor a simulated world can tell."""
-    if isinstance(record, PerformedRecord):
-        return bool(record.motion or record.observation)
-    return isinstance(record, LateRecord | ReinitialisedRecord)
-
-
 class Robot:
     """The loop of one robot over the trials of a run.
 
-    Parameters
-    ----------
-    rate_hz : float or None
-        Task actions per second; None for as soon as possible.
+    ``rate_hz`` is task actions per second; None is as soon as possible.
 
     Attributes
     ----------
-    missed_ticks : int
-        Ticks of ``rate_hz`` at which the robot was not ready.
+    num_performed, missed_ticks : int
+        Task actions performed, and ticks of ``rate_hz`` at which the robot was not ready.
     has_decided : bool
         Whether this process has used an answer.
     """
@@ -100,10 +83,13 @@ class Robot:
         simulator: SimulatorSettings,
         source: DecisionSource,
         rate_hz: float | None = None,
+        lost: LostSettings | None = None,
     ) -> None:
         self._planner = planner
         self._simulator = simulator
         self._source = source
+        self._lost = LostSettings() if lost is None else lost
+        self.reports = ObservationReports(source.effects, self._lost)
         self._period_s = None if rate_hz is None else 1.0 / rate_hz
         # One list for both, because the order of all effects counts.
         self._effects = source.effects
@@ -123,6 +109,7 @@ class Robot:
         self._reported_ticks = 0
         self._report_ticks_at = 0.0
         self.missed_ticks = 0
+        self.num_performed = 0
         self.has_decided = False
 
     @property
@@ -197,16 +184,21 @@ class Robot:
         resumed = history.begun
         if resumed:
             self._effects.report("resumed_trial", trial=trial, step=history.state.step)
+        is_lost = history.alarm is not None and history.alarm.kind == "lost"
         try:
+            if is_lost and history.pending is None and self._lost.on_lost == "reinitialise":
+                # The process ended between the observation and this, or held still there.
+                self._reinitialise()
             again = self._settle_pending_action(begun, resumed, tail_is_certain)
             for late in begun.late:
                 self._came_late(late)
         except HoldfastError as error:
             self._stop(error)
             return self._take()
-        if again is not None:
+        if again is not None and not self._stopped:
             # It is in the journal already, and the environment says that it was not performed.
             self._awaits_environment = True
+            self._write()
             self._effects.append(Act(history.state.step, again))
         else:
             self._go_on(now)
@@ -320,43 +312,23 @@ class Robot:
             return
         self._write(record)
         self._judge(step, info, sensing_action=sensing_action)
-        if not self._pausing:
-            self._ask(record.digest, now)
+        if not self._pausing and not self._stopped:
+            self._ask(self._planner.digest(history.state), now)
 
     def _judge(self, step: int, info: ObservationInfo, **of_what: object) -> None:
-        """Report an observation outside the validation gate, and a run of these."""
-        if info.explained:
-            return
+        """Report what an observation has shown, and act if the robot is lost."""
         history = self._current_history
-        gate = f"{VALIDATION_GATE_SQUARED**0.5:g} standard deviations"
-        if history.num_unexplained <= _MAX_REPORTS:
-            distance = info.mahalanobis_distance
-            fields: dict[str, object] = {} if distance is None else {"deviations": distance}
-            more = history.num_unexplained == _MAX_REPORTS
-            self._effects.report(
-                "unexplained",
-                trial=self._trial,
-                step=step,
-                **of_what,
-                **fields,
-                reason=(
-                    "no particle can have made it"
-                    if distance is None
-                    else f"outside the validation gate of every particle ({gate})"
-                )
-                + ("; further ones of this trial are counted only" if more else ""),
-            )
-        if (
-            history.unexplained_in_a_row == DIVERGENCE_RUN
-            and history.num_divergences <= _MAX_REPORTS
-        ):
-            self._effects.report(
-                "filter_diverged",
-                trial=self._trial,
-                step=step,
-                reason=f"the last {DIVERGENCE_RUN} observations were unexplained: the belief has "
-                "lost the state, or the problem's model is wrong; the robot goes on",
-            )
+        on_lost = self.reports.observed(history, step, info, **of_what)
+        if on_lost == "hold":
+            self._stop(held_error(history, step))
+        elif on_lost == "reinitialise":
+            self._reinitialise()
+
+    def _reinitialise(self) -> None:
+        """Begin the belief anew, before anything else is decided."""
+        history = self._current_history
+        self._write(history.reinitialised())
+        self.reports.reinitialised(history)
 
     def _performed(self, event: Acted) -> None:
         self._ending = event.ending
@@ -375,6 +347,7 @@ class Robot:
         )
         record = PerformedRecord(event.step, event.reward, motion, shown)
         self._unwritten.append(record)
+        self.num_performed += 1
         info = self._current_history.performed(record)
         if info is not None:
             self._judge(event.step, info, of="move")
@@ -567,7 +540,7 @@ class Robot:
         history = self._current_history
         self._report_ticks(now)
         self._count_recoveries()
-        if any(_has_shown(record) for record in self._unwritten):
+        if any(has_shown(record) for record in self._unwritten):
             self._write()
         result = history.result(self._ending)
         self._history = None

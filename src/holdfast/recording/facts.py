@@ -14,6 +14,7 @@ from holdfast.belief import Belief
 from holdfast.outcome import TrialResult
 
 __all__ = [
+    "SCORES",
     "Decider",
     "EventFact",
     "FactSink",
@@ -23,6 +24,16 @@ __all__ = [
     "TrialBeginFact",
     "TrialEndFact",
 ]
+
+
+SCORES = {
+    "action_entropy": "expected entropy of\nthe actions (nats)",
+    "path_entropy": "expected entropies of\nthe actions, sum (nats)",
+    "state_entropy": "expected entropy of\nthe state (nats)",
+    "action_covariance": "expected covariance\nof the actions (trace)",
+    "expected_return": "expected loss\n(minus the return)",
+}
+"""What a fact's entropies are, by the method that weighs them, in two lines."""
 
 
 class Decider(NamedTuple):

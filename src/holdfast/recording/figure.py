@@ -35,6 +35,7 @@ from holdfast.files import write_atomically
 from holdfast.outcome import Outcome
 from holdfast.problem_attributes import choice_labels, circular_states
 from holdfast.problems.problem import Problem, Scene
+from holdfast.recording.facts import SCORES
 from holdfast.recording.recorder import SensingRecord, TrialRecord
 
 __all__ = ["STYLE", "trial_figure"]
@@ -376,7 +377,9 @@ def _action_handles(problem: Problem, record: TrialRecord) -> list[Line2D]:
     handles = []
     for action, name in enumerate(_choices(problem, record)):
         if action in chosen:
-            handles.append(_dot(*_style_of(action), fill(f"sensed {name}", 30), size=5.5))
+            is_sensed = action < len(problem.sensing_actions)
+            label = fill(f"sensed {name}", 30) if is_sensed else "did not sense"
+            handles.append(_dot(*_style_of(action), label, size=5.5))
         elif compared:
             label = fill(f"{name}, never sensed", 30)
             handles.append(_dot(*_style_of(action), label, size=4.5, hollow=0.9))
@@ -470,19 +473,9 @@ def _draw_choices(panel: Axes, problem: Problem, record: TrialRecord) -> None:
     panel.set_ylabel("sensed")
 
 
-_SCORES = {
-    "action_entropy": "expected entropy of\nthe actions (nats)",
-    "path_entropy": "expected entropies of\nthe actions, sum (nats)",
-    "state_entropy": "expected entropy of\nthe state (nats)",
-    "action_covariance": "expected covariance\nof the actions (trace)",
-    "expected_return": "expected loss\n(minus the return)",
-}
-"""What is drawn of the alternatives, by the method that weighs them."""
-
-
 def _draw_entropies(panel: Axes, configuration: Configuration, record: TrialRecord) -> None:
     """Draw every sensing action's score at each sensing step; the lowest was chosen."""
-    panel.set_ylabel(_SCORES.get(configuration.planning.selector.method, ""), fontsize=_SMALLEST)
+    panel.set_ylabel(SCORES.get(configuration.planning.selector.method, ""), fontsize=_SMALLEST)
     panel.yaxis.set_major_locator(MaxNLocator(nbins=4))
     known = [sensing for sensing in record.sensing if sensing.entropies is not None]
     if not known:

@@ -22,6 +22,7 @@ from holdfast.errors import HoldfastError, OutputError
 from holdfast.outcome import TrialResult
 from holdfast.recording.journal_reader import JournalReader
 from holdfast.recording.run_directory import first_difference
+from holdfast.robot.environment import BUILT_IN
 
 __all__ = ["OutcomeComparison", "OutcomeEffect", "RunOutcomes", "compare_outcomes", "effects_of"]
 
@@ -43,13 +44,14 @@ class OutcomeEffect(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    measure : {"success_rate", "steps", "reward", "decision_ms"}
+    measure : {"success_rate", "failure_rate", "steps", "reward", "decision_ms"}
     kind : {"difference", "ratio"}
         Of the run's value to the baseline's.
     trials : int
         Of the run, in the comparison.
     baseline, run : float
-        Rate of success, geometric mean of the steps, mean reward, median of the decision times.
+        Rate of success and of failure (a truncated trial is neither), geometric mean of the steps,
+        mean reward, median of the decision times.
     interval : tuple of float, or None
         For ``effect``; None if no two trials differ in it, so nothing is known of its scatter.
     verdict : {"better", "worse", "no difference found", "too few trials"}
@@ -223,7 +225,8 @@ def _read(path: Path) -> _Run:
             "simulator": {"max_steps": int(simulator["max_steps"])},
             "environment": {"object": environment},
         },
-        simulated=environment is None,
+        # An episode of gymnasium follows from seed and trial, too.
+        simulated=environment is None or environment in BUILT_IN,
     )
 
 
@@ -320,6 +323,7 @@ def _geometric_mean(values: FloatArray, axis: int) -> Any:
 
 _MEASURES = (
     _Measure("success_rate", "difference", True, lambda result, _: float(result.success), np.mean),
+    _Measure("failure_rate", "difference", False, lambda result, _: float(result.failed), np.mean),
     _Measure("steps", "ratio", False, _steps_to_goal, _geometric_mean),
     _Measure("reward", "difference", True, lambda result, _: result.reward, np.mean),
     _Measure("decision_ms", "ratio", False, _decision_ms, np.median),
@@ -333,6 +337,8 @@ def _effect_of(
     numbers = [[measure.of_trial(result, limit) for result in results] for results in pairs]
     if measure.name == "reward" and any(None in values for values in numbers):
         return None  # a mean over the trials that have one would not be of the same trials
+    if measure.name == "failure_rate" and not any(map(any, numbers)):
+        return None  # in most worlds nothing can fail
     if paired:
         known = [pair for pair in zip(*numbers, strict=True) if None not in pair]
         numbers = [[pair[which] for pair in known] for which in (0, 1)]
@@ -399,11 +405,12 @@ def _row(effect: OutcomeEffect) -> tuple[str, ...]:
     """Return what the table says of a measure."""
     title, unit, of_run, of_effect = {
         "success_rate": ("success", " points", "{:.1%}", "{:+.1f}"),
+        "failure_rate": ("failed", " points", "{:.1%}", "{:+.1f}"),
         "steps": ("steps", " times", "{:.4g}", "{:.3g}"),
         "reward": ("reward", "", "{:.4g}", "{:+.4g}"),
         "decision_ms": ("decision time", " times", "{:.3g} ms", "{:.3g}"),
     }[effect.measure]
-    scale = 100.0 if effect.measure == "success_rate" else 1.0
+    scale = 100.0 if effect.measure.endswith("_rate") else 1.0
     low_high = "all alike"
     if effect.interval is not None:
         low, high = (of_effect.format(scale * end) for end in effect.interval)

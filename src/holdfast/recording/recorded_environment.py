@@ -18,7 +18,6 @@ from holdfast.protocol.records import (
     ObservedRecord,
     PerformedRecord,
     Record,
-    ReinitialisedRecord,
 )
 from holdfast.robot.environment import LATER, Later, SimulatedEnvironment
 
@@ -48,7 +47,7 @@ class RecordedEnvironment:
         self._result = result
         self._trial = trial
         self._simulated = simulated
-        kinds = ObservedRecord | ActingRecord | PerformedRecord | LateRecord | ReinitialisedRecord
+        kinds = ObservedRecord | ActingRecord | PerformedRecord | LateRecord
         self._records = [record for record in records if isinstance(record, kinds)]
         self._next = 0
         self._step = 0

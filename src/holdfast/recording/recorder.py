@@ -33,6 +33,8 @@ class SensingRecord:
         What was minimised; None if nothing was.
     before, after : array of shape (at most 500, state_size)
         Particles of the belief before and after the observation.
+    weights : array of shape (at most 500,)
+        Of the particles after, normalised.
     explained : bool
         Whether any particle explained the observation.
     """
@@ -42,6 +44,7 @@ class SensingRecord:
     entropies: FloatArray | None
     before: FloatArray
     after: FloatArray
+    weights: FloatArray
     explained: bool
 
 
@@ -107,6 +110,7 @@ class Recorder(TrialObserver):
                 entropies=None if entropies is None else np.array(entropies, dtype=np.float64),
                 before=_some_particles(step.before.belief),
                 after=_some_particles(step.after.belief),
+                weights=_some_weights(step.after.belief),
                 explained=step.observation_info.explained,
             )
         )
@@ -149,5 +153,15 @@ class Recorder(TrialObserver):
 
 
 def _some_particles(belief: Belief) -> FloatArray:
-    stride = -(-len(belief.states) // MAX_PARTICLES_KEPT)
-    return np.array(belief.states[::stride], dtype=np.float64)
+    return np.array(belief.states[:: _stride(belief)], dtype=np.float64)
+
+
+def _some_weights(belief: Belief) -> FloatArray:
+    weights = np.array(belief.weights[:: _stride(belief)], dtype=np.float64)
+    total = weights.sum()
+    # None of these few need have any.
+    return np.asarray(weights / total if total > 0.0 else np.full(len(weights), 1 / len(weights)))
+
+
+def _stride(belief: Belief) -> int:
+    return -(-len(belief.states) // MAX_PARTICLES_KEPT)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Self
@@ -28,7 +28,7 @@ from holdfast.errors import DecidedOtherwiseError, EndOfRecordsError, HoldfastEr
 from holdfast.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
 from holdfast.planning import Planner, PlanningState, digest
 from holdfast.protocol.messages import decode_floats
-from holdfast.protocol.records import ActingRecord, ObservedRecord
+from holdfast.protocol.records import ActingRecord, ObservedRecord, reinitialised_after
 from holdfast.recording.facts import (
     Decider,
     EventFact,
@@ -163,7 +163,7 @@ class RecordedRun:
             _write_decisions(result, decisions, times, output)
         else:
             replay = _Replay(trial, list(decisions), times, output, result, self._planner)
-            self._run_again(trial, world, replay)
+            self._run_again(trial, world, replay, decisions.reinitialised_after())
         return trial
 
     def _replay_unfinished(self, begun: UnfinishedTrial, output: _Output, clock: StepClock) -> int:
@@ -181,7 +181,7 @@ class RecordedRun:
         times = self._times(trial, steps, clock)
         replay = _Replay(trial, expected, times, output, None, self._planner)
         try:
-            self._run_again(trial, world, replay)
+            self._run_again(trial, world, replay, reinitialised_after(begun.records))
         except EndOfRecordsError:
             replay.end_here()
         return trial
@@ -190,7 +190,9 @@ class RecordedRun:
         configuration = self.configuration
         return SimulatedEnvironment(configuration.problem, configuration.simulator.seed, trial)
 
-    def _run_again(self, trial: int, world: Environment, replay: _Replay) -> None:
+    def _run_again(
+        self, trial: int, world: Environment, replay: _Replay, reinitialised_after: Collection[int]
+    ) -> None:
         configuration = self.configuration
         try:
             run_trial(
@@ -200,6 +202,7 @@ class RecordedRun:
                 max_steps=configuration.simulator.max_steps,
                 environment=world,
                 observer=replay,
+                reinitialised_after=reinitialised_after,
             )
         except DecidedOtherwiseError as error:
             # Most likely the code has changed.

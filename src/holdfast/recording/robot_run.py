@@ -14,7 +14,7 @@ from holdfast.protocol.events import Timing, VerificationNoted
 from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME, VERIFICATION_NAME
 from holdfast.recording.timings import EventTable, count_verified
 from holdfast.robot.links import make_links
-from holdfast.robot.process import RobotProcess
+from holdfast.robot.process import RobotProcess, StepJournal
 from holdfast.runtime.events import BoundedEventLog
 from holdfast.runtime.logs import EventLog
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from holdfast.outcome import TrialResult
     from holdfast.planning import PlanningState
     from holdfast.protocol.events import Act, Sense
+    from holdfast.recording.live_view import LiveView
     from holdfast.recording.run_directory import RunDirectory
     from holdfast.robot.environment import EnvironmentMaker
     from holdfast.robot.health import RobotWatch
@@ -61,10 +62,12 @@ def perform_trials(
     sinks: Sequence[EventSink],
     watch: Callable[[EventSink], RobotWatch] | None = None,
     observer: RobotObserver | None = None,
+    view: LiveView | None = None,
 ) -> int:
     """Run the missing trials one after another; return how many ticks of the rate were missed.
 
-    The ``sinks`` get the events, besides the run's own log, and are closed at the end.
+    The ``sinks`` get the events, besides the run's own log, and are closed at the end; so is the
+    ``view``, which shows the run while it goes on.
 
     Raises
     ------
@@ -73,6 +76,12 @@ def perform_trials(
     """
     with contextlib.ExitStack() as stack:
         log = EventLog(directory.path / EVENTS_NAME, format="json", component="robot")
+        journal: StepJournal = directory.journal
+        if view is not None:
+            from holdfast.recording.live_view import ShownJournal
+
+            view.start()
+            journal, sinks = ShownJournal(directory.journal, view), [*sinks, view]
         events = BoundedEventLog(log, *sinks)
         stack.callback(events.close)
         links = make_links(configuration, directory.path / RECOVERY_LOG_NAME, events)
@@ -89,14 +98,21 @@ def perform_trials(
             timings.add(timing)
             if observer is not None:
                 observer.timing(timing)
+            if view is not None:
+                view.timing(timing)
+
+        def on_end(result: TrialResult) -> None:
+            on_result(result)
+            if view is not None:
+                view.ended(result)
 
         robot = RobotProcess(
             configuration,
             links,
-            directory.journal,
+            journal,
             maker,
             events,
-            on_result,
+            on_end,
             on_timing,
             (lambda _: None) if verification is None else verification.add,
             rate_hz,

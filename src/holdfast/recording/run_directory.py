@@ -68,7 +68,8 @@ OUTPUT_NAMES = (
 )
 """The last three are there only if services decided."""
 
-_SECTIONS_WITHOUT_DECISIONS = ("offload", "recovery")
+_SECTIONS_WITHOUT_DECISIONS = ("offload", "recovery", "lost")
+"""Of what ``lost`` does to a belief, each time is in the journal."""
 
 _MAX_SUFFIX = 10_000
 

@@ -42,7 +42,9 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     mean_reward_of_successes : float or None
         Earlier work reports this one.
     unexplained_observations : int
-        Observations outside the validation gate of every particle.
+        Observations that no particle explains.
+    lost, suspect_sensors : int
+        Times that the robot was found lost, and a sensing action suspect.
     recoveries : int
         Times that the local service took over, in all processes of the run.
     sensing_decisions_by_service, task_answers_by_service, longest_wait_ms
@@ -73,6 +75,8 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     mean_steps: float | None
     sensing_decisions: int
     unexplained_observations: int
+    lost: int = 0
+    suspect_sensors: int = 0
     recoveries: int
     sensing_decisions_by_service: dict[str, int] | None = None
     task_answers_by_service: dict[str, int] | None = None
@@ -150,6 +154,8 @@ class SummaryBuilder:
         self._steps = 0
         self._sensing_decisions = 0
         self._unexplained = 0
+        self._lost = 0
+        self._suspect_sensors = 0
         self._recoveries = 0
         self._sensing_ms = array("f")
         self._digest = hashlib.blake2b(digest_size=32)
@@ -165,6 +171,8 @@ class SummaryBuilder:
         self._steps += result.steps
         self._sensing_decisions += result.sensing_decisions
         self._unexplained += result.unexplained_observations
+        self._lost += result.lost
+        self._suspect_sensors += result.suspect_sensors
         self._recoveries += result.recoveries
         self._sensing_ms.extend(result.sensing_ms)
         self._digest.update(bytes.fromhex(result.digest))
@@ -201,6 +209,8 @@ class SummaryBuilder:
             mean_steps=self._steps / count if count else None,
             sensing_decisions=self._sensing_decisions,
             unexplained_observations=self._unexplained,
+            lost=self._lost,
+            suspect_sensors=self._suspect_sensors,
             recoveries=self._recoveries,
             **{} if answers is None else answers._asdict(),
             **{} if verified is None else verified._asdict(),

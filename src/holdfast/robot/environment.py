@@ -50,7 +50,10 @@ GROUP = "holdfast.environments"
 
 _REQUIRED = ("perform_sensing", "perform", "is_done")
 
-_PROVIDED = ("problem", "seed", "trial", "resumed")
+_PROVIDED = ("problem", "seed", "trial", "resumed", "performed")
+
+BUILT_IN = {"gymnasium": "holdfast.robot.gymnasium_environment:GymnasiumEnvironment"}
+"""holdfast's own environments by name."""
 
 
 class Later(enum.Enum):
@@ -265,7 +268,9 @@ class EnvironmentMaker:
     - ``problem``: the :class:`~holdfast.problems.problem.Problem`;
     - ``seed``, ``trial``: of the run;
     - ``resumed``: True if the robot's process has died in the middle of this trial. The robot is
-      where it was left then, and must not be brought back to its start.
+      where it was left then, and must not be brought back to its start;
+    - ``performed``: the task actions that were performed in this trial before that. A world that
+      has died with the process performs them again.
 
     Parameters
     ----------
@@ -337,6 +342,7 @@ class EnvironmentMaker:
             "seed": self._seed,
             "trial": trial,
             "resumed": resumed,
+            "performed": performed,
         }
         environment = self._class(
             # A copy: what one trial does to its arguments must not reach the next one.
@@ -367,20 +373,22 @@ def load_environment(configuration: Configuration) -> EnvironmentMaker:
     """
     settings = configuration.environment
     seed, timeout_ms = configuration.simulator.seed, settings.timeout_ms
-    name = settings.object
-    if name is None:
+    if settings.object is None:
         simulated = f"the simulated {configuration.problem_name}"
         return EnvironmentMaker(simulated, configuration.problem, seed, timeout_ms)
     # It is used by the environment's thread, while the robot's own is by the loop's.
     problem = type(configuration).from_plain(configuration.plain()).problem
     directory = None if settings.directory is None else Path(settings.directory)
+    name = BUILT_IN.get(settings.object, settings.object)
     try:
         found = find_class(
             name,
             what="environment.object",
             group=GROUP,
-            # Else, for a name without a module: where to look for what may have been meant.
-            search_directory=directory if ":" in name else configuration.path.parent,
+            built_in=BUILT_IN,
+            # Else, for a name without a module: where to look for what may have been meant, and
+            # for functions that its arguments name.
+            search_directory=directory if ":" in settings.object else configuration.path.parent,
             error_type=ConfigurationError,
         )
         return EnvironmentMaker(

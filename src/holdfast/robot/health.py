@@ -1,4 +1,4 @@
-"""A robot's condition for monitors: HTTP, and the service manager.
+"""A robot's condition and metrics for monitors: HTTP, and the service manager.
 
 The robot's own event loop answers. So an answer proves that the loop runs, and it says whether a
 service decides for the robot.
@@ -10,11 +10,15 @@ import asyncio
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
+from holdfast.outcome import TrialResult
+from holdfast.protocol.events import Timing
+from holdfast.protocol.robot import Robot
 from holdfast.runtime.events import EventSink
 from holdfast.runtime.service_manager import ServiceManager
 
 if TYPE_CHECKING:
-    from holdfast.service.health import HttpAddress, MonitoringServers
+    from holdfast.robot.metrics import RobotMetrics
+    from holdfast.service.health import HttpAddress, MonitoringServers, Pages
 
 __all__ = ["Condition", "RobotWatch"]
 
@@ -38,36 +42,70 @@ class RobotWatch:
     """Reports a robot's condition."""
 
     def __init__(
-        self, manager: ServiceManager, health: HttpAddress | None, events: EventSink
+        self,
+        manager: ServiceManager,
+        health: HttpAddress | None,
+        metrics: HttpAddress | None,
+        events: EventSink,
     ) -> None:
         self._manager = manager
         self._health = health
+        self._metrics_address = metrics
+        self._metrics: RobotMetrics | None = None
         self._events = events
         self._watched: MonitoringServers | None = None
         self._has_begun = False
 
-    async def start(self, condition: Callable[[], Condition]) -> None:
+    async def start(self, condition: Callable[[], Condition], robot: Robot) -> None:
         """Answer from now on, in the running loop.
 
         Raises
         ------
         HealthError
             If it cannot listen there; the message names the address.
+        MetricsError
+            If metrics are to be offered and ``prometheus_client`` is not installed.
         """
-        if self._health is not None:
-            from holdfast.service.health import MonitoringServers, Page
-
-            async def alive() -> Page:
-                return Page.of(None)
-
-            async def ready() -> Page:
-                now = condition()
-                return Page(200 if now.is_deciding else 503, f"{now.word}\n".encode())
-
-            self._watched = MonitoringServers()
-            offered = {"health": (self._health, {"/livez": alive, "/readyz": ready})}
-            self._events.event("offers", **await self._watched.start(offered))
+        if self._health is not None or self._metrics_address is not None:
+            await self._offer(condition, robot)
         self._manager.watch(asyncio.get_running_loop(), lambda: str(condition()))
+
+    async def _offer(self, condition: Callable[[], Condition], robot: Robot) -> None:
+        from holdfast.service.health import MonitoringServers, Page
+
+        async def alive() -> Page:
+            return Page.of(None)
+
+        async def ready() -> Page:
+            now = condition()
+            return Page(200 if now.is_deciding else 503, f"{now.word}\n".encode())
+
+        offered: dict[str, tuple[HttpAddress, Pages]] = {}
+        if self._health is not None:
+            offered["health"] = self._health, {"/livez": alive, "/readyz": ready}
+        if self._metrics_address is not None:
+            from holdfast.robot.metrics import RobotMetrics
+            from holdfast.runtime.exposition import CONTENT_TYPE
+
+            self._metrics = counted = RobotMetrics()
+
+            async def metrics() -> Page:
+                text = counted.text(robot, is_deciding=condition().is_deciding)
+                return Page(200, text, CONTENT_TYPE)
+
+            offered["metrics"] = self._metrics_address, {"/metrics": metrics}
+        self._watched = MonitoringServers()
+        self._events.event("offers", **await self._watched.start(offered))
+
+    def timed(self, timing: Timing) -> None:
+        """Count a decision."""
+        if self._metrics is not None:
+            self._metrics.timed(timing)
+
+    def ended(self, result: TrialResult) -> None:
+        """Count a trial."""
+        if self._metrics is not None:
+            self._metrics.ended(result)
 
     def begun(self) -> None:
         """Report that a trial has begun."""

@@ -226,7 +226,7 @@ class RobotProcess:
             may_be_brief=":" not in configuration.problem_name,
         )
         self._planner = links.make_planner(problem, configuration.planning)
-        self._robot = Robot(self._planner, simulator, dispatcher, rate_hz)
+        self._robot = Robot(self._planner, simulator, dispatcher, rate_hz, configuration.lost)
 
     @property
     def missed_ticks(self) -> int:
@@ -281,7 +281,7 @@ class RobotProcess:
         sys.setswitchinterval(_SWITCH_INTERVAL_S)
         try:
             if self._watch is not None:
-                loop.run_until_complete(self._watch.start(self.condition))
+                loop.run_until_complete(self._watch.start(self.condition, self._robot))
             with ending_signals(loop, self._interrupt):
                 loop.call_soon(self._start)
                 loop.run_forever()
@@ -493,6 +493,8 @@ class RobotProcess:
                 self._runner.sense(effect.step, effect.sensing_action)
             elif isinstance(effect, Timing):
                 self._on_timing(effect)
+                if self._watch is not None:
+                    self._watch.timed(effect)
             elif isinstance(effect, Plan):
                 self._in_process.ask(effect)
             elif isinstance(effect, Send):
@@ -527,6 +529,8 @@ class RobotProcess:
             self._runner.close()
             self._runner = None
         self._on_result(result)
+        if self._watch is not None:
+            self._watch.ended(result)
         self._finished.add(result.trial)
         self._events.event(
             "trial",
@@ -565,7 +569,8 @@ class RobotProcess:
             trial, records, tail_is_certain = following, (), True
         self._replayed = trial
         seed = self._configuration.simulator.seed
-        history = replay(self._planner, seed, trial, records)
+        rate = self._configuration.lost.false_alarm_rate
+        history = replay(self._planner, seed, trial, records, rate)
         self._replayed = None
         self._starting = (trial, history, tail_is_certain)
         self._runner = make_runner(

@@ -10,6 +10,7 @@ An observer sees every step (to draw a figure, say). The default one does nothin
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from time import perf_counter
 from typing import NamedTuple
 
@@ -17,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast.arrays import FloatArray
-from holdfast.config.settings import SimulatorSettings
-from holdfast.errors import EnvironmentFailedError, InvalidValueError, ProblemError
+from holdfast.config.settings import LostSettings, OnLost, SimulatorSettings
+from holdfast.errors import EnvironmentFailedError, HeldError, InvalidValueError, ProblemError
 from holdfast.outcome import Ending, MoveResult, TrialResult, ending_of
 from holdfast.planning import (
     ObservationInfo,
@@ -96,11 +97,16 @@ class TrialObserver:
     def observed_late(self, step: LateStep) -> None:
         """Take note of an observation that came late."""
 
+    def reinitialised(self, state: PlanningState) -> None:
+        """Take note of the state with a belief that was begun anew."""
+
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
         """Take note of the last state and of the outcome."""
 
 
 NULL_OBSERVER = TrialObserver()
+
+_LOST_BY_DEFAULT = LostSettings()
 
 
 def run_trial(
@@ -111,6 +117,8 @@ def run_trial(
     max_steps: int = SimulatorSettings().max_steps,
     environment: Environment | None = None,
     observer: TrialObserver = NULL_OBSERVER,
+    lost: LostSettings = _LOST_BY_DEFAULT,
+    reinitialised_after: Collection[int] | None = None,
 ) -> TrialResult:
     """Run one trial until it is done, has failed, or has had ``max_steps``.
 
@@ -124,9 +132,15 @@ def run_trial(
         Task actions, at least 1.
     environment : Environment, optional
         By default simulated from the problem.
+    lost : LostSettings
+        When the robot counts as lost, and what it does then.
+    reinitialised_after : collection of int, optional
+        Of a recorded trial: after how many inputs the belief was begun anew; instead of ``lost``.
 
     Raises
     ------
+    HeldError
+        If the robot is lost and ``lost.on_lost`` is ``hold``.
     HoldfastError
         If holdfast refuses what the problem or the environment returned; :class:`ProblemError` for
         a reward that is not finite, :class:`EnvironmentFailedError` for anything else than what
@@ -136,13 +150,14 @@ def run_trial(
         raise InvalidValueError(f"max_steps is {max_steps!r}; allowed are integers from 1")
     if environment is None:
         environment = SimulatedEnvironment(planner.problem, seed, trial)
-    track = Trial(planner, seed, trial)
+    track = Trial(planner, seed, trial, lost.false_alarm_rate)
     observer.trial_began(environment, track.state)
     late_observations = getattr(environment, "late_observations", None)
     ending = _ask_done(environment)
     while ending is None and track.state.step < max_steps:
         if planner.needs_sensing(track.state):
             _sense(track, environment, observer)
+            _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
         before = track.state
         executed, task_info = planner.choose_task_action(before)
         shown = environment.perform(executed)
@@ -159,11 +174,14 @@ def run_trial(
             _numbers(observation),
         )
         observer.acted(TaskStep(environment, before, task_info, executed, reward, result, info))
+        if info is not None:
+            _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
         for step, came in () if late_observations is None else late_observations():
             late = LateObservation(step, np.array(came, dtype=np.float64))
             found = track.observe_late(late)
             if found is not None:
                 observer.observed_late(LateStep(late, track.state, found[0]))
+                _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
         ending = _ask_done(environment)
     ended = track.result(ending)
     observer.trial_ended(track.state, ended)
@@ -184,6 +202,29 @@ def _sense(track: Trial, environment: Environment, observer: TrialObserver) -> N
     observer.sensed(
         SensingStep(before, sensing_action, sensing_info, observation, track.state, info)
     )
+
+
+def _act_if_lost(
+    track: Trial,
+    on_lost: OnLost,
+    recorded: Collection[int] | None,
+    observer: TrialObserver,
+) -> None:
+    """Do what is to be done after an input."""
+    alarm = track.alarm
+    is_lost = alarm is not None and alarm.kind == "lost"
+    if recorded is not None:
+        again = track.num_inputs in recorded
+    elif is_lost and on_lost == "hold":
+        raise HeldError(
+            f"the robot is lost in trial {track.state.trial}, step {track.state.step}, and holds "
+            "still, as lost.on_lost says"
+        )
+    else:
+        again = is_lost and on_lost == "reinitialise"
+    if again:
+        track.reinitialise()
+        observer.reinitialised(track.state)
 
 
 def _numbers(shown: npt.ArrayLike | None) -> FloatArray | None:

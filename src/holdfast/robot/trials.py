@@ -193,6 +193,7 @@ def _run_one(
             trial,
             max_steps=simulator.max_steps,
             observer=observer,
+            lost=configuration.lost,
         )
     except (_TrialIsLongError, KeyboardInterrupt):
         raise

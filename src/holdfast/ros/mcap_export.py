@@ -33,8 +33,9 @@ from holdfast.recording.facts import (
     TrialBeginFact,
     TrialEndFact,
 )
-from holdfast.ros.markers import Marker, scene_markers, sensing_markers
-from holdfast.ros.poses import pose_layout
+from holdfast.recording.markers import Marker, scene_markers, sensing_markers
+from holdfast.recording.poses import pose_layout
+from holdfast.runtime.events import severity
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -55,27 +56,6 @@ _PATH_GROWTH = 20
 times its length, not the square of it."""
 
 _LEVELS = {"DEBUG": 10, "INFO": 20, "WARN": 30, "ERROR": 40}
-_WARNINGS = frozenset(
-    [
-        "launch_failed",
-        "recovery_exited",
-        "service_vanished",
-        "service_suspected",
-        "unreachable",
-        "holding",
-        "unexplained",
-        "filter_diverged",
-        "malformed_reply",
-        "disagreement",
-        "refused",
-        "verification_failed",
-        "distrusted",
-        "missed_ticks",
-        "performed_unseen",
-        "insecure",
-    ]
-)
-_ERRORS = frozenset(("wrong_answer", "not_deterministic", "state_diverged", "stopped", "error"))
 
 
 def require_rosbags() -> None:
@@ -244,8 +224,7 @@ class McapSink:
         name, fields = fact.name, dict(fact.fields)
         if name == "trial":
             return  # its beginning and its end are there
-        worse = name == "status" and fields.get("to") == Status.LOCAL_RECOVERY.value
-        level = "ERROR" if name in _ERRORS else "WARN" if worse or name in _WARNINGS else "INFO"
+        level = severity(name, fields)
         component = str(fields.pop("component", "robot"))
         text = ", ".join(f"{key} {value}" for key, value in fields.items())
         self._log(fact.time_ns, level, f"{name}: {text}" if text else name, component)

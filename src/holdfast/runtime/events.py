@@ -9,8 +9,9 @@ retry, hedge, restore, restored, state_diverged, service_appeared, service_vanis
 service_suspected, unreachable, no_datagrams, insecure, credentials,
 late_replies, waiting, holding, resumed, busy, refused, malformed_reply, disagreement,
 wrong_answer, not_deterministic, verification_failed, distrusted,
-limits_unknown, verifying, prefetch_unused, unexplained, filter_diverged,
-resumed_trial, performed_unseen, trial, missed_ticks, stopped, note, interrupted, offers.
+limits_unknown, verifying, prefetch_unused, unexplained, lost, sensor_suspect, reinitialised,
+late_unused, resumed_trial, performed_unseen, trial, missed_ticks, stopped, note, interrupted,
+offers.
 Of a service: ready, session_opened, session_taken_over, restored, state_diverged, refused, busy,
 evicted, robot_connected, robot_disconnected, link_refused, credentials, credentials_reloaded,
 stopping, process_ended, process_started.
@@ -27,7 +28,9 @@ import math
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterable, Mapping
-from typing import Protocol, TypeAlias
+from typing import Literal, Protocol, TypeAlias
+
+from holdfast.protocol.status import Status
 
 __all__ = [
     "BoundedEventLog",
@@ -35,14 +38,45 @@ __all__ = [
     "EventRates",
     "EventSink",
     "NullEventLog",
+    "severity",
 ]
 
 _REPEAT_INTERVAL_S = 1.0
 _BURST = 20
 """Events of one kind that pass at once: more than correct peers cause."""
 
+_WARNINGS = frozenset(
+    [
+        "launch_failed",
+        "recovery_exited",
+        "service_vanished",
+        "service_suspected",
+        "unreachable",
+        "holding",
+        "unexplained",
+        "lost",
+        "sensor_suspect",
+        "reinitialised",
+        "malformed_reply",
+        "disagreement",
+        "refused",
+        "verification_failed",
+        "distrusted",
+        "missed_ticks",
+        "performed_unseen",
+        "insecure",
+    ]
+)
+_ERRORS = frozenset(("wrong_answer", "not_deterministic", "state_diverged", "stopped", "error"))
+
 Event: TypeAlias = tuple[str, Mapping[str, object]]
 """A name and its fields; after dropped ones like it with their number."""
+
+
+def severity(name: str, fields: Mapping[str, object]) -> Literal["INFO", "WARN", "ERROR"]:
+    """Return how bad it is that an event has happened."""
+    worse = name == "status" and fields.get("to") == Status.LOCAL_RECOVERY.value
+    return "ERROR" if name in _ERRORS else "WARN" if worse or name in _WARNINGS else "INFO"
 
 
 class EventSink(Protocol):

@@ -8,42 +8,28 @@ processes, so that no counter decreases.
 from __future__ import annotations
 
 import os
-from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import msgspec
 
 from holdfast import __version__
-from holdfast.errors import MetricsError
 from holdfast.protocol.messages import PROTOCOL_VERSION
 from holdfast.protocol.service_limits import ServiceStatistics
+from holdfast.runtime.exposition import Durations, exposition, require_prometheus
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
 
 __all__ = [
-    "BUCKETS_S",
-    "CONTENT_TYPE",
     "DecisionKind",
     "DecisionTimes",
-    "Durations",
     "Exposition",
     "ServiceReport",
     "summed",
 ]
 
 DecisionKind: TypeAlias = Literal["task", "sensing"]
-
-BUCKETS_S = (
-    *(50e-6, 100e-6, 250e-6, 500e-6),
-    *(1e-3, 2.5e-3, 5e-3, 10e-3, 25e-3, 50e-3, 100e-3, 250e-3, 500e-3),
-    *(1.0, 2.5, 5.0, 10.0, 30.0, 60.0),
-)
-"""Upper bounds of the histograms' buckets."""
-
-CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-"""Of :class:`Exposition`."""
 
 _COUNTERS = (
     ("restores", "States taken from a robot's checkpoint."),
@@ -64,26 +50,6 @@ _GAUGES = (
     ("running", "running_jobs", "Decisions being computed."),
     ("calls", "open_calls", "Calls that have not ended."),
 )
-
-
-class Durations(msgspec.Struct):
-    """A histogram of durations: a count per bucket of :data:`BUCKETS_S`, and one beyond."""
-
-    counts: list[int] = msgspec.field(default_factory=lambda: [0] * (len(BUCKETS_S) + 1))
-    sum_s: float = 0.0
-
-    def add(self, seconds: float) -> None:
-        """Count a duration."""
-        self.counts[bisect_left(BUCKETS_S, seconds)] += 1
-        self.sum_s += seconds
-
-    def cumulative(self) -> list[tuple[str, float]]:
-        """Return the upper bounds and Prometheus's cumulative counts."""
-        buckets, count = [], 0
-        for end, own in zip((*map(str, BUCKETS_S), "+Inf"), self.counts, strict=True):
-            count += own
-            buckets.append((end, float(count)))
-        return buckets
 
 
 class DecisionTimes(msgspec.Struct):
@@ -148,24 +114,13 @@ class Exposition:
     def __init__(
         self, name: str, processes: Callable[[], Sequence[int]] = lambda: (os.getpid(),)
     ) -> None:
-        try:
-            import prometheus_client
-        except ImportError as error:
-            raise MetricsError(
-                "metrics need the package prometheus-client: pip install prometheus-client"
-            ) from error
-        del prometheus_client
+        require_prometheus()
         self._name = name
         self._processes = processes
 
     def text(self, report: ServiceReport, *, is_ready: bool = True) -> bytes:
         """Return the metrics."""
-        from prometheus_client import CollectorRegistry, generate_latest
-
-        families = [*self._families(report, is_ready), *self._process_families()]
-        registry = CollectorRegistry(auto_describe=False)
-        registry.register(_FixedCollector(families))
-        return generate_latest(registry)
+        return exposition(self._families(report, is_ready), self._processes())
 
     def _families(self, report: ServiceReport, is_ready: bool) -> Iterator[Metric]:
         from prometheus_client.core import (
@@ -220,41 +175,3 @@ class Exposition:
         yield CounterMetricFamily(
             "holdfast_process_restarts", "Processes of the service started again.", report.restarts
         )
-
-    def _process_families(self) -> Iterator[Metric]:
-        """Yield the standard process metrics, summed over all processes.
-
-        The start time and the limit on descriptors are the first process's. Its ended children
-        count too, so that the computing time does not decrease.
-        """
-        first, *others = map(_process_metrics, self._processes())
-        for family in first:
-            (sample,) = family.samples
-            value = sample.value
-            if family.name not in ("process_start_time_seconds", "process_max_fds"):
-                value += sum(
-                    other.samples[0].value
-                    for families in others
-                    for other in families
-                    if other.name == family.name
-                )
-            if family.name == "process_cpu_seconds":
-                ended = os.times()
-                # Rounded, so that floating-point noise cannot make it decrease.
-                value = round(value + ended.children_user + ended.children_system, 6)
-            family.samples = [sample._replace(value=value)]
-            yield family
-
-
-def _process_metrics(process: int) -> list[Metric]:
-    from prometheus_client import ProcessCollector
-
-    return list(ProcessCollector(pid=lambda: process, registry=None).collect())
-
-
-class _FixedCollector:
-    def __init__(self, families: list[Metric]) -> None:
-        self._families = families
-
-    def collect(self) -> list[Metric]:
-        return self._families

@@ -405,7 +405,8 @@ async def _watched(
     if options.health is not None:
         offered["health"] = options.health, {"/livez": alive, "/readyz": ready}
     if options.metrics is not None:
-        from holdfast.service.metrics import CONTENT_TYPE, Exposition
+        from holdfast.runtime.exposition import CONTENT_TYPE
+        from holdfast.service.metrics import Exposition
 
         exposition = Exposition(options.name, processes)
 

@@ -28,6 +28,10 @@ _SESSION_AT, _EPOCH_AT = 1, 2
 _ANSWERS = frozenset({1, 2})
 """Tags of the replies by which a robot acts."""
 
+_NEED_STATE = 4
+_DIVERGED_AT = 3
+"""Tag of the reply of a service that lacks the state, and where it says that it came to another."""
+
 _REPLY_TAG_AT = 1
 """Position of the tag in the bytes of a reply."""
 
@@ -116,7 +120,8 @@ class StatusChecker:
 class WireChecker:
     """All messages between a robot and its services."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, services_forget: bool = False) -> None:
+        self._may_diverge = services_forget
         self._sent: dict[int, tuple[str | None, bytes]] = {}
         self._sessions: dict[int, tuple[tuple[str | None, bytes], int]] = {}
         self._newest: dict[tuple[str, int, tuple[str | None, bytes]], int] = {}
@@ -125,6 +130,10 @@ class WireChecker:
         self._ended: set[int] = set()
         self._replies: dict[int, int] = {}
         self._crowd = 0
+
+    def robot_forgets(self) -> None:
+        """Take note of a power cut: a service may know what the robot has forgotten."""
+        self._may_diverge = True
 
     def requested(self, call: int, payload: bytes, owner: str | None = None) -> None:
         """Take note of a request, and of the certificate with which it is sent."""
@@ -162,13 +171,20 @@ class WireChecker:
         self._newest[place] = max(epoch, self._newest.get(place, 0))
 
     def replied(self, service: str, incarnation: int, call: int, payload: bytes) -> None:
-        """Check a reply: its call is open, its request was whole and of the newest epoch."""
+        """Check a reply: its call is open, its request was whole and of the newest epoch.
+
+        No service comes to another state than the robot, which it was told, unless it has forgotten
+        the robot: then an old request may be new to it.
+        """
         if call in self._ended:
             raise Violation(f"{service} replies to call {call} after its end")
         count = self._replies[call] = self._replies.get(call, 0) + 1
         if count > _MAX_REPLIES:
             raise Violation(f"{service} has sent {count} replies to call {call}")
-        tag = _decode(payload[:-_CHECKSUM_BYTES])[0]
+        fields = _decode(payload[:-_CHECKSUM_BYTES])
+        tag = fields[0]
+        if tag == _NEED_STATE and fields[_DIVERGED_AT] and not self._may_diverge:
+            raise Violation(f"{service} comes to another state in call {call} than the robot")
         if tag not in _ANSWERS:
             return
         if call not in self._sessions:

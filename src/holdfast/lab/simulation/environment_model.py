@@ -1,139 +1,66 @@
 """What the robot acts on: a world that goes on when the robot's process does not.
 
-Each trial is run once by the plain closed loop, with no service, no message and no journal in it.
-What was sensed and done there is kept: it is what every other run of that trial must do, and, as
-long as it does, what the world shows to it. To sense or do something else, again, too early or too
-late raises a :class:`Violation` at once.
+Each trial is run once by the plain closed loop (:mod:`holdfast.lab.simulation.reference_runs`).
+What was sensed and done there is what every other run of that trial must do, and, as long as it
+does, what the world shows to it. To sense or do something else, again, too early or too late raises
+a :class:`Violation` at once.
+
+An observation may come later than it was taken, or never. When it comes is part of the trial: the
+undisturbed run gets it at the same moment. A robot that dies may change that moment, and then there
+is another undisturbed run to compare with, which is the same up to there.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from holdfast.arrays import FloatArray
-from holdfast.config.settings import PlanningSettings, SimulatorSettings
 from holdfast.lab.errors import Violation
-from holdfast.lab.simulation.memo_cache import Memo
-from holdfast.outcome import MoveResult, TrialResult
-from holdfast.planning import Planner
-from holdfast.problems.problem import Problem
-from holdfast.robot.environment import SimulatedEnvironment
-from holdfast.robot.trial import run_trial
+from holdfast.lab.simulation.reference_runs import (
+    BEFORE_CHOOSING,
+    BEFORE_MOVING,
+    BEFORE_SENSING,
+    Circumstances,
+    Delivery,
+    ReferenceRuns,
+    ReferenceStep,
+)
+from holdfast.outcome import TrialResult
+from holdfast.protocol.records import (
+    ActingRecord,
+    LateRecord,
+    ObservedRecord,
+    PerformedRecord,
+    Record,
+)
+from holdfast.tracking import LateObservation
 
-__all__ = ["EnvironmentModel", "ReferenceRun", "ReferenceRuns", "ReferenceStep", "Repeats"]
-
-Repeats: TypeAlias = tuple[tuple[int, int], ...]
-"""Steps, and how often something was sensed in them before."""
-
-_MOST = 2_000
+__all__ = ["EnvironmentModel", "Resumed"]
 
 
-class ReferenceStep(NamedTuple):
-    """One step of the undisturbed run.
+class _Coming(NamedTuple):
+    """An observation on its way: of which step, and how many task actions it takes."""
+
+    taken: int
+    due: int
+
+
+class Resumed(NamedTuple):
+    """What the world tells a robot's next process.
 
     Attributes
     ----------
-    sensing_action : int or None
-        What was sensed before the task action, if anything.
-    observation : array or None
-        What it showed.
-    action : bytes
-        The task action, little-endian float64.
-    done : bool
-        Whether the task is done after it.
+    last : ReferenceStep or None
+        Its last task action, if it can still tell what that has shown.
+    late : tuple of LateObservation
+        What has come meanwhile.
     """
 
-    sensing_action: int | None
-    observation: FloatArray | None
-    action: bytes
-    reward: float | None
-    done: bool
-
-
-class ReferenceRun(NamedTuple):
-    """A trial as it goes when nothing disturbs it."""
-
-    steps: tuple[ReferenceStep, ...]
-    done_at_start: bool
-    digest: str
-
-
-class _Recorder:
-    """The world, and what is done in it."""
-
-    def __init__(self, problem: Problem, seed: int, trial: int, repeats: Repeats) -> None:
-        self._problem = problem
-        self._seed = seed
-        self._trial = trial
-        self._environment = SimulatedEnvironment(problem, seed, trial)
-        self._repeats = dict(repeats)
-        self._sensed: tuple[int, FloatArray] | None = None
-        self.steps: list[ReferenceStep] = []
-
-    def perform_sensing(self, sensing_action: int) -> FloatArray:
-        times = self._repeats.get(len(self.steps), 0)
-        environment = self._again(times) if times else self._environment
-        shown = np.array(environment.perform_sensing(sensing_action), dtype=np.float64)
-        shown.setflags(write=False)
-        self._sensed = sensing_action, shown
-        return shown
-
-    def _again(self, times: int) -> SimulatedEnvironment:
-        """Return the same world with noise of its own for what is sensed again."""
-        world = self._environment
-        again = SimulatedEnvironment(self._problem, self._seed + times, self._trial)
-        again.state, again.step = world.state, world.step
-        return again
-
-    def perform(self, task_action: FloatArray) -> float | None:
-        reward = self._environment.perform(task_action)
-        assert not isinstance(reward, MoveResult)
-        sensing_action, shown = self._sensed or (None, None)
-        written = np.asarray(task_action, dtype="<f8").tobytes()
-        done = self._environment.is_done()
-        self.steps.append(ReferenceStep(sensing_action, shown, written, reward, done))
-        self._sensed = None
-        return reward
-
-    def is_done(self) -> bool:
-        return self._environment.is_done()
-
-
-class ReferenceRuns:
-    """The undisturbed trials, each run when it is first asked for."""
-
-    def __init__(self, problem: Problem, planning: PlanningSettings, seed: int) -> None:
-        self._problem = problem
-        self._planning = planning
-        self._seed = seed
-        self._runs: Memo[tuple[int, int, Repeats], ReferenceRun] = Memo(_MOST)
-
-    def get(self, trial: int, max_steps: int, repeats: Repeats = ()) -> ReferenceRun:
-        """Return a trial of at most so many steps.
-
-        Parameters
-        ----------
-        repeats : tuple of (int, int)
-            Steps in which something had been sensed before, and how often, without anybody knowing
-            it now. What is sensed there then shows something else: the trial as it goes from there.
-        """
-        key = trial, max_steps, repeats
-        return self._runs.get(key, lambda: self._run(trial, max_steps, repeats))
-
-    def _run(self, trial: int, max_steps: int, repeats: Repeats) -> ReferenceRun:
-        simulator = SimulatorSettings(num_trials=trial + 1, max_steps=max_steps, seed=self._seed)
-        recorder = _Recorder(self._problem, self._seed, trial, repeats)
-        done_at_start = recorder.is_done()
-        result = run_trial(
-            Planner(self._problem, self._planning),
-            simulator.seed,
-            trial,
-            max_steps=simulator.max_steps,
-            environment=recorder,
-        )
-        return ReferenceRun(tuple(recorder.steps), done_at_start, result.digest)
+    last: ReferenceStep | None
+    late: tuple[LateObservation, ...]
 
 
 class EnvironmentModel:
@@ -142,20 +69,54 @@ class EnvironmentModel:
     Parameters
     ----------
     shows_the_same : bool
-        Whether what is sensed again shows the same again. In a world outside of the simulation it
-        does not: a robot that has forgotten what it sensed will know something else.
+        Whether it dies with the robot's process, and what is sensed again shows the same again. In
+        a world outside of the simulation it does not: a robot that has forgotten what it sensed
+        will know something else.
+    lateness : mapping of int to tuple
+        By step, after how many task actions the observation comes, None for never. With several it
+        comes several times.
+    remembers : bool
+        Whether it tells a robot's next process again what the last task action has shown and which
+        observations have come late.
+    senses_on : bool
+        Whether what it still senses when the robot's process dies is there when the next one asks.
+    reinitialises : bool
+        Whether the robot is carried away, and begins its belief anew after each observation outside
+        the validation gate.
     """
 
     def __init__(
-        self, trial: int, max_steps: int, references: ReferenceRuns, *, shows_the_same: bool
+        self,
+        trial: int,
+        max_steps: int,
+        references: ReferenceRuns,
+        *,
+        shows_the_same: bool,
+        lateness: Mapping[int, tuple[int | None, ...]] | None = None,
+        remembers: bool = False,
+        senses_on: bool = False,
+        reinitialises: bool = False,
     ) -> None:
         self.trial = trial
         self._max_steps = max_steps
         self._references = references
-        self._reference = references.get(trial, max_steps)
         self._shows_the_same = shows_the_same
+        self._lateness = lateness or {}
+        self._remembers = remembers
+        self._senses_on = senses_on
+        self._reinitialises = reinitialises
         self._times: dict[int, int] = {}
+        self._sensed: set[int] = set()
+        self._awaited: set[int] = set()
+        self._coming: list[_Coming] = []
+        self._told: list[_Coming] = []
+        # Those that the robot had awaited, and how many of them it must have written down.
+        self._deliveries: list[Delivery] = []
+        self._num_written = 0
+        self._useless: list[int] = []
+        self._unseen: set[int] = set()
         self.performed = 0
+        self._refer()
 
     @property
     def done(self) -> bool:
@@ -164,14 +125,109 @@ class EnvironmentModel:
             return self._reference.done_at_start
         return self._reference.steps[self.performed - 1].done
 
+    def _refer(self) -> None:
+        """Look up the undisturbed run under what has happened so far."""
+        repeats: tuple[tuple[int, int], ...] = ()
+        if not self._shows_the_same:
+            repeats = tuple((at, count - 1) for at, count in self._times.items() if count > 1)
+        circumstances = Circumstances(
+            repeats,
+            tuple(sorted(self._lateness)),
+            (*self._deliveries, *self._foreseen()),
+            tuple(sorted(self._unseen)),
+            self._reinitialises,
+        )
+        self._reference = self._references.get(self.trial, self._max_steps, circumstances)
+
+    def _foreseen(self) -> list[Delivery]:
+        """Return what will come if the robot's process lives on."""
+        coming = [each for each in self._coming if each.taken in self._awaited]
+        for step in sorted(self._lateness.keys() - self._sensed):
+            coming += self._of(step)
+        first: dict[int, int] = {}
+        for taken, due in coming:
+            comes = max(due, taken + 1, self.performed + 1)
+            first[taken] = min(comes, first.get(taken, comes))
+        foreseen = [Delivery(step, BEFORE_SENSING, taken) for taken, step in first.items()]
+        return sorted(foreseen, key=lambda each: each.step)
+
+    def _is_late(self, step: int) -> bool:
+        """Return whether something was sensed in a step, and came late."""
+        return step in self._lateness and self._reference.steps[step].sensing_action is not None
+
+    def _of(self, step: int) -> list[_Coming]:
+        delays = self._lateness.get(step, ())
+        return [_Coming(step, step + moves) for moves in delays if moves is not None]
+
+    # -- the robot's process ---------------------------------------------------------------------
+
+    def resumed(self, records: Sequence[Record], *, may_lack: bool) -> Resumed:
+        """Tell the robot's next process what has happened meanwhile.
+
+        Parameters
+        ----------
+        records : sequence of Record
+            What the journal holds of this trial.
+        may_lack : bool
+            Whether a power cut has taken some away.
+        """
+        observed = [each for each in records if isinstance(each, ObservedRecord)]
+        written = [each.taken for each in records if isinstance(each, LateRecord)]
+        known = sum(isinstance(each, PerformedRecord) for each in records)
+        acting = sum(isinstance(each, ActingRecord) for each in records)
+        if self._shows_the_same:
+            self.performed = known
+        self._check_written(written, may_lack=may_lack)
+        self._sensed = {each.step for each in observed if self._is_late(each.step)}
+        self._awaited = self._sensed.difference(written)
+        self._coming = [] if self._shows_the_same else [*self._told, *self._coming]
+        self._told = []
+        if self._senses_on:
+            self._coming = [_Coming(taken, min(taken, due)) for taken, due in self._coming]
+        unseen = acting > known and self.performed > known
+        if unseen and not self._remembers:
+            self._unseen.add(known)
+        self._refer()
+        last = None
+        if self._remembers and self.performed:
+            last = self._reference.steps[self.performed - 1]
+        if not (observed or acting):
+            return Resumed(last, ())  # nothing is known to have begun
+        moment = BEFORE_SENSING
+        if acting > known:
+            moment = BEFORE_SENSING if unseen else BEFORE_MOVING
+        elif observed and observed[-1].step == known:
+            moment = BEFORE_CHOOSING
+        return Resumed(last, self.come(moment))
+
+    def _check_written(self, written: list[int], *, may_lack: bool) -> None:
+        """Forget deliveries that the robot may have forgotten."""
+        had = [each.taken for each in self._deliveries]
+        for taken in written:
+            if taken not in had:
+                raise Violation(
+                    f"trial {self.trial}: the journal has a late observation of step {taken}, "
+                    "which never came"
+                )
+        for taken in had[: self._num_written]:
+            if taken not in written and not may_lack:
+                raise Violation(
+                    f"trial {self.trial}: the journal lacks the late observation of step {taken}, "
+                    "after which the robot went on"
+                )
+        self._deliveries = [each for each in self._deliveries if each.taken in written]
+        self._num_written = len(self._deliveries)
+
     def begin_again(self, actions: list[FloatArray]) -> None:
         """Perform these from the beginning: this world does not outlive the robot's process."""
         self.performed = 0
         for step, action in enumerate(actions):
             self.act(step, action)
 
-    def sense(self, step: int, sensing_action: int) -> FloatArray:
-        """Perform a sensing action and return what it shows."""
+    # -- what the robot does ---------------------------------------------------------------------
+
+    def sense(self, step: int, sensing_action: int) -> FloatArray | None:
+        """Perform a sensing action and return what it shows; None if that comes later."""
         where = f"trial {self.trial}: sensing action {sensing_action} of step {step}"
         if step != self.performed:
             raise Violation(f"{where}, where {self.performed} task actions have been performed")
@@ -179,17 +235,28 @@ class EnvironmentModel:
         expected = steps[step].sensing_action if step < len(steps) else None
         if sensing_action != expected:
             raise Violation(f"{where}: the undisturbed run has {expected}")
+        self._num_written = len(self._deliveries)
         times = self._times.get(step, 0)
         self._times[step] = times + 1
+        is_late = step in self._lateness
+        if is_late:
+            # Whoever senses again waits for that.
+            for coming in (self._coming, self._told):
+                coming[:] = [each for each in coming if each.taken != step]
+            self._coming += self._of(step)
+            self._sensed.add(step)
+            self._awaited.add(step)
         if times and not self._shows_the_same:
-            repeats = tuple((at, count - 1) for at, count in self._times.items() if count > 1)
-            self._reference = self._references.get(self.trial, self._max_steps, repeats)
+            self._refer()
+        return None if is_late else self._shown_at(step)
+
+    def _shown_at(self, step: int) -> FloatArray:
         shown = self._reference.steps[step].observation
         assert shown is not None
         return shown
 
-    def act(self, step: int, action: FloatArray) -> tuple[float | None, bool]:
-        """Perform a task action; return its reward and whether the task is done."""
+    def act(self, step: int, action: FloatArray) -> ReferenceStep:
+        """Perform a task action; return what it has shown."""
         where = f"trial {self.trial}: task action of step {step}"
         if step != self.performed:
             again = " again" if step < self.performed else ""
@@ -201,8 +268,39 @@ class EnvironmentModel:
         if written != due.action:
             expected = np.frombuffer(due.action, dtype="<f8")
             raise Violation(f"{where}: {action}, the undisturbed run has {expected}")
+        self._num_written = len(self._deliveries)
         self.performed += 1
-        return due.reward, due.done
+        return due
+
+    def come(self, moment: int = BEFORE_SENSING) -> tuple[LateObservation, ...]:
+        """Return the observations of earlier steps that have come."""
+        if not self._coming:
+            return ()
+        came = [each for each in self._coming if each.due <= self.performed]
+        self._coming = [each for each in self._coming if each.due > self.performed]
+        if self._remembers:
+            self._told += came
+        late = []
+        for taken, _ in came:
+            shown = self._shown_at(taken)
+            if taken in self._awaited:
+                self._awaited.remove(taken)
+                self._deliveries.append(Delivery(self.performed, moment, taken))
+            else:
+                # Once more, or of a process that has forgotten that it sensed: it must not count.
+                shown = shown + 1.0
+                self._useless.append(taken)
+            late.append(LateObservation(taken, shown))
+        self._refer()
+        return tuple(late)
+
+    def is_useless(self, taken: int) -> None:
+        """Take note that the robot does not use an observation of an earlier step."""
+        if taken not in self._useless:
+            raise Violation(
+                f"trial {self.trial}: the observation of step {taken} has come late and is not used"
+            )
+        self._useless.remove(taken)
 
     def check_end(self, result: TrialResult, *, rewards_are_known: bool) -> None:
         """Compare the robot's result; its reward only if it has heard of that of each action."""
@@ -225,6 +323,8 @@ class EnvironmentModel:
         for name, said, true in (
             ("success", result.success, self.done),
             ("sensing decisions", result.sensing_decisions, sensed),
+            ("unexplained observations", result.unexplained_observations, reference.unexplained),
+            ("times lost", result.lost if self._reinitialises else reference.lost, reference.lost),
             ("reward", result.reward if rewards_are_known else reward, reward),
         ):
             if said != true:

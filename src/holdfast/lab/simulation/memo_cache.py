@@ -102,6 +102,10 @@ class MemoizingPlanner(Planner):
         self._advanced: Memo[tuple[int, bytes, bytes], tuple[PlanningState, PlanningState]] = Memo(
             check=lambda known, now: _check_states(known[1], now[1])
         )
+        self._moves_observed: Memo[
+            tuple[int, bytes, bytes], tuple[PlanningState, PlanningState, ObservationInfo]
+        ] = Memo(check=lambda known, now: _check_states(known[1], now[1]))
+        self._reinitialised: Memo[int, tuple[PlanningState, PlanningState]] = Memo()
         self._decided: Memo[int, tuple[PlanningState, Decision]] = Memo()
 
     def init(self, seed: int, trial: int = 0) -> PlanningState:
@@ -128,6 +132,22 @@ class MemoizingPlanner(Planner):
         return self._advanced.get(
             (id(state), task_action.tobytes(), bytes_of(motion)),
             lambda: (state, self._planner.advance(state, task_action, motion)),
+        )[1]
+
+    def observe_move(
+        self, state: PlanningState, task_action: FloatArray, observation: npt.ArrayLike
+    ) -> tuple[PlanningState, ObservationInfo]:
+        """Fold what came with a move into the belief."""
+        _, after, info = self._moves_observed.get(
+            (id(state), task_action.tobytes(), bytes_of(observation)),
+            lambda: (state, *self._planner.observe_move(state, task_action, observation)),
+        )
+        return after, info
+
+    def reinitialise(self, state: PlanningState) -> PlanningState:
+        """Begin the belief anew."""
+        return self._reinitialised.get(
+            id(state), lambda: (state, self._planner.reinitialise(state))
         )[1]
 
     def decide(self, state: PlanningState, max_actions: int) -> Decision:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import (
+    LostSettings,
     OffloadSettings,
     RecoverySettings,
     SimulatorSettings,
@@ -23,6 +24,7 @@ from holdfast.lab.simulation.checkers import StatusChecker
 from holdfast.lab.simulation.disk import Disk
 from holdfast.lab.simulation.environment_model import EnvironmentModel
 from holdfast.lab.simulation.event_queue import Clock
+from holdfast.lab.simulation.reference_runs import ReferenceStep
 from holdfast.lab.simulation.schedule import LOCAL_SERVICE
 from holdfast.outcome import Ending
 from holdfast.planning import Planner
@@ -52,8 +54,9 @@ from holdfast.protocol.events import (
     WriteRecords,
 )
 from holdfast.protocol.messages import MAX_TASK_ACTIONS
-from holdfast.protocol.records import TrialHistory, replay
+from holdfast.protocol.records import Record, TrialHistory, replay
 from holdfast.protocol.robot import Robot
+from holdfast.tracking import LateObservation
 
 if TYPE_CHECKING:
     from holdfast.lab.simulation.world import World
@@ -101,7 +104,7 @@ class RobotNode:
         self._world = world
         self._run = run = world.run
         self._queue = world.queue
-        self._planner: Planner = world.simulator.planner
+        self._planner: Planner = world.setup.planner
         self._clock = Clock(world.queue, run.robot_clock_offset_s, run.robot_clock_rate)
         self._disk = Disk(forces_out=run.journal_survives == "power_cut")
         self._trials = range(run.trial, run.trial + run.num_trials)
@@ -115,8 +118,14 @@ class RobotNode:
             lease_ms=max(50.0, 1e3 * run.lease_s),
             decision_deadline_ms=run.deadline_ms,
         )
+        self._lost = LostSettings(on_lost=run.on_lost)
+        if run.on_lost == "reinitialise":
+            # The test itself is not what is looked at here: at this rate each observation outside
+            # the gate raises its alarm.
+            self._lost = LostSettings(false_alarm_rate=1.0, on_lost="reinitialise")
         self._recovery = RecoverySettings(launch=run.launch, journal_survives=run.journal_survives)
         self._environment: EnvironmentModel | None = None
+        self._lateness = world.lateness()
         self._statuses = StatusChecker()
         self._asked: dict[int, str] = {}
         self._todo: deque[RobotEffect] = deque()
@@ -175,11 +184,13 @@ class RobotNode:
             self._recovery,
             SESSION,
             self._disk.opened(),
-            self._world.simulator.session_configuration,
+            self._world.setup.session_configuration,
             self._planner.problem,
             _SECRET,
         )
-        self.machine = Robot(self._planner, self._simulator, dispatcher, self._run.rate_hz)
+        self.machine = Robot(
+            self._planner, self._simulator, dispatcher, self._run.rate_hz, self._lost
+        )
         self._world.network.review_all()
         self._carry_out(self.machine.start(self._now()))
         if self.up:  # else it was killed meanwhile
@@ -355,7 +366,12 @@ class RobotNode:
         if effect.name == "status":
             self._statuses.changed(effect.fields["from"], effect.fields["to"])
         elif effect.name == "performed_unseen":
-            self._rewards_are_known = False
+            self._rewards_are_known = self._rewards_are_known and self._run.remembers
+        elif effect.name == "late_unused":
+            assert self._environment is not None
+            taken = effect.fields["taken"]
+            assert isinstance(taken, int)
+            self._environment.is_useless(taken)
         self._world.log_event(effect.name, effect.fields)
 
     def _decide(self, effect: ComputeOwnAnswer) -> None:
@@ -412,11 +428,14 @@ class RobotNode:
                 self.finished = True
                 return
             trial, records, is_complete = following, [], True
-        history = replay(self._planner, self._simulator.seed, trial, records)
-        begin = (self.incarnation, self._begin, trial, history, is_complete)
+        rate = self._lost.false_alarm_rate
+        history = replay(self._planner, self._simulator.seed, trial, records, rate)
+        begin = (self.incarnation, self._begin, trial, history, records, is_complete)
         self._queue.after(_BEGINS_AFTER_S, self._happens, *begin)
 
-    def _begin(self, trial: int, history: TrialHistory, is_complete: bool) -> None:
+    def _begin(
+        self, trial: int, history: TrialHistory, records: list[Record], is_complete: bool
+    ) -> None:
         robot = self.machine
         assert robot is not None
         simulated = self._run.environment == "simulated"
@@ -424,10 +443,15 @@ class RobotNode:
             self._environment = EnvironmentModel(
                 trial,
                 self._simulator.max_steps,
-                self._world.simulator.references,
+                self._world.setup.references,
                 shows_the_same=simulated,
+                lateness=self._lateness,
+                remembers=self._run.remembers,
+                senses_on=self._run.senses_on,
+                reinitialises=self._run.on_lost == "reinitialise",
             )
         environment = self._environment
+        resumed = environment.resumed(records, may_lack=not is_complete)
         if simulated:
             environment.begin_again(history.actions)
         counts = self._run.environment != "not_counting"
@@ -443,11 +467,19 @@ class RobotNode:
         self._may_doubt = False
         performed = environment.performed if counts else None
         ending = Ending("succeeded") if environment.done else None
-        begun = EnvironmentReady(ending, performed)
+        last = None
+        if performed and resumed.last is not None:
+            last = _acted(performed - 1, resumed.last)
+        begun = EnvironmentReady(ending, performed, last, resumed.late)
         self._world.note("robot", "begins trial %s at step %s", trial, known)
+        self._note_late(resumed.late)
         self._carry_out(
             robot.begin_trial(trial, history, begun, self._now(), tail_is_certain=is_complete)
         )
+
+    def _note_late(self, late: tuple[LateObservation, ...]) -> None:
+        for each in late:
+            self._world.note("robot", "is shown what was sensed in step %s", each.step)
 
     # -- its body --------------------------------------------------------------------------------
 
@@ -456,6 +488,8 @@ class RobotNode:
             return
         assert self._environment is not None
         shown = self._environment.sense(step, sensing_action)
+        if shown is None:
+            self._world.sensed_late(step)
         self._happens(process, self._heard, Sensed(step, shown))
 
     def _performs(self, process: int, step: int, action: FloatArray) -> None:
@@ -468,6 +502,13 @@ class RobotNode:
             self._deferred.append((None, self._performs, (process, step, action)))
             return
         assert self._environment is not None
-        reward, done = self._environment.act(step, action)
-        event = Acted(step, reward, Ending("succeeded") if done else None)
+        shown = self._environment.act(step, action)
+        late = self._environment.come()
+        self._note_late(late)
+        event = _acted(step, shown)._replace(late=late)
         self._queue.after(self._run.act_s, self._happens, process, self._heard, event)
+
+
+def _acted(step: int, done: ReferenceStep) -> Acted:
+    ending = Ending("succeeded") if done.done else None
+    return Acted(step, done.reward, ending, done.motion, done.shown)

@@ -28,6 +28,7 @@ __all__ = [
     "Cut",
     "DiskStall",
     "KillRobot",
+    "Late",
     "LaunchFault",
     "MessageFault",
     "OutOfMemory",
@@ -46,6 +47,9 @@ LOCAL_SERVICE = "local"
 
 NUM_TRIALS = 64
 """Trials to choose from; each has one run without faults, that all others are compared with."""
+
+_LONG_S, _MANY_SESSIONS = 60.0, 100
+"""A run is shorter, and has fewer robots at a time."""
 
 Seconds = Annotated[float, msgspec.Meta(ge=0.0, le=3600.0)]
 Offset = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
@@ -84,6 +88,11 @@ class RunSettings(_Item, frozen=True, kw_only=True, tag="run", tag_field="item")
     certificates: bool = False
     forgets_after_s: Seconds = 600.0
     environment: Literal["simulated", "counting", "not_counting"] = "counting"
+    remembers: bool = False
+    senses_on: bool = False
+    moves_show: bool = False
+    sensing_is_optional: bool = False
+    on_lost: Literal["continue", "reinitialise"] = "continue"
     journal_survives: Literal["process_crash", "power_cut"] = "process_crash"
     lease_s: Annotated[float, msgspec.Meta(gt=0.0, le=3600.0)] = 0.4
     bytes_per_s: Annotated[float, msgspec.Meta(ge=1000.0, le=1e12)] | None = None
@@ -97,6 +106,11 @@ class RunSettings(_Item, frozen=True, kw_only=True, tag="run", tag_field="item")
     def services(self) -> tuple[str, ...]:
         """The cloud's services in order of preference."""
         return tuple(f"cloud-{number}" for number in range(1, self.replicas + 1))
+
+    @property
+    def services_forget(self) -> bool:
+        """Whether services forget a robot that was not heard, or where there are many."""
+        return self.forgets_after_s < _LONG_S or self.sessions_kept < _MANY_SESSIONS
 
 
 class Crash(_Item, frozen=True, kw_only=True, tag="crash", tag_field="item"):
@@ -210,6 +224,17 @@ class LaunchFault(_Item, frozen=True, kw_only=True, tag="launch", tag_field="ite
     seconds: Seconds = 0.1
 
 
+class Late(_Item, frozen=True, kw_only=True, tag="late", tag_field="item"):
+    """The observation of a step comes so many task actions later; ``none`` for never.
+
+    With the move by which it is there, at the earliest with the next one. Of a step that has
+    several such lines it comes several times.
+    """
+
+    step: Count
+    moves: Count | None
+
+
 SimulatedFault: TypeAlias = (
     Crash
     | Stop
@@ -220,6 +245,7 @@ SimulatedFault: TypeAlias = (
     | MessageFault
     | KillRobot
     | PauseRobot
+    | Late
     | DiskStall
     | LaunchFault
 )

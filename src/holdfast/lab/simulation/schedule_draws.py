@@ -17,6 +17,7 @@ from holdfast.lab.simulation.schedule import (
     Direction,
     DiskStall,
     KillRobot,
+    Late,
     LaunchFault,
     MessageFault,
     PauseRobot,
@@ -35,6 +36,17 @@ _SPAN_S = 0.7
 _MESSAGES = 60
 """Of each service and direction, among which some are struck; a run without faults has fewer."""
 
+_SHOW_OTHERWISE = 0.2
+"""Share of the runs in which observations come late, moves show something, or sensing may be left
+out."""
+
+_FEW_TRIALS = 4
+_PATTERNS = 16
+"""Of lateness. Each trial has one run without faults for each of these: few, so that they are
+remembered."""
+
+_SENSING_STEPS = range(0, 40, 9)
+
 _T = TypeVar("_T")
 
 
@@ -44,7 +56,37 @@ def draw_schedule(seed: int) -> SimulationSchedule:
     Each seed allows some kinds of faults only, so that what one kind hides another does not, and
     some seeds have many faults of few kinds (swarm testing; Groce et al., ISSTA 2012).
     """
-    return _Draw(seed).schedule()
+    schedule = _Draw(seed).schedule()
+    # A generator of its own: what the other one draws is as it was without it.
+    apart = random.Random(f"holdfast simulation {seed}: what is shown, and when")
+    if apart.random() >= _SHOW_OTHERWISE:
+        return schedule
+    run = msgspec.structs.replace(
+        schedule.run,
+        trial=apart.randrange(_FEW_TRIALS),
+        moves_show=apart.random() < 0.3,
+        sensing_is_optional=apart.random() < 0.2,
+        remembers=apart.random() < 0.5,
+        senses_on=apart.random() < 0.5,
+        on_lost="reinitialise" if apart.random() < 0.3 else "continue",
+    )
+    late: tuple[Late, ...] = ()
+    if not (run.moves_show or run.sensing_is_optional) or apart.random() < 0.7:
+        late = _lateness(apart.randrange(_PATTERNS))
+    return SimulationSchedule(run, (*late, *schedule.faults))
+
+
+def _lateness(pattern: int) -> tuple[Late, ...]:
+    """Return when observations come."""
+    chance = random.Random(f"holdfast lateness {pattern}")
+    late = []
+    for step in _SENSING_STEPS:
+        if chance.random() < 0.2:
+            continue
+        for _ in range(2 if chance.random() < 0.15 else 1):
+            moves = chance.choice((None, 0, 1, 2, 3, 5, 8, 9, 10, 12, 18, 20, 30))
+            late.append(Late(step=step, moves=moves))
+    return tuple(late)
 
 
 class _Draw:

@@ -70,7 +70,7 @@ class ServiceNode:
         self.stopped_until = 0.0
         if not keeps_memory or self.machine is None:
             run = self._world.run
-            problem = self._world.simulator.planner.problem
+            problem = self._world.setup.planner.problem
             limits = ServiceLimits(
                 max_sessions=run.sessions_kept,
                 max_idle_s=run.forgets_after_s,
@@ -149,9 +149,9 @@ class ServiceNode:
         assert self.machine is not None
         if job.kind in self.lacks_memory_for:
             failure = ("out_of_memory", f"out of memory for a {job.kind} part")
-            outcome = JobResult(failure=failure, problem=self._world.simulator.planner.problem)
+            outcome = JobResult(failure=failure, problem=self._world.setup.planner.problem)
         else:
-            outcome = self._world.simulator.jobs.outcome(job)
+            outcome = self._world.setup.jobs.outcome(job)
         self._carry_out(self.machine.finished(job, outcome, self._clock.now()))
 
     def _tick(self, memory: int, due: float) -> None:

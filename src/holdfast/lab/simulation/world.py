@@ -15,10 +15,11 @@ from holdfast.config.settings import ParticleFilterSettings, PlanningSettings, S
 from holdfast.errors import HoldfastError, IllegalTransitionError, MessageError
 from holdfast.lab.errors import Violation
 from holdfast.lab.simulation.checkers import WireChecker, check_size
-from holdfast.lab.simulation.environment_model import ReferenceRuns
 from holdfast.lab.simulation.event_queue import EventQueue
 from holdfast.lab.simulation.memo_cache import JobCache, Memo, MemoizingPlanner
 from holdfast.lab.simulation.network import Network
+from holdfast.lab.simulation.peg_with_encoders import PegWithEncoders
+from holdfast.lab.simulation.reference_runs import ReferenceRuns
 from holdfast.lab.simulation.robot_node import SESSION, RobotNode
 from holdfast.lab.simulation.schedule import (
     LOCAL_SERVICE,
@@ -28,10 +29,12 @@ from holdfast.lab.simulation.schedule import (
     Cut,
     DiskStall,
     KillRobot,
+    Late,
     LaunchFault,
     MessageFault,
     OutOfMemory,
     PauseRobot,
+    RunSettings,
     SimulatedFault,
     SimulationSchedule,
     Slow,
@@ -76,6 +79,9 @@ RECOVERY_S = 3.0
 _SEED = 20_260
 _NUM_PARTICLES = 30
 _MAX_STEPS = 40
+_NATS_PER_COST = 0.3
+"""Where not to sense is a choice: it is the better one now and then."""
+
 _MAX_MESSAGES = 5_000
 """Of a run; one without faults has about fifty."""
 
@@ -102,22 +108,41 @@ class Simulator:
     """Runs schedules; what does not depend on them is made once."""
 
     def __init__(self) -> None:
-        problem = PegInHole2D()
-        planning = PlanningSettings(
-            particle_filter=ParticleFilterSettings(num_particles=_NUM_PARTICLES),
-            selector=SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
-        )
         self.seed = _SEED
         self.max_steps = _MAX_STEPS
+        self._setups: dict[tuple[bool, bool], Setup] = {}
+
+    def setup(self, run: RunSettings) -> Setup:
+        """Return what a run has in common with others of its problem and settings."""
+        key = run.moves_show, run.sensing_is_optional
+        if key not in self._setups:
+            self._setups[key] = Setup(*key)
+        return self._setups[key]
+
+    def run(self, schedule: SimulationSchedule, *, tell: bool = False) -> RunOutcome:
+        """Run a schedule."""
+        return World(self, schedule, tell=tell).go()
+
+
+class Setup:
+    """A problem and its settings, and what is known of them from the runs before."""
+
+    def __init__(self, moves_show: bool, sensing_is_optional: bool) -> None:
+        problem = PegWithEncoders() if moves_show else PegInHole2D()
+        planning = PlanningSettings(
+            particle_filter=ParticleFilterSettings(num_particles=_NUM_PARTICLES),
+            selector=SelectorSettings(
+                method="action_entropy",
+                estimator="nearest_neighbor",
+                sensing_is_optional=sensing_is_optional,
+                nats_per_cost=_NATS_PER_COST if sensing_is_optional else 0.0,
+            ),
+        )
         self.references = ReferenceRuns(problem, planning, _SEED)
         self.planner = MemoizingPlanner(Planner(problem, planning))
         self.jobs = JobCache()
         self.session_configuration = SessionConfiguration(problem.name, {}, {}, planning, _SEED)
         self._requests: Memo[tuple[int, int], bytes] = Memo(5_000)
-
-    def run(self, schedule: SimulationSchedule, *, tell: bool = False) -> RunOutcome:
-        """Run a schedule."""
-        return World(self, schedule, tell=tell).go()
 
     def request_of_another(self, robot: int, trial: int) -> bytes:
         """Return the first request of another robot, numbered from 1, for the start of a trial."""
@@ -153,14 +178,16 @@ class World:
     def __init__(self, simulator: Simulator, schedule: SimulationSchedule, *, tell: bool) -> None:
         self.simulator = simulator
         self.run = run = schedule.run
+        self.setup = simulator.setup(run)
         self._schedule = schedule
         self._tell = tell
         self._story: list[StoryLine] = []
         self.queue = EventQueue()
-        self.checker = WireChecker()
+        self.checker = WireChecker(services_forget=run.services_forget)
         self.services = {name: ServiceNode(name, self) for name in (*run.services, LOCAL_SERVICE)}
-        self.robot = RobotNode(self)
         faults = schedule.faults
+        self._late = [each for each in faults if isinstance(each, Late)]
+        self.robot = RobotNode(self)
         self.network = Network(self, [each for each in faults if isinstance(each, MessageFault)])
         self._nodes: dict[str, RobotNode | ServiceNode] = {"robot": self.robot, **self.services}
         self._launches = 0
@@ -190,8 +217,8 @@ class World:
             KillRobot: self._kill,
         }
         for fault in faults:
-            if isinstance(fault, MessageFault):
-                continue  # most are; the network has them
+            if isinstance(fault, MessageFault | Late):
+                continue  # most are; the network and the robot's body have them
             if isinstance(fault, DiskStall):
                 self._stalls.append(fault)
             elif isinstance(fault, LaunchFault):
@@ -245,6 +272,9 @@ class World:
         run = self.run
         step_s = max(run.act_s, 0.0 if run.rate_hz is None else 1.0 / run.rate_hz) + 0.001
         turn_s = 2 * run.latency_s + run.jitter_s + run.task_s + run.sensing_s + run.sense_s
+        if run.moves_show:
+            # Each step is a turn then, and a service that forgets is asked twice.
+            turn_s *= 2
         nominal_s = _MAX_STEPS * (step_s + turn_s) / min(1.0, run.robot_clock_rate)
         events = 0
         while not self.robot.finished and self.robot.stopped_by is None:
@@ -412,9 +442,9 @@ class World:
                 other = self._num_others
                 if self.run.certificates and number == 0:
                     # An impostor: our session, as our robot's next process would ask.
-                    payload = self.simulator.first_request(SESSION, other % NUM_TRIALS, 2**31)
+                    payload = self.setup.first_request(SESSION, other % NUM_TRIALS, 2**31)
                 else:
-                    payload = self.simulator.request_of_another(other, number % NUM_TRIALS)
+                    payload = self.setup.request_of_another(other, number % NUM_TRIALS)
                 self.network.call_of_another(service, payload)
         return iter(())
 
@@ -431,6 +461,8 @@ class World:
             return
         self.happened(fault, fault.down_s)
         self.note("robot", "is killed" + (" by a power cut" if fault.power_cut else ""))
+        if fault.power_cut:
+            self.checker.robot_forgets()
         self.robot.kill(
             lost_appends=fault.lost_appends if fault.power_cut else None,
             body_goes_on=fault.body_goes_on,
@@ -443,6 +475,20 @@ class World:
         if not self.robot.up:
             self.note("robot", "is started again")
             self.robot.start()
+
+    def lateness(self) -> dict[int, tuple[int | None, ...]]:
+        """Return by step after how many task actions its observation comes."""
+        steps = {fault.step for fault in self._late}
+        return {
+            step: tuple(fault.moves for fault in self._late if fault.step == step) for step in steps
+        }
+
+    def sensed_late(self, step: int) -> None:
+        """Take note that the observation of a step does not come at once."""
+        for fault in self._late:
+            if fault.step == step:
+                self._counts[fault.kind] = self._counts.get(fault.kind, 0) + 1
+                self._injected.add(id(fault))
 
     # -- what the robot's process asks of its machine --------------------------------------------
 

@@ -44,6 +44,8 @@ _STUDIES: Mapping[str, str] = {
     "published_worlds": "holdfast.lab.studies.published_worlds:PublishedWorlds",
     "selectors": "holdfast.lab.studies.selectors:Selectors",
     "parameters": "holdfast.lab.studies.parameters:Parameters",
+    "estimates": "holdfast.lab.studies.estimates:Estimates",
+    "sensing_price": "holdfast.lab.studies.sensing_price:SensingPrice",
 }
 """Where each is; imported when it is needed."""
 

@@ -60,11 +60,17 @@ class JudgedStudy(TrialStudy):
     columns: ClassVar[tuple[str, ...]]
     """Those that name a cell."""
     num_trials: ClassVar[Mapping[str, int]]
+    kind: ClassVar[str] = "trials"
+    """Of the tasks."""
     quick_trials: ClassVar[Mapping[str, int]] = {CHOICE: 2, CLAIM: 4}
 
     @abstractmethod
     def cells(self, scale: Scale) -> Iterable[Any]:
         """Return all cells, in the order of the tables."""
+
+    def judged_cells(self, scale: Scale) -> Iterable[Any]:
+        """Return the cells that are judged: all, unless a study judges only what it chose."""
+        return self.cells(scale)
 
     @abstractmethod
     def names(self, cell: Any) -> tuple[Cell, ...]:
@@ -77,13 +83,16 @@ class JudgedStudy(TrialStudy):
     def parts(self, scale: Scale) -> Iterator[Part]:
         """Yield the trials of each cell, by purpose."""
         for purpose, number in (self.quick_trials if scale.quick else self.num_trials).items():
-            for cell in self.cells(scale):
+            for cell in self._cells_for(purpose, scale):
                 names = (purpose, scale.seed_of(purpose), *self.names(cell))
                 series = self.series(cell, purpose, scale, number)
                 yield Part(
                     dict(zip((*_PURPOSE, *self.columns), names, strict=True)),
-                    list(trial_tasks(series, _TRIALS_IN_EACH)),
+                    list(trial_tasks(series, _TRIALS_IN_EACH, self.kind)),
                 )
+
+    def _cells_for(self, purpose: str, scale: Scale) -> Iterable[Any]:
+        return self.judged_cells(scale) if purpose == CLAIM else self.cells(scale)
 
     def kept(self, trials: pd.DataFrame) -> pd.DataFrame:
         """Return what is kept; of times, which differ from run to run, the median of each cell."""
@@ -113,7 +122,7 @@ class JudgedStudy(TrialStudy):
             {
                 (purpose, *self.names(cell)): (purpose, cell)
                 for purpose in (CHOICE, CLAIM)
-                for cell in self.cells(Scale(quick=quick))
+                for cell in self._cells_for(purpose, Scale(quick=quick))
             }
             for quick in (False, True)
         )

@@ -31,6 +31,7 @@ __all__ = ["Task", "code_of", "run_task", "task_key"]
 _FUNCTIONS: Mapping[str, str] = {
     "trials": "holdfast.lab.studies.trial_batches:run_trials_of",
     "cloud_trials": "holdfast.lab.studies.cloud_trials:run_cloud_trials",
+    "estimates": "holdfast.lab.studies.estimate_candidates:run_estimates",
     "emulation_2017": "holdfast.lab.studies.emulation_2017:run_emulation",
     "vdp_tag": "holdfast.lab.studies.published_worlds:run_vdp_tag",
     "exchange_times": "holdfast.lab.studies.exchange_times:measure_exchange",

@@ -90,7 +90,9 @@ def trial_tasks(series: TrialSeries, trials_in_each: int, kind: str = "trials") 
         yield Task(kind=kind, parameters=parameters, units=count)
 
 
-def run_trials_of(first_trial: int, **series: Any) -> pd.DataFrame:
+def run_trials_of(
+    first_trial: int, planner_class: type[Planner] = Planner, **series: Any
+) -> pd.DataFrame:
     """Run some trials of a series in this process; the function of tasks of the kind ``trials``.
 
     It gets the fields of :class:`TrialSeries`, and returns a table with the columns of
@@ -104,7 +106,7 @@ def run_trials_of(first_trial: int, **series: Any) -> pd.DataFrame:
 
     def run(trial: int, max_steps: int) -> TrialResult:
         try:
-            planner = Planner(problem, wanted.planning)
+            planner = planner_class(problem, wanted.planning)
             return run_trial(planner, wanted.seed, trial, max_steps=max_steps)
         except HoldfastError as error:
             raise TaskError(

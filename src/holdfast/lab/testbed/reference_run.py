@@ -85,6 +85,7 @@ def make_reference_run(
                     trial,
                     max_steps=simulator.max_steps,
                     environment=world,
+                    lost=configuration.lost,
                 )
             )
     took_s = time.perf_counter() - began

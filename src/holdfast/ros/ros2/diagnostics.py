@@ -49,12 +49,12 @@ class Diagnostics:
         self._launch_failed = False
         self._status = ""
         self._finished: int | str = ""
-        self.diverged = False
+        self._alarms: set[str] = set()
 
     def event(self, name: str) -> None:
         """Take note of an event of the robot's, from its thread."""
-        if name == "filter_diverged":
-            self.diverged = True
+        if name in ("lost", "sensor_suspect"):
+            self._alarms.add(name)
         elif name == "holding":
             self._holding_since = self._clock()
             self._launch_failed = False
@@ -72,7 +72,7 @@ class Diagnostics:
             word, level = condition.word, Level.OK
             if word == _HOLDING:
                 level = self._level_of_holding()
-            elif word == Status.LOCAL_RECOVERY.value or self.diverged:
+            elif word == Status.LOCAL_RECOVERY.value or self._alarms:
                 level = Level.WARN
         elif last is not None and segment is None:
             word = last.ending.name.lower()
@@ -95,7 +95,8 @@ class Diagnostics:
             "trial": "" if trial is None else trial,
             "finished_trials": self._finished,
             "unexplained_observations": 0 if segment is None else segment.unexplained_observations,
-            "filter_diverged": str(self.diverged).lower(),
+            "lost": str("lost" in self._alarms).lower(),
+            "sensor_suspect": str("sensor_suspect" in self._alarms).lower(),
             "decisions_not_published": 0 if telemetry is None else telemetry.dropped_decisions,
             "last_error": "" if last is None or level != Level.ERROR else last.message[:500],
         }

@@ -35,10 +35,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from holdfast.errors import HoldfastError
 from holdfast.planning import PlanningState
 from holdfast.protocol.events import Act, Sense
+from holdfast.recording.poses import PoseLayout, pose_layout
 from holdfast.recording.run_directory import RunDirectory
 from holdfast.robot.links import check_services
 from holdfast.ros.executive import DecideCode, DecideRequest
-from holdfast.ros.poses import PoseLayout, pose_layout
 from holdfast.ros.ros2 import messages
 from holdfast.ros.ros2.diagnostics import Diagnostics
 from holdfast.ros.ros2.parameters import (
@@ -78,7 +78,9 @@ _TOLD_AT_ONCE = frozenset(
         "launch_failed",
         "recovery_exited",
         "unexplained",
-        "filter_diverged",
+        "lost",
+        "sensor_suspect",
+        "reinitialised",
         "service_vanished",
         "service_appeared",
         "wrong_answer",
@@ -88,7 +90,18 @@ _TOLD_AT_ONCE = frozenset(
 )
 """Events that change the diagnostics."""
 
-_LOGGED = frozenset(("status", "holding", "resumed", "filter_diverged", "wrong_answer", "stopped"))
+_LOGGED = frozenset(
+    (
+        "status",
+        "holding",
+        "resumed",
+        "lost",
+        "sensor_suspect",
+        "reinitialised",
+        "wrong_answer",
+        "stopped",
+    )
+)
 
 
 class _Events:

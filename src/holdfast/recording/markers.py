@@ -17,7 +17,7 @@ from holdfast.arrays import FloatArray
 from holdfast.belief import Belief, estimate
 from holdfast.geometry import BoxWorld
 from holdfast.problems.problem import Problem, Scene
-from holdfast.ros.poses import POSE_COORDINATES, PoseLayout
+from holdfast.recording.poses import POSE_COORDINATES, PoseLayout
 
 __all__ = ["Marker", "scene_markers", "sensing_markers"]
 

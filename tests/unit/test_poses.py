@@ -10,7 +10,7 @@ from holdfast.belief import Belief, estimate
 from holdfast.errors import ProblemError
 from holdfast.problems.problem import ProblemBase
 from holdfast.problems.registry import BUILT_IN, problem_class
-from holdfast.ros.poses import pose_layout
+from holdfast.recording.poses import pose_layout
 
 RANDOM = np.random.default_rng(7)
 

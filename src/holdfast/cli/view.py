@@ -1,0 +1,121 @@
+"""``holdfast view``: a recorded run in Rerun's viewer, or as a file for it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from holdfast.cli.exit_codes import ended_by_signals
+from holdfast.cli.export import (
+    MAX_RATE_HZ,
+    MIN_RATE_HZ,
+    chosen_trials,
+    notes_about,
+    replay_trials,
+    size_of,
+    trial_range,
+)
+from holdfast.errors import InvalidValueError, OptionError, ViewError
+from holdfast.files import directory_beside, move_into_place, require_free
+from holdfast.printable import printable
+from holdfast.recording.view_target import ViewTarget, require_rerun, viewer_url
+from holdfast.runtime.command_line import (
+    Options,
+    argument,
+    flag,
+    location,
+    number,
+    option,
+)
+
+__all__ = ["main"]
+
+
+class ViewOptions(Options):
+    """Show a recorded run in Rerun's viewer (extra view); the run is not changed.
+
+    Beliefs are not recorded, but computed again from the recorded seed and observations. Every
+    decision on the way must be the recorded one, bit for bit.
+
+    A viewer is started on this machine if none is there. With --save there is none, unless --viewer
+    names one; rerun FILE opens the file, here or elsewhere.
+    """
+
+    needs_arguments = True
+
+    run: Path = argument("RUN", "Directory of a run, or its journal.", location)
+    trials: range | None = option(
+        metavar="A:B",
+        read=trial_range,
+        help="Only the trials from A up to, but without, B (default: all).",
+    )
+    save: Path | None = option(
+        metavar="FILE", read=location, help="Write FILE (.rrd) instead of showing it."
+    )
+    viewer: str | None = option(
+        metavar="HOST:PORT",
+        help="Show it in the viewer that listens there; Rerun's port is 9876.",
+    )
+    rate: float = option(
+        metavar="HZ",
+        read=number(MIN_RATE_HZ, MAX_RATE_HZ, "Hz"),
+        default=10.0,
+        help="Steps a second, for a run that was recorded without times.",
+    )
+    quiet: bool = flag("-q", help="Show no progress.")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Show what the options ask for and return the exit code."""
+    options = ViewOptions.parse("view", arguments)
+    with ended_by_signals():
+        _view(options)
+    return 0
+
+
+def _view(options: ViewOptions) -> None:
+    save = options.save
+    url = "" if save is None else None
+    if options.viewer is not None:
+        try:
+            url = viewer_url(options.viewer)
+        except InvalidValueError as error:
+            raise OptionError(f"--viewer is {options.viewer!r:.80}; allowed are {error}") from error
+    require_rerun(ViewTarget(url))
+    if save is not None:
+        require_free(save, "--save", directory=False)
+    from holdfast.recording.replay import RecordedRun
+    from holdfast.recording.rerun_sink import RerunSink
+
+    with RecordedRun(options.run, "view") as recorded, ExitStack() as stack:
+        trials = chosen_trials(recorded, options.trials)
+        notes = notes_about(recorded, trials, options.rate)
+        made = None
+        if save is not None:
+            made = stack.enter_context(directory_beside(save)) / save.name
+        target = ViewTarget(url, None if made is None else str(made))
+        with RerunSink(
+            recorded.configuration, target, has_times=recorded.has_times, live=False
+        ) as sink:
+
+            def require_viewer() -> None:
+                if sink.streams.lost is not None:
+                    raise ViewError(f"the viewer {sink.streams.lost}")
+
+            replay_trials(
+                recorded,
+                trials,
+                [sink],
+                options.rate,
+                quiet=options.quiet,
+                after_each=require_viewer,
+            )
+        if save is not None and made is not None:
+            move_into_place(made, save)
+    for note in () if options.quiet else notes:
+        sys.stderr.write(f"note: {printable(note)}\n")
+    if save is not None:
+        sys.stdout.write(printable(f"{save}  {size_of(save)}\n"))
+        sys.stdout.flush()

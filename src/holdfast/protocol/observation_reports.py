@@ -1,0 +1,106 @@
+"""What a robot reports about its observations: what no particle explains, lost, a suspect sensor.
+
+The trial counts (:mod:`holdfast.tracking`); here is what becomes an event, with words and bounds.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from holdfast.belief import VALIDATION_GATE_SQUARED
+from holdfast.config.settings import LostSettings, OnLost
+from holdfast.errors import HeldError
+from holdfast.lost import MOVE, Verdict
+from holdfast.planning import ObservationInfo
+from holdfast.protocol.events import Effects, RobotEffect
+from holdfast.tracking import Trial
+
+__all__ = ["ObservationReports", "held_error"]
+
+_MAX_REPORTS = 10
+"""Bound on reports of each kind per trial; all are counted."""
+
+_FAR = f"more than {VALIDATION_GATE_SQUARED**0.5:g} standard deviations from every particle"
+
+_WHY = {
+    "lost": "the belief does not know where the robot is",
+    "sensor_suspect": "other observations are explained: the sensor is dead, or its model wrong",
+}
+_OR_ITS_SENSOR = ", or this sensor is dead: nothing else was sensed meanwhile"
+
+
+class ObservationReports:
+    """Reports to ``effects`` what is observed in trials.
+
+    Attributes
+    ----------
+    counts : Counter of str
+        Events of each kind in this process, also those that were counted only.
+    """
+
+    def __init__(self, effects: Effects[RobotEffect], lost: LostSettings) -> None:
+        self._effects = effects
+        self._lost = lost
+        self.counts: Counter[str] = Counter()
+
+    def observed(
+        self, trial: Trial, step: int, info: ObservationInfo, **of_what: object
+    ) -> OnLost | None:
+        """Report what an observation of a step has shown; return what to do if the robot is lost.
+
+        ``of_what`` says in the report which observation it was.
+        """
+        self.counts["unexplained"] += not info.explained
+        if not info.explained and trial.num_unexplained <= _MAX_REPORTS:
+            distance = info.mahalanobis_distance
+            more = trial.num_unexplained == _MAX_REPORTS
+            self._effects.report(
+                "unexplained",
+                trial=trial.state.trial,
+                step=step,
+                **of_what,
+                **({} if distance is None else {"deviations": distance}),
+                reason=("no particle can have made it" if distance is None else _FAR)
+                + ("; further ones of this trial are counted only" if more else ""),
+            )
+        alarm = trial.alarm
+        if alarm is None:
+            return None
+        self.counts[alarm.kind] += 1
+        self._raised(trial, step, alarm)
+        return self._lost.on_lost if alarm.kind == "lost" else None
+
+    def reinitialised(self, trial: Trial) -> None:
+        """Report that the belief of a lost robot has begun anew."""
+        self.counts["reinitialised"] += 1
+        self._effects.report("reinitialised", trial=trial.state.trial, step=trial.state.step)
+
+    def _raised(self, trial: Trial, step: int, alarm: Verdict) -> None:
+        is_lost = alarm.kind == "lost"
+        count = trial.lost_test.num_lost if is_lost else trial.lost_test.num_suspect
+        if count > _MAX_REPORTS:
+            return
+        action = alarm.sensing_action
+        fields: dict[str, object] = {}
+        if action is not None:
+            labels = trial.planner.problem.sensing_actions
+            fields["sensing_action"] = "move" if action == MOVE else f"{action} ({labels[action]})"
+        self._effects.report(
+            alarm.kind,
+            trial=trial.state.trial,
+            step=step,
+            **fields,
+            outside=alarm.outside,
+            observations=alarm.observations,
+            false_alarm_rate=self._lost.false_alarm_rate,
+            reason=_WHY[alarm.kind] + (_OR_ITS_SENSOR if is_lost and fields else ""),
+        )
+
+
+def held_error(trial: Trial, step: int) -> HeldError:
+    """Return why a lost robot holds still, and what to do."""
+    return HeldError(
+        f"the robot is lost in trial {trial.state.trial}, step {step}, and holds still, as "
+        "lost.on_lost says. Bring it to where it believes to be and resume the run; or resume it "
+        "with lost.on_lost=reinitialise, and its belief begins anew"
+    )

@@ -1,0 +1,64 @@
+"""What a trial's beliefs tell about its settings: angles taken for numbers, and several modes.
+
+Both make a robot slow or stop it, and neither looks like an error. A heading of which half of the
+particles say 3.1 and half -3.1 has a mean of 0; and the mean of a belief with several modes is
+where the robot is not.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from holdfast.arrays import FloatArray
+from holdfast.circular import unwrapped
+from holdfast.config.settings import PlanningSettings
+from holdfast.modes import heaviest_mode
+from holdfast.problem_attributes import circular_states, name_of
+from holdfast.recording.recorder import TrialRecord
+
+__all__ = ["belief_remarks"]
+
+_SHARE = 0.2
+"""Of the beliefs after an observation, from which on it is worth a remark."""
+
+
+def belief_remarks(problem: Any, settings: PlanningSettings, record: TrialRecord) -> list[str]:
+    """Return what a user should know of the beliefs after a trial's observations; mostly nothing.
+
+    A coordinate counts as an angle that wraps if its label has the unit rad, and its particles
+    span more than half a circle as numbers, but less than that on the circle. Several modes are
+    told of where the trial failed: a sharp observation may leave particles in a few heaps, too,
+    which does no harm.
+    """
+    count = len(record.sensing)
+    remarks: list[str] = []
+    circular = tuple(circular_states(problem))
+    for coordinate, label in enumerate(problem.state_labels):
+        if coordinate in circular or "rad" not in str(label):
+            continue
+        wraps = sum(_wraps(step.after, coordinate) for step in record.sensing)
+        if wraps > _SHARE * count:
+            remarks.append(
+                f"{label} lay on both sides of a whole turn in {wraps} of {count} beliefs, and was "
+                f"averaged as a number: give {name_of(problem)} circular = ({coordinate},), so "
+                "that pi is -pi"
+            )
+    failed = record.result is not None and not record.result.success
+    if failed and not remarks and settings.particle_filter.estimate == "mean":
+        several = sum(
+            heaviest_mode(step.after, step.weights, circular) is not step.weights
+            for step in record.sensing
+        )
+        if several > _SHARE * count:
+            remarks.append(
+                f"{several} of {count} beliefs had several modes, and the mean lies between them, "
+                "where the robot is not: particle_filter.estimate: heaviest_mode takes one of them"
+            )
+    return remarks
+
+
+def _wraps(states: FloatArray, coordinate: int) -> bool:
+    angles = states[:, [coordinate]]
+    return bool(np.ptp(angles) > np.pi > np.ptp(unwrapped(angles, (0,))))

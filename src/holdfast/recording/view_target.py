@@ -1,0 +1,70 @@
+"""What ``--view`` and ``--view-file`` ask for; it needs no Rerun to be told."""
+
+from __future__ import annotations
+
+import os
+import re
+from importlib.metadata import PackageNotFoundError, version
+from typing import NamedTuple
+
+from holdfast.errors import InvalidValueError, ViewError
+
+__all__ = ["LOCAL_URL", "ViewTarget", "require_rerun", "viewer_url"]
+
+_PORT = 9876
+LOCAL_URL = f"rerun+http://127.0.0.1:{_PORT}/proxy"
+"""Of a viewer on this machine."""
+
+_URL = re.compile(r"rerun(\+https?)?://\S+/proxy")
+_PLACE = re.compile(r"(\[[0-9a-fA-F:.%]+\]|[\w.-]+)(?::(\d{1,5}))?")
+
+
+class ViewTarget(NamedTuple):
+    """Where to show a run.
+
+    Attributes
+    ----------
+    viewer : str or None
+        URL of a viewer; empty for one on this machine, which is started if none is there.
+    file : str or None
+        To be written (``.rrd``).
+    """
+
+    viewer: str | None = None
+    file: str | None = None
+
+
+def viewer_url(place: str) -> str:
+    """Return the URL of a viewer, from that or from ``HOST[:PORT]``.
+
+    Raises InvalidValueError for anything else.
+    """
+    if _URL.fullmatch(place):
+        return place
+    found = _PLACE.fullmatch(place)
+    port = int(found[2] or _PORT) if found else 0
+    if found is None or not 0 < port < 65536:
+        raise InvalidValueError("HOST, HOST:PORT or a URL such as rerun+http://HOST:9876/proxy")
+    return f"rerun+http://{found[1]}:{port}/proxy"
+
+
+def require_rerun(target: ViewTarget) -> None:
+    """Make sure that a run can be shown there.
+
+    Raises
+    ------
+    ViewError
+        If Rerun is not installed, or a viewer would have to be started without a display.
+    """
+    try:
+        version("rerun-sdk")
+    except PackageNotFoundError as error:
+        raise ViewError(
+            "a view needs Rerun, which is not installed: pip install 'holdfast[view]'"
+        ) from error
+    if target.viewer == "" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ViewError(
+            "there is no display for Rerun's viewer (neither DISPLAY nor WAYLAND_DISPLAY is set): "
+            "write a file instead and open it elsewhere with rerun FILE, or name a viewer that "
+            "runs elsewhere by HOST:PORT (started there with rerun --bind 0.0.0.0)"
+        )

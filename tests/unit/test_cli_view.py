@@ -1,0 +1,153 @@
+"""``holdfast view``, and ``holdfast run --view-file``: the same steps, and the same decisions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rerun.chunk import RrdReader
+from tests.command_line import Said, run_here
+
+from holdfast.recording import rerun_streams
+
+RUN = """
+problem: peg_in_hole_2d
+particle_filter: {num_particles: 40}
+active_sensing: {num_observation_samples: 3, num_cores: 1}
+simulator: {num_trials: 3, max_steps: 20, seed: 3, sensing_intervals: 4}
+"""
+
+
+@pytest.fixture
+def here(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+    """Return a directory with a run."""
+    (tmp_path / "run.yaml").write_text(RUN)
+    done(run_here(capsys, tmp_path, "run", "run.yaml", "--out", "run", "-q", "--jobs", "1"))
+    return tmp_path
+
+
+def done(said: Said) -> Said:
+    assert said.code == 0, said.stderr
+    return said
+
+
+def rows(file: Path, path: str) -> list[dict[str, Any]]:
+    chunks = RrdReader(file).stream().to_chunks()
+    found = [
+        row
+        for chunk in chunks
+        if chunk.entity_path == path and not chunk.is_static
+        for row in chunk.to_record_batch().to_pylist()
+    ]
+    return sorted(found, key=lambda row: int(row["step"]))
+
+
+def log_of(file: Path) -> list[str]:
+    return [row["TextLog:text"][0] for row in rows(file, "/log")]
+
+
+def summary_of(run: Path) -> Any:
+    return json.loads((run / "summary.json").read_text())
+
+
+class TestARecordedRun:
+    def test_as_a_file(self, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        said = done(run_here(capsys, here, "view", "run", "--save", "run.rrd"))
+        assert said.stdout.startswith("run.rrd  ")
+        assert "every step takes 0.1 s (--rate)" in said.stderr
+        begun = [line for line in log_of(here / "run.rrd") if line.endswith("begins")]
+        assert begun == [f"trial {trial} begins" for trial in range(3)]
+        assert sorted(path.name for path in here.iterdir()) == ["run", "run.rrd", "run.yaml"]
+
+    def test_some_trials(self, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        done(run_here(capsys, here, "view", "run", "--save", "run.rrd", "--trials", "1:2", "-q"))
+        trials = {row["trial"] for row in rows(here / "run.rrd", "/world/belief")}
+        assert trials == {1}
+        assert rows(here / "run.rrd", "/world/estimate")[0]["step"] == 0
+
+    @pytest.mark.parametrize(
+        ("options", "why"),
+        [
+            (["--save", "run.yaml"], "run.yaml: exists already"),
+            (["--save", "run.rrd", "--trials", "7:9"], "has no trial from 7 to 8"),
+            ([], "there is no display for Rerun's viewer"),
+            (["--viewer", "127.0.0.1:1"], "no Rerun viewer listens at"),
+        ],
+    )
+    def test_what_cannot_be(
+        self,
+        options: list[str],
+        why: str,
+        here: Path,
+        capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        monkeypatch.setattr(rerun_streams, "_listens", lambda _: False)
+        for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+            monkeypatch.delenv(name, raising=False)
+        said = run_here(capsys, here, "view", "run", *options)
+        assert said.code == 2
+        assert why in said.stderr
+        assert sorted(path.name for path in here.iterdir()) == ["run", "run.yaml"]
+
+    def test_a_viewer_that_is_closed(
+        self, here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def lose(streams: rerun_streams.RerunStreams, *, last: bool = False) -> None:
+            streams.lost = "was closed, or the connection was lost"
+
+        monkeypatch.setattr(rerun_streams.RerunStreams, "flush", lose)
+        said = run_here(capsys, here, "view", "run", "--save", "run.rrd")
+        assert said.code == 2
+        assert "the viewer was closed" in said.stderr
+        assert not (here / "run.rrd").exists()
+
+
+class TestARunThatGoesOn:
+    def test_the_same_decisions_and_steps(
+        self, here: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        words = ["run", "run.yaml", "--out", "live", "--view-file", "live.rrd"]
+        said = done(run_here(capsys, here, *words))
+        assert "the view" not in said.stderr
+        assert summary_of(here / "live")["digest"] == summary_of(here / "run")["digest"]
+        done(run_here(capsys, here, "view", "live", "--save", "again.rrd", "-q"))
+        for path, column in [
+            ("/world/estimate", "Transform3D:translation"),
+            ("/world/truth", "Transform3D:translation"),
+            ("/world/belief", "Points3D:positions"),
+            ("/scores", "Scalars:scalars"),
+            ("/decisions/sensing_action", "StateChange:state"),
+        ]:
+            live, again = (
+                [(row["step"], row["trial"], row[column]) for row in rows(here / name, path)]
+                for name in ("live.rrd", "again.rrd")
+            )
+            assert live == again, path
+            assert live, path
+
+    @pytest.mark.parametrize(
+        ("options", "why"),
+        [
+            (["--view-file", "run.yaml"], "run.yaml: exists already"),
+            (["--view-file", "live.rrd", "--jobs", "2"], "leave out --service"),
+            (["--view", "rerun"], "there is no display for Rerun's viewer"),
+            (["--view", "rerun=127.0.0.1:1"], "no Rerun viewer listens at"),
+        ],
+    )
+    def test_what_cannot_be(
+        self,
+        options: list[str],
+        why: str,
+        here: Path,
+        capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+            monkeypatch.delenv(name, raising=False)
+        said = run_here(capsys, here, "run", "run.yaml", "--out", "live", *options)
+        assert said.code == 2 if "rerun=" not in options[-1] else said.code in (2, 4)
+        assert why in said.stderr
+        assert not (here / "live" / "trials.csv").exists() or "rerun=" in options[-1]

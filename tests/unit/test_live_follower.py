@@ -1,0 +1,216 @@
+"""The process that shows a run comes to the robot's own beliefs, and leaves out what is late."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.recordings import configuration_of
+
+from holdfast.arrays import FloatArray
+from holdfast.config.loader import Configuration
+from holdfast.outcome import Ending
+from holdfast.planning import Planner
+from holdfast.protocol.events import Timing
+from holdfast.protocol.messages import encode_floats
+from holdfast.protocol.records import (
+    ActingRecord,
+    LateRecord,
+    PerformedRecord,
+    Record,
+    TrialHistory,
+)
+from holdfast.recording.facts import (
+    EventFact,
+    LateFact,
+    SensingFact,
+    TaskFact,
+    TrialBeginFact,
+    TrialEndFact,
+)
+from holdfast.recording.live_follower import Follower
+from holdfast.recording.live_messages import (
+    EndedMessage,
+    EventMessage,
+    FinishMessage,
+    LostMessage,
+    RecordsMessage,
+    TimingMessage,
+)
+from holdfast.robot.environment import SimulatedEnvironment
+from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
+from holdfast.tracking import LateObservation
+
+SECOND = 1_000_000_000
+
+
+class Facts:
+    """Keeps the facts that it gets."""
+
+    def __init__(self) -> None:
+        self.all: list[Any] = []
+        self.trial_begins = self.sensed = self.acted = self.observed_late = self.all.append
+        self.trial_ends = self.happened = self.all.append
+
+    def of(self, kind: type) -> list[Any]:
+        return [fact for fact in self.all if isinstance(fact, kind)]
+
+
+class Steps(TrialObserver):
+    def __init__(self) -> None:
+        self.sensing: list[SensingStep] = []
+        self.acting: list[TaskStep] = []
+
+    def sensed(self, step: SensingStep) -> None:
+        self.sensing.append(step)
+
+    def acted(self, step: TaskStep) -> None:
+        self.acting.append(step)
+
+
+def a_trial(configuration: Configuration, number: int) -> tuple[list[Record], TrialHistory]:
+    """Run a trial, and return its records as a robot journals them."""
+    seed, max_steps = configuration.simulator.seed, configuration.simulator.max_steps
+    planner = Planner(configuration.problem, configuration.planning)
+    history = TrialHistory(planner, seed, number)
+    world = SimulatedEnvironment(configuration.problem, seed, number)
+    records: list[Record] = []
+    while not world.is_done() and history.state.step < max_steps:
+        state = history.state
+        if planner.needs_sensing(state):
+            sensing_action, _ = planner.choose_sensing_action(state)
+            shown = np.asarray(world.perform_sensing(sensing_action), dtype=np.float64)
+            records.append(history.observed(sensing_action, shown, 0.0)[1])
+        action, _ = planner.choose_task_action(history.state)
+        reward = world.perform(action)
+        assert reward is None or isinstance(reward, float)
+        performed = PerformedRecord(state.step, reward)
+        records += [ActingRecord(state.step, encode_floats(action)), performed]
+        history.pending = action
+        history.performed(performed)
+    return records, history
+
+
+def _known(values: FloatArray | None) -> FloatArray:
+    assert values is not None
+    return values
+
+
+@pytest.fixture
+def configuration(tmp_path: Path) -> Configuration:
+    return configuration_of(tmp_path, max_steps=20)
+
+
+def test_the_same_facts_as_of_the_trial_itself(configuration: Configuration) -> None:
+    records, history = a_trial(configuration, 1)
+    facts = Facts()
+    follower = Follower(configuration, facts, clock=lambda: 0)
+    for record in records[:-1]:  # the last one is in the result
+        follower.take(RecordsMessage(0, 1, (record,)))
+    follower.take(EndedMessage(0, history.result(Ending("failed", "it fell"))))
+    expected = Steps()
+    run_trial(
+        Planner(configuration.problem, configuration.planning),
+        configuration.simulator.seed, 1, max_steps=20, observer=expected,
+    )  # fmt: skip
+    assert len(facts.of(SensingFact)) == len(expected.sensing) > 1
+    for fact, step in zip(facts.of(SensingFact), expected.sensing, strict=True):
+        assert fact.sensing_action == step.sensing_action
+        assert np.array_equal(fact.entropies, _known(step.sensing_info.entropies))
+        assert np.array_equal(fact.observation, _known(step.observation))
+        assert fact.before.states.tobytes() == step.before.belief.states.tobytes()
+        assert fact.after.states.tobytes() == step.after.belief.states.tobytes()
+        assert fact.explained == step.observation_info.explained
+    world = SimulatedEnvironment(configuration.problem, configuration.simulator.seed, 1)
+    for fact, acted in zip(facts.of(TaskFact), expected.acting, strict=True):
+        assert fact.action.tobytes() == acted.executed.tobytes()
+        assert fact.belief.states.tobytes() == acted.state.belief.states.tobytes()
+        assert fact.estimate.tolist() == acted.task_info.estimate.tolist()
+        assert fact.true_state.tolist() == world.state.tolist()
+        world.perform(fact.action)
+    (end,) = facts.of(TrialEndFact)
+    assert end.steps == 20
+    assert (end.result.outcome, end.result.reason) == ("failed", "it fell")
+    assert end.belief.states.tobytes() == history.state.belief.states.tobytes()
+    assert (follower.steps, follower.left_out) == (20, 0)
+
+
+def test_what_is_late_is_folded_and_not_shown(configuration: Configuration) -> None:
+    records, history = a_trial(configuration, 0)
+    facts = Facts()
+    now = 0
+    follower = Follower(configuration, facts, clock=lambda: now)
+    middle = len(records) // 2
+    now = 4 * SECOND
+    follower.take(RecordsMessage(SECOND // 2, 0, tuple(records[:middle])))
+    assert facts.of(SensingFact) == facts.of(TaskFact) == []
+    left_out = follower.left_out
+    assert left_out > 0
+    follower.take(RecordsMessage(now, 0, tuple(records[middle:])))
+    follower.take(EndedMessage(now, history.result(None)))
+    assert follower.left_out == left_out
+    assert len(facts.of(TaskFact)) == follower.steps - left_out
+    assert facts.all[-1].belief.states.tobytes() == history.state.belief.states.tobytes()
+
+
+def test_who_decided(configuration: Configuration) -> None:
+    records, _ = a_trial(configuration, 0)
+    facts = Facts()
+    follower = Follower(configuration, facts, clock=lambda: 0)
+    follower.take(TimingMessage(7, Timing(0, 0, "sensing", "tcp/a:1", "standard", 1.0, 2.0, 3.0)))
+    follower.take(TimingMessage(8, Timing(0, 0, "task", "local", "local_recovery", 4.0, 5.0, 6.0)))
+    follower.take(RecordsMessage(9, 0, tuple(records)))
+    (sensed, *_), (first, second, *_) = facts.of(SensingFact), facts.of(TaskFact)
+    assert (sensed.decider.service, sensed.decided_ns, sensed.observed_ns) == ("tcp/a:1", 7, 9)
+    assert first.decider.service == "local"
+    assert second.decider == first.decider  # of the same answer
+
+
+def test_events_and_endings(configuration: Configuration) -> None:
+    records, history = a_trial(configuration, 0)
+    facts = Facts()
+    follower = Follower(configuration, facts, clock=lambda: 0)
+    follower.take(
+        EventMessage(3, '{"time":"t","component":"robot","event":"holding","reason":"r"}')
+    )
+    assert facts.all == [EventFact(3, "holding", {"component": "robot", "reason": "r"})]
+    follower.take(RecordsMessage(4, 0, tuple(records[:2])))
+    # What follows belongs to another trial, and nothing is known of this one's end.
+    follower.take(LostMessage())
+    assert facts.all[-1].result is None
+    follower.take(EndedMessage(5, history.result(None)))
+    assert [fact.trial for fact in facts.of(TrialBeginFact)] == [0, 0]
+    assert (facts.all[-1].steps, facts.all[-1].belief) == (20, None)
+    follower.take(FinishMessage())
+    assert len(facts.of(TrialEndFact)) == 2
+
+
+def test_an_observation_that_comes_late(configuration: Configuration) -> None:
+    planner = Planner(configuration.problem, configuration.planning)
+    seed = configuration.simulator.seed
+    history = TrialHistory(planner, seed, 0)
+    world = SimulatedEnvironment(configuration.problem, seed, 0)
+    shown = np.asarray(world.perform_sensing(1), dtype=np.float64)
+    _, observed = history.observed(1, None, 0.0)
+    action, _ = planner.choose_task_action(history.state)
+    history.pending = action
+    performed = PerformedRecord(0, None)
+    history.performed(performed)
+    came = history.came_late(LateObservation(0, shown))
+    assert came is not None
+    late = came[1]
+    assert isinstance(late, LateRecord)
+    facts = Facts()
+    follower = Follower(configuration, facts, clock=lambda: 0)
+    acting = ActingRecord(0, encode_floats(action))
+    follower.take(RecordsMessage(0, 0, (observed, acting, performed, late)))
+    follower.take(FinishMessage())
+    (sensed,) = facts.of(SensingFact)
+    assert (sensed.sensing_action, sensed.observation, sensed.explained) == (1, None, None)
+    (came_late,) = facts.of(LateFact)
+    assert (came_late.step, came_late.taken, came_late.explained) == (1, 0, came[0].explained)
+    assert came_late.observation.tobytes() == shown.tobytes()
+    assert came_late.after.states.tobytes() == history.state.belief.states.tobytes()
+    assert facts.all[-1].belief.states.tobytes() == history.state.belief.states.tobytes()

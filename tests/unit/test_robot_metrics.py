@@ -1,0 +1,114 @@
+"""A robot's metrics are what its machine has counted, in the text format of Prometheus."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from tests.robot_world import Misleading, World
+
+from holdfast.config.settings import SimulatorSettings
+from holdfast.protocol.events import Timing
+from holdfast.robot.metrics import RobotMetrics
+
+RULES = Path(__file__).parents[2] / "deploy" / "prometheus" / "rules.yaml"
+
+Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
+
+
+def told(metrics: RobotMetrics, world: World, *, is_deciding: bool = True) -> Samples:
+    text = metrics.text(world.robot, is_deciding=is_deciding).decode()
+    return {
+        (sample.name, tuple(sorted(sample.labels.items()))): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+class Lying(Misleading):
+    lies = frozenset(range(40))
+
+
+def world_of(environment_class: type[Misleading] = Misleading) -> World:
+    world = World(
+        simulator=SimulatorSettings(num_trials=2, max_steps=44, seed=11), on_lost="reinitialise"
+    )
+    world.environment_class = environment_class
+    return world
+
+
+def test_a_run_in_numbers() -> None:
+    world, metrics = world_of(), RobotMetrics()
+    world.start()
+    world.run()
+    timings = [effect for _, effect in world.trace if isinstance(effect, Timing)]
+    for timing in timings:
+        metrics.timed(timing)
+    for result in world.results:
+        metrics.ended(result)
+    samples = told(metrics, world)
+    for kind in ("task", "sensing"):
+        count = sum(timing.kind == kind for timing in timings)
+        labels = (("kind", kind), ("service", "cloud"))
+        assert samples["holdfast_robot_decisions_total", labels] == count > 0
+    assert samples["holdfast_robot_wait_seconds_count", ()] == len(timings)
+    waited_s = sum(timing.waited_ms for timing in timings) / 1e3
+    assert samples["holdfast_robot_wait_seconds_sum", ()] == pytest.approx(waited_s)
+    outcomes = [result.outcome for result in world.results]
+    assert samples["holdfast_robot_trials_total", (("outcome", outcomes[0]),)] == outcomes.count(
+        outcomes[0]
+    )
+    steps = sum(result.steps for result in world.results)
+    assert samples["holdfast_robot_steps_total", ()] == steps == 88
+    assert samples["holdfast_robot_status", (("status", "standard"),)] == 1
+    assert samples["holdfast_robot_status", (("status", "keep_alive"),)] == 0
+    assert samples["holdfast_robot_holding", ()] == 0
+    assert samples["holdfast_robot_deciding", ()] == 1
+    # The run is over: there is no current trial.
+    assert ("holdfast_robot_trial", ()) not in samples
+
+
+def test_what_the_observations_have_shown() -> None:
+    world, metrics = world_of(Lying), RobotMetrics()
+    world.start()
+    world.run()
+    samples = told(metrics, world)
+    for name, column in (
+        ("unexplained_observations", "unexplained_observations"),
+        ("lost", "lost"),
+        ("reinitialisations", "lost"),
+        ("sensor_suspects", "suspect_sensors"),
+    ):
+        expected = sum(getattr(result, column) for result in world.results)
+        assert samples[f"holdfast_robot_{name}_total", ()] == expected, name
+    assert samples["holdfast_robot_lost_total", ()] > 0
+
+
+def test_a_robot_in_a_trial_that_nobody_decides_for() -> None:
+    world, metrics = World(launch="never"), RobotMetrics()
+    world.start(present=False)
+    world.after(3.0, list)
+    world.run(until_s=2.0)
+    samples = told(metrics, world, is_deciding=False)
+    assert samples["holdfast_robot_holding", ()] == 1
+    assert samples["holdfast_robot_deciding", ()] == 0
+    assert samples["holdfast_robot_trial", ()] == samples["holdfast_robot_step", ()] == 0
+    assert samples["holdfast_robot_wait_seconds_count", ()] == 0
+
+
+def test_the_alerts_watch_what_is_told() -> None:
+    watched = set(re.findall(r"\bholdfast_robot_\w+", RULES.read_text(encoding="utf-8")))
+    assert len(watched) == 3
+    assert watched <= {name for name, _ in told(RobotMetrics(), world_of())}
+
+
+def test_the_package_is_not_imported_before_it_is_used() -> None:
+    program = "import sys, holdfast.robot.metrics; print('prometheus_client' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "False\n"

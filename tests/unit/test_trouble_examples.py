@@ -1,0 +1,111 @@
+"""The examples of robots in trouble: each is found, told, and mended as its page says."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.command_line import run_here
+
+from holdfast.config.loader import Configuration, load
+from holdfast.config.settings import LostSettings, OnLost
+from holdfast.outcome import TrialResult
+from holdfast.planning import Planner
+from holdfast.robot.environment import load_environment
+from holdfast.robot.trial import run_trial
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+TRIALS = 10
+
+
+def example(name: str, **overrides: Any) -> Configuration:
+    return load(EXAMPLES / f"{name}.yaml", overrides=overrides)
+
+
+def results_of(configuration: Configuration, on_lost: OnLost) -> list[TrialResult]:
+    planner = Planner(configuration.problem, configuration.planning)
+    make = load_environment(configuration)
+    return [
+        run_trial(
+            planner,
+            1,
+            trial,
+            max_steps=configuration.simulator.max_steps,
+            environment=make(trial),
+            lost=LostSettings(on_lost=on_lost),
+        )
+        for trial in range(TRIALS)
+    ]
+
+
+def successes(configuration: Configuration, on_lost: OnLost = "continue") -> int:
+    return sum(result.success for result in results_of(configuration, on_lost))
+
+
+def run(capsys: pytest.CaptureFixture[str], name: str, out: Path) -> list[dict[str, Any]]:
+    """Run the example as its page says, and return its events."""
+    words = ("--trials", "1", "--seed", "1", "--quiet", "--out", str(out))
+    said = run_here(capsys, out.parent, "run", str(EXAMPLES / f"{name}.yaml"), *words)
+    assert said.code == 0, said.stderr
+    return [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]
+
+
+def test_a_kidnapped_robot_is_told_and_finds_its_dock(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of 40 trials all reach the dock with a new belief, and none without it."""
+    configuration = example("kidnapped_robot")
+    anew = results_of(configuration, "reinitialise")
+    assert sum(result.success for result in anew) == TRIALS
+    assert [result.lost for result in anew] == [1] * TRIALS
+    assert successes(configuration) == 0
+    events = run(capsys, "kidnapped_robot", tmp_path / "run")
+    (lost,) = [event for event in events if event["event"] == "lost"]
+    assert 20 < lost["step"] < 60
+    (anew_at,) = [event["step"] for event in events if event["event"] == "reinitialised"]
+    assert anew_at == lost["step"]
+    # What was recorded can be believed again, the new belief included.
+    assert run_here(capsys, tmp_path, "export", "run", "--csv", "csv", "--quiet").code == 0
+
+
+def test_a_robot_that_nobody_carries_is_not_lost() -> None:
+    """Each trial has some 20 observations, so with this rate an alarm comes once in 50 tests."""
+    configuration = example("kidnapped_robot", **{"environment.arguments": {"at_step": -1}})
+    assert [result.lost for result in results_of(configuration, "reinitialise")] == [0] * TRIALS
+
+
+def test_a_dead_sensor_is_named_and_can_be_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of 40 trials 35 name it at first, and 5 say lost; all reach the bay without that sensor."""
+    dead = results_of(example("dead_sensor"), "continue")
+    assert sum(result.suspect_sensors > 0 for result in dead) >= 6
+    assert sum(result.success for result in dead) <= 2
+    assert successes(example("dead_sensor", **{"model.left_out": 0})) == TRIALS
+    events = run(capsys, "dead_sensor", tmp_path / "run")
+    suspect = next(event for event in events if event["event"] == "sensor_suspect")
+    assert suspect["sensing_action"] == "0 (receiver x)"
+    assert suspect["step"] > 30
+
+
+def test_backlash_is_seen_in_the_measured_motion(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of 40 trials all reach the mark with the encoder, and 12 without."""
+    blind = example("backlash", **{"environment.arguments": {"encoder": False}})
+    assert successes(example("backlash")) == TRIALS
+    assert successes(blind) <= 7
+    run(capsys, "backlash", tmp_path / "run")
+    assert run_here(capsys, tmp_path, "export", "run", "--csv", "csv", "--quiet").code == 0
+    with (tmp_path / "csv" / "steps.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["action_0"]]
+    back = [row for row in rows if row["stage"] == "1"]
+    motion = np.array([float(row["motion"]) for row in back[:8]])
+    assert [float(row["action_0"]) for row in back[:8]] == pytest.approx([-0.1] * 8)
+    # 0.4 m of play are four steps; then it moves as it is told.
+    assert np.abs(motion[:3]).max() < 0.05
+    assert motion[5:].max() < -0.05

@@ -1,0 +1,188 @@
+"""The validation gate: its odds, its two distances, its covariance."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from holdfast import numerics, randomness
+from holdfast.belief import Belief, uniform_weights, update
+from holdfast.planning import Planner
+from holdfast.problems.problem import ProblemBase
+from holdfast.validation_gate import OUTSIDE_PROBABILITY, _squared_distance, gate, is_within
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 6, 20, 100, 1000])
+def test_the_quantile(size: int) -> None:
+    exact = stats.chi2.isf(OUTSIDE_PROBABILITY, size)
+    assert gate(size) == pytest.approx(exact, rel=0.01)
+    assert stats.chi2.sf(gate(size), size) == pytest.approx(OUTSIDE_PROBABILITY, rel=0.03)
+
+
+@pytest.mark.parametrize("size", [1, 2, 5])
+@pytest.mark.parametrize("varying", [False, True])
+def test_the_distance_is_that_of_the_whole_covariance(size: int, varying: bool) -> None:
+    draws = np.random.default_rng(3)
+    mean = draws.normal(size=(40, size)) @ draws.normal(size=(size, size))
+    variance = draws.uniform(0.1, 2.0, (40, size) if varying else size)
+    weights = draws.dirichlet(np.ones(40))
+    observed = draws.normal(size=size)
+    residual = observed - weights @ mean
+    noise = weights @ variance if varying else variance
+    covariance = np.cov(mean.T, aweights=weights, ddof=0).reshape(size, size) + np.diag(noise)
+    expected = residual @ np.linalg.solve(covariance, residual)
+    assert _squared_distance(observed, mean, variance, weights) == pytest.approx(expected)
+
+
+class TwoDoors:
+    """Observes the coordinates of the state."""
+
+    def __init__(self, variance: float) -> None:
+        self.variance = variance
+
+    def observation_mean(self, states: np.ndarray, sensing_action: int) -> np.ndarray:
+        return states
+
+    def observation_variance(self, states: np.ndarray, sensing_action: int) -> np.ndarray:
+        return np.full(states.shape[-1], self.variance)
+
+
+def within(belief: Belief, variance: float, *observed: float) -> bool:
+    return update(TwoDoors(variance), belief, 0, observed)[1].within_gate
+
+
+def test_one_mode_of_two_is_no_alarm() -> None:
+    """It is far from the mean prediction of a belief that is nearly sure of another place."""
+    belief = Belief.weighted([[0.0], [10.0]], [0.999, 0.001])
+    assert within(belief, 0.01, 10.1)
+    assert not within(belief, 0.01, 12.0)
+
+
+def test_a_gap_between_few_particles_is_no_alarm() -> None:
+    """It is twenty deviations of the sensor from any of them."""
+    belief = Belief.uniform([[-1.0], [0.0], [1.0]])
+    assert within(belief, 0.0004, 0.5)
+    assert not within(belief, 0.0004, 3.0)
+
+
+def test_angles_are_near_across_the_cut() -> None:
+    mean = np.array([[3.10], [-3.12], [3.14], [-3.08]])
+    for observed, near in ((3.12, True), (-3.11, True), (0.0, False), (2.0, False)):
+        shown = np.array([observed]), mean, np.array([1e-4]), uniform_weights(4)
+        assert is_within(*shown, circular=(0,)) is near
+    assert not is_within(np.array([3.0]), mean, np.array([1e-4]), uniform_weights(4), (0,))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("observed", [1e200, -1e308])
+def test_what_overflows_is_outside(observed: float) -> None:
+    with np.errstate(over="raise", invalid="raise"):
+        assert not is_within(
+            np.array([observed]), np.zeros((3, 1)), np.array([1.0]), uniform_weights(3)
+        )
+
+
+def test_how_often_a_sound_belief_is_surprised() -> None:
+    """The truth is one more draw of what the particles are drawn from.
+
+    With 3,000 observations each of probability at most 0.01, more than 52 would come once in
+    10,000 series; and the gate is no wall.
+    """
+    outside = 0
+    for trial in range(3000):
+        random = randomness.stream(5, trial, 0, randomness.Purpose.INITIAL_BELIEF)
+        states = random.normal((201, 2))
+        observed = states[0] + 0.5 * random.substream(1).normal(2)
+        outside += not within(Belief.uniform(states[1:]), 0.25, *observed)
+    assert 3 <= outside <= 52
+
+
+class Heavy(ProblemBase):
+    """Observes a place with noise of long tails (Cauchy), whose likelihood is zero nowhere."""
+
+    name = "heavy"
+    state_size = action_size = 1
+    sensing_actions = ("look",)
+    asked = 0
+
+    def initial_states(self, stream: randomness.Stream, count: int) -> np.ndarray:
+        return stream.normal((count, 1))
+
+    def move(
+        self, states: np.ndarray, actions: np.ndarray, stream: randomness.Stream
+    ) -> np.ndarray:
+        return states
+
+    def policy(self, states: np.ndarray, stage: int) -> np.ndarray:
+        return states
+
+    def is_goal(self, states: np.ndarray) -> np.ndarray:
+        return states[..., 0] > 99.0
+
+    def log_likelihood(
+        self, states: np.ndarray, sensing_action: int, observation: np.ndarray
+    ) -> np.ndarray:
+        self.asked += 1
+        away = (observation[0] - states[:, 0]) / 0.1
+        return -numerics.log(1.0 + away * away)
+
+    def sample_observation(
+        self, state: np.ndarray, sensing_action: int, stream: randomness.Stream
+    ) -> np.ndarray:
+        above, below = stream.normal(2)
+        shown: np.ndarray = state + 0.1 * above / below
+        return shown
+
+
+def ranked(problem: Heavy, belief: Belief, observed: np.ndarray, trial: int) -> bool:
+    random = randomness.stream(7, trial, 0, randomness.Purpose.RANK_TEST)
+    return update(problem, belief, 0, observed, random)[1].within_gate
+
+
+def test_the_rank_test_is_exact() -> None:
+    """Of 2,000 observations that the belief itself makes 5 % are outside, which is 100.
+
+    More than 140 or fewer than 62 come once in 10,000 series. It takes few draws.
+    """
+    outside = 0
+    problem = Heavy()
+    for trial in range(2000):
+        random = randomness.stream(5, trial, 0, randomness.Purpose.INITIAL_BELIEF)
+        states = np.concatenate([random.normal((20, 1)), 5.0 + random.substream(0).normal((20, 1))])
+        truth = states[int(40 * random.substream(1).uniform())]
+        observed = problem.sample_observation(truth, 0, random.substream(2))
+        problem.asked -= 1  # the update itself
+        outside += not ranked(problem, Belief.uniform(states), observed, trial)
+    assert 62 <= outside <= 140
+    assert problem.asked / 2000 < 4.5
+
+
+def test_the_rank_test_finds_what_is_far_and_repeats_itself() -> None:
+    belief = Belief.uniform(
+        randomness.stream(3, 0, 0, randomness.Purpose.PREDICTION).normal((50, 1))
+    )
+    far = [ranked(Heavy(), belief, np.array([80.0]), trial) for trial in range(20)]
+    near = [ranked(Heavy(), belief, np.array([0.5]), trial) for trial in range(20)]
+    assert sum(far) <= 4
+    assert all(near)
+    assert far == [ranked(Heavy(), belief, np.array([80.0]), trial) for trial in range(20)]
+    # Who does not ask for it gets none: every observation is possible.
+    assert update(Heavy(), belief, 0, [80.0])[1].within_gate
+
+
+def test_a_problem_asks_for_the_rank_test() -> None:
+    class Asking(Heavy):
+        rank_test = True
+
+    reached = []
+    problem: Any
+    for problem, within in ((Heavy(), True), (Asking(), False)):
+        planner = Planner(problem, particles=50)
+        after, info = planner.observe(planner.init(3), 0, np.array([1e3]))
+        assert info.within_gate is within
+        assert info.explained
+        reached.append(planner.digest(after))
+    assert reached[0] == reached[1], "it draws from a stream of its own"
