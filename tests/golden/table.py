@@ -96,8 +96,6 @@ _FIRST_DEFAULTS: dict[str, Any] = {
 def _examples() -> Iterator[Run]:
     for path in sorted((ROOT / "examples").rglob("*.yaml")):
         file = path.relative_to(ROOT).as_posix()
-        if load(path).environment.object is not None:
-            continue  # the command would run that robot, with what it is made of
         short: dict[str, Any] = {"simulator.max_steps": 300}
         if load(path).environment.object is not None:  # what is pinned is simulated
             short["environment.object"] = None
