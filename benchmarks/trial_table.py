@@ -1,0 +1,111 @@
+"""Trials of robots that a study of the package cannot have, in one CSV that goes on growing.
+
+A row is written as soon as its trial is over, so the same command goes on after Ctrl-C. What a row
+depends on besides its seed (code, settings) is not noted: begin a new file after a change.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from holdfast.lab.studies import statistics
+from holdfast.lab.studies.statistics import Interval
+
+__all__ = ["Cell", "compare", "rate", "read", "run", "shown"]
+
+
+class Cell(NamedTuple):
+    """A setting: the columns that tell it from others, and what runs one of its trials.
+
+    Attributes
+    ----------
+    run : callable
+        Gets a trial's number and returns the columns of its row.
+    most_trials : int or None
+        A limit of its own.
+    """
+
+    names: Mapping[str, str]
+    run: Callable[[int], Mapping[str, Any]]
+    most_trials: int | None = None
+
+
+def run(path: Path, cells: Sequence[Cell], trials: int, seed: int, columns: Sequence[str]) -> None:
+    """Run what the file does not have, and tell of it on stderr.
+
+    Trials come before cells: an unfinished file has all cells, with about as many trials.
+    """
+    header = [*cells[0].names, "seed", "trial", *columns]
+    known = set()
+    if path.exists():
+        with path.open(newline="") as lines:
+            for row in csv.DictReader(lines):
+                if list(row) != header:
+                    raise SystemExit(f"{path} has other columns: begin a new file")
+                known.add((*(row[name] for name in cells[0].names), row["seed"], row["trial"]))
+    else:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(",".join(header) + "\n")
+    wanted = [
+        (cell, trial)
+        for trial in range(trials)
+        for cell in cells
+        if (cell.most_trials is None or trial < cell.most_trials)
+        and (*cell.names.values(), str(seed), str(trial)) not in known
+    ]
+    started = time.monotonic()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, header)
+        for count, (cell, trial) in enumerate(wanted, start=1):
+            writer.writerow({**cell.names, "seed": seed, "trial": trial, **cell.run(trial)})
+            file.flush()
+            left = (time.monotonic() - started) / count * (len(wanted) - count)
+            sys.stderr.write(f"\r{count} of {len(wanted)} trials, {left:.0f} s left   ")
+    sys.stderr.write("\n" if wanted else "")
+
+
+def read(path: Path, names: Sequence[str]) -> dict[tuple[str, ...], pd.DataFrame]:
+    """Return the trials of each cell by its names, in the order of their numbers."""
+    table = pd.read_csv(path, dtype=dict.fromkeys(names, str)).sort_values("trial", kind="stable")
+    return {key: rows.reset_index(drop=True) for key, rows in table.groupby(list(names))}
+
+
+def rate(trials: pd.DataFrame) -> Interval:
+    """Return the success rate in per cent, with Wilson's interval."""
+    succeeded = trials["outcome"] == "succeeded"
+    return statistics.rate_interval(int(succeeded.sum()), len(trials), 100.0)
+
+
+def compare(own: pd.DataFrame, other: pd.DataFrame, column: str) -> tuple[Interval, Interval]:
+    """Return how a cell compares with another one on the same trials.
+
+    Returns
+    -------
+    gain : Interval
+        In success, in points.
+    ratio : Interval
+        Of a column, as a geometric mean over the trials in which both succeeded.
+    """
+    pairs = own.merge(other, on=["seed", "trial"], suffixes=("", "_other"), validate="1:1")
+    succeeded = (pairs["outcome"] == "succeeded").to_numpy()
+    others = (pairs["outcome_other"] == "succeeded").to_numpy()
+    gain, _ = statistics.paired_rates(succeeded, others)
+    both = pairs[succeeded & others]
+    own_steps, other_steps = (
+        statistics.log_steps(both[name].to_numpy(float)) for name in (column, f"{column}_other")
+    )
+    ratio, _ = statistics.paired_difference(own_steps, other_steps)
+    return Interval(*(100.0 * end for end in gain)), statistics.ratio_of(ratio)
+
+
+def shown(interval: Interval, digits: int) -> str:
+    """Return an interval as tables show it."""
+    value, low, high = (f"{end:.{digits}f}" for end in interval)
+    return f"{value} [{low}, {high}]"

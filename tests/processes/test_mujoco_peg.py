@@ -1,0 +1,75 @@
+"""The peg in MuJoCo with its cloud killed: motions and forces lead to the same decisions."""
+
+from __future__ import annotations
+
+import csv
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+from tests.ports import free_port
+from tests.processes.faults import COMMAND, PATIENCE_S
+
+pytest.importorskip("mujoco")
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "mujoco_peg"
+PROBLEMS = {"2d": "contact_peg:ContactPeg2D", "3d": "contact_peg:ContactPeg3D"}
+
+
+@pytest.mark.parametrize("peg", PROBLEMS)
+def test_the_cloud_is_killed_and_nothing_is_decided_otherwise(peg: str, tmp_path: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    run = [*COMMAND, "run", str(EXAMPLE / f"peg_{peg}.yaml"), "--trials", "4", "--seed", "3"]
+    undisturbed = subprocess.run(
+        [*run, "--out", "undisturbed"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert undisturbed.returncode == 0, undisturbed.stderr
+    cloud = subprocess.Popen(
+        [
+            *(*COMMAND, "serve", "--listen", endpoint),
+            *("--problem", PROBLEMS[peg], "--problem-directory", str(EXAMPLE)),
+        ],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert cloud.stdout is not None
+        assert endpoint in cloud.stdout.readline()
+        # A hundred steps a second: the run goes on for seconds after its first trial.
+        robot = subprocess.Popen(
+            [*run, "--service", endpoint, "--rate", "100", "--out", "disturbed"],
+            cwd=tmp_path,
+            stderr=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            text=True,
+        )
+        assert robot.stderr is not None
+        log = []
+        for line in robot.stderr:
+            log.append(line)
+            if "trial 0, outcome" in line:
+                cloud.send_signal(signal.SIGKILL)
+        assert robot.wait(PATIENCE_S) == 0, "".join(log)
+        robot.stderr.close()
+    finally:
+        cloud.kill()
+        cloud.communicate()
+    with (tmp_path / "disturbed" / "trials.csv").open(newline="") as rows:
+        trials = list(csv.DictReader(rows))
+    assert sum(int(trial["recoveries"]) for trial in trials) >= 1
+    assert {trial["outcome"] for trial in trials} <= {"succeeded", "failed"}
+    compared = subprocess.run(
+        [*COMMAND, "compare", "undisturbed", "disturbed"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert compared.returncode == 0, compared.stdout + compared.stderr
