@@ -95,6 +95,8 @@ _FIRST_DEFAULTS: dict[str, Any] = {
 
 def _examples() -> Iterator[Run]:
     for path in sorted((ROOT / "examples").rglob("*.yaml")):
+        if path.stem == "taskboard":
+            continue  # without the arm nothing ends a trial
         file = path.relative_to(ROOT).as_posix()
         short: dict[str, Any] = {"simulator.max_steps": 300}
         if load(path).environment.object is not None:  # what is pinned is simulated
