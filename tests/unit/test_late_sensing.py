@@ -197,3 +197,25 @@ def test_what_sensing_raises_is_heard() -> None:
     message = "perform_sensing, begun at step 0 in the background, raised OSError: the camera is un"
     with pytest.raises(EnvironmentFailedError, match=message):
         robot.perform_sensing(1)
+
+
+def test_it_is_closed_when_sensing_has_ended() -> None:
+    """The next trial's robot is made after that: there is one robot."""
+    ended: list[str] = []
+
+    class Closed(Slow):
+        def perform_sensing(self, sensing_action: int) -> FloatArray:
+            shown = super().perform_sensing(sensing_action)
+            ended.append("sensed")
+            return shown
+
+        def close(self) -> None:
+            ended.append("closed")
+
+    slow = Closed()
+    robot = SenseInBackground(slow)
+    robot.perform_sensing(0)
+    threading.Timer(0.05, slow.may_end.set).start()
+    robot.close()
+    assert ended == ["sensed", "closed"]
+    SenseInBackground(Slow()).close()

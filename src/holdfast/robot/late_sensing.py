@@ -85,6 +85,14 @@ class SenseInBackground(_Around):
         self._raise()
         return [self._came.popleft() for _ in range(len(self._came))]
 
+    def close(self) -> None:
+        """Wait for a sensing action that has not ended, and close the other environment."""
+        if self._thread is not None:
+            self._thread.join()
+        close = getattr(self._environment, "close", None)
+        if callable(close):
+            close()
+
     def _sense(self, step: int, sensing_action: int) -> None:
         try:
             shown = self._environment.perform_sensing(sensing_action)
