@@ -141,7 +141,7 @@ RARE = [
     (
         "lost_forgotten_in_a_crash",
         "A robot that was killed when it was found lost goes on with its old belief.",
-        Edit(Robot, "begin_trial", "if is_lost and history.pending is None", "if False"),
+        Edit(Robot, "begin_trial", "if history.is_lost and history.pending is None", "if False"),
         "run trial=2 on_lost=reinitialise\nkill_robot boundary=25 before=journal down_s=0.05",
         "the undisturbed run has",
     ),

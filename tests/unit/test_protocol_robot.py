@@ -267,6 +267,27 @@ def test_the_lines_about_what_nobody_awaits_are_bounded() -> None:
     assert robot.reports.counts["late_unused"] == 1000
 
 
+def test_what_cannot_be_folded_in_is_not_written_down() -> None:
+    """So the robot can go on once its environment is mended, which says again what it has shown."""
+    planner = Planner(PROBLEM, PLANNING)
+    history = TrialHistory(planner, 11, 0)
+    history.observed(0, np.array([0.0]), 1.0)
+    history.pending, _ = planner.choose_task_action(history.state)
+
+    def begin(last: Acted) -> list[RobotEffect]:
+        robot = Robot(planner, SimulatorSettings(), InProcessSource())
+        begun = EnvironmentReady(None, 1, last)
+        return robot.begin_trial(0, history, begun, 0.0, tail_is_certain=True)
+
+    effects = begin(Acted(0, None, None, np.array([0.5])))
+    assert isinstance(effects[-1], Halt)
+    assert "has no move_by_measurement" in str(effects[-1].error)
+    assert not any(isinstance(effect, WriteRecords) for effect in effects)
+    effects = begin(Acted(0, None, None))
+    written = [effect.records for effect in effects if isinstance(effect, WriteRecords)]
+    assert written == [(PerformedRecord(0, None),)]
+
+
 @pytest.mark.parametrize("lost_by", ["move", "late"])
 def test_what_comes_with_a_move_is_written_before_a_lost_robot_holds_still(lost_by: str) -> None:
     """And it is still lost then for a robot that goes on and begins its belief anew."""

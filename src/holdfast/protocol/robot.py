@@ -355,9 +355,10 @@ class Robot:
             for each in (event.motion, event.observation)
         )
         record = PerformedRecord(event.step, event.reward, motion, shown)
-        self._unwritten.append(record)
         self.num_performed += 1
+        # Before it is written: what cannot be folded in now can never be.
         info = self._current_history.performed(record)
+        self._unwritten.append(record)
         if info is not None:
             self._judge(event.step, info, of="move")
 
