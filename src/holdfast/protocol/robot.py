@@ -297,10 +297,8 @@ class Robot:
 
     def next_wakeup(self) -> float | None:
         """Return when :meth:`wake` is due if nothing happens before; None if never."""
-        asleep_until, due = self._asleep_until, self._source.next_wakeup()
-        if asleep_until is None or due is None:
-            return due if asleep_until is None else asleep_until
-        return min(asleep_until, due)
+        times = self._asleep_until, self._source.next_wakeup()
+        return min((each for each in times if each is not None), default=None)
 
     # -- the environment -------------------------------------------------------------------------
 
@@ -313,10 +311,12 @@ class Robot:
             self._stop(error)
             return
         self._write(record)
+        state = history.state
         self._judge(step, info, sensing_action=sensing_action)
         self._hold_if_lost()
         if not self._pausing and not self._stopped:
-            self._ask(self._planner.digest(history.state), now)
+            is_new = history.state is not state  # its belief has begun anew
+            self._ask(self._planner.digest(history.state) if is_new else record.digest, now)
 
     def _judge(self, step: int, info: ObservationInfo, **of_what: object) -> None:
         """Report what an observation has shown, and act if the robot is lost."""
