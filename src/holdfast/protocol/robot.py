@@ -102,8 +102,7 @@ class Robot:
         self._computed_ms = 0.0
         self._timed_provenance: Provenance | None = None
         self._unwritten: list[Record] = []
-        self._pausing = False
-        self._stopped = False
+        self._pausing = self._stopped = False
         self._next_tick: float | None = None
         self._asleep_until: float | None = None
         self._recoveries_counted = 0
