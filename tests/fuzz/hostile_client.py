@@ -194,7 +194,7 @@ class HostileMessages:
         changes = {
             "session_configuration": session_configuration,
             "checkpoint": None,
-            "observations": (),
+            "inputs": (),
         }
         return encode(msgspec.structs.replace(request, **changes))
 

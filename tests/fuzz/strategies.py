@@ -23,6 +23,7 @@ from holdfast.protocol.messages import (
     MAX_TASK_ACTIONS,
     PROTOCOL_VERSION,
     Busy,
+    Moved,
     NeedState,
     Observed,
     Progress,
@@ -36,11 +37,13 @@ from holdfast.protocol.messages import (
 )
 from holdfast.protocol.records import (
     ActingRecord,
+    LateRecord,
     LocalTookOverRecord,
     ObservedRecord,
     PausedRecord,
     PerformedRecord,
     Record,
+    ReinitialisedRecord,
 )
 
 __all__ = ["records", "replies", "requests", "spoilt", "states"]
@@ -92,6 +95,7 @@ session_configurations = st.builds(
     seed=st.integers(0, 2**63 - 1),
 )
 observed = st.builds(Observed, step=words, sensing_action=words, observation=numbers)
+moved = st.builds(Moved, step=words, motion=numbers, observation=numbers)
 _asked = {
     "version": st.just(PROTOCOL_VERSION),
     "session": st.binary(min_size=16, max_size=16),
@@ -106,9 +110,9 @@ _asked = {
 requests: st.SearchStrategy[Request] = st.builds(
     Request,
     **_asked,
-    inputs=st.lists(observed, max_size=MAX_INPUTS).map(tuple),
+    inputs=st.lists(observed | moved, max_size=MAX_INPUTS).map(tuple),
 ) | st.builds(Request, **_asked, checkpoint=st.binary(max_size=500))
-"""With and without an opening, observations and a checkpoint."""
+"""With and without an opening, inputs and a checkpoint."""
 
 replies: st.SearchStrategy[Reply] = st.one_of(
     st.builds(
@@ -142,7 +146,21 @@ records: st.SearchStrategy[Record] = st.one_of(
         sensing_ms=finite,
     ),
     st.builds(ActingRecord, step=words, action=numbers),
-    st.builds(PerformedRecord, step=words, reward=st.none() | finite),
+    st.builds(
+        PerformedRecord,
+        step=words,
+        reward=st.none() | finite,
+        motion=numbers,
+        observation=numbers,
+    ),
+    st.builds(
+        LateRecord,
+        step=words,
+        taken=words,
+        observation=numbers,
+        digest=st.binary(min_size=32, max_size=32),
+    ),
+    st.builds(ReinitialisedRecord, step=words, digest=st.binary(min_size=32, max_size=32)),
     st.just(PausedRecord()),
     st.builds(LocalTookOverRecord, times=words),
 )
