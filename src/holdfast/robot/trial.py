@@ -160,9 +160,15 @@ def run_trial(
     track = Trial(planner, seed, trial, lost.false_alarm_rate)
     observer.trial_began(environment, track.state)
 
+    # Only a recorded world has the first two.
+    late_ones = {
+        method: ask
+        for method in ("late_before_choosing", "late_before_moving", "late_observations")
+        if callable(ask := getattr(environment, method, None))
+    }
+
     def take_late(method: str) -> None:
-        ask = getattr(environment, method, None)
-        for step, came in () if ask is None else ask():
+        for step, came in late_ones[method]() if method in late_ones else ():
             late = LateObservation(step, np.array(came, dtype=np.float64))
             found = track.observe_late(late)
             if found is not None:
@@ -174,7 +180,7 @@ def run_trial(
         if planner.needs_sensing(track.state):
             _sense(track, environment, observer)
             _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
-        take_late("late_before_choosing")  # only a recorded world has these two
+        take_late("late_before_choosing")
         before = track.state
         executed, task_info = planner.choose_task_action(before)
         take_late("late_before_moving")
