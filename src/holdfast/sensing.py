@@ -420,11 +420,11 @@ def _hypotheses(
     if not usable or not numerics.all_finite(predicted):
         for action, (mean, variance) in zip(actions, found, strict=True):
             checked.require_usable(problem, action, mean, variance)
-    angles = [
-        int(coordinate in circular_observation(problem, action, size))
-        for action, size in zip(actions, sizes, strict=True)
-        for coordinate in range(size if has_circular_observations(problem) else 0)
-    ]
+    angles: list[int] = []
+    if has_circular_observations(problem):
+        for action, size in zip(actions, sizes, strict=True):
+            own = circular_observation(problem, action, size)
+            angles += [int(coordinate in own) for coordinate in range(size)]
     return _GaussianHypotheses(
         (belief.weights, sizes, predicted, variances, samples, stream.words, angles)
     )
