@@ -167,8 +167,8 @@ def decisions_of(run: Path) -> list[dict[str, str]]:
     path = run / "timings.csv"
     if not path.exists():
         return []
-    with path.open() as file:
-        return list(csv.DictReader(file))
+    # Read at once: the head may be written while it is read line by line.
+    return list(csv.DictReader(path.read_text().splitlines()))
 
 
 class _Measured(NamedTuple):
