@@ -10,7 +10,6 @@ tables of ``docs/results/mujoco_peg.md``. Seed 1 chose the example's settings.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -110,15 +109,6 @@ def tables(path: Path) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("runs/mujoco_peg/trials.csv"))
-    parser.add_argument("--trials", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=2026)
-    options = parser.parse_args()
-    trial_table.run(options.out, cells_of(options.seed), options.trials, options.seed, COLUMNS)
-    print(tables(options.out))
-
-
 if __name__ == "__main__":
-    main()
+    out = trial_table.main(__doc__, "runs/mujoco_peg/trials.csv", 200, cells_of, COLUMNS)
+    print(tables(out))

@@ -12,7 +12,6 @@ runs 60 trials of each (an hour), goes on after Ctrl-C, and prints the table of
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -134,15 +133,6 @@ def tables(path: Path) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("runs/taskboard/trials.csv"))
-    parser.add_argument("--trials", type=int, default=60)
-    parser.add_argument("--seed", type=int, default=2026)
-    options = parser.parse_args()
-    trial_table.run(options.out, cells_of(options.seed), options.trials, options.seed, COLUMNS)
-    print(tables(options.out))
-
-
 if __name__ == "__main__":
-    main()
+    out = trial_table.main(__doc__, "runs/taskboard/trials.csv", 60, cells_of, COLUMNS)
+    print(tables(out))

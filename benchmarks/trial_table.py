@@ -6,6 +6,7 @@ depends on besides its seed (code, settings) is not noted: begin a new file afte
 
 from __future__ import annotations
 
+import argparse
 import csv
 import sys
 import time
@@ -18,7 +19,7 @@ import pandas as pd
 from holdfast.lab.studies import statistics
 from holdfast.lab.studies.statistics import Interval
 
-__all__ = ["Cell", "compare", "rate", "read", "run", "shown"]
+__all__ = ["Cell", "compare", "main", "rate", "read", "run", "shown"]
 
 
 class Cell(NamedTuple):
@@ -69,6 +70,24 @@ def run(path: Path, cells: Sequence[Cell], trials: int, seed: int, columns: Sequ
             left = (time.monotonic() - started) / count * (len(wanted) - count)
             sys.stderr.write(f"\r{count} of {len(wanted)} trials, {left:.0f} s left   ")
     sys.stderr.write("\n" if wanted else "")
+
+
+def main(
+    description: str | None,
+    default_out: str,
+    default_trials: int,
+    cells_of: Callable[[int], Sequence[Cell]],
+    columns: Sequence[str],
+) -> Path:
+    """Run the trials that the command line asks for, and return their file."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--out", type=Path, default=Path(default_out))
+    parser.add_argument("--trials", type=int, default=default_trials)
+    parser.add_argument("--seed", type=int, default=2026)
+    options = parser.parse_args()
+    run(options.out, cells_of(options.seed), options.trials, options.seed, columns)
+    out: Path = options.out
+    return out
 
 
 def read(path: Path, names: Sequence[str]) -> dict[tuple[str, ...], pd.DataFrame]:

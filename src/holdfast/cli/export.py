@@ -7,7 +7,7 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from holdfast.cli.exit_codes import ended_by_signals
 from holdfast.cli.terminal import counted, progress_line
@@ -36,9 +36,10 @@ __all__ = [
     "chosen_trials",
     "main",
     "notes_about",
+    "rate_option",
     "replay_trials",
     "size_of",
-    "trial_range",
+    "trials_option",
 ]
 
 MIN_RATE_HZ, MAX_RATE_HZ = 0.001, 10_000.0
@@ -57,6 +58,25 @@ def trial_range(text: str) -> range:
     if begin >= end:
         raise bad_value(text, "A:B with B above A: 0:5 are the first five trials")
     return range(begin, end)
+
+
+def trials_option() -> Any:
+    """Declare which trials are meant."""
+    return option(
+        metavar="A:B",
+        read=trial_range,
+        help="Only the trials from A up to, but without, B (default: all).",
+    )
+
+
+def rate_option() -> Any:
+    """Declare how long a step takes where no times were recorded."""
+    return option(
+        metavar="HZ",
+        read=number(MIN_RATE_HZ, MAX_RATE_HZ, "Hz"),
+        default=10.0,
+        help="Steps a second, for a run that was recorded without times.",
+    )
 
 
 class ExportOptions(Options):
@@ -83,17 +103,8 @@ class ExportOptions(Options):
         read=location,
         help="Write DIR: trials.csv, steps.csv, beliefs.csv and events.csv.",
     )
-    trials: range | None = option(
-        metavar="A:B",
-        read=trial_range,
-        help="Only the trials from A up to, but without, B (default: all).",
-    )
-    rate: float = option(
-        metavar="HZ",
-        read=number(MIN_RATE_HZ, MAX_RATE_HZ, "Hz"),
-        default=10.0,
-        help="Steps a second, for a run that was recorded without times.",
-    )
+    trials: range | None = trials_option()
+    rate: float = rate_option()
     quiet: bool = flag("-q", help="Show no progress.")
 
 

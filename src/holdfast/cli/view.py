@@ -9,13 +9,12 @@ from pathlib import Path
 
 from holdfast.cli.exit_codes import ended_by_signals
 from holdfast.cli.export import (
-    MAX_RATE_HZ,
-    MIN_RATE_HZ,
     chosen_trials,
     notes_about,
+    rate_option,
     replay_trials,
     size_of,
-    trial_range,
+    trials_option,
 )
 from holdfast.errors import InvalidValueError, OptionError, ViewError
 from holdfast.files import directory_beside, move_into_place, require_free
@@ -26,7 +25,6 @@ from holdfast.runtime.command_line import (
     argument,
     flag,
     location,
-    number,
     option,
 )
 
@@ -46,11 +44,7 @@ class ViewOptions(Options):
     needs_arguments = True
 
     run: Path = argument("RUN", "Directory of a run, or its journal.", location)
-    trials: range | None = option(
-        metavar="A:B",
-        read=trial_range,
-        help="Only the trials from A up to, but without, B (default: all).",
-    )
+    trials: range | None = trials_option()
     save: Path | None = option(
         metavar="FILE", read=location, help="Write FILE (.rrd) instead of showing it."
     )
@@ -58,12 +52,7 @@ class ViewOptions(Options):
         metavar="HOST:PORT",
         help="Show it in the viewer that listens there; Rerun's port is 9876.",
     )
-    rate: float = option(
-        metavar="HZ",
-        read=number(MIN_RATE_HZ, MAX_RATE_HZ, "Hz"),
-        default=10.0,
-        help="Steps a second, for a run that was recorded without times.",
-    )
+    rate: float = rate_option()
     quiet: bool = flag("-q", help="Show no progress.")
 
 
