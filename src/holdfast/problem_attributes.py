@@ -14,9 +14,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from holdfast.arrays import FloatArray, in_brief
+from holdfast.arrays import FloatArray, in_brief, real_numbers
 from holdfast.errors import InvalidValueError, ProblemError
 
 __all__ = [
@@ -99,7 +98,7 @@ def check_problem(problem: Any) -> None:
     if getattr(problem, "state_resolution", None) is not None:
         _check_resolution(problem, "state_resolution", "a state", problem.state_size)
     variance = getattr(problem, "motion_variance", ())
-    numbers = _numbers(variance)
+    numbers = real_numbers(variance)
     fits = numbers is not None and numbers.shape == (problem.action_size,)
     if numbers is None or not fits or not (numbers >= 0.0).all():
         raise ProblemError(
@@ -134,7 +133,7 @@ def check_sizes(problem: Any) -> None:
 
 def _check_resolution(problem: Any, attribute: str, of_what: str, size: int) -> None:
     value = getattr(problem, attribute, None)
-    numbers = _numbers(value)
+    numbers = real_numbers(value)
     # A comparison with NaN is false.
     usable = numbers is not None and ((numbers > 0.0) & (numbers < np.inf)).all()
     if numbers is not None and numbers.ndim == 0 and not usable:
@@ -146,15 +145,6 @@ def _check_resolution(problem: Any, attribute: str, of_what: str, size: int) -> 
             f"{attribute} of {problem.name} is {in_brief(value)}: must be one number or {size}, "
             f"one for each coordinate of {of_what}, positive and finite"
         )
-
-
-def _numbers(value: object) -> npt.NDArray[Any] | None:
-    """Return an array of a number or of numbers; None for anything else, truth values included."""
-    try:
-        numbers = np.asarray(value)
-    except (TypeError, ValueError):
-        return None  # A ragged list.
-    return numbers if numbers.dtype.kind in "fiu" else None
 
 
 def _check_circular(problem: Any) -> None:
@@ -180,7 +170,7 @@ def _check_circular(problem: Any) -> None:
 
 
 def _require_indices(name: str, attribute: str, given: Any, size: int | None) -> None:
-    numbers = _numbers(given)
+    numbers = real_numbers(given)
     usable = numbers is not None and numbers.ndim == 1
     if numbers is not None and usable and numbers.size:
         usable = (
@@ -252,7 +242,7 @@ def resolution_of(
         attribute = "state_resolution"
     own = getattr(problem, attribute)
     # A configuration asks before check_problem has.
-    numbers = _numbers(own)
+    numbers = real_numbers(own)
     if numbers is None:
         raise ProblemError(f"{attribute} of {name_of(problem)} is {own!r:.80}: must be numbers")
     if numbers.ndim == 0:
@@ -309,7 +299,7 @@ def _costs_of_actions(problem: Any, otherwise: float) -> FloatArray:
     given = getattr(problem, "sensing_costs", None)
     if given is None:
         return np.full(count, otherwise)
-    costs = _numbers(given)
+    costs = real_numbers(given)
     # A comparison with NaN is false.
     if (
         costs is None

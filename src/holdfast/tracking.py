@@ -68,8 +68,6 @@ class Trial:
     state : PlanningState
         After everything that is known to be performed.
     log : DecisionLog
-    num_observations : int
-        Choices of a sensing action so far, those not to sense included.
     num_sensed : int
         Sensing actions that were performed.
     num_inputs : int
@@ -97,7 +95,6 @@ class Trial:
         self.state = planner.init(seed, trial)
         self.log = DecisionLog(planner.problem.action_size)
         self.rewards = RewardAccount(planner.problem)
-        self.num_observations = 0
         self.num_sensed = 0
         self.num_inputs = 0
         self.num_unexplained = 0
@@ -130,7 +127,6 @@ class Trial:
             self._give_up_oldest()
         self._keep(_Sensed(sensing_action, observation), before if awaited else None)
         self.state = after
-        self.num_observations += 1
         self.num_sensed += performed
         self.num_inputs += 1
         self._judge(sensing_action, None if observation is None else info)

@@ -169,7 +169,7 @@ def test_not_to_sense_awaits_nothing() -> None:
     assert trial.state.sensed
     assert trial.state.belief is before
     assert trial.awaited == ()
-    assert (trial.num_observations, trial.num_sensed) == (1, 0)
+    assert (trial.num_inputs, trial.num_sensed) == (1, 0)
     with pytest.raises(InvalidValueError, match="sensing action 1: cart has 0 to 0"):
         trial.observe(planner.no_sensing, np.zeros(1), 0.0)
 

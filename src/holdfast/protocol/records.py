@@ -111,6 +111,11 @@ class LateRecord(msgspec.Struct, array_like=True, frozen=True, tag=6):
     observation: bytes
     digest: bytes
 
+    def late(self) -> LateObservation:
+        """Return the observation and its step."""
+        shown = decode_floats(self.observation, len(self.observation) // 8)
+        return LateObservation(self.taken, shown)
+
 
 class ReinitialisedRecord(msgspec.Struct, array_like=True, frozen=True, tag=7):
     """The belief was begun anew; ``digest`` is that of the state that this led to."""
@@ -302,8 +307,7 @@ def _replay_record(planner: Planner, history: TrialHistory, record: Record) -> N
         _, again = history.observed(record.sensing_action, observation, record.sensing_ms)
         _require_same_state(record.digest, again.digest)
     elif isinstance(record, LateRecord):
-        observation = decode_floats(record.observation, len(record.observation) // 8)
-        found = history.came_late(LateObservation(record.taken, observation))
+        found = history.came_late(record.late())
         if found is None:
             raise RecordError(f"is an observation of step {record.taken}, where none is awaited")
         _require_same_state(record.digest, found[1].digest)

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from holdfast.errors import MessageError, StaleEpochError
+from holdfast.planning import Planner
 from holdfast.problems.problem import Problem
 from holdfast.protocol.events import Abandon, Effects, RobotEffect, Send
 from holdfast.protocol.messages import (
@@ -130,8 +131,7 @@ class OpenRequests:
     ) -> None:
         self._timeout_s = timeout_s
         self._action_size = problem.action_size
-        optional = session_configuration.planning.selector.sensing_is_optional
-        self._num_choices = len(problem.sensing_actions) + optional
+        self._num_choices = Planner(problem, session_configuration.planning).num_choices
         self._verification = verification
         self._session = session
         self._epoch = epoch

@@ -51,7 +51,7 @@ from holdfast.recording.live_messages import (
 )
 from holdfast.recording.view_target import ViewTarget
 from holdfast.robot.environment import SimulatedEnvironment
-from holdfast.tracking import LateObservation, Trial
+from holdfast.tracking import Trial
 
 __all__ = ["Follower", "follow"]
 
@@ -179,8 +179,8 @@ class Follower:
                 self._simulated.perform(self._pending)
             self._pending = None
         elif isinstance(record, LateRecord):
-            shown = decode_floats(record.observation, len(record.observation) // 8)
-            found = trial.observe_late(LateObservation(record.taken, shown))
+            late = record.late()
+            found = trial.observe_late(late)
             if found is not None and not is_late:
                 self._sink.observed_late(
                     LateFact(
@@ -188,7 +188,7 @@ class Follower:
                         step=record.step,
                         time_ns=time_ns,
                         taken=record.taken,
-                        observation=shown,
+                        observation=late.observation,
                         after=trial.state.belief,
                         explained=found[0].explained,
                     )

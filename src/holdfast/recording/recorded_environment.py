@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from holdfast.arrays import FloatArray
 from holdfast.errors import DecidedOtherwiseError, EndOfRecordsError
 from holdfast.outcome import Done, Ending, MoveResult, TrialResult
-from holdfast.protocol.messages import decode_floats, encode_floats, numbers_of
+from holdfast.protocol.messages import encode_floats, numbers_of
 from holdfast.protocol.records import (
     ActingRecord,
     LateRecord,
@@ -23,6 +23,7 @@ from holdfast.protocol.records import (
     Record,
 )
 from holdfast.robot.environment import LATER, Later, SimulatedEnvironment
+from holdfast.tracking import LateObservation
 
 __all__ = ["RecordedEnvironment"]
 
@@ -93,7 +94,7 @@ class RecordedEnvironment:
                 return MoveResult(performed.reward, *shown)
         return MoveResult()
 
-    def late_before_choosing(self) -> list[tuple[int, FloatArray]]:
+    def late_before_choosing(self) -> list[LateObservation]:
         """Return the observations of earlier steps that came before a task action was chosen."""
         if self._next < len(self._records):
             record = self._records[self._next]
@@ -101,18 +102,18 @@ class RecordedEnvironment:
                 self._next += 1  # the choice was not to sense
         return self.late_observations()
 
-    def late_before_moving(self) -> list[tuple[int, FloatArray]]:
+    def late_before_moving(self) -> list[LateObservation]:
         """Return those that came between the choice of a task action and its performance."""
-        return [_late(record) for record in self._before_moving.pop(self._step, ())]
+        return [record.late() for record in self._before_moving.pop(self._step, ())]
 
-    def late_observations(self) -> list[tuple[int, FloatArray]]:
+    def late_observations(self) -> list[LateObservation]:
         """Return the observations of earlier steps that came next."""
         late = []
         while self._next < len(self._records):
             record = self._records[self._next]
             if not isinstance(record, LateRecord):
                 break
-            late.append(_late(record))
+            late.append(record.late())
             self._next += 1
         return late
 
@@ -138,7 +139,3 @@ class RecordedEnvironment:
         kinds = {ObservedRecord: "sensing", ActingRecord: "task"}
         kind = None if record is None else kinds.get(type(record))
         return DecidedOtherwiseError(self._trial, self._step, kind)
-
-
-def _late(record: LateRecord) -> tuple[int, FloatArray]:
-    return record.taken, decode_floats(record.observation, len(record.observation) // 8)

@@ -20,9 +20,8 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 
-from holdfast.arrays import FloatArray
+from holdfast.arrays import FloatArray, floats_or_none
 from holdfast.config.loader import Configuration
 from holdfast.errors import DecidedOtherwiseError, EndOfRecordsError, HoldfastError
 from holdfast.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
@@ -305,8 +304,8 @@ class _Replay(TrialObserver):
             estimate=np.array(step.task_info.estimate, dtype=np.float64),
             true_state=self._true_state,
             reward=None if step.reward is None else float(step.reward),
-            motion=_numbers(step.shown.motion),
-            observation=_numbers(step.shown.observation),
+            motion=floats_or_none(step.shown.motion),
+            observation=floats_or_none(step.shown.observation),
         )
         for sink in self._output.at(fact.time_ns):
             sink.acted(fact)
@@ -371,10 +370,6 @@ def _same(one: SensingDecision | TaskDecision, other: SensingDecision | TaskDeci
             np.array(one.action).tobytes() == np.array(other.action).tobytes()
         )
     return type(one) is type(other) and one == other
-
-
-def _numbers(shown: npt.ArrayLike | None) -> FloatArray | None:
-    return None if shown is None else np.array(shown, dtype=np.float64)
 
 
 def _true_state(environment: Environment) -> FloatArray | None:

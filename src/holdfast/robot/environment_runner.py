@@ -22,7 +22,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import FloatArray
+from holdfast.arrays import FloatArray, real_numbers
 from holdfast.config.user_code import account_of_user_error
 from holdfast.errors import EnvironmentFailedError, HoldfastError, InvalidValueError
 from holdfast.outcome import Ending, MoveResult, ending_of
@@ -243,7 +243,7 @@ class EnvironmentRunner(abc.ABC):
 
     def _observation(self, sensing_action: int, value: object) -> FloatArray:
         size = self._sizes[sensing_action]
-        array = _numbers(value)
+        array = real_numbers(value)
         if array is None or array.ndim != 1 or array.size < 1 or size not in (None, array.size):
             raise self._unusable(value, f"an array of shape ({size or 'n'},)")
         return self._finite(array, value)
@@ -251,7 +251,7 @@ class EnvironmentRunner(abc.ABC):
     def _reward(self, value: object) -> float | None:
         if value is None:
             return None
-        number = _numbers(value)
+        number = real_numbers(value)
         if number is None or number.ndim != 0 or not np.isfinite(number):
             raise self._unusable(value, "a finite number, the reward, a MoveResult, or None")
         return float(number)
@@ -266,7 +266,7 @@ class EnvironmentRunner(abc.ABC):
         """Return what a move has shown."""
         if value is None:
             return None
-        array = _numbers(value)
+        array = real_numbers(value)
         if array is None or array.ndim != 1 or not 1 <= array.size <= MAX_ACTION_SIZE:
             need = f"a MoveResult whose {what} is an array of 1 to {MAX_ACTION_SIZE} numbers"
             raise self._unusable(value, need)
@@ -287,7 +287,7 @@ class EnvironmentRunner(abc.ABC):
             if not isinstance(entry, tuple | list) or len(entry) != 2:
                 raise self._unusable(value, need)
             step = self._count(entry[0])
-            array = _numbers(entry[1])
+            array = real_numbers(entry[1])
             if array is None or array.ndim != 1 or not 1 <= array.size <= MAX_ACTION_SIZE:
                 raise self._unusable(value, f"{need} with observations of shape (n,)")
             late.append(LateObservation(step, self._finite(array, value)))
@@ -301,7 +301,7 @@ class EnvironmentRunner(abc.ABC):
         return finite
 
     def _count(self, value: object) -> int:
-        number = _numbers(value)
+        number = real_numbers(value)
         if number is None or number.ndim != 0 or number.dtype.kind not in "iu" or number < 0:
             raise self._unusable(value, "a whole number >= 0")
         return int(number)
@@ -311,15 +311,6 @@ class EnvironmentRunner(abc.ABC):
         return EnvironmentFailedError(
             f"{self._called(self._method)} returned {came}{value!r:.80}; it must return {need}"
         )
-
-
-def _numbers(value: object) -> npt.NDArray[Any] | None:
-    """Return real numbers as an array; None if the value is anything else."""
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError):  # a list of lists of different lengths
-        return None
-    return array if array.dtype.kind in "fiu" else None
 
 
 class InlineRunner(EnvironmentRunner):

@@ -25,7 +25,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from holdfast import checked, numerics
-from holdfast.arrays import FloatArray
+from holdfast.arrays import FloatArray, floats_or_none
 from holdfast.belief import Belief, standard_deviation
 from holdfast.config.settings import Method, PlanningSettings, SimulatorSettings, check_settings
 from holdfast.errors import InvalidValueError
@@ -261,7 +261,7 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
         shown = world.perform(executed)
         result = shown if isinstance(shown, MoveResult) else MoveResult(shown)
         reward, motion, observation = result
-        track.move(executed, reward, *map(_numbers, (motion, observation)))
+        track.move(executed, reward, *map(floats_or_none, (motion, observation)))
         self._ending = ending_of(world.is_done())
         return -1.0 if reward is None or self._minus_steps else float(reward)
 
@@ -407,10 +407,6 @@ def _logarithmic(ratios: FloatArray) -> list[float]:
     decades = numerics.log(np.clip(ratios, floor, 1.0)) / math.log(10.0)
     scaled: list[float] = np.clip(1.0 + 2.0 * decades / _DECADES, -1.0, 1.0).tolist()
     return scaled
-
-
-def _numbers(shown: npt.ArrayLike | None) -> FloatArray | None:
-    return None if shown is None else np.array(shown, dtype=np.float64)
 
 
 def _require_one_of(key: str, value: object, allowed: tuple[str, ...]) -> None:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import FloatArray
+from holdfast.arrays import FloatArray, real_numbers
 from holdfast.config.settings import LostSettings, OnLost, SimulatorSettings
 from holdfast.errors import EnvironmentFailedError, HeldError, InvalidValueError, ProblemError
 from holdfast.outcome import Ending, MoveResult, TrialResult, ending_of
@@ -251,11 +251,8 @@ def _numbers(environment: Environment, what: str, shown: npt.ArrayLike | None) -
     """Return what a move has shown, checked as for a robot."""
     if shown is None:
         return None
-    try:
-        array = np.asarray(shown)
-    except (TypeError, ValueError):  # a list of lists of different lengths
-        array = np.empty(0, dtype=object)
-    if array.dtype.kind not in "fiu" or array.ndim != 1 or not 1 <= array.size <= MAX_ACTION_SIZE:
+    array = real_numbers(shown)
+    if array is None or array.ndim != 1 or not 1 <= array.size <= MAX_ACTION_SIZE:
         came = " ".join(repr(shown).split())
         raise EnvironmentFailedError(
             f"{type(environment).__name__}: perform returned a MoveResult whose {what} is "
