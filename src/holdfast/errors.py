@@ -182,10 +182,6 @@ class MetricsError(HoldfastError):
     """A package that metrics need is missing."""
 
 
-class ServiceBrokenError(HoldfastError):
-    """The service's own code failed: a defect. The process must restart."""
-
-
 class ServiceProcessError(HoldfastError):
     """A process of a service has ended before it served."""
 

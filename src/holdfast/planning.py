@@ -522,7 +522,9 @@ def decode_checkpoint(data: bytes | memoryview) -> PlanningState:
     """
     try:
         content = _checkpoint_decoder.decode(data)
-    except (msgspec.DecodeError, msgspec.ValidationError) as error:
+    except MemoryError:
+        raise
+    except Exception as error:  # decoding may raise anything
         raise CheckpointError(f"{len(data)} bytes are no checkpoint: {error}") from error
     if content.version != CHECKPOINT_VERSION:
         raise CheckpointError(

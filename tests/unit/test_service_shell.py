@@ -16,7 +16,7 @@ from typing import Any, cast
 import pytest
 from tests.unit.test_protocol_service import Robot, content, planning_of
 
-from holdfast.errors import MessageError, ServiceBrokenError
+from holdfast.errors import MessageError
 from holdfast.lab.testbed.in_process import InProcessNetwork
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.problem import Problem
@@ -29,6 +29,7 @@ from holdfast.protocol.events import (
 )
 from holdfast.protocol.messages import (
     Busy,
+    NeedState,
     Progress,
     Refused,
     Reply,
@@ -452,6 +453,7 @@ class Script(Service):
         self.begun_at = 0.0
         self.trace: list[str] = []
         self.times: list[float] = []
+        self.outcome: JobResult | None = None
 
     def receive(self, call: int, *arguments: Any) -> list[ServiceEffect]:
         self.trace.append(f"call {call} of {arguments[-1]}")
@@ -465,6 +467,7 @@ class Script(Service):
 
     def finished(self, job: Job, outcome: JobResult, now: float) -> list[ServiceEffect]:
         self.trace.append(f"finished {job.kind}")
+        self.outcome = outcome
         self.times.append(now)
         return []
 
@@ -598,26 +601,59 @@ def broken(*_: object) -> None:
 
 @pytest.mark.parametrize("expected_s", [1e-4, math.inf], ids=["loop", "thread"])
 @on_a_loop
-async def test_a_job_with_a_defect_ends_the_service(expected_s: float) -> None:
+async def test_a_job_with_a_defect_is_refused_alone(expected_s: float) -> None:
     machine, both = scripted(("one", expected_s, broken))
     await both.start()
     both.deliver(Call(machine.trace))
-    with pytest.raises(ServiceBrokenError, match="a defect"):
-        await both.wait()
-    both.deliver(Call(machine.trace))
-    assert machine.trace[-1] == "end"  # nobody waits for an answer that will not come
+    while machine.outcome is None:
+        await asyncio.sleep(0)
+    assert machine.outcome.failure is not None
+    code, text = machine.outcome.failure
+    assert code == "failed"
+    assert "RuntimeError: a defect" in text
+    await asyncio.sleep(0)
+    assert both.statistics().defects == 1
     await both.close()
 
 
+@pytest.mark.parametrize("method", ["receive", "finished", "tick", "started"])
 @on_a_loop
-async def test_a_machine_with_a_defect_ends_the_service_and_robots_see_it(
-    monkeypatch: pytest.MonkeyPatch,
+async def test_a_machine_with_a_defect_forgets_everything_and_goes_on(
+    method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Half-way through a change its tables may not agree any more; it holds nothing of worth."""
     async with joined() as both:
-        patient = Patient(both.network)
-        monkeypatch.setattr(Service, "receive", broken)
-        call = patient.send(b"rubbish")
-        with pytest.raises(ServiceBrokenError, match="a defect"):
-            await both.shell.wait()
-        events = [await patient.events.get() for _ in range(3)]
-        assert set(events[1:]) == {ServiceVanished("service", "boot"), CallEnded(call)}
+        turns, other = Robot(key=1), Robot(key=2)
+        patient, busy = Patient(both.network), Patient(both.network)
+        await patient.run_turns(turns, 1)
+        held = busy.send(encode(held_robot(3).request()))
+        while not both.held.begun.is_set():
+            await asyncio.sleep(0.001)
+        sound = getattr(Service, method)
+
+        def fails_once(self: Service, *arguments: Any) -> Any:
+            sound(self, *arguments)  # what it has changed is not undone
+            monkeypatch.setattr(Service, method, sound)
+            raise RuntimeError("a defect")
+
+        monkeypatch.setattr(Service, method, fails_once)
+        replies = await Patient(both.network).ask(encode(other.request()))
+        if method == "receive":
+            (refused,) = replies
+            assert isinstance(refused, Refused)
+            assert (refused.number, refused.code) == (0, "failed")
+            assert "RuntimeError: a defect" in refused.text
+        # All others are told to come again, and nothing is left of what was.
+        (come_again,) = (await busy.collect({held}))[held]
+        assert isinstance(come_again, Busy)
+        statistics = both.shell.statistics()
+        assert (statistics.defects, statistics.calls, statistics.running) == (1, 0, 0)
+        (defect,) = [fields for name, fields in both.log.events if name == "defect"]
+        assert "RuntimeError: a defect" in str(defect["reason"])
+        assert "fails_once" in str(defect["traceback"])
+        # The result of a job from before is nobody's; the next questions are answered.
+        both.held.let_go.set()
+        (need_state,) = await patient.ask(encode(turns.request(session_configuration=False)))
+        assert isinstance(need_state, NeedState)
+        assert content(await patient.ask(encode(turns.restore()))) == turns.right_answer()
+        await Patient(both.network).run_turns(other, 2)

@@ -18,6 +18,7 @@ about one damaged segment in ten thousand passes TCP's own check (Stone and Part
 from __future__ import annotations
 
 import hashlib
+import math
 import zlib
 from typing import Annotated, TypeAlias
 
@@ -35,6 +36,7 @@ __all__ = [
     "DIGEST_SIZE",
     "MAX_ACTION_SIZE",
     "MAX_CONFIGURATION_BYTES",
+    "MAX_CONFIGURATION_DEPTH",
     "MAX_CONFIGURATION_VALUES",
     "MAX_INPUTS",
     "MAX_TASK_ACTIONS",
@@ -92,6 +94,9 @@ MAX_CONFIGURATION_BYTES = 256 * 1024
 
 MAX_CONFIGURATION_VALUES = 10_000
 """Bound on its values: the smallest take one byte each when encoded, and sixty in memory."""
+
+MAX_CONFIGURATION_DEPTH = 32
+"""Bound on levels of lists and mappings in each of its free sections, as in a YAML file."""
 
 DIGEST_SIZE = 16
 """Bytes sent of a state's digest: the first of :func:`holdfast.planning.digest`."""
@@ -304,8 +309,8 @@ _REQUEST_DECODER = msgspec.msgpack.Decoder(_SentRequest)
 _CONFIGURATION_DECODER = msgspec.msgpack.Decoder(SessionConfiguration)
 _REPLY_DECODER: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)
 
-_CONTAINERS = (dict, list, tuple)
-"""Values of a configuration that contain others."""
+_SCALARS = (type(None), bool, int, float, str)
+"""Values of a configuration that contain no others: those of JSON."""
 
 _ARRAY_HEADERS = {0xDC: 3, 0xDD: 5}
 """Sizes in bytes of the longer array headers of MessagePack, by their first byte."""
@@ -372,10 +377,12 @@ def decode_request(payload: bytes) -> Request:
     Raises
     ------
     MessageError
-        ``damaged``: the checksum is wrong. ``malformed``: not a request. ``version``: another
-        protocol version. ``too_large``: the session configuration has more than
-        :data:`MAX_CONFIGURATION_BYTES` or :data:`MAX_CONFIGURATION_VALUES`. ``other_code``: its
-        settings mean something else here than on the robot.
+        ``damaged``: the checksum is wrong. ``malformed``: not a request, or its session
+        configuration has values that JSON does not have, or more than
+        :data:`MAX_CONFIGURATION_DEPTH` levels. ``out_of_memory``: it may be sent again.
+        ``version``: another protocol version. ``too_large``: the session configuration has more
+        than :data:`MAX_CONFIGURATION_BYTES` or :data:`MAX_CONFIGURATION_VALUES`. ``other_code``:
+        its settings mean something else here than on the robot.
     """
     content = _checked_content(payload)
     # Other versions may have other fields. A decoder would look at all of a large message first.
@@ -389,7 +396,13 @@ def decode_request(payload: bytes) -> Request:
             if sent.session_configuration is None
             else _session_configuration_of(sent.session_configuration, sent.settings)
         )
-    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+    except MessageError:
+        raise
+    except MemoryError:
+        text = f"out of memory for a request of {len(payload)} bytes"
+        raise MessageError("out_of_memory", text) from None
+    except Exception as error:
+        # Decoding has raised RecursionError, UnicodeDecodeError and ValueError, too.
         raise MessageError("malformed", f"{len(payload)} bytes are no request: {error}") from error
     if sent.version != PROTOCOL_VERSION:
         raise _other_version(sent.version)
@@ -411,7 +424,7 @@ def decode_reply(payload: bytes) -> Reply:
     content = _checked_content(payload)
     try:
         return _REPLY_DECODER.decode(content)
-    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+    except Exception as error:
         raise MessageError("malformed", f"{len(payload)} bytes are no reply: {error}") from error
 
 
@@ -470,12 +483,7 @@ def _session_configuration_of(data: bytes, settings: bytes | None) -> SessionCon
             f"state_space_planner among them: at most {MAX_CONFIGURATION_BYTES} are allowed",
         )
     session_configuration = _CONFIGURATION_DECODER.decode(data)
-    if _count_values(session_configuration) > MAX_CONFIGURATION_VALUES:
-        raise MessageError(
-            "too_large",
-            f"problem {session_configuration.problem}: more than {MAX_CONFIGURATION_VALUES} values "
-            "in the sections model and state_space_planner",
-        )
+    _check_sections(session_configuration)
     understood = settings_digest(session_configuration)
     if settings != understood:
         raise MessageError(
@@ -488,25 +496,50 @@ def _session_configuration_of(data: bytes, settings: bytes | None) -> SessionCon
     return session_configuration
 
 
-def _count_values(session_configuration: SessionConfiguration) -> int:
-    """Count the values in the problem's sections, however they are nested.
+def _check_sections(session_configuration: SessionConfiguration) -> None:
+    """Refuse what a YAML file cannot say in the problem's sections.
 
-    Returns
-    -------
-    int
-        Of one that has more than :data:`MAX_CONFIGURATION_VALUES`, some number above that.
+    MessagePack has more than JSON: times, extensions, bytes, numbers that are not finite, keys of
+    any kind. What has passed here can be encoded again, at any depth of the caller's stack.
     """
-    containers: list[object] = [
-        session_configuration.model,
-        session_configuration.state_space_planner,
-    ]
-    count = 0
-    while containers:
-        container = containers.pop()
-        assert isinstance(container, _CONTAINERS)
-        count += len(container) * (2 if isinstance(container, dict) else 1)
-        if count > MAX_CONFIGURATION_VALUES:
-            break
-        parts = (*container, *container.values()) if isinstance(container, dict) else container
-        containers += [part for part in parts if isinstance(part, _CONTAINERS)]
-    return count
+    problem = session_configuration.problem
+    level: list[object] = [session_configuration.model, session_configuration.state_space_planner]
+    depth = count = 0
+    while level:
+        depth += 1
+        inside: list[object] = []
+        for container in level:
+            values: list[object]
+            if isinstance(container, dict):
+                values = list(container.values())
+                count += len(values)
+                # A key may itself be large: the tuple that msgspec makes of an array.
+                odd = next((key for key in container if not isinstance(key, str)), None)
+                if odd is not None:
+                    raise _no_plain_data(problem, f"a key of type {type(odd).__name__}")
+            else:
+                assert isinstance(container, list)
+                values = container
+            count += len(values)
+            if count > MAX_CONFIGURATION_VALUES:
+                raise MessageError(
+                    "too_large",
+                    f"problem {problem}: more than {MAX_CONFIGURATION_VALUES} values in the "
+                    "sections model and state_space_planner",
+                )
+            for value in values:
+                if isinstance(value, (dict, list)):
+                    inside.append(value)
+                elif not isinstance(value, _SCALARS):
+                    raise _no_plain_data(problem, f"a value of type {type(value).__name__}")
+                elif isinstance(value, float) and not math.isfinite(value):
+                    raise _no_plain_data(problem, f"the number {value}")
+        if inside and depth == MAX_CONFIGURATION_DEPTH:
+            raise _no_plain_data(problem, f"more than {MAX_CONFIGURATION_DEPTH} levels")
+        level = inside
+
+
+def _no_plain_data(problem: str, what: str) -> MessageError:
+    return MessageError(
+        "malformed", f"problem {problem}: {what} in the sections model and state_space_planner"
+    )

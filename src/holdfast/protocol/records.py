@@ -153,7 +153,7 @@ def decode_record(data: bytes) -> Record:
     """
     try:
         return _DECODER.decode(data)
-    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+    except Exception as error:  # decoding may raise anything
         raise RecordError(f"{len(data)} bytes are no record of a journal: {error}") from error
 
 

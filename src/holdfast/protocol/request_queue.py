@@ -253,6 +253,10 @@ class RequestQueue:
         self._running_of[task.session, task.slot] = task
         self._running[job] = task
 
+    def is_running(self, job: Job) -> bool:
+        """Return whether a worker has a job of this queue."""
+        return job in self._running
+
     def started(self, job: Job, now: float) -> None:
         """Note that a worker starts its task only now."""
         self._running[job].started_at = now

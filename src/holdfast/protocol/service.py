@@ -97,12 +97,21 @@ class Service:
             raise InvalidValueError(f"workers {workers}: a service needs at least 1")
         self._make_problem = make_problem
         self._describe_error = describe_error or _described
+        self._workers = workers
         self._limits = limits or ServiceLimits()
         self._statistics = ServiceStatistics()
+        self.forget_everything()
+
+    def forget_everything(self) -> None:
+        """Forget all sessions, tasks and calls, as a new process would have none.
+
+        The remedy after an exception of a method: nothing here cannot be lost. The caller ends the
+        calls. Results of jobs that were handed out before are ignored.
+        """
         self._effects: Effects[ServiceEffect] = Effects()
         self._sessions = SessionTable(self._limits)
         self._problems = ProblemPool(self._limits.max_problems)
-        self._queue = RequestQueue(workers, self._limits)
+        self._queue = RequestQueue(self._workers, self._limits)
         self._calls = WaitingCalls(self._limits, self._statistics, self._effects)
         # Of all robots; each session has its own, which begin here.
         self._task_time = ExpectedTime(1e-3)
@@ -154,10 +163,13 @@ class Service:
 
     def started(self, job: Job, now: float) -> None:
         """Note that a job that was handed out starts only now."""
-        self._queue.started(job, now)
+        if self._queue.is_running(job):
+            self._queue.started(job, now)
 
     def finished(self, job: Job, outcome: JobResult, now: float) -> list[ServiceEffect]:
         """Handle the result of a job that was handed out."""
+        if not self._queue.is_running(job):
+            return []  # handed out before everything was forgotten
         task = self._queue.end(job)
         session = task.session
         session.remove_task(task)

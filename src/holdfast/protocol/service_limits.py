@@ -85,6 +85,8 @@ class ServiceStatistics(msgspec.Struct):
         Requests answered with the need for the state, or turned away for lack of capacity.
     refusals : dict of str to int
         By code.
+    defects : int
+        Unexpected exceptions, each of which has ended a request or a link.
     sessions, state_bytes, waiting, running, calls : int
         Held now.
     """
@@ -98,6 +100,7 @@ class ServiceStatistics(msgspec.Struct):
     state_requests: int = 0
     states_diverged: int = 0
     busy: int = 0
+    defects: int = 0
     refusals: dict[str, int] = msgspec.field(default_factory=dict)
     sessions_opened: int = 0
     sessions_taken_over: int = 0

@@ -14,7 +14,7 @@ late_unused, resumed_trial, performed_unseen, trial, missed_ticks, stopped, note
 offers.
 Of a service: ready, session_opened, session_taken_over, restored, state_diverged, refused, busy,
 evicted, robot_connected, robot_disconnected, link_refused, credentials, credentials_reloaded,
-stopping, process_ended, process_started.
+stopping, process_ended, process_started, ros_master, ros_shutdown. Of both: defect.
 Of ``holdfast ros1-guard``: ready, guarding, master_started, master_lost, master_failed,
 master_hangs, nodes_gone, journal_failed, journal_written, rosout_ended, note, stopping.
 Of ``holdfast chaos``: chaos_trial, left_out, note, interrupted. Of a command that ends with an
@@ -27,17 +27,20 @@ from __future__ import annotations
 import math
 import threading
 import time
+import traceback
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from typing import Literal, Protocol, TypeAlias
 
 from holdfast.protocol.status import Status
 
 __all__ = [
+    "DEFECT",
     "BoundedEventLog",
     "Event",
     "EventRates",
     "EventSink",
     "NullEventLog",
+    "defect_fields",
     "severity",
 ]
 
@@ -67,7 +70,14 @@ _WARNINGS = frozenset(
         "insecure",
     ]
 )
-_ERRORS = frozenset(("wrong_answer", "not_deterministic", "state_diverged", "stopped", "error"))
+DEFECT = "defect"
+"""An exception that our code does not expect. It has ended a request or a link."""
+
+_ERRORS = frozenset(
+    ("wrong_answer", "not_deterministic", "state_diverged", "stopped", "error", DEFECT)
+)
+_MAX_TRACEBACK = 4000
+"""Characters; the end is kept, where the exception is."""
 
 Event: TypeAlias = tuple[str, Mapping[str, object]]
 """A name and its fields; after dropped ones like it with their number."""
@@ -77,6 +87,12 @@ def severity(name: str, fields: Mapping[str, object]) -> Literal["INFO", "WARN",
     """Return how bad it is that an event has happened."""
     worse = name == "status" and fields.get("to") == Status.LOCAL_RECOVERY.value
     return "ERROR" if name in _ERRORS else "WARN" if worse or name in _WARNINGS else "INFO"
+
+
+def defect_fields(error: BaseException) -> dict[str, str]:
+    """Return the fields of a :data:`DEFECT`: what was raised, and where."""
+    trace = "".join(traceback.format_exception(error))
+    return {"reason": f"{type(error).__name__}: {error}", "traceback": trace[-_MAX_TRACEBACK:]}
 
 
 class EventSink(Protocol):

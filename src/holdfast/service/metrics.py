@@ -42,6 +42,7 @@ _COUNTERS = (
     ("sessions_opened", "Sessions opened."),
     ("sessions_taken_over", "Sessions that a restarted robot went on with."),
     ("sessions_evicted", "Sessions forgotten for want of room."),
+    ("defects", "Unexpected exceptions, each of which has ended a request or a link."),
 )
 _GAUGES = (
     ("sessions", "sessions", "Sessions held."),

@@ -9,6 +9,13 @@ large requests go to threads; their results return to the loop.
 A brief job cannot be interrupted, so a job counts as brief only if those before it of the same
 robot were, and if it is as usual (:class:`~holdfast.protocol.service_jobs.StartJob`).
 
+What a peer sends may lead to any exception, and none ends the process. Decoding and jobs touch
+nothing that is shared, so an exception there refuses that request alone. One in the machine, also
+while nothing but time passes, may leave it half-way through a change. Nobody can say which of its
+tables still agree, and it holds nothing that cannot be lost, so it forgets everything, as a new
+process would: the request that was being handled is refused, all others are told to come again, and
+the links stand. Each is logged as ``defect`` with its traceback, and counted.
+
 Nothing here needs a socket.
 """
 
@@ -17,16 +24,15 @@ from __future__ import annotations
 import asyncio
 import functools
 import itertools
-import traceback
 from collections import Counter, deque
 from collections.abc import Callable
 from typing import Literal, TypeAlias
 
 import msgspec
 
-from holdfast.errors import MessageError, ServiceBrokenError
+from holdfast.errors import MessageError
 from holdfast.protocol.events import LogEvent
-from holdfast.protocol.messages import Busy, Request, decode_request, encode
+from holdfast.protocol.messages import Busy, Refused, Request, decode_request, encode
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import (
     EndCall,
@@ -37,7 +43,7 @@ from holdfast.protocol.service_jobs import (
     StartJob,
 )
 from holdfast.protocol.service_limits import ServiceStatistics
-from holdfast.runtime.events import EventRates, EventSink
+from holdfast.runtime.events import DEFECT, EventRates, EventSink, defect_fields
 from holdfast.runtime.pool import ThreadPool
 from holdfast.transport.contract import IncomingCall, ServiceTransport
 
@@ -83,8 +89,8 @@ class ServiceShell:
     ) -> None:
         self._service = service
         self._transport = transport
-        self._jobs = ThreadPool(workers, "holdfast-worker", self._broke)
-        self._decoder = ThreadPool(1, "holdfast-decoder", self._broke)
+        self._jobs = ThreadPool(workers, "holdfast-worker")
+        self._decoder = ThreadPool(1, "holdfast-decoder")
         self._events = events
         self._on_decision = on_decision
         self._calls: dict[int, IncomingCall] = {}
@@ -114,13 +120,7 @@ class ServiceShell:
         await self._transport.start(self.deliver)
 
     async def wait(self) -> str:
-        """Wait for :meth:`stop`, and return its reason.
-
-        Raises
-        ------
-        ServiceBrokenError
-            If the service's own code has failed.
-        """
+        """Wait for :meth:`stop`, and return its reason."""
         return await asyncio.shield(self._stopped)
 
     def stop(self, reason: str) -> None:
@@ -158,6 +158,8 @@ class ServiceShell:
 
     def note(self, event: str, /, **fields: object) -> None:
         """Log an event, with a limited rate for each kind."""
+        if event == DEFECT:
+            self._service.statistics.defects += 1
         for name, told in self._rates.admit(event, event, fields, self._loop.time()):
             self._events.event(name, **told)
         self._set_timer()
@@ -179,23 +181,23 @@ class ServiceShell:
             self._guarded(self._received, call)
 
     def _guarded(self, handler: Callable[..., None], *arguments: object) -> None:
-        """Call a handler unless the shell is closed; an exception from it is a defect here."""
+        """Call a handler unless the shell is closed; whatever it raises has the machine forget."""
         if self._closed:
             return
         try:
             handler(*arguments)
-        except Exception as error:  # noqa: BLE001 - half a service is worse than none
-            self._broke(error)
+        except Exception as error:  # noqa: BLE001 - what a peer sends may raise anything
+            self._forget_everything(error)
 
-    def _broke(self, error: BaseException) -> None:
-        """Have :meth:`wait` raise, and close the transport."""
-        if self._closed:
-            return
-        self._closed = True
-        trace = "".join(traceback.format_exception(error))
-        if not self._stopped.done():
-            self._stopped.set_exception(ServiceBrokenError(f"the service has failed\n{trace}"))
-        self._closing = self._loop.create_task(self._transport.close(0.0))
+    def _forget_everything(self, error: Exception) -> None:
+        """Go on as a new process would, after an exception of the machine."""
+        self.note(DEFECT, **defect_fields(error))
+        self._service.forget_everything()
+        self._brief_jobs.clear()
+        calls, self._calls = self._calls, {}
+        for call in calls.values():
+            self._reject_unread(call)
+        self._note_if_idle()
 
     def _received(self, call: IncomingCall) -> None:
         payload = call.payload
@@ -238,9 +240,18 @@ class ServiceShell:
         number = next(self._numbers)
         self._calls[number] = call
         now = self._loop.time()
-        self._carry_out(self._service.receive(number, request, size, now, call.robot))
+        try:
+            effects = self._service.receive(number, request, size, now, call.robot)
+        except Exception as error:
+            del self._calls[number]
+            call.reply(encode(Refused(0, "failed", _in_words(error))))
+            call.end()
+            raise
+        self._carry_out(effects)
 
     def _run_brief_job(self) -> None:
+        if not self._brief_jobs:
+            return  # forgotten meanwhile
         job = self._brief_jobs.popleft()
         if self._brief_jobs:
             self._run_brief_job_soon()
@@ -257,7 +268,13 @@ class ServiceShell:
     def _computed(self, job: Job) -> tuple[JobResult, float]:
         """Run a job on any thread; return its outcome and its duration."""
         began = self._loop.time()
-        outcome = job.run()
+        try:
+            outcome = job.run()
+        except BaseException as error:  # noqa: BLE001 - a job touches nothing that is shared
+            self._loop.call_soon_threadsafe(
+                functools.partial(self.note, DEFECT, **defect_fields(error))
+            )
+            outcome = JobResult(failure=("failed", _in_words(error)))
         return outcome, self._loop.time() - began
 
     def _finished(self, job: Job, outcome: JobResult, computed_s: float) -> None:
@@ -290,6 +307,9 @@ class ServiceShell:
             elif self._on_decision is not None:
                 self._on_decision(effect.kind, effect.computed_s, effect.waited_s)
         self._set_timer()
+        self._note_if_idle()
+
+    def _note_if_idle(self) -> None:
         if self._idle is not None and not self._calls and not self._undecoded:
             self._idle.set_result(None)
             self._idle = None
@@ -325,3 +345,9 @@ def _decode(payload: bytes) -> Request | MessageError:
     except MessageError as error:
         # Kept in this frame, it would hold itself and the message until garbage collection.
         return error
+    except Exception as error:  # noqa: BLE001 - what a peer sends may raise anything
+        return MessageError("malformed", f"{len(payload)} bytes: {_in_words(error)}")
+
+
+def _in_words(error: BaseException) -> str:
+    return f"this service's own code has failed: {type(error).__name__}: {error}"

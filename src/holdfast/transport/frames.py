@@ -8,10 +8,11 @@ violation ends the link with a reason for the log. Nothing here knows a socket.
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 from collections.abc import Mapping
-from typing import Final, NamedTuple, cast
+from typing import Final, NamedTuple, TypeVar, cast
 
 import msgspec
 
@@ -99,6 +100,9 @@ class _Version(msgspec.Struct):
     release: str = "unknown"
 
 
+_Form = TypeVar("_Form")
+
+
 def encode_frame(kind: int, call: int = 0, payload: bytes = b"") -> bytes:
     """Return a frame's bytes."""
     return _HEADER.pack(len(payload), kind, call) + payload
@@ -130,17 +134,14 @@ def decode_hello(payload: bytes) -> Hello:
     FrameError
         If it is of another version, or malformed.
     """
-    try:
-        version = msgspec.msgpack.decode(payload, type=_Version)
-        if version.version != WIRE_VERSION:
-            raise FrameError(
-                f"is holdfast {printable(version.release[:40])} with version {version.version} of "
-                f"the wire; here is holdfast {__version__} with version {WIRE_VERSION}: install "
-                "the same release at both ends"
-            )
-        hello = msgspec.msgpack.decode(payload, type=Hello)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise FrameError(f"sends a malformed hello: {printable(str(error))}") from None
+    version = _decoded(payload, _Version)
+    if version.version != WIRE_VERSION:
+        raise FrameError(
+            f"is holdfast {printable(version.release[:40])} with version {version.version} of "
+            f"the wire; here is holdfast {__version__} with version {WIRE_VERSION}: install "
+            "the same release at both ends"
+        )
+    hello = _decoded(payload, Hello)
     try:
         check_name("incarnation", hello.incarnation)
         if hello.role == "service" or hello.name:
@@ -149,7 +150,16 @@ def decode_hello(payload: bytes) -> Hello:
         raise FrameError(f"sends a malformed hello: {error}") from None
     if not 1.0 <= hello.lease_ms <= 3.6e6:
         raise FrameError(f"sends a hello with a lease of {hello.lease_ms:g} ms (1 to 3.6e6)")
+    if not math.isfinite(hello.clock_s):
+        raise FrameError(f"sends a hello with a clock of {hello.clock_s:g} s")
     return hello
+
+
+def _decoded(payload: bytes, form: type[_Form]) -> _Form:
+    try:
+        return msgspec.msgpack.decode(payload, type=form)
+    except Exception as error:  # noqa: BLE001 - decoding may raise anything
+        raise FrameError(f"sends a malformed hello: {printable(str(error))}") from None
 
 
 class FrameDecoder:
