@@ -82,14 +82,12 @@ class OddValues:
 
     def _integer(self) -> bytes:
         chance = self._chance
-        head: bytes
-        form: str
         head, form = chance.choice(
             ((b"\xcc", ">B"), (b"\xcd", ">H"), (b"\xce", ">I"), (b"\xcf", ">Q"))
         )
         width = struct.calcsize(form)
-        number = chance.choice((*_EDGES, 2 ** (8 * width) - 1, 2 ** (8 * width - 1)))
-        raw = (number % 2 ** (8 * width)).to_bytes(width, "big")
+        last = (1 << 8 * width) - 1
+        raw = (chance.choice((*_EDGES, last, last // 2 + 1)) & last).to_bytes(width, "big")
         signed = bytes([head[0] + 4])
         return chance.choice((head, signed)) + raw if chance.random() < 0.8 else raw[:1]
 
@@ -132,15 +130,13 @@ class OddValues:
 
     def _lie(self) -> bytes:
         """Return a header that says how much follows, and little of it."""
-        head: int
-        width: int
         head, width = self._chance.choice(
             (
                 *((0xC4, 1), (0xC5, 2), (0xC6, 4), (0xD9, 1), (0xDA, 2), (0xDB, 4)),
                 *((0xDC, 2), (0xDD, 4), (0xDE, 2), (0xDF, 4), (0xC7, 1), (0xC8, 2), (0xC9, 4)),
             )
         )
-        size = self._chance.choice(_EDGES) % 2 ** (8 * width)
+        size = self._chance.choice(_EDGES) & ((1 << 8 * width) - 1)
         return bytes([head]) + size.to_bytes(width, "big") + self._chance.randbytes(3)
 
     def _array(self, depth: int) -> bytes:
