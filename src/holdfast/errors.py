@@ -7,6 +7,8 @@ has the file open, not this code.
 
 from __future__ import annotations
 
+import traceback
+
 
 class HoldfastError(Exception):
     """Base of every error that holdfast raises on purpose."""
@@ -208,3 +210,16 @@ class GoneError(CallError):
 
 class KeysExhaustedError(TransportError):
     """A key has encrypted its maximum number of datagrams; a new link has new keys."""
+
+
+DEFECT = "defect"
+"""Name of the event that reports an exception that no code of ours expects."""
+
+_MAX_TRACEBACK = 4000
+"""Characters; the end is kept, where the exception is."""
+
+
+def defect_fields(error: BaseException) -> dict[str, str]:
+    """Return the fields of a :data:`DEFECT`: what was raised, and where."""
+    trace = "".join(traceback.format_exception(error))
+    return {"reason": f"{type(error).__name__}: {error}", "traceback": trace[-_MAX_TRACEBACK:]}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import socket
 import stat
 from pathlib import Path
@@ -34,6 +35,7 @@ from holdfast.protocol.events import (
     ReplyReceived,
     ServiceAppeared,
     ServiceVanished,
+    TransportEvent,
 )
 from holdfast.transport import frames, links, robot_end, service_end
 from holdfast.transport.contract import IncomingCall
@@ -281,6 +283,87 @@ class TestStreams:
             await robot.close()
 
 
+@pytest.fixture(params=["tcp", "tls", "udp"])
+def any_stream(
+    request: pytest.FixtureRequest,
+    socket_directory: Path,
+    robot_tls: TlsFiles,
+    service_tls: TlsFiles,
+) -> StreamWire:
+    encrypted = request.param in ("tls", "udp")
+    return StreamWire(
+        request.param,
+        socket_directory,
+        robot_tls=robot_tls if encrypted else None,
+        service_tls=service_tls if encrypted else None,
+    )
+
+
+class TestDefects:
+    """Whatever a peer sends may lead to any exception: it ends that peer's link alone."""
+
+    async def test_at_the_service(self, any_stream: StreamWire) -> None:
+        def answer(call: IncomingCall) -> None:
+            if call.payload == b"bad":
+                raise RuntimeError("year 10000")
+            echo(call)
+
+        other, of_other, _ = await connected(any_stream, answer)
+        robot, inbox = any_stream.robot("cloud"), Inbox()
+        robot.start(inbox)
+        await inbox.appeared()
+        robot.call("cloud", 1, b"bad")
+        await inbox.wait_for(ServiceVanished("cloud", "b1"))
+        assert CallEnded(1) in inbox
+        other.call("cloud", 1, b"good")
+        assert await of_other.of_call(1) == [ReplyReceived(1, b"good"), CallEnded(1)]
+        assert ServiceVanished("cloud", "b1") not in of_other
+        # It may come again.
+        await inbox.wait(lambda _: inbox.count(ServiceAppeared("cloud", "b1")) == 2)
+        robot.call("cloud", 2, b"good")
+        assert await inbox.of_call(2) == [ReplyReceived(2, b"good"), CallEnded(2)]
+        (defect,) = [fields for name, fields in any_stream.events if name == "defect"]
+        assert defect["reason"] == "RuntimeError: year 10000"
+        assert "in answer" in str(defect["traceback"])
+
+    async def test_at_the_robot(self, any_stream: StreamWire) -> None:
+        told: list[str] = []
+
+        class Fragile(Inbox):
+            def __call__(self, event: TransportEvent) -> None:
+                if event == ReplyReceived(1, b"bad"):
+                    raise RuntimeError("year 10000")
+                super().__call__(event)
+
+        await any_stream.service("cloud", "b1").start(echo)
+        robot, inbox = any_stream.robot("cloud"), Fragile()
+        robot.on_event = lambda name, **fields: told.append(f"{name} {fields.get('reason')}")
+        robot.start(inbox)
+        await inbox.appeared()
+        robot.call("cloud", 1, b"bad")
+        await inbox.wait_for(ServiceVanished("cloud", "b1"))
+        assert CallEnded(1) in inbox
+        await inbox.wait(lambda _: inbox.count(ServiceAppeared("cloud", "b1")) == 2)
+        robot.call("cloud", 2, b"good")
+        assert await inbox.of_call(2) == [ReplyReceived(2, b"good"), CallEnded(2)]
+        assert told[0] == "defect RuntimeError: year 10000"
+
+    async def test_while_nothing_but_time_passes(
+        self, tcp: StreamWire, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        tcp.lease_ms = 300.0
+        _, _, service = await connected(tcp)
+        assert isinstance(service, StreamServiceTransport)
+        (link,) = service._links
+
+        def fail(now: float) -> bool:
+            raise RuntimeError("no time")
+
+        monkeypatch.setattr(link, "_owes_ping", fail)
+        await until(lambda: link not in service._links)
+        assert ("defect", None, "RuntimeError: no time") in tcp.heard()
+
+
 class TestPeers:
     """Peers that say hello and then break the protocol."""
 
@@ -347,6 +430,36 @@ class TestPeers:
                 ]
             lost = ("robot_disconnected", "", "does not read what it is sent")
             await until(lambda: tcp.heard().count(lost) == 2, lambda: tcp.events)
+        assert ServiceVanished("cloud", "b1") not in inbox
+
+    async def test_what_waits_for_all_robots_together_has_a_bound(
+        self, tcp: StreamWire, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(service_end, "MAX_UNSENT_BYTES", 2 * MAX_BYTES)
+
+        def answer(call: IncomingCall) -> None:
+            call.reply(bytes(MAX_BYTES) if call.payload == b"much" else call.payload)
+            call.end()
+
+        def are_connected(number: int) -> bool:
+            return tcp.heard().count(("robot_connected", "", None)) == number
+
+        robot, inbox, service = await connected(tcp, answer)
+        assert isinstance(service, StreamServiceTransport)
+        with contextlib.ExitStack() as visitors:
+            for number in range(2, 7):
+                visitor = visitors.enter_context(await Visitor(tcp.endpoint("cloud")).connect())
+                await visitor.say(HELLO)
+                await until(functools.partial(are_connected, number))
+                await visitor.say(frames.encode_frame(frames.CALL, 1, b"much"))
+                robot.call("cloud", number, b"question")
+                assert await inbox.of_call(number) == [
+                    ReplyReceived(number, b"question"),
+                    CallEnded(number),
+                ]
+            lost = "does not read what it is sent, and others need the memory"
+            await until(lambda: ("robot_disconnected", "", lost) in tcp.heard())
+            assert sum(link.unsent_bytes for link in service._links) <= 2 * MAX_BYTES
         assert ServiceVanished("cloud", "b1") not in inbox
 
     async def test_what_waits_for_a_robot_has_a_bound(self, tcp: StreamWire) -> None:

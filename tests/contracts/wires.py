@@ -235,7 +235,7 @@ class StreamWire:
 def unreachable_into(refusals: list[tuple[str, str]]) -> Callable[..., None]:
     """Return a log that keeps which services are unreachable, and why."""
 
-    def note(event: str, *, reason: str, service: str = "") -> None:
+    def note(event: str, *, reason: str, service: str = "", **_: object) -> None:
         if event == "unreachable":
             refusals.append((service, reason))
 

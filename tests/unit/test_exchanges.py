@@ -589,6 +589,29 @@ class TestBounds:
             assert answers.received(question, datagram=True) is not None
             answers.reply(number, b"answer", 0.0, last=True)
         assert len(answers._cached) == MAX_CACHED_REQUESTS
+        assert answers.held_bytes == MAX_CACHED_REQUESTS * len(b"\0\0\0\1\0\0answer")
+
+    def test_what_is_kept_for_a_robot_is_measured(self) -> None:
+        answers = ServiceExchange(Paths(lambda _: None, lambda _n, _m: None, lambda: 0))
+        size = 6 + len(b"answer")
+
+        def ask(number: int, settled: int, *, datagram: bool = True) -> None:
+            head = number.to_bytes(4, "big") + settled.to_bytes(4, "big") + b"\0\0"
+            answers.received(b"\1\0" + head + b"x", datagram=datagram)
+
+        for number in (1, 2, 3):
+            ask(number, 1)
+            answers.reply(number, b"answer", 0.0, last=False)
+            answers.reply(number, b"answer", 0.0, last=True)
+        assert answers.held_bytes == 6 * size
+        ask(2, 1)  # once more: it is still kept
+        assert answers.held_bytes == 6 * size
+        ask(2, 1, datagram=False)  # the stream loses nothing
+        assert answers.held_bytes == 4 * size
+        ask(3, 3)
+        assert answers.held_bytes == 2 * size
+        ask(4, 4)
+        assert answers.held_bytes == 0
 
     @given(st.binary(max_size=60), st.booleans())
     def test_arbitrary_messages_do_no_harm(self, message: bytes, datagram: bool) -> None:

@@ -1,10 +1,10 @@
-"""The bound on half-received messages: which link is ended when memory runs out."""
+"""Bounds on the memory of all links: which link is ended when it runs out."""
 
 from __future__ import annotations
 
 from typing import cast
 
-from holdfast.transport.link_settings import LinkSettings, PartialMessageBudget
+from holdfast.transport.link_settings import LinkSettings, MemoryBudget
 from holdfast.transport.links import Link
 
 
@@ -15,15 +15,16 @@ class Holder:
         self.owner = owner
         self.reason = ""
 
-    def end(self, reason: str) -> None:
+    def end(self, reason: str, *, abort: bool = False) -> None:
         self.reason = reason
+        self.aborted = abort
 
-    def holds(self, budget: PartialMessageBudget, size_bytes: int) -> None:
+    def holds(self, budget: MemoryBudget, size_bytes: int) -> None:
         budget.note(cast(Link, self), size_bytes)
 
 
 def test_within_the_bound_nobody_is_ended() -> None:
-    budget = PartialMessageBudget(100)
+    budget = MemoryBudget(100, "holds too much")
     holders = [Holder(name) for name in "abc"]
     for holder in holders:
         holder.holds(budget, 30)
@@ -34,7 +35,7 @@ def test_within_the_bound_nobody_is_ended() -> None:
 
 
 def test_the_owner_that_holds_the_most_loses_its_oldest() -> None:
-    budget = PartialMessageBudget(100)
+    budget = MemoryBudget(100, "holds too much")
     small = Holder("small")
     greedy = [Holder("greedy") for _ in range(3)]
     small.holds(budget, 20)
@@ -45,6 +46,21 @@ def test_the_owner_that_holds_the_most_loses_its_oldest() -> None:
     greedy[0].holds(budget, 0)
     small.holds(budget, 40)
     assert not small.reason
+
+
+def test_what_has_shrunk_meanwhile_is_measured_before_anybody_is_ended() -> None:
+    now = {"a": 60, "b": 30, "c": 30}
+    budget = MemoryBudget(100, "holds too much", lambda link: now[cast(str, link.owner)])
+    holders = [Holder(name) for name in now]
+    for holder in holders:
+        holder.holds(budget, now[holder.owner])
+    assert [holder.reason for holder in holders] == ["holds too much", "", ""]
+    assert holders[0].aborted
+    again = Holder("a")
+    again.holds(budget, 60)
+    now |= {"a": 10}
+    holders[1].holds(budget, 30)
+    assert not again.reason
 
 
 def test_ends_do_not_share_a_buffer() -> None:

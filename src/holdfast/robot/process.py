@@ -22,7 +22,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from holdfast.config.loader import Configuration
 from holdfast.config.user_code import account_of_user_error, describe_problem_error
-from holdfast.errors import HeldError, HoldfastError, TrialError
+from holdfast.errors import DEFECT, HeldError, HoldfastError, TrialError, defect_fields
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner, PlanningState
 from holdfast.problems.problem import Problem
@@ -447,7 +447,7 @@ class RobotProcess:
         del loop
         error = context.get("exception") or RuntimeError(context["message"])
         if "protocol" in context:
-            self._events.event("link_failed", reason=repr(error))
+            self._events.event(DEFECT, **defect_fields(error))
         else:
             self._fail(error)
 

@@ -27,20 +27,18 @@ from __future__ import annotations
 import math
 import threading
 import time
-import traceback
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from typing import Literal, Protocol, TypeAlias
 
+from holdfast.errors import DEFECT
 from holdfast.protocol.status import Status
 
 __all__ = [
-    "DEFECT",
     "BoundedEventLog",
     "Event",
     "EventRates",
     "EventSink",
     "NullEventLog",
-    "defect_fields",
     "severity",
 ]
 
@@ -70,14 +68,9 @@ _WARNINGS = frozenset(
         "insecure",
     ]
 )
-DEFECT = "defect"
-"""An exception that our code does not expect. It has ended a request or a link."""
-
 _ERRORS = frozenset(
     ("wrong_answer", "not_deterministic", "state_diverged", "stopped", "error", DEFECT)
 )
-_MAX_TRACEBACK = 4000
-"""Characters; the end is kept, where the exception is."""
 
 Event: TypeAlias = tuple[str, Mapping[str, object]]
 """A name and its fields; after dropped ones like it with their number."""
@@ -87,12 +80,6 @@ def severity(name: str, fields: Mapping[str, object]) -> Literal["INFO", "WARN",
     """Return how bad it is that an event has happened."""
     worse = name == "status" and fields.get("to") == Status.LOCAL_RECOVERY.value
     return "ERROR" if name in _ERRORS else "WARN" if worse or name in _WARNINGS else "INFO"
-
-
-def defect_fields(error: BaseException) -> dict[str, str]:
-    """Return the fields of a :data:`DEFECT`: what was raised, and where."""
-    trace = "".join(traceback.format_exception(error))
-    return {"reason": f"{type(error).__name__}: {error}", "traceback": trace[-_MAX_TRACEBACK:]}
 
 
 class EventSink(Protocol):

@@ -16,9 +16,9 @@ import socket
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypeAlias
 
-from holdfast.errors import HoldfastError, InvalidValueError
+from holdfast.errors import DEFECT, HoldfastError, InvalidValueError, defect_fields
 from holdfast.printable import printable
 from holdfast.service.options import ServeOptions, checked_endpoints, parse_options
 
@@ -266,6 +266,7 @@ class _ServiceProcess:
         import asyncio
 
         loop = asyncio.get_running_loop()
+        loop.set_exception_handler(self._loop_failed)
         options, shell, supervised = self._options, self._shell, self._supervised
         async with _watched(options, lambda: None, self._why_not_ready, self._reported) as watched:
             try:
@@ -343,6 +344,13 @@ class _ServiceProcess:
         """Log an event, from any thread."""
         with contextlib.suppress(RuntimeError):  # the loop is closed
             loop.call_soon_threadsafe(functools.partial(self._shell.note, event, **fields))
+
+    def _loop_failed(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Log an exception that nothing else has handled, in a callback or task of the loop."""
+        del loop
+        error = context.get("exception")
+        told = {"reason": str(context["message"])} if error is None else defect_fields(error)
+        self._shell.note(DEFECT, **told)
 
     def _end_for_ros(self, reason: str) -> None:
         """End because ROS asks for it, as after SIGTERM."""

@@ -30,7 +30,7 @@ from typing import Literal, TypeAlias
 
 import msgspec
 
-from holdfast.errors import MessageError
+from holdfast.errors import DEFECT, MessageError, defect_fields
 from holdfast.protocol.events import LogEvent
 from holdfast.protocol.messages import Busy, Refused, Request, decode_request, encode
 from holdfast.protocol.service import Service
@@ -43,7 +43,7 @@ from holdfast.protocol.service_jobs import (
     StartJob,
 )
 from holdfast.protocol.service_limits import ServiceStatistics
-from holdfast.runtime.events import DEFECT, EventRates, EventSink, defect_fields
+from holdfast.runtime.events import EventRates, EventSink
 from holdfast.runtime.pool import ThreadPool
 from holdfast.transport.contract import IncomingCall, ServiceTransport
 

@@ -48,6 +48,7 @@ from holdfast.transport.frames import (
     FrameDecoder,
     encode_frame,
 )
+from holdfast.transport.link_defects import ends_link
 from holdfast.transport.link_settings import SLICE_S, LinkSettings
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.redundancy import Paths
@@ -147,6 +148,7 @@ class _DatagramLink(Link):
 
     # -- receiving -------------------------------------------------------------------------------
 
+    @ends_link
     def take_datagram(self, datagram: bytes, address: Any) -> None:
         """Take a datagram with this link's association; it may be forged."""
         cipher = self._cipher
@@ -175,6 +177,7 @@ class _DatagramLink(Link):
             if self._num_dropped >= _MAX_DROPPED:
                 self.refuse(_OVERRUN)
 
+    @ends_link
     def _handle_backlog(self) -> None:
         """Handle waiting messages for one slice."""
         backlog, scheduler = self._backlog, self._settings.scheduler
@@ -250,6 +253,7 @@ class _DatagramLink(Link):
         self._due_at = due_at
         self._due = self._loop.call_at(due_at, self._expire)
 
+    @ends_link
     def _expire(self) -> None:
         self._due, self._due_at = None, float("inf")
         self._exchange.expire(self._loop.time())
@@ -273,6 +277,7 @@ class RobotDatagramLink(_DatagramLink):
         """Whether short messages go beside the stream."""
         return self._exchange.open
 
+    @ends_link
     def send_message(self, kind: int, call: int, payload: bytes = b"") -> None:
         """Send a request."""
         if kind != CALL:
@@ -347,6 +352,7 @@ class RobotDatagramLink(_DatagramLink):
                     continue
             return
 
+    @ends_link
     def _readable(self, opened: socket.socket) -> None:
         for _ in range(DATAGRAMS_AT_ONCE):
             if self._socket is not opened:
@@ -410,6 +416,7 @@ class RobotDatagramLink(_DatagramLink):
         if not self._ended:
             self._exchange.probe(self._loop.time())
 
+    @ends_link
     def _end_if_unanswered(self, since: float) -> None:
         if not self._ended and self._datagram_heard_at <= since:
             self.end("has broken the connection, and answers no datagram", abort=True)
@@ -465,6 +472,12 @@ class ServiceDatagramLink(_DatagramLink):
         self._sockets = sockets
         self._socket: DatagramSocket | None = None
 
+    @property
+    def unsent_bytes(self) -> int:
+        """Bytes that wait until the other end reads, or confirms that it has them."""
+        return super().unsent_bytes + self._exchange.held_bytes
+
+    @ends_link
     def send_message(self, kind: int, call: int, payload: bytes = b"") -> None:
         """Send a reply."""
         if kind not in (REPLY, LAST, END):
@@ -473,6 +486,7 @@ class ServiceDatagramLink(_DatagramLink):
         self._exchange.reply(
             call, None if kind == END else payload, self._loop.time(), last=kind != REPLY
         )
+        self._note_unsent()
         self._plan(self._exchange.due)
 
     def _take(self, frame: Frame) -> None:
@@ -515,6 +529,7 @@ class ServiceDatagramLink(_DatagramLink):
         if self._socket is not None and self._peer_address is not None:
             self._socket.send(datagram, self._peer_address)
 
+    @ends_link
     def _flush(self) -> None:
         self._exchange.flush()
 

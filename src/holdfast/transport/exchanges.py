@@ -370,6 +370,7 @@ class ServiceExchange:
         self._sender = RedundantSender(paths)
         self._cached: dict[int, _CachedReplies] = {}
         self._settled = 0
+        self.held_bytes = 0  # of replies that the robot may lack
 
     @property
     def due(self) -> float:
@@ -431,6 +432,7 @@ class ServiceExchange:
             self._sender.send_on_stream(number, _REPLY, body)
             return
         cached.bodies.append(body)
+        self.held_bytes += len(body)
         self._sender.send_first(
             _REPLY, body, now, lambda: number in self._cached and not cached.hedged
         )
@@ -455,6 +457,7 @@ class ServiceExchange:
             cached.on_stream = True
             for body in lacks:
                 self._sender.send_on_stream(number, _REPLY, body)
+            self.held_bytes -= sum(map(len, lacks))
             cached.bodies[have:] = [None] * len(cached.bodies[have:])
             return
         for body in lacks:
@@ -468,7 +471,7 @@ class ServiceExchange:
         # The service bounds requests that are not done; here the oldest answered one makes room.
         if len(self._cached) >= MAX_CACHED_REQUESTS:
             done = (known for known, cached in self._cached.items() if cached.done)
-            self._cached.pop(next(done, -1), None)
+            self._forget(next(done, -1))
         self._cached[number] = _CachedReplies(on_stream)
         return True
 
@@ -477,4 +480,9 @@ class ServiceExchange:
             return
         self._settled = settled
         for number in [number for number in self._cached if number < settled]:
-            del self._cached[number]
+            self._forget(number)
+
+    def _forget(self, number: int) -> None:
+        cached = self._cached.pop(number, None)
+        if cached is not None:
+            self.held_bytes -= sum(len(body) for body in cached.bodies if body is not None)

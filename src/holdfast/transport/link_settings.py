@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
@@ -12,7 +13,7 @@ from holdfast.transport.frames import HEADER_BYTES
 if TYPE_CHECKING:
     from holdfast.transport.links import Link
 
-__all__ = ["SLICE_S", "FairScheduler", "LinkSettings", "PartialMessageBudget"]
+__all__ = ["SLICE_S", "FairScheduler", "LinkSettings", "MemoryBudget"]
 
 _RECEIVED_AT_ONCE_BYTES: Final = 256 * 1024
 
@@ -74,35 +75,53 @@ class FairScheduler:
             loop.call_soon(self._run_next)
 
 
-class PartialMessageBudget:
-    """Bounds the memory that half-received messages of all links together take.
+class MemoryBudget:
+    """Bounds the memory that all links together take for one purpose.
 
     Above the bound a link is ended: among the owners that hold at least half of the largest share,
-    the link whose message began first. So an owner that sends much cannot end the links of owners
-    that hold little.
+    the link that has held something for longest. So an owner that takes much cannot end the links
+    of owners that take little.
+
+    Parameters
+    ----------
+    max_bytes : float
+    reason : str
+        Why a link is ended, as the rest of a sentence about the other end.
+    measure : callable, optional
+        What a link holds now, where that shrinks without a :meth:`note`.
     """
 
-    def __init__(self, max_bytes: int) -> None:
+    def __init__(
+        self, max_bytes: float, reason: str, measure: Callable[[Link], int] | None = None
+    ) -> None:
         self._max_bytes = max_bytes
+        self._reason = reason
+        self._measure = measure
         self._sizes: dict[Link, int] = {}
         self._total = 0
 
     def note(self, link: Link, size_bytes: int) -> None:
         """Note how many bytes a link holds now."""
-        before = self._sizes.get(link, 0)
-        if size_bytes:
-            self._sizes[link] = size_bytes
-        elif before:
-            del self._sizes[link]
-        self._total += size_bytes - before
+        self._set(link, size_bytes)
+        if self._total > self._max_bytes and self._measure is not None:
+            for each in list(self._sizes):
+                self._set(each, self._measure(each))
         while self._total > self._max_bytes:
             held: dict[object, int] = {}
             for each, its_bytes in self._sizes.items():
                 held[each.owner] = held.get(each.owner, 0) + its_bytes
             least = max(held.values()) / 2
             oldest = next(each for each in self._sizes if held[each.owner] >= least)
-            self._total -= self._sizes.pop(oldest)
-            oldest.end("has not finished a message, and others need the memory")
+            self._set(oldest, 0)
+            oldest.end(self._reason, abort=self._measure is not None)
+
+    def _set(self, link: Link, size_bytes: int) -> None:
+        before = self._sizes.get(link, 0)
+        if size_bytes:
+            self._sizes[link] = size_bytes
+        elif before:
+            del self._sizes[link]
+        self._total += size_bytes - before
 
 
 class LinkSettings:
@@ -116,6 +135,8 @@ class LinkSettings:
         This end sends something several times in this time.
     pauses_for_readers : bool
         Whether reading pauses while the other end does not read.
+    max_unsent_bytes : float
+        Of all links together: bytes that wait for the other ends to read.
     pause_s : float
         Of the :class:`FairScheduler`.
     """
@@ -127,13 +148,22 @@ class LinkSettings:
         max_message_bytes: int,
         *,
         pauses_for_readers: bool,
+        max_unsent_bytes: float = math.inf,
         pause_s: float = 0.0,
     ) -> None:
         self.hello = hello
         self.lease_ms = lease_ms
         self.max_message_bytes = max_message_bytes
         self.pauses_for_readers = pauses_for_readers
-        self.partial_messages = PartialMessageBudget(2 * (max_message_bytes + HEADER_BYTES))
+        self.partial_messages = MemoryBudget(
+            2 * (max_message_bytes + HEADER_BYTES),
+            "has not finished a message, and others need the memory",
+        )
+        self.unsent = MemoryBudget(
+            max_unsent_bytes,
+            "does not read what it is sent, and others need the memory",
+            lambda link: link.unsent_bytes,
+        )
         self.scheduler = FairScheduler(pause_s)
         # Takes received bytes. Links copy them out at once and so can share it: allocating one
         # takes longer than handling a short message.

@@ -3,7 +3,8 @@
 A closed stream means a dead peer: the system closes the sockets of a process that dies. A peer that
 falls silent is considered lost after its lease, so each end sends pings. A peer that does not read
 must not delay others: unsent bytes wait in a bounded buffer, nothing waits for them, and a peer
-that never empties it loses the link.
+that never empties it loses the link. Whatever exception a peer's bytes lead to ends its own link
+(:mod:`~holdfast.transport.link_defects`).
 
 Each end opens with a hello. With TLS the robot speaks first, without it the end that dialled. The
 other end only answers, so a port scanner learns nothing.
@@ -35,6 +36,7 @@ from holdfast.transport.frames import (
     encode_goodbye,
     read_goodbye,
 )
+from holdfast.transport.link_defects import ends_link
 from holdfast.transport.link_settings import SLICE_S, LinkSettings
 
 if TYPE_CHECKING:
@@ -95,6 +97,9 @@ class LinkOwner(ABC):
     def on_datagrams_blocked(self, link: Link) -> None:  # noqa: B027 - optional
         """Note that no datagram gets through, so that everything goes on the stream."""
 
+    def on_defect(self, link: Link, error: Exception) -> None:  # noqa: B027 - optional
+        """Report an exception that no code here expects; it has ended the link."""
+
     @abstractmethod
     def on_ended(self, link: Link) -> None:
         """Handle the end of the link: called once, and last."""
@@ -129,7 +134,7 @@ class Link(asyncio.BufferedProtocol):
         self._peer_lease_s = 0.0
         self._progress_at = now
         self._said_hello = False
-        self._holds = False
+        self._holds = self._has_unsent = False
         # Received: undecoded bytes, the offset of the next one, and decoded frames.
         self._unread, self._unread_at = b"", 0
         self._frames: deque[Frame] = deque()
@@ -174,6 +179,11 @@ class Link(asyncio.BufferedProtocol):
         return None if self.peer is None else self.peer.name
 
     @property
+    def unsent_bytes(self) -> int:
+        """Bytes that wait until the other end reads."""
+        return 0 if self._transport is None else self._transport.get_write_buffer_size()
+
+    @property
     def sends_datagrams(self) -> bool:
         """Whether short messages go beside the stream."""
         return False
@@ -194,6 +204,7 @@ class Link(asyncio.BufferedProtocol):
             stream.close()
             self.connection_lost(error)
 
+    @ends_link
     def send(self, data: bytes) -> None:
         """Send frames; never waits. Nothing is sent before the handshake, or after the end."""
         transport = self._transport
@@ -207,8 +218,15 @@ class Link(asyncio.BufferedProtocol):
         transport.write(data)
         self._spoke_at = self._loop.time()
         self._handed_over_bytes += len(data)
-        if transport.get_write_buffer_size() > self._max_unsent_bytes:
+        self._note_unsent()
+
+    def _note_unsent(self) -> None:
+        unsent_bytes = self.unsent_bytes
+        if unsent_bytes > self._max_unsent_bytes:
             self.end("does not read what it is sent", abort=True)
+        elif unsent_bytes or self._has_unsent:
+            self._has_unsent = unsent_bytes > 0
+            self._settings.unsent.note(self, unsent_bytes)
 
     def send_message(self, kind: int, call: int, payload: bytes = b"") -> None:
         """Send a frame of a call; never waits."""
@@ -234,6 +252,8 @@ class Link(asyncio.BufferedProtocol):
             return
         if not (abort or refused):
             self._flush()
+            if self.ended:
+                return
         if goodbye is not None:
             self.send(
                 encode_goodbye(goodbye) if self._said_hello else MAGIC + encode_goodbye(goodbye)
@@ -246,7 +266,7 @@ class Link(asyncio.BufferedProtocol):
         self._timer.cancel()
         self._unread = b""
         self._frames.clear()
-        self._settings.partial_messages.note(self, 0)
+        self._release_memory()
         self._loop.call_soon(self._notify_owner)
         transport = self._transport
         if transport is None:
@@ -262,6 +282,15 @@ class Link(asyncio.BufferedProtocol):
         transport.close()
         self._timer = self._loop.call_later(_CLOSE_TIMEOUT_S, transport.abort)
 
+    def fail(self, error: Exception) -> None:
+        """End the link after an exception that no code here expects."""
+        self.end(f"has led to an error here ({type(error).__name__})", abort=True)
+        self._owner.on_defect(self, error)
+
+    def _release_memory(self) -> None:
+        self._settings.partial_messages.note(self, 0)
+        self._settings.unsent.note(self, 0)
+
     def refuse(self, reason: str) -> None:
         """End the link, and tell the other end why."""
         self.end(reason, goodbye=reason, refused=True)
@@ -271,6 +300,7 @@ class Link(asyncio.BufferedProtocol):
 
     # -- callbacks of asyncio --------------------------------------------------------------------
 
+    @ends_link
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Send the hello or begin the handshake, if this end speaks first."""
         assert isinstance(transport, asyncio.Transport)
@@ -300,6 +330,7 @@ class Link(asyncio.BufferedProtocol):
         del sizehint
         return self._settings.buffer
 
+    @ends_link
     def buffer_updated(self, nbytes: int) -> None:
         """Take received bytes."""
         if self._ended:
@@ -319,6 +350,7 @@ class Link(asyncio.BufferedProtocol):
             self._is_paused = True
             self._pause_reading()
 
+    @ends_link
     def resume_writing(self) -> None:
         """Go on reading."""
         if self._is_paused:
@@ -329,6 +361,7 @@ class Link(asyncio.BufferedProtocol):
     def eof_received(self) -> None:
         """Let asyncio close this end, as the other one has."""
 
+    @ends_link
     def connection_lost(self, exc: Exception | None) -> None:
         """Handle the end of the connection."""
         self._transport = None
@@ -338,13 +371,14 @@ class Link(asyncio.BufferedProtocol):
             # A dying process resets the connection if it has unread bytes.
             if exc is not None and not isinstance(exc, (ConnectionResetError, BrokenPipeError)):
                 self.reason = getattr(exc, "strerror", None) or str(exc)
-            self._settings.partial_messages.note(self, 0)
+            self._release_memory()
         self._notify_owner()
         if not self.closed.done():
             self.closed.set_result(None)
 
     # -- receiving -------------------------------------------------------------------------------
 
+    @ends_link
     def _run_slice(self) -> None:
         """Handle received bytes for one slice."""
         self._is_queued = False
@@ -476,6 +510,7 @@ class Link(asyncio.BufferedProtocol):
         self._said_hello = True
         self.send(self._settings.hello())
 
+    @ends_link
     def _notify_owner(self) -> None:
         if not self._notified:
             self._notified = True
@@ -483,6 +518,7 @@ class Link(asyncio.BufferedProtocol):
 
     # -- time ------------------------------------------------------------------------------------
 
+    @ends_link
     def _tick(self) -> None:
         """Check that the other end lives and reads, and send a ping if this end was silent."""
         now = self._loop.time()
@@ -499,6 +535,7 @@ class Link(asyncio.BufferedProtocol):
         if self.hello is not None and transport is not None:
             if self._owes_ping(now):
                 self.send(_PING)
+            self._note_unsent()
             unsent = transport.get_write_buffer_size()
             sent_bytes = self._handed_over_bytes - unsent
             if unsent == 0 or sent_bytes != self._progress_bytes:
@@ -516,6 +553,7 @@ class Link(asyncio.BufferedProtocol):
         """Whether nothing was sent since the last tick, or little later."""
         return self._spoke_at < now - 0.9 * self._ping_interval_s
 
+    @ends_link
     def _end_if_silent(self) -> None:
         if self._ended:
             return

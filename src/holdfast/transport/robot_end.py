@@ -14,7 +14,13 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import count
 
-from holdfast.errors import FrameError, InvalidValueError, TransportError
+from holdfast.errors import (
+    DEFECT,
+    FrameError,
+    InvalidValueError,
+    TransportError,
+    defect_fields,
+)
 from holdfast.protocol.events import TransportEvent
 from holdfast.transport.calls import CallTable, PendingCall, too_large
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
@@ -78,10 +84,12 @@ class StreamRobotTransport:
     tls : TlsFiles or None
         The robot's credentials, for ``tls`` and ``udp``.
     on_event : callable
-        Called for the log: ``unreachable`` with ``service`` and ``reason``, the rest of a sentence
-        about a service that cannot be reached, refuses this robot or is another one (recent reasons
-        are not repeated until it has appeared); ``no_datagrams`` with ``service`` and ``reason``,
-        once for each; ``credentials`` with ``reason``, when replaced ones cannot be used.
+        Called for the log: ``defect`` with ``service``, ``reason`` and ``traceback``, when an
+        exception that no code here expects has ended a link; ``unreachable`` with ``service`` and
+        ``reason``, the rest of a sentence about a service that cannot be reached, refuses this
+        robot or is another one (recent reasons are not repeated until it has appeared);
+        ``no_datagrams`` with ``service`` and ``reason``, once for each; ``credentials`` with
+        ``reason``, when replaced ones cannot be used.
 
     Raises
     ------
@@ -452,6 +460,10 @@ class _ServiceLinks(LinkOwner):
         if not self._reported_blocked:
             self._reported_blocked = True
             self._robot.on_event("no_datagrams", service=self._name, reason=_NO_DATAGRAMS)
+
+    def on_defect(self, link: Link, error: Exception) -> None:
+        del link
+        self._robot.on_event(DEFECT, service=self._name, **defect_fields(error))
 
     def on_ended(self, link: Link) -> None:
         self._made.pop(link, None)

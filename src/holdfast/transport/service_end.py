@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from holdfast.errors import FrameError, TransportError
+from holdfast.errors import DEFECT, FrameError, TransportError, defect_fields
 from holdfast.transport.calls import too_large
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, IncomingCall
 from holdfast.transport.dialer import Dialer
@@ -52,6 +52,9 @@ __all__ = ["MAX_LINKS", "MAX_UNKNOWN", "StreamServiceTransport"]
 
 MAX_LINKS: Final = 4096
 """Of robots, at the same time. Above it the owner of the most links loses one."""
+
+MAX_UNSENT_BYTES: Final = 32 << 20
+"""Of replies that wait until robots read, all together: the largest has 2 MiB."""
 
 _SAID_GOODBYE: Final = "said goodbye"
 _NO_GOODBYE: Final = "closed the connection without a goodbye, as one that is killed does"
@@ -130,9 +133,10 @@ class StreamServiceTransport(LinkOwner):
     tls : TlsFiles or None
         The service's credentials, for ``tls`` and ``udp``.
     on_event : callable or None
-        Called for the log: ``link_refused`` with ``reason`` and, if known, ``robot``;
-        ``robot_connected`` with ``robot``; ``robot_disconnected`` with ``robot`` and ``reason``.
-        Each has the robot's ``address``, None over a local socket.
+        Called for the log: ``defect`` with ``robot``, ``reason`` and ``traceback``, when an
+        exception that no code here expects has ended a link; ``link_refused`` with ``reason`` and,
+        if known, ``robot``; ``robot_connected`` with ``robot``; ``robot_disconnected`` with
+        ``robot`` and ``reason``. Each has the robot's ``address``, None over a local socket.
     on_shutdown : callable or None
         Called with the reason when ROS ends this process, or another one takes its name there.
 
@@ -182,6 +186,7 @@ class StreamServiceTransport(LinkOwner):
             lease_ms,
             max_message_bytes,
             pauses_for_readers=True,
+            max_unsent_bytes=MAX_UNSENT_BYTES,
         )
         self._on_event = on_event
         self._on_shutdown = on_shutdown
@@ -427,6 +432,10 @@ class StreamServiceTransport(LinkOwner):
     def on_goodbye(self, link: Link) -> None:
         """End the link: a robot that leaves waits for no reply."""
         link.end("")
+
+    def on_defect(self, link: Link, error: Exception) -> None:
+        """Report an exception."""
+        self._report(DEFECT, robot=_certified(link), address=link.address, **defect_fields(error))
 
     def on_ended(self, link: Link) -> None:
         """Note that a link has ended."""
