@@ -11,7 +11,7 @@ import threading
 import warnings
 import xmlrpc.client
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from tests.ports import free_port
@@ -235,6 +235,85 @@ async def test_what_is_no_question_to_a_node_is_answered_with_a_fault(
     writer.close()
     await node.close()
     assert not caplog.records
+
+
+def post(content: bytes) -> bytes:
+    return f"POST / HTTP/1.1\r\nContent-Length: {len(content)}\r\n\r\n".encode() + content
+
+
+def place_of(node: RosNode) -> tuple[str, int]:
+    host, port = node._uri.removeprefix("http://").rstrip("/").split(":")
+    return host, int(port)
+
+
+async def test_calls_of_many_hold_up_nobody_else(
+    master: Master, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Parsing one takes a millisecond: in each turn of the loop there is one at most."""
+    turn = 0
+    parsed: list[int] = []
+
+    def note(method: str, arguments: object) -> tuple[int, str, int]:
+        parsed.append(turn)
+        return 1, method, 0
+
+    async def count() -> None:
+        nonlocal turn
+        while len(parsed) < 20:
+            turn += 1
+            await asyncio.sleep(0)
+
+    node = RosNode("cloud", around(master))
+    await node.start(0.0)
+    content = xmlrpc.client.dumps(("/x",), "getPid").encode()
+    async with asyncio.timeout(PATIENCE_S):
+        streams = [await asyncio.open_connection(*place_of(node)) for _ in range(20)]
+        monkeypatch.setattr(node, "_answer", note)
+        for _, writer in streams:
+            writer.write(post(content))
+        await count()
+        for reader, writer in streams:
+            head = await HttpHead.read(reader)
+            assert b"<int>" in await reader.readexactly(head.size)
+            writer.close()
+    assert len(set(parsed)) == len(parsed)
+    await node.close()
+
+
+async def test_a_call_larger_than_any_of_ros_is_not_read(master: Master) -> None:
+    node = RosNode("cloud", around(master))
+    await node.start(0.0)
+    reader, writer = await asyncio.open_connection(*place_of(node))
+    with contextlib.suppress(ConnectionError):
+        writer.write(post(b"<a/>" * 4096))
+        assert await asyncio.wait_for(reader.read(), PATIENCE_S) == b""
+    writer.close()
+    await node.close()
+
+
+class Deaf:
+    """A subscriber that never reads."""
+
+    def __init__(self) -> None:
+        self.transport = self
+        self.waiting = 0
+
+    def get_write_buffer_size(self) -> int:
+        return self.waiting
+
+    def write(self, data: bytes) -> None:
+        self.waiting += len(data)
+
+
+def test_what_waits_for_the_subscribers_of_a_topic_has_a_bound() -> None:
+    topic = ros1_node.Topic("/topic", ros1_node.TopicType("a/B", "0" * 32, ""), latched=False)
+    deaf = [Deaf() for _ in range(200)]
+    for each in deaf:
+        topic.add(cast(asyncio.StreamWriter, each))
+    for _ in range(300):
+        topic.send(bytes(10_000))
+    assert sum(each.waiting for each in deaf) <= 16 << 20
+    assert all(each.waiting > 70_000 for each in deaf)
 
 
 def address_of(node: RosNode) -> tuple[str, int]:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from xmlrpc.server import SimpleXMLRPCServer
 
+import pytest
 from tests.ports import free_port
 
-from holdfast.ros.master.plan import NodeReport, ask_everyone, snapshot
+from holdfast.errors import CallError
+from holdfast.ros.master.plan import NodeReport, ask_everyone, process_of, snapshot
 from holdfast.ros.master.process import MasterState
 from holdfast.transport.ros1_calls import Connection
 
@@ -73,6 +75,56 @@ def test_a_stock_masters_state() -> None:
         assert state.services == {"/stop": ("/lidar", uri, "rosrpc://robot:1")}
     assert state.types == {"/scan": "sensor_msgs/LaserScan"}
     assert state.parameters == {"speed": 2}
+
+
+async def asked(uri: str, ask: Callable[[Connection], Awaitable[object]]) -> object:
+    connection = Connection(uri)
+    try:
+        return await ask(connection)
+    finally:
+        connection.close()
+
+
+@pytest.mark.parametrize("pid", ["7447", "a text", "", [], {}, -1, 0, 1.5, None])
+def test_a_master_that_tells_no_process_id(pid: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    def answer(self: Stock, caller: str) -> tuple[int, str, object]:
+        return 1, "", "nothing" if pid is None else pid
+
+    monkeypatch.setattr(Stock, "getPid", answer, raising=False)
+    with stock() as uri, pytest.raises(CallError, match="which is no process id"):
+        asyncio.run(asked(uri, lambda connection: process_of(connection, within_s=30.0)))
+
+
+@pytest.mark.parametrize(
+    ("method", "value"),
+    [
+        ("getSystemState", 5),
+        ("getSystemState", []),
+        ("getSystemState", [[], []]),
+        ("getSystemState", {}),
+        ("getSystemState", [[[1, 2, 3]], [], []]),
+        ("getSystemState", [[["/scan", [["/lidar"]]]], [], []]),
+        ("getSystemState", [[["/scan", ["/lidar", 5]]], [], []]),
+        ("getSystemState", [[[7, ["/lidar"]]], [], []]),
+        ("getTopicTypes", 5),
+        ("getTopicTypes", ["ab", "c"]),
+        ("getParam", "a text"),
+    ],
+)
+def test_a_master_whose_answers_have_another_form(
+    method: str, value: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Stock, method, lambda *_: (1, "", value))
+    with stock() as uri, pytest.raises(CallError, match="cannot be understood"):
+        asyncio.run(asked(uri, snapshot))
+
+
+def test_a_place_that_is_no_text_is_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Stock, "lookupNode", lambda *_: (1, "", [5]))
+    with stock() as uri:
+        state = asyncio.run(asked(uri, snapshot))
+    assert isinstance(state, MasterState)
+    assert state.publishers == {}
 
 
 def test_a_node_reports_its_topics_and_a_dead_one_is_gone() -> None:

@@ -92,3 +92,11 @@ def test_names() -> None:
 def test_what_is_no_name_is_refused(name: str) -> None:
     with pytest.raises(TransportError, match="is no name in ROS 1"):
         HERE.resolved(name)
+
+
+def test_a_header_has_a_bounded_number_of_fields() -> None:
+    fields = {f"f{number}": "" for number in range(65)}
+    with pytest.raises(TransportError, match="more than 64 fields"):
+        decode_header(encode_header(fields)[4:])
+    del fields["f64"]
+    assert decode_header(encode_header(fields)[4:]) == fields

@@ -5,8 +5,6 @@ The service's own package knows nothing of ROS.
 
 from __future__ import annotations
 
-import os
-import signal
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
@@ -57,13 +55,17 @@ class _OfRos:
     _wire: ClassVar[str]
     _where: str
     _on_event: Callable[..., None] | None = None
+    _on_shutdown: Callable[[str], None] | None = None
 
     @property
     def is_busy(self) -> bool:
         return self._server.is_busy
 
-    def start(self, on_event: Callable[..., None]) -> Mapping[str, str]:
+    def start(
+        self, on_event: Callable[..., None], on_shutdown: Callable[[str], None]
+    ) -> Mapping[str, str]:
         self._on_event = on_event
+        self._on_shutdown = on_shutdown
         self._server.start()
         return {self._wire: self._where}
 
@@ -128,14 +130,13 @@ class _Ros1(_OfRos):
                 configuration,
                 options.ros1_name,
                 ros_environment,
-                on_shutdown=self._end,
+                on_shutdown=self._asked_to_end,
                 on_event=self._tell,
             )
         except TransportError as error:
             raise TransportError(f"--ros1-name: {error}") from None
         self._where = f"{self._server.name} (master {ros_environment.master})"
 
-    def _end(self, reason: str) -> None:
-        """End this process, as ROS asks a node to; it has the time that SIGTERM leaves."""
-        self._tell("ros_shutdown", reason=reason)
-        os.kill(os.getpid(), signal.SIGTERM)
+    def _asked_to_end(self, reason: str) -> None:
+        if self._on_shutdown is not None:
+            self._on_shutdown(reason)

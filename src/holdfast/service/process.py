@@ -40,6 +40,7 @@ _BETWEEN_COLLECTIONS = 10_000
 _CLOSE_TIMEOUT_S = 0.7
 _CHECK_INTERVAL_S = 0.01
 _STDIN = 0
+_ROS1 = "ros1"
 
 _OFFERED = ("health", "metrics", "ros2", "ros1")
 """Keys of the ready line for what else is offered, and where."""
@@ -57,11 +58,14 @@ class Extension(Protocol):
         """Whether it owes answers."""
         ...
 
-    def start(self, on_event: Callable[..., None]) -> Mapping[str, str]:
+    def start(
+        self, on_event: Callable[..., None], on_shutdown: Callable[[str], None]
+    ) -> Mapping[str, str]:
         """Start; return what is offered where, for the ready line.
 
-        ``on_event(name, **fields)`` logs an event, from any thread. A start that raises a
-        HoldfastError has released everything.
+        ``on_event(name, **fields)`` logs an event, and ``on_shutdown(reason)`` tells that ROS asks
+        this to end; both from any thread. A start that raises a HoldfastError has released
+        everything.
         """
         ...
 
@@ -216,6 +220,9 @@ class _ServiceProcess:
         self._extensions = extensions
         self._supervised = supervised
         self._is_serving = False
+        # Parts that ROS has asked to end; None: the links over ROS 1.
+        self._withdrawn: set[Extension | None] = set()
+        self._withdrawing: set[asyncio.Task[None]] = set()
         self._incarnation = os.urandom(8).hex()
         reserved = NEEDED + MAX_UNKNOWN
         allowed = allow_descriptors(reserved + MAX_LINKS)
@@ -279,7 +286,10 @@ class _ServiceProcess:
                     self._credentials.watch(loop, self._transport, self.events)
                 offered: dict[str, object] = {}
                 for each in self._extensions:
-                    offered |= each.start(functools.partial(self._note, loop))
+                    offered |= each.start(
+                        functools.partial(self._note, loop),
+                        functools.partial(self._ros_ends_extension, loop, each),
+                    )
                 if options.until_stdin_closes:
                     _watch_stdin(loop, shell)
                 # Loaded modules stay; the collector need not scan them.
@@ -352,10 +362,46 @@ class _ServiceProcess:
         told = {"reason": str(context["message"])} if error is None else defect_fields(error)
         self._shell.note(DEFECT, **told)
 
-    def _end_for_ros(self, reason: str) -> None:
-        """End because ROS asks for it, as after SIGTERM."""
-        self._shell.note("ros_shutdown", reason=reason)
-        os.kill(os.getpid(), signal.SIGTERM)
+    def _end_for_ros(self, reason: str, part: Extension | None = None) -> None:
+        """Withdraw a part in ROS 1 that ROS asks to end: an extension, or the links.
+
+        Anybody who reaches a node's port can ask for it, so it must not end what is served beside
+        it, to robots that have to prove who they are. If nothing is, the process ends as after
+        SIGTERM: ``rosnode kill`` and a second node of the same name are to end a node.
+        """
+        self._withdrawn.add(part)
+        links_end = None in self._withdrawn
+        goes_on = bool(
+            self._options.connect
+            or any(not (links_end and each.startswith(_ROS1)) for each in self._transport.endpoints)
+            or any(each not in self._withdrawn for each in self._extensions)
+        )
+        self._shell.note("ros_shutdown", reason=reason, goes_on=goes_on)
+        if not goes_on:
+            os.kill(os.getpid(), signal.SIGTERM)
+            return
+        import asyncio
+
+        # Kept, because the loop's own references are weak.
+        task = asyncio.get_running_loop().create_task(self._withdraw(part))
+        self._withdrawing.add(task)
+        task.add_done_callback(self._withdrawing.discard)
+
+    def _ros_ends_extension(
+        self, loop: asyncio.AbstractEventLoop, part: Extension, reason: str
+    ) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop is closed
+            loop.call_soon_threadsafe(self._end_for_ros, reason, part)
+
+    async def _withdraw(self, part: Extension | None) -> None:
+        import asyncio
+
+        if part is None:
+            await self._transport.withdraw(_ROS1, self._options.drain_s)
+            return
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._drain_extensions((part,)), self._options.drain_s)
+        await asyncio.to_thread(part.close, _CLOSE_TIMEOUT_S)
 
     async def _drain(self) -> None:
         import asyncio
@@ -363,15 +409,18 @@ class _ServiceProcess:
         drain_s = self._options.drain_s
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(
-                asyncio.gather(self._shell.drain(drain_s), self._drain_extensions()), drain_s
+                asyncio.gather(
+                    self._shell.drain(drain_s), self._drain_extensions(self._extensions)
+                ),
+                drain_s,
             )
 
-    async def _drain_extensions(self) -> None:
+    async def _drain_extensions(self, extensions: Sequence[Extension]) -> None:
         import asyncio
 
-        for each in self._extensions:
+        for each in extensions:
             each.take_no_more()
-        while any(each.is_busy for each in self._extensions):
+        while any(each.is_busy for each in extensions):
             await asyncio.sleep(_CHECK_INTERVAL_S)
 
 

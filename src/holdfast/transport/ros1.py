@@ -106,6 +106,11 @@ class _Stream(asyncio.Transport, asyncio.Protocol):
             self._raw.clear()
             self._link.end(str(error), refused=True)
             return
+        except Exception as error:  # noqa: BLE001 - what a peer sends may raise anything
+            self._is_refused = True
+            self._raw.clear()
+            self._link.fail(error)
+            return
         self._deliver()
 
     def pause_writing(self) -> None:

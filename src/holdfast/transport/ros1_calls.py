@@ -96,9 +96,15 @@ def _place_of(uri: str) -> tuple[str, int]:
 
 
 class Connection:
-    """A connection to the XML-RPC server of a master or node; ``caller`` is the calling node."""
+    """A connection to the XML-RPC server of a master or node; ``caller`` is the calling node.
 
-    def __init__(self, uri: str, caller: str = CALLER) -> None:
+    Larger answers than ``max_answer_bytes`` are errors.
+    """
+
+    def __init__(
+        self, uri: str, caller: str = CALLER, max_answer_bytes: int = _MAX_RESPONSE_BYTES
+    ) -> None:
+        self._max_answer_bytes = max_answer_bytes
         self.uri = uri
         self._caller = caller
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
@@ -162,8 +168,9 @@ class Connection:
         head = await HttpHead.read(reader)
         if head.line.split(" ")[1:2] != ["200"]:
             raise ValueError(f"it answers {head.line:.100}")
-        if not 0 <= head.size <= _MAX_RESPONSE_BYTES:
-            raise ValueError(f"its answer has {head.size} bytes; allowed are {_MAX_RESPONSE_BYTES}")
+        if not 0 <= head.size <= self._max_answer_bytes:
+            most = self._max_answer_bytes
+            raise ValueError(f"its answer has {head.size} bytes; allowed are {most}")
         content = await reader.readexactly(head.size)
         if head.ends:
             self.close()

@@ -16,7 +16,7 @@ import xmlrpc.client
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
-from holdfast.errors import CallError, TransportError
+from holdfast.errors import DEFECT, CallError, TransportError, defect_fields
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
 from holdfast.transport.endpoints import host_and_port, why_not_bound
 from holdfast.transport.ros1_calls import Connection, HttpHead, message, offers_service
@@ -55,9 +55,16 @@ _CHECK_INTERVAL_S: Final = 1.0
 _RETRY_S: Final = 0.1
 """After the master could not be reached."""
 
-_MAX_CALL_BYTES: Final = 1 << 20
+_MAX_CALL_BYTES: Final = 8 << 10
+"""An XML-RPC call to a node has some hundred bytes. Parsing takes a microsecond for each of them,
+during which nobody else is served."""
+
+_MAX_ANSWER_BYTES: Final = 256 << 10
+"""The same of a master's answer, which names this node's services."""
+
 _MAX_UNREAD_BYTES: Final = 1 << 20
-"""Of messages that wait for one subscriber; further ones are dropped."""
+_MAX_UNREAD_BYTES_OF_ALL: Final = 16 << 20
+"""Of messages that wait for one subscriber of a topic, and for all; further ones are dropped."""
 
 _UNKNOWN: Final = -1
 _OK: Final = 1
@@ -100,10 +107,10 @@ class Topic:
         if self._last is not None:
             self._write(writer, self._last)
 
-    @staticmethod
-    def _write(writer: asyncio.StreamWriter, message: bytes) -> None:
+    def _write(self, writer: asyncio.StreamWriter, message: bytes) -> None:
         waiting = writer.transport.get_write_buffer_size()
-        if waiting == 0 or waiting + len(message) <= _MAX_UNREAD_BYTES:
+        bound = min(_MAX_UNREAD_BYTES, _MAX_UNREAD_BYTES_OF_ALL // len(self.subscribers))
+        if waiting == 0 or waiting + len(message) <= bound:
             writer.write(message)
 
 
@@ -132,7 +139,8 @@ class RosNode:
         self._services: dict[str, _Offer] = {}
         self._other_ports: dict[str, int] = {}
         self._topics: dict[str, Topic] = {}
-        self._master = Connection(environment.master, self.name)
+        self._master = Connection(environment.master, self.name, _MAX_ANSWER_BYTES)
+        self._parsing = asyncio.Lock()
         self._servers: list[asyncio.Server] = []
         self._uri = ""
         self._port = 0
@@ -164,10 +172,11 @@ class RosNode:
         """
         environment = self._environment
         try:
-            for serve in (self._serve_node, self._serve_tcpros):
-                server = await asyncio.start_server(
-                    serve, environment.bind, 0, limit=MAX_HEADER_BYTES
-                )
+            for serve, limit in (
+                (self._serve_node, _MAX_CALL_BYTES),
+                (self._serve_tcpros, MAX_HEADER_BYTES),
+            ):
+                server = await asyncio.start_server(serve, environment.bind, 0, limit=limit)
                 self._servers.append(server)
         except OSError as error:
             self._stop()
@@ -290,12 +299,14 @@ class RosNode:
                 return False
             content = await reader.readexactly(head.size)
             answer: tuple[tuple[int, str, Any]] | xmlrpc.client.Fault
-            try:
-                arguments, method = xmlrpc.client.loads(content)
-                answer = (self._answer(str(method), arguments),)
-            except Exception as error:  # noqa: BLE001 - the parser may raise anything
-                reason = f"{type(error).__name__}: {error}"
-                answer = xmlrpc.client.Fault(1, f"this is no method of a node: {reason:.500}")
+            async with self._parsing:
+                await asyncio.sleep(0)  # one call in each turn of the loop, however many wait
+                try:
+                    arguments, method = xmlrpc.client.loads(content)
+                    answer = (self._answer(str(method), arguments),)
+                except Exception as error:  # noqa: BLE001 - the parser may raise anything
+                    reason = f"{type(error).__name__}: {error}"
+                    answer = xmlrpc.client.Fault(1, f"this is no method of a node: {reason:.500}")
             body = xmlrpc.client.dumps(answer, methodresponse=True).encode()
             writer.write(
                 b"HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\n"
@@ -428,6 +439,9 @@ class RosNode:
             *(asyncio.LimitOverrunError, asyncio.CancelledError),
         ):
             pass  # the peer is gone, or breaks the protocol
+        except Exception as error:  # noqa: BLE001 - what a peer sends may raise anything
+            if self._on_event is not None:
+                self._on_event(DEFECT, **defect_fields(error))
         finally:
             self._connections.discard(task)
             writer.close()

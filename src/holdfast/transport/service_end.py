@@ -138,7 +138,8 @@ class StreamServiceTransport(LinkOwner):
         if known, ``robot``; ``robot_connected`` with ``robot``; ``robot_disconnected`` with
         ``robot`` and ``reason``. Each has the robot's ``address``, None over a local socket.
     on_shutdown : callable or None
-        Called with the reason when ROS ends this process, or another one takes its name there.
+        Called with the reason when ROS asks this node to end, or another one takes its name there;
+        the caller may :meth:`withdraw` the protocol.
 
     Raises
     ------
@@ -199,6 +200,7 @@ class StreamServiceTransport(LinkOwner):
         self._without_hello: dict[Link, bytes] = {}
         self._links: dict[Link, set[_StreamCall]] = {}
         self._closing: set[asyncio.Future[None]] = set()
+        self._protocols: dict[Link, str] = {}
         self._gone: asyncio.Future[None] | None = None
 
     @property
@@ -268,17 +270,38 @@ class StreamServiceTransport(LinkOwner):
             dialer.stop()
         self._takes_links = False
 
+    async def withdraw(self, protocol: str, timeout_s: float) -> None:
+        """Stop listening with one protocol, and ask its robots to leave; all others go on.
+
+        Links that still stand after ``timeout_s`` are ended.
+        """
+        kept: list[tuple[Endpoint, Listener]] = []
+        for endpoint, listener in zip(self._listen, self._listeners, strict=True):
+            if endpoint.protocol == protocol:
+                listener.close()
+            else:
+                kept.append((endpoint, listener))
+        self._listen = [endpoint for endpoint, _ in kept]
+        self._listeners = [listener for _, listener in kept]
+        leaving = [link for link, its in self._protocols.items() if its == protocol]
+        for link in leaving:
+            if link in self._links:
+                link.send(encode_goodbye(""))
+            else:
+                link.end("")
+        await self._schemes[protocol].withdraw(timeout_s)
+        if leaving:
+            await asyncio.wait([link.closed for link in leaving], timeout=timeout_s)
+        for link in leaving:
+            self._end(link)
+
     async def close(self, timeout_s: float = 1.0) -> None:
         """End all calls, send what was to be sent, and close all links, within this time."""
         self._deliver = None
         self._started = True
         self._stop_listening()
-        for link, calls in list(self._links.items()):
-            for call in list(calls):
-                call.end()
-            link.end(_SERVICE_ENDS, goodbye="")
-        for link in list(self._without_hello):
-            link.end("")
+        for link in (*self._links, *self._without_hello):
+            self._end(link)
         withdrawing = {
             asyncio.ensure_future(scheme.withdraw(timeout_s)) for scheme in self._schemes.values()
         }
@@ -286,6 +309,16 @@ class StreamServiceTransport(LinkOwner):
             await asyncio.wait(closing, timeout=timeout_s)
         for scheme in self._schemes.values():
             scheme.close()
+
+    def _end(self, link: Link) -> None:
+        """End a link in order, because this service ends or withdraws its protocol."""
+        calls = self._links.get(link)
+        if calls is None:
+            link.end("")
+            return
+        for call in list(calls):
+            call.end()
+        link.end(_SERVICE_ENDS, goodbye="")
 
     def end_links(self, objection: Callable[[PeerCertificate], str | None]) -> int:
         """End the links of robots whose certificate is not accepted; return their number.
@@ -353,6 +386,7 @@ class StreamServiceTransport(LinkOwner):
             del self._without_hello[other]
             other.end("has said no hello, and others wait", abort=True)
         self._without_hello[link] = network
+        self._protocols[link] = endpoint.protocol
         self._closing.add(link.closed)
         link.closed.add_done_callback(self._closing.discard)
         return link
@@ -440,6 +474,7 @@ class StreamServiceTransport(LinkOwner):
     def on_ended(self, link: Link) -> None:
         """Note that a link has ended."""
         self._without_hello.pop(link, None)
+        self._protocols.pop(link, None)
         was_there = self._links.pop(link, None) is not None
         if was_there and link.hello is not None:
             reason = link.reason or (_SAID_GOODBYE if link.said_goodbye else _NO_GOODBYE)

@@ -36,6 +36,9 @@ __all__ = [
 MAX_HEADER_BYTES = 64 * 1024
 """Bound on a connection header; a topic's contains the whole definition of its type."""
 
+_MAX_FIELDS = 64
+"""Bound on its fields; ROS has eight."""
+
 ANY_TYPE = "*"
 """The digest that matches any type."""
 
@@ -80,9 +83,11 @@ def decode_header(data: bytes) -> dict[str, str]:
     TransportError
         If it is malformed; the message continues a sentence about its sender.
     """
-    fields = {}
+    fields: dict[str, str] = {}
     place = 0
     while place < len(data):
+        if len(fields) >= _MAX_FIELDS:
+            raise TransportError(f"has sent a connection header of more than {_MAX_FIELDS} fields")
         if place + 4 > len(data):
             raise TransportError("has sent a connection header that is cut off")
         (size,) = _LENGTH.unpack_from(data, place)

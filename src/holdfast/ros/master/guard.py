@@ -33,6 +33,7 @@ from holdfast.ros.master.plan import (
     NodeReport,
     Reconciled,
     ask_everyone,
+    process_of,
     reconcile,
     snapshot,
     unregistrations,
@@ -305,7 +306,7 @@ class MasterGuard:
 
     async def _recognise(self, connection: Connection) -> None:
         """Identify a foreign master."""
-        pid = int(await connection.call("getPid", within_s=_PROBE_S))
+        pid = await process_of(connection, within_s=_PROBE_S)
         # A stock master has no such call and answers so at once.
         (journal,) = await connection.calls([("getJournal", (CALLER,))], within_s=_PROBE_S)
         inherited = journal == str(self._journal)
@@ -324,15 +325,12 @@ class MasterGuard:
 
     async def _write_down(self, connection: Connection) -> None:
         """Journal a stock master's state, if it has changed."""
-        try:
-            state = await snapshot(connection)
-        except (TypeError, ValueError) as error:
-            raise CallError(f"{self._uri}: cannot be understood: {error}") from error
+        state = await snapshot(connection)
         changed, self._followed = state != self._followed, state
         try:
             if changed or self._unwritten is not None or not self._has_journal():
                 write_journal(self._journal, state)
-        except (OSError, TypeError, ValueError) as error:
+        except Exception as error:  # noqa: BLE001 - a parameter may have any type
             before, self._unwritten = (
                 self._unwritten,
                 f"{self._journal}: what the master knows cannot be written down: "

@@ -24,6 +24,7 @@ __all__ = [
     "Reconciled",
     "ask_everyone",
     "lookups_of",
+    "process_of",
     "reconcile",
     "snapshot",
     "state_of_snapshot",
@@ -217,6 +218,9 @@ def _add(
 def lookups_of(system_state: Any) -> tuple[list[str], list[str]]:
     """Return the nodes and the services that a master's ``getSystemState`` names."""
     nodes = {node for table in system_state for _, names in table for node in names}
+    named = {name for table in system_state for name, _ in table}
+    if odd := [name for name in nodes | named if not isinstance(name, str)]:
+        raise TypeError(f"{odd[0]!r:.100} is no name")
     return sorted(nodes), [service for service, _ in system_state[2]]
 
 
@@ -255,8 +259,16 @@ def state_of_snapshot(
     return state
 
 
+async def process_of(connection: Connection, *, within_s: float) -> int:
+    """Return a master's process id; raise CallError if it does not tell one."""
+    pid = await connection.call("getPid", within_s=within_s)
+    if not isinstance(pid, int) or pid < 1:
+        raise CallError(f"{connection.uri}: getPid answers {pid!r:.100}, which is no process id")
+    return pid
+
+
 async def snapshot(connection: Connection) -> MasterState:
-    """Return a stock master's state."""
+    """Return a stock master's state; raise CallError if its answers cannot be understood."""
     system_state, types, parameters = await connection.calls(
         [
             ("getSystemState", (CALLER,)),
@@ -265,18 +277,24 @@ async def snapshot(connection: Connection) -> MasterState:
         ],
         within_s=_SNAPSHOT_S,
     )
-    names, services = lookups_of(system_state)
-    uris = await connection.calls(
-        [
-            *(("lookupNode", (CALLER, name)) for name in names),
-            *(("lookupService", (CALLER, service)) for service in services),
-        ],
-        within_s=_SNAPSHOT_S,
-    )
-    return state_of_snapshot(
-        system_state,
-        types,
-        parameters,
-        dict(zip(names, uris, strict=False)),
-        dict(zip(services, uris[len(names) :], strict=True)),
-    )
+    try:
+        names, services = lookups_of(system_state)
+        uris = await connection.calls(
+            [
+                *(("lookupNode", (CALLER, name)) for name in names),
+                *(("lookupService", (CALLER, service)) for service in services),
+            ],
+            within_s=_SNAPSHOT_S,
+        )
+        uris = [uri if isinstance(uri, str) else None for uri in uris]
+        return state_of_snapshot(
+            system_state,
+            types,
+            parameters,
+            dict(zip(names, uris, strict=False)),
+            dict(zip(services, uris[len(names) :], strict=True)),
+        )
+    except CallError:
+        raise
+    except Exception as error:
+        raise CallError(f"{connection.uri}: cannot be understood: {error}") from error
