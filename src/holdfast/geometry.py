@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel
-from holdfast.arrays import BoolArray, FloatArray, IntArray
+from holdfast.arrays import BoolArray, FloatArray, IntArray, floats, real_number
 from holdfast.errors import InvalidValueError
 from holdfast.randomness import NoiseFreeStream
 
@@ -51,7 +51,7 @@ class _World:
 
     def _check_obstacles(self, obstacles: npt.ArrayLike) -> FloatArray:
         half = self.space_dimension
-        limits = np.array(obstacles, dtype=np.float64, order="C")
+        limits = floats("obstacles", obstacles).copy()
         if limits.size == 0:
             limits = limits.reshape(0, 2 * half)
         if limits.ndim != 2 or limits.shape[1] != 2 * half:
@@ -324,9 +324,10 @@ class BoxWorld(_World):
 
 
 def _check_length(name: str, value: float) -> float:
-    if not 0.0 < value <= FAR:  # false for NaN too
+    length = real_number(value)
+    if length is None or not 0.0 < length <= FAR:  # false for NaN too
         raise InvalidValueError(f"{name}: {value}, must be above 0 and at most {FAR:g}")
-    return float(value)
+    return length
 
 
 def _broadcast(states: FloatArray, actions: FloatArray) -> tuple[FloatArray, FloatArray]:
