@@ -21,6 +21,7 @@ __all__ = [
     "BoolArray",
     "FloatArray",
     "IntArray",
+    "KeepsReadOnly",
     "floats",
     "floats_or_none",
     "in_brief",
@@ -37,6 +38,26 @@ BoolArray = npt.NDArray[np.bool_]
 
 _EDGE = 4
 """Entries of a long array that a message shows, at either end."""
+
+
+class KeepsReadOnly:
+    """A class whose objects are pickled and copied with their read-only arrays still read-only."""
+
+    def __getstate__(self) -> tuple[dict[str, Any], list[str]]:
+        return vars(self), [name for name, value in vars(self).items() if _is_read_only(value)]
+
+    def __setstate__(self, state: tuple[dict[str, Any], list[str]]) -> None:
+        attributes, read_only = state
+        vars(self).update(attributes)
+        for name in read_only:
+            value = attributes[name]
+            for array in value if isinstance(value, list | tuple) else (value,):
+                array.setflags(write=False)
+
+
+def _is_read_only(value: object) -> bool:
+    arrays = value if isinstance(value, list | tuple) and value else (value,)
+    return all(isinstance(each, np.ndarray) and not each.flags.writeable for each in arrays)
 
 
 def in_brief(values: object) -> str:

@@ -60,6 +60,10 @@ class Belief(NamedTuple):
     states: FloatArray
     weights: FloatArray
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Be pickled and copied as what is read-only: NumPy forgets that of its arrays."""
+        return _restored, (self.states, self.weights)
+
     @classmethod
     def uniform(cls, states: npt.ArrayLike) -> Belief:
         """Return a belief of equally weighted particles, (num_particles, state_size).
@@ -100,6 +104,12 @@ class Belief(NamedTuple):
         normalized = array / total
         normalized.setflags(write=False)
         return cls(belief.states, normalized)
+
+
+def _restored(states: FloatArray, weights: FloatArray) -> Belief:
+    states.setflags(write=False)
+    weights.setflags(write=False)
+    return Belief(states, weights)
 
 
 def uniform_weights(count: int) -> FloatArray:

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import checked
-from holdfast.arrays import FloatArray, floats, integer, whole
+from holdfast.arrays import FloatArray, KeepsReadOnly, floats, integer, whole
 from holdfast.config.user_code import find_class
 from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import Done, MoveResult
@@ -135,7 +135,7 @@ class RememberingEnvironment(CountingEnvironment, Protocol):
         ...
 
 
-class SimulatedEnvironment:
+class SimulatedEnvironment(KeepsReadOnly):
     """A world simulated from a problem, with its own random streams.
 
     What happens is a function of (seed, trial) and of the task actions performed so far: sensing
