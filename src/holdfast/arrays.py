@@ -1,14 +1,36 @@
-"""Arrays: the three types that holdfast uses, and how a message shows one."""
+"""Arrays and numbers: the types that holdfast uses, how they are read, how a message shows one.
+
+NumPy makes numbers of almost anything: of the text "4.0", of True, of a date, of what a mask hides.
+The readers here take what is a real number and nothing else, so they stand at every entry of
+the public interface, and wherever something comes from a user's function.
+"""
 
 from __future__ import annotations
 
+import operator
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["BoolArray", "FloatArray", "IntArray", "floats_or_none", "in_brief", "real_numbers"]
+from holdfast.errors import InvalidValueError
+
+__all__ = [
+    "BoolArray",
+    "FloatArray",
+    "IntArray",
+    "KeepsReadOnly",
+    "floats",
+    "floats_or_none",
+    "in_brief",
+    "integer",
+    "plain",
+    "real_number",
+    "real_numbers",
+    "whole",
+]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -16,6 +38,26 @@ BoolArray = npt.NDArray[np.bool_]
 
 _EDGE = 4
 """Entries of a long array that a message shows, at either end."""
+
+
+class KeepsReadOnly:
+    """A class whose objects are pickled and copied with their read-only arrays still read-only."""
+
+    def __getstate__(self) -> tuple[dict[str, Any], list[str]]:
+        return vars(self), [name for name, value in vars(self).items() if _is_read_only(value)]
+
+    def __setstate__(self, state: tuple[dict[str, Any], list[str]]) -> None:
+        attributes, read_only = state
+        vars(self).update(attributes)
+        for name in read_only:
+            value = attributes[name]
+            for array in value if isinstance(value, list | tuple) else (value,):
+                array.setflags(write=False)
+
+
+def _is_read_only(value: object) -> bool:
+    arrays = value if isinstance(value, list | tuple) and value else (value,)
+    return all(isinstance(each, np.ndarray) and not each.flags.writeable for each in arrays)
 
 
 def in_brief(values: object) -> str:
@@ -28,12 +70,77 @@ def in_brief(values: object) -> str:
 
 
 def real_numbers(value: object) -> npt.NDArray[Any] | None:
-    """Return an array of a number or of numbers; None for anything else, truth values included."""
+    """Return an array of a number or of numbers; None for anything else.
+
+    Truth values are none, nor are texts, dates, objects, or an array of which a mask hides entries.
+    """
+    if _hides_something(value):
+        return None
     try:
         numbers = np.asarray(value)
     except (TypeError, ValueError):
         return None  # A ragged list.
     return numbers if numbers.dtype.kind in "fiu" else None
+
+
+def _hides_something(value: object) -> bool:
+    """Tell whether NumPy would silently make a number of something else, in a list say."""
+    if isinstance(value, list | tuple):
+        return any(map(_hides_something, value)) if value else False
+    if isinstance(value, np.ma.MaskedArray):
+        return bool(np.ma.is_masked(value))
+    return isinstance(value, bool | np.bool_)
+
+
+def real_number(value: object) -> float | None:
+    """Return one real number, finite or not; None for anything else."""
+    if type(value) is float:
+        return value
+    number = None if isinstance(value, list | tuple) else real_numbers(value)
+    return float(number) if number is not None and number.ndim == 0 else None
+
+
+def integer(value: object) -> int | None:
+    """Return a whole number, NumPy's too; None for anything else, 3.0 and True included."""
+    if isinstance(value, bool | np.bool_) or _hides_something(value):
+        return None
+    try:
+        return operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        return None
+
+
+def whole(what: str, value: object, least: int, most: int | None = None) -> int:
+    """Return a whole number within bounds; InvalidValueError says which ``what`` is not."""
+    number = integer(value)
+    if number is None or number < least or (most is not None and number > most):
+        limits = f"from {least}" if most is None else f"from {least} to {most}"
+        raise InvalidValueError(f"{what} {value!r:.80}: allowed are whole numbers {limits}")
+    return number
+
+
+def floats(what: str, value: object) -> FloatArray:
+    """Return real numbers as float64, in C order; InvalidValueError says which are none."""
+    numbers = real_numbers(value)
+    if numbers is None:
+        came = " ".join(repr(value).split())
+        raise InvalidValueError(
+            f"{what} is {came:.80}: must be real numbers (no text, truth value, date or masked "
+            "entry)"
+        )
+    return np.ascontiguousarray(numbers, dtype=np.float64).reshape(numbers.shape)
+
+
+def plain(value: Any) -> Any:
+    """Return a value with Python's own numbers and lists in the place of NumPy's, however deep.
+
+    What is neither a number nor a text of NumPy's stays as it is.
+    """
+    if isinstance(value, np.ndarray | np.generic) and not _hides_something(value):
+        return value.tolist() if value.dtype.kind in "biufU" else value
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
+    return type(value)(map(plain, value)) if type(value) in (list, tuple) else value
 
 
 def floats_or_none(shown: npt.ArrayLike | None) -> FloatArray | None:

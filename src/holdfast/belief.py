@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel, checked, numerics
-from holdfast.arrays import FloatArray, in_brief
+from holdfast.arrays import FloatArray, floats, in_brief
 from holdfast.circular import differences, mean_angles
 from holdfast.config.settings import Estimate
 from holdfast.errors import InvalidValueError
@@ -60,13 +60,17 @@ class Belief(NamedTuple):
     states: FloatArray
     weights: FloatArray
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Be pickled and copied as what is read-only: NumPy forgets that of its arrays."""
+        return _restored, (self.states, self.weights)
+
     @classmethod
     def uniform(cls, states: npt.ArrayLike) -> Belief:
         """Return a belief of equally weighted particles, (num_particles, state_size).
 
         Raises InvalidValueError if there is no particle or a coordinate is not finite.
         """
-        array = np.array(states, dtype=np.float64, order="C")
+        array = floats("states", states).copy()
         if array.ndim != 2 or array.shape[0] == 0 or array.shape[1] == 0:
             raise InvalidValueError(
                 f"states of shape {array.shape}: need (num_particles, state_size), at least 1 each"
@@ -85,7 +89,7 @@ class Belief(NamedTuple):
         out of bounds raises InvalidValueError.
         """
         belief = cls.uniform(states)
-        array = np.ascontiguousarray(weights, dtype=np.float64)
+        array = floats("weights", weights)
         count = belief.states.shape[0]
         if array.shape != (count,):
             raise InvalidValueError(f"weights of shape {array.shape}: need ({count},)")
@@ -100,6 +104,12 @@ class Belief(NamedTuple):
         normalized = array / total
         normalized.setflags(write=False)
         return cls(belief.states, normalized)
+
+
+def _restored(states: FloatArray, weights: FloatArray) -> Belief:
+    states.setflags(write=False)
+    weights.setflags(write=False)
+    return Belief(states, weights)
 
 
 def uniform_weights(count: int) -> FloatArray:
@@ -272,7 +282,7 @@ def update_by_move(
 
 
 def _finite(observation: npt.ArrayLike) -> FloatArray:
-    observed = np.ascontiguousarray(observation, dtype=np.float64).reshape(-1)
+    observed = floats("observation", observation).reshape(-1)
     if not numerics.all_finite(observed):
         raise InvalidValueError(
             f"observation {in_brief(observed)}: every coordinate must be finite"

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel
-from holdfast.arrays import BoolArray, FloatArray, IntArray, in_brief
+from holdfast.arrays import BoolArray, FloatArray, IntArray, floats, in_brief
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.problem_attributes import has_own, name_of
 
@@ -144,7 +144,7 @@ def moved_by_measurement(
     problem: Any, states: FloatArray, motion: npt.ArrayLike, stream: object
 ) -> FloatArray:
     """Return states moved by a measured motion, with the noise of the measurement, read-only."""
-    measured = np.array(motion, dtype=np.float64).reshape(-1)
+    measured = floats("motion", motion).reshape(-1).copy()
     if not _kernel.all_finite(measured):
         raise InvalidValueError(f"motion {in_brief(measured)}: every coordinate must be finite")
     function = "move_by_measurement"

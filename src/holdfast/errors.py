@@ -13,6 +13,14 @@ import traceback
 class HoldfastError(Exception):
     """Base of every error that holdfast raises on purpose."""
 
+    def __reduce__(self) -> tuple[object, ...]:
+        # Else a pool of processes, which passes errors on, would have to call __init__ again.
+        return _restored, (type(self), self.args), vars(self)
+
+
+def _restored(kind: type[HoldfastError], arguments: tuple[object, ...]) -> HoldfastError:
+    return kind.__new__(kind, *arguments)
+
 
 class InvalidValueError(HoldfastError, ValueError):
     """A value is outside its bounds: a negative variance, a NaN in an observation, k >= N."""

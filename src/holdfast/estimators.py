@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel, numerics
-from holdfast.arrays import FloatArray, in_brief
+from holdfast.arrays import FloatArray, floats, in_brief, real_number, whole
 from holdfast.circular import unwrapped
 from holdfast.config.settings import MAX_PRIOR_NEIGHBORS_POINTS
 from holdfast.errors import InvalidValueError
@@ -201,9 +201,9 @@ def first_unbounded(points: FloatArray) -> int | None:
     return None if bounded.all() else int(np.argmin(bounded.all(axis=1)))
 
 
-def scale_of(resolution: FloatArray, dimension: int) -> tuple[FloatArray, float]:
+def scale_of(resolution: npt.ArrayLike, dimension: int) -> tuple[FloatArray, float]:
     """Return what makes a resolution 1 in every coordinate, and the log of its cell's volume."""
-    sizes = np.ascontiguousarray(resolution, dtype=np.float64)
+    sizes = floats("resolution", resolution)
     if sizes.shape != (dimension,):
         raise InvalidValueError(
             f"resolution of shape {sizes.shape}: need one number, or ({dimension},)"
@@ -233,24 +233,21 @@ def kernel_estimator(
             f"points of {dimension} coordinates: allowed are 1 to {MAX_DIMENSION}"
         )
     if isinstance(estimator, NearestNeighbor | PriorNeighbors):
-        if estimator.neighbors < 1:
-            raise InvalidValueError(f"neighbors {estimator.neighbors}: must be at least 1")
+        neighbors = whole("neighbors", estimator.neighbors, 1)
         if isinstance(estimator, NearestNeighbor):
             kind, prior = EstimatorKind.NEAREST_NEIGHBOR, _NO_PRIOR
         else:
             kind, prior = EstimatorKind.PRIOR_NEIGHBORS, _checked_prior(estimator.prior)
-        if np.ndim(estimator.resolution) > 0:
-            scale, log_volume = scale_of(np.asarray(estimator.resolution), dimension)
-            return KernelEstimator(
-                kind, estimator.neighbors, 1.0, 0.0, 0.0, scale, log_volume, prior
-            )
-        resolution = float(estimator.resolution)
+        resolution = real_number(estimator.resolution)
+        if resolution is None:  # one for each coordinate
+            scale, log_volume = scale_of(estimator.resolution, dimension)
+            return KernelEstimator(kind, neighbors, 1.0, 0.0, 0.0, scale, log_volume, prior)
         if not 1.0 / LARGEST <= resolution <= LARGEST:
             raise InvalidValueError(
                 f"resolution {resolution}: allowed are {1.0 / LARGEST:g} to {LARGEST:g}"
             )
-        return KernelEstimator(kind, estimator.neighbors, resolution, 0.0, 0.0, None, 0.0, prior)
-    variance = np.ascontiguousarray(estimator.variance, dtype=np.float64).reshape(-1)
+        return KernelEstimator(kind, neighbors, resolution, 0.0, 0.0, None, 0.0, prior)
+    variance = floats("variance", estimator.variance).reshape(-1)
     if variance.shape != (dimension,):
         raise InvalidValueError(f"variance of shape {variance.shape}: need ({dimension},)")
     if not (variance > 0.0).all() or not np.isfinite(variance).all():
@@ -270,7 +267,7 @@ def kernel_estimator(
 
 
 def _checked_prior(prior: npt.ArrayLike) -> FloatArray:
-    weights = np.ascontiguousarray(prior, dtype=np.float64)
+    weights = floats("prior", prior)
     if weights.ndim != 1 or not 1 <= weights.shape[0] <= MAX_PRIOR_NEIGHBORS_POINTS:
         raise InvalidValueError(
             f"prior of shape {weights.shape}: need (n,) with n from 1 to "
@@ -325,7 +322,7 @@ def entropy(
             f"estimator is {estimator!r}; it must be a NearestNeighbor, PriorNeighbors or "
             "GaussianMixture"
         )
-    array = np.ascontiguousarray(points, dtype=np.float64)
+    array = floats("points", points)
     if array.ndim != 2 or array.shape[0] == 0:
         raise InvalidValueError(f"points of shape {array.shape}: need (n, d) with n >= 1")
     count = array.shape[0]
@@ -340,7 +337,7 @@ def entropy(
         )
     if isinstance(estimator, PriorNeighbors) and kernel.prior.shape != (count,):
         raise InvalidValueError(f"prior of shape {kernel.prior.shape}: need ({count},)")
-    rows = np.ones((1, count)) if weights is None else np.ascontiguousarray(weights, np.float64)
+    rows = np.ones((1, count)) if weights is None else floats("weights", weights)
     single = rows.ndim == 1 or weights is None
     rows = rows.reshape(1, -1) if rows.ndim == 1 else rows
     if rows.ndim != 2 or rows.shape[1] != count:
@@ -353,7 +350,9 @@ def entropy(
     if not (rows > 0.0).any(axis=1).all():
         bad = int(np.argmin((rows > 0.0).any(axis=1)))
         raise InvalidValueError(f"weights[{bad}] are all zero: one must be positive")
-    array = scaled(unwrapped(array, circular) if circular else array, kernel)
+    angles = [whole("circular", each, 0, array.shape[1] - 1) for each in circular]
+    threads = whole("threads", threads, 0)
+    array = scaled(unwrapped(array, angles) if angles else array, kernel)
     result, _, _, _ = _kernel.entropies(
         array,
         rows,

@@ -18,14 +18,21 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel
-from holdfast.arrays import BoolArray, FloatArray, IntArray
+from holdfast.arrays import BoolArray, FloatArray, IntArray, KeepsReadOnly, floats, real_number
 from holdfast.errors import InvalidValueError
 from holdfast.randomness import NoiseFreeStream
 
 if TYPE_CHECKING:
     from holdfast.randomness import Stream
 
-__all__ = ["FAR", "MAX_NOISE_ATTEMPTS", "BoxWorld", "DiscWorld", "RectangleWorld"]
+__all__ = [
+    "FAR",
+    "MAX_NOISE_ATTEMPTS",
+    "BoxWorld",
+    "DiscWorld",
+    "KernelObject",
+    "RectangleWorld",
+]
 
 FAR = 1.0e6
 """Extent of an unbounded obstacle, in metres."""
@@ -34,7 +41,18 @@ MAX_NOISE_ATTEMPTS = 1000
 """Draws of noise, the first included, after which a state gets no noise."""
 
 
-class _World:
+class KernelObject:
+    """An object of the kernel, ``own``, that can be pickled and copied: it is made again."""
+
+    def __init__(self, kind: type[Any], *arguments: Any) -> None:
+        self.own = kind(*arguments)
+        self._made_of = (kind, *arguments)
+
+    def __reduce__(self) -> tuple[type[KernelObject], tuple[Any, ...]]:
+        return KernelObject, self._made_of
+
+
+class _World(KeepsReadOnly):
     """Base of the worlds: the checks and the calls into the kernel.
 
     ``dimension`` is the number of a state's coordinates, ``space_dimension`` that of a point's.
@@ -46,12 +64,12 @@ class _World:
 
     dimension: int
     space_dimension: int
-    _kernel: Any  # one of the kernel's three worlds, which have the same methods
+    _kernel: KernelObject  # one of the kernel's three worlds, which have the same methods
     obstacles: FloatArray
 
     def _check_obstacles(self, obstacles: npt.ArrayLike) -> FloatArray:
         half = self.space_dimension
-        limits = np.array(obstacles, dtype=np.float64, order="C")
+        limits = floats("obstacles", obstacles).copy()
         if limits.size == 0:
             limits = limits.reshape(0, 2 * half)
         if limits.ndim != 2 or limits.shape[1] != 2 * half:
@@ -71,7 +89,7 @@ class _World:
         """Tell which states overlap an obstacle; the result has their leading shape."""
         states = self._rows("states", states)
         result = np.empty(states.shape[:-1], dtype=np.bool_)
-        if not self._kernel.collides(states.reshape(-1, self.dimension), result.reshape(-1)):
+        if not self._kernel.own.collides(states.reshape(-1, self.dimension), result.reshape(-1)):
             _raise_not_finite("states", states)
         return result
 
@@ -113,7 +131,7 @@ class _World:
         if isinstance(stream, NoiseFreeStream):
             standard_deviation = np.zeros(dimension)
         next_states = np.empty(shape)
-        moved = self._kernel.move(
+        moved = self._kernel.own.move(
             states.reshape(-1, dimension),
             actions.reshape(-1, dimension),
             np.ascontiguousarray(standard_deviation, dtype=np.float64),
@@ -147,7 +165,7 @@ class _World:
         shape = (len(offsets), states.shape[0])
         states_at = np.empty((*shape, self.dimension))
         stages_at = np.empty(shape, dtype=np.int64)
-        followed = self._kernel.follow(
+        followed = self._kernel.own.follow(
             policy,
             states,
             stage,
@@ -184,7 +202,7 @@ class _World:
                 f"({count}, {self.dimension})"
             )
         next_states = np.empty(states.shape)
-        moved = self._kernel.move_each(
+        moved = self._kernel.own.move_each(
             states,
             actions,
             np.ascontiguousarray(standard_deviation, dtype=np.float64),
@@ -216,7 +234,7 @@ class _World:
         self._check_vector("mean", mean)
         self._check_deviation(standard_deviation)
         states = np.empty((count, self.dimension))
-        num_unplaced = self._kernel.draw_free(
+        num_unplaced = self._kernel.own.draw_free(
             np.ascontiguousarray(mean, dtype=np.float64),
             np.ascontiguousarray(standard_deviation, dtype=np.float64),
             stream.words,
@@ -276,7 +294,7 @@ class DiscWorld(_World):
     def __init__(self, radius: float, obstacles: npt.ArrayLike) -> None:
         self.radius = _check_length("radius", radius)
         self.obstacles = self._check_obstacles(obstacles)
-        self._kernel = _kernel.DiscWorld(self.radius, self.obstacles)
+        self._kernel = KernelObject(_kernel.DiscWorld, self.radius, self.obstacles)
 
 
 class RectangleWorld(_World):
@@ -297,7 +315,7 @@ class RectangleWorld(_World):
         self.width = _check_length("width", width)
         self.height = _check_length("height", height)
         self.obstacles = self._check_obstacles(obstacles)
-        self._kernel = _kernel.RectangleWorld(self.width, self.height, self.obstacles)
+        self._kernel = KernelObject(_kernel.RectangleWorld, self.width, self.height, self.obstacles)
 
 
 class BoxWorld(_World):
@@ -320,13 +338,14 @@ class BoxWorld(_World):
         x, y, z = (_check_length(f"size[{i}]", length) for i, length in enumerate(size))
         self.size = (x, y, z)
         self.obstacles = self._check_obstacles(obstacles)
-        self._kernel = _kernel.BoxWorld(x, y, z, self.obstacles)
+        self._kernel = KernelObject(_kernel.BoxWorld, x, y, z, self.obstacles)
 
 
 def _check_length(name: str, value: float) -> float:
-    if not 0.0 < value <= FAR:  # false for NaN too
+    length = real_number(value)
+    if length is None or not 0.0 < length <= FAR:  # false for NaN too
         raise InvalidValueError(f"{name}: {value}, must be above 0 and at most {FAR:g}")
-    return float(value)
+    return length
 
 
 def _broadcast(states: FloatArray, actions: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -64,8 +64,6 @@ class Verdict(NamedTuple):
 class _Evidence:
     """A cumulative sum, and what it is made of."""
 
-    __slots__ = ("actions", "observations", "outside", "ratio")
-
     def __init__(self) -> None:
         self.restart()
 

@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import checked, numerics, sensing
-from holdfast.arrays import FloatArray, in_brief
+from holdfast.arrays import FloatArray, floats, in_brief, integer, plain, whole
 from holdfast.belief import (
     Belief,
     ObservationInfo,
@@ -42,7 +42,13 @@ from holdfast.belief import (
     update,
     update_by_move,
 )
-from holdfast.config.settings import MAX_PARTICLES, Method, PlanningSettings, check_settings
+from holdfast.config.settings import (
+    MAX_PARTICLES,
+    Method,
+    PlanningSettings,
+    check_settings,
+    plain_settings,
+)
 from holdfast.errors import CheckpointError, InvalidValueError, ProblemError
 from holdfast.problem_attributes import check_problem, circular_states, moves_show
 from holdfast.problems.problem import Problem
@@ -135,9 +141,9 @@ class Planner:
         if isinstance(problem, str):
             raise InvalidValueError(f"problem is the name {problem!r}: holdfast.make builds it")
         self.problem = problem
-        self.settings = PlanningSettings() if settings is None else settings
+        self.settings = PlanningSettings() if settings is None else plain_settings(settings)
         if particles is not None:
-            self._replace_setting("particle_filter", "num_particles", particles)
+            self._replace_setting("particle_filter", "num_particles", plain(particles))
         if method is not None:
             self._replace_setting("selector", "method", method)
         if particles is not None or method is not None:
@@ -159,11 +165,7 @@ class Planner:
         ProblemError
             If the problem breaks its contract: its initial states are not finite, say.
         """
-        for what, number, bits in (("seed", seed, 63), ("trial", trial, 32)):
-            if not isinstance(number, int | np.integer):
-                raise InvalidValueError(
-                    f"{what} {number!r:.80}: allowed are whole numbers from 0 to {2**bits - 1}"
-                )
+        seed, trial = whole("seed", seed, 0, 2**63 - 1), whole("trial", trial, 0, 2**32 - 1)
         problem = self.problem
         check_problem(problem)
         check_settings(self.settings)
@@ -254,7 +256,8 @@ class Planner:
         problem = self.problem
         self._require_size(state)
         known = len(problem.sensing_actions) + (observation is None)
-        if not (isinstance(sensing_action, int | np.integer) and 0 <= sensing_action < known):
+        chosen = integer(sensing_action)
+        if chosen is None or not 0 <= chosen < known:
             raise InvalidValueError(
                 f"sensing action {sensing_action!r:.80}: {problem.name} has 0 to "
                 f"{len(problem.sensing_actions) - 1}"
@@ -265,7 +268,7 @@ class Planner:
         ranks = None
         if getattr(problem, "rank_test", False):
             ranks = stream(state.seed, state.trial, state.step, Purpose.RANK_TEST)
-        updated = update(problem, state.belief, sensing_action, observation, ranks)
+        updated = update(problem, state.belief, chosen, observation, ranks)
         belief, info = self._resampled(state, *updated, Purpose.RESAMPLING)
         return state._replace(sensed=True, belief=belief), info
 
@@ -285,7 +288,8 @@ class Planner:
             If the problem has no ``move_log_likelihood``, or it breaks its contract.
         """
         self._require_size(state)
-        updated = update_by_move(self.problem, state.belief, task_action, observation)
+        action = floats("task action", task_action)
+        updated = update_by_move(self.problem, state.belief, action, observation)
         belief, info = self._resampled(state, *updated, Purpose.MOVE_RESAMPLING)
         return state._replace(belief=belief), info
 
@@ -371,7 +375,7 @@ class Planner:
             ``move_by_measurement``.
         """
         problem = self.problem
-        action = np.asarray(task_action, dtype=np.float64)
+        action = floats("task action", task_action)
         if action.shape != (problem.action_size,) or not numerics.all_finite(action):
             raise InvalidValueError(
                 f"task action {in_brief(action)}: {problem.name} needs "
@@ -399,6 +403,7 @@ class Planner:
         the state that they lead to. Only one, if a move may show something.
         """
         actions: list[FloatArray] = []
+        max_actions = whole("max_actions", max_actions, 0)
         if self.moves_show:
             max_actions = min(max_actions, 1)
         while len(actions) < max_actions and not self.needs_sensing(state):
@@ -499,11 +504,11 @@ def encode_checkpoint(state: PlanningState) -> bytes:
     return _checkpoint_encoder.encode(
         _Checkpoint(
             CHECKPOINT_VERSION,
-            state.seed,
-            state.trial,
-            state.step,
-            state.stage,
-            state.sensed,
+            int(state.seed),
+            int(state.trial),
+            int(state.step),
+            int(state.stage),
+            bool(state.sensed),
             states.shape[0],
             states.shape[1],
             np.ascontiguousarray(states, dtype="<f8").data,

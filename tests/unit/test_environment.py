@@ -168,7 +168,7 @@ def test_task_action_not_finite(problem: Problem, bad: float) -> None:
 
 @pytest.mark.parametrize(("seed", "trial"), [(-1, 0), (2**63, 0), (0, -1), (0, 2**32)])
 def test_seed_and_trial_out_of_range(seed: int, trial: int) -> None:
-    with pytest.raises(InvalidValueError, match=r"(seed|trial) (-1|\d+).*: allowed are 0 to"):
+    with pytest.raises(InvalidValueError, match=r"(seed|trial) (-1|\d+).*: allowed are whole numb"):
         SimulatedEnvironment(PegInHole2D(), seed, trial)
 
 

@@ -323,7 +323,7 @@ class TestBadInput:
 
     @pytest.mark.parametrize("neighbors", [0, -1])
     def test_no_neighbours(self, neighbors: int) -> None:
-        with pytest.raises(InvalidValueError, match=f"neighbors {neighbors}: must be at least 1"):
+        with pytest.raises(InvalidValueError, match=f"neighbors {neighbors}: allowed are whole n"):
             entropy(draw(20)[0], None, NearestNeighbor(neighbors, 0.1))
 
     @pytest.mark.parametrize("neighbors", [20, 21, 10**6])

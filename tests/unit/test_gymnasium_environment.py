@@ -219,6 +219,17 @@ class TestActions:
         assert space.contains(action)
         assert np.array_equal(action, performed)
 
+    @pytest.mark.parametrize(
+        ("kind", "given", "wanted"), [(np.float32, 0.7, 0.7), (np.float64, 9.0, 1.0), (int, 0.7, 1)]
+    )
+    def test_a_box_of_one_number(self, kind: Any, given: float, wanted: float) -> None:
+        """Its shape is (), as that of Discrete, but its numbers are not whole."""
+        inner = Counter(spaces.Box(-1, 1, (), kind))
+        counter(inner).perform(np.array([given]))
+        (action,) = inner.actions
+        assert inner.action_space.contains(action)
+        assert action == kind(wanted)
+
     def test_a_function_says_what_is_done(self) -> None:
         world = Counter(spaces.Discrete(3))
         environment = counter(world, action=lambda _, given: int(np.argmax(given)))
@@ -273,6 +284,16 @@ class TestWhatIsShown:
         for key, deviation in (("0", 0.1), ("1", 2.0), ("moved", 0.5), ("came", 3.0)):
             assert np.std(drawn[key]) == pytest.approx(deviation, rel=5 / np.sqrt(2000))
             assert np.mean(drawn[key]) == pytest.approx(0.0, abs=5 * deviation / np.sqrt(1000))
+
+    def test_an_array_says_what_its_list_says(self) -> None:
+        noise = [[0.5, 0.25], [2.0, 1.0]]
+        listed = counter(sensing=[[0, 1], [1, 0]], sensing_noise=noise)
+        given = counter(sensing=np.array([[0, 1], [1, 0]]), sensing_noise=np.array(noise))
+        for sensing_action in range(2):
+            expected = listed.perform_sensing(sensing_action)
+            assert given.perform_sensing(sensing_action).tolist() == expected.tolist()
+        with pytest.raises(ConfigurationError, match="sensing_noise has 3 entries; there are 2"):
+            counter(sensing_noise=np.ones(3))
 
     def test_sensing_again_shows_the_same(self) -> None:
         environment = car(sensing_noise=0.1)

@@ -79,7 +79,7 @@ def test_a_late_robot_gets_there_all_the_same() -> None:
 
 
 def test_no_moves_are_no_lateness() -> None:
-    with pytest.raises(InvalidValueError, match="moves is 0; it must be at least 1"):
+    with pytest.raises(InvalidValueError, match="moves 0: allowed are whole numbers from 1"):
         SenseLater(world(), 0)
 
 

@@ -381,8 +381,8 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("seed", "trial", "text"),
         [
-            (-1, 0, "seed -1: allowed are 0"),
-            (2**63, 0, f"seed {2**63}: allowed are 0"),
+            (-1, 0, "seed -1: allowed are whole numbers from 0 to 9223372036854775807"),
+            (2**63, 0, f"seed {2**63}: allowed are whole numbers from 0"),
             (0, -1, "trial -1"),
             (0, 2**32, f"trial {2**32}"),
             (1.5, 0, r"seed 1\.5: allowed are whole numbers from 0 to 9223372036854775807"),

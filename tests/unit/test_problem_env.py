@@ -240,7 +240,7 @@ class TestWhatIsRefused:
             ({"model": {"peg_with": 1.0}}, "peg_with"),
             ({"observation": "all"}, "observation is 'all'; allowed: summary, particles"),
             ({"reward": "one"}, "reward is 'one'; allowed: problem, steps"),
-            ({"max_steps": 0}, "max_steps is 0; allowed are integers from 1"),
+            ({"max_steps": 0}, "max_steps 0: allowed are whole numbers from 1"),
             ({"particles": 0}, "num_particles"),
             ({"sensing_interval": -1}, "sensing_interval"),
             ({"problem": "no_such_file.yaml"}, "no_such_file.yaml"),
@@ -268,6 +268,42 @@ class TestWhatIsRefused:
         episode(inner, lambda: 0, seed=1)
         with pytest.raises(gymnasium.error.ResetNeeded, match="has ended"):
             inner.step(0)
+
+    @pytest.mark.parametrize("begun", [False, True])
+    @pytest.mark.parametrize(
+        "refused",
+        [
+            {"options": {"trial": -1}},
+            {"options": {"trial": "2"}},
+            {"seed": -1},
+            {"seed": 2**63},
+            {"seed": 3, "options": {"trial": 2**32}},
+        ],
+    )
+    def test_a_refused_reset_leaves_the_episode_as_it_was(
+        self, begun: bool, refused: dict[str, Any]
+    ) -> None:
+        def following(env: ProblemEnv) -> list[Any]:
+            if not begun:
+                return [str(env.reset(seed=7))]
+            return [str(env.step(1)), str(env.reset()), str(env.reset(options={"trial": 5}))]
+
+        asked, other = ProblemEnv(**SMALL), ProblemEnv(**SMALL)
+        if begun:
+            asked.reset(seed=7)
+            other.reset(seed=7)
+        with pytest.raises(InvalidValueError):
+            asked.reset(**refused)
+        assert following(asked) == following(other)
+
+    @pytest.mark.parametrize("action", [-1, 3, 1.0, True, "1", None])
+    def test_a_refused_step_leaves_the_episode_as_it_was(self, action: Any) -> None:
+        asked, other = ProblemEnv(**SMALL), ProblemEnv(**SMALL)
+        for env in (asked, other):
+            env.reset(seed=7)
+        with pytest.raises(InvalidValueError, match="peg_in_hole_2d has 0 to 2"):
+            asked.step(action)
+        assert str(asked.step(1)) == str(other.step(1))
 
     def test_settings_of_python(self) -> None:
         settings = PlanningSettings(selector=SelectorSettings(method="fixed", sensing_action=2))

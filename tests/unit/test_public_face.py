@@ -153,14 +153,18 @@ def test_load_configuration(tmp_path: Path) -> None:
             ).init(0),
             r"selector is of type dict; it must be a SelectorSettings",
         ),
-        (lambda: hf.run_trial(planner_of(), max_steps=0), r"max_steps is 0; allowed are"),
+        (lambda: hf.run_trial(planner_of(), max_steps=0), r"max_steps 0: allowed are"),
+        (
+            lambda: hf.run_trial(cast("Any", hf.make("peg_in_hole_2d"))),
+            r"planner is a PegInHole2D: run_trial takes a planner, as in run_trial\(Planner\(probl",
+        ),
         (
             lambda: hf.entropy(np.zeros((9, 1)), None, cast("Any", "nearest")),
             r"estimator is 'nearest'",
         ),
         (
             lambda: hf.make("peg_in_hole_2d", hole_tolernce=0.2),
-            r"no setting 'hole_tolernce'; allowed: .*hole_tolerance",
+            r"no setting 'hole_tolernce'; did you mean hole_tolerance.; allowed: .*hole_tolerance",
         ),
     ],
 )

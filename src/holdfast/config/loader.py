@@ -25,6 +25,7 @@ from typing import Any
 import msgspec
 import msgspec.inspect
 
+from holdfast.arrays import plain
 from holdfast.config.problem_builder import build_from, find_problem, schemas_of
 from holdfast.config.settings import (
     UNINFORMED_METHODS,
@@ -179,7 +180,7 @@ def load(
     document = read(_content(path), str(path))
     of_simulator = {"simulator.num_trials": num_trials, "simulator.seed": seed}
     given = {name: value for name, value in of_simulator.items() if value is not None}
-    return _build(document, path, problem, {**given, **(overrides or {})})
+    return _build(document, path, problem, plain({**given, **(overrides or {})}))
 
 
 def settings_keys() -> dict[str, str]:

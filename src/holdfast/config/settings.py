@@ -30,6 +30,7 @@ __all__ = [
     "check_settings",
     "estimator_of",
     "path_steps",
+    "plain_settings",
     "unfit_for_the_method",
 ]
 
@@ -432,6 +433,32 @@ def unfit_for_the_method(settings: PlanningSettings) -> tuple[tuple[str, str], s
             "selector.path_offsets are how far that looks ahead"
         )
     return None
+
+
+def plain_settings(settings: PlanningSettings) -> PlanningSettings:
+    """Return settings with Python's own numbers in the place of NumPy's.
+
+    What is out of bounds stays as it is, for :func:`check_settings` to name.
+    """
+    try:
+        msgspec.to_builtins(settings)
+    except TypeError:
+        pass  # It has something that is not plain.
+    else:
+        return settings
+    try:
+        plain = msgspec.to_builtins(settings, enc_hook=_plain)
+        return msgspec.convert(plain, PlanningSettings)
+    except (TypeError, msgspec.ValidationError):
+        return settings
+
+
+def _plain(value: Any) -> Any:
+    from holdfast.arrays import plain
+
+    if (found := plain(value)) is value:
+        raise TypeError(f"{value!r:.80} is neither a number nor a text")
+    return found
 
 
 def check_settings(settings: PlanningSettings) -> None:

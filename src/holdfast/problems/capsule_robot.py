@@ -15,7 +15,7 @@ import numpy as np
 from holdfast import _kernel
 from holdfast.arrays import BoolArray, FloatArray, IntArray
 from holdfast.errors import InvalidValueError
-from holdfast.geometry import DiscWorld
+from holdfast.geometry import DiscWorld, KernelObject
 from holdfast.problems.problem import Scene
 from holdfast.problems.rigid_body import (
     Coordinate,
@@ -146,7 +146,8 @@ class CapsuleRobot(RigidBodyProblem):
         gains = (planner.gain_0, planner.gain_1)
         self._gains = constant([gains if target.axis == 0 else gains[::-1] for target in targets])
         self._step_size = planner.step_size
-        self._path_policy = _kernel.ViaPointPolicy(
+        self._path_policy = KernelObject(
+            _kernel.ViaPointPolicy,
             np.column_stack([self._centers, self._gains, self._squared_radii]).tolist(),
             self._step_size,
         )

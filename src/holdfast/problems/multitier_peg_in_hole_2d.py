@@ -15,7 +15,7 @@ import numpy as np
 from holdfast import _kernel
 from holdfast.arrays import BoolArray, FloatArray, IntArray
 from holdfast.errors import InvalidValueError
-from holdfast.geometry import FAR, RectangleWorld
+from holdfast.geometry import FAR, KernelObject, RectangleWorld
 from holdfast.problems.problem import Scene
 from holdfast.problems.rigid_body import (
     Coordinate,
@@ -114,8 +114,12 @@ class MultitierPegInHole2D(PegProblem):
             [upright_limit(hole.tol, 0.5 * height) for hole in model.holes]
         )
         stages = np.column_stack([self._hole_x, self._upright_limits, self._passed_below])
-        self._path_policy = _kernel.PegPolicy2D(
-            stages.tolist(), self._half_width, self._peg_height, self._upper_limits.tolist()
+        self._path_policy = KernelObject(
+            _kernel.PegPolicy2D,
+            stages.tolist(),
+            self._half_width,
+            self._peg_height,
+            self._upper_limits.tolist(),
         )
 
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:

@@ -15,7 +15,7 @@ import numpy as np
 
 from holdfast import _kernel
 from holdfast.arrays import BoolArray, FloatArray, IntArray
-from holdfast.geometry import FAR, RectangleWorld
+from holdfast.geometry import FAR, KernelObject, RectangleWorld
 from holdfast.problems.problem import Scene
 from holdfast.problems.rigid_body import (
     Coordinate,
@@ -90,8 +90,12 @@ class PegInHole2D(PegProblem):
         super().__init__(model, planner, world)
         self._half_width = 0.5 * model.peg_width
         self._upright_limit = upright_limit(model.hole_tolerance, 0.5 * model.peg_height)
-        self._path_policy = _kernel.PegPolicy2D(
-            [(0.0, self._upright_limit, 0.0)], self._half_width, 0.0, self._upper_limits.tolist()
+        self._path_policy = KernelObject(
+            _kernel.PegPolicy2D,
+            [(0.0, self._upright_limit, 0.0)],
+            self._half_width,
+            0.0,
+            self._upper_limits.tolist(),
         )
 
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:

@@ -15,7 +15,7 @@ import numpy as np
 from holdfast import _kernel
 from holdfast.arrays import BoolArray, FloatArray, IntArray
 from holdfast.errors import InvalidValueError
-from holdfast.geometry import FAR, BoxWorld
+from holdfast.geometry import FAR, BoxWorld, KernelObject
 from holdfast.problems.problem import Scene
 from holdfast.problems.rigid_body import (
     Coordinate,
@@ -105,8 +105,8 @@ class PegInHole3D(PegProblem):
         )
         self._half_width = 0.5 * min(model.peg_dim[0], model.peg_dim[1])
         self._upright_limit = upright_limit(model.hole_tolerance, 0.5 * model.peg_dim[2])
-        self._path_policy = _kernel.PegPolicy3D(
-            self._half_width, self._upright_limit, self._upper_limits.tolist()
+        self._path_policy = KernelObject(
+            _kernel.PegPolicy3D, self._half_width, self._upright_limit, self._upper_limits.tolist()
         )
 
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:

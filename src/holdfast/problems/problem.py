@@ -37,7 +37,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import BoolArray, FloatArray, IntArray
+from holdfast.arrays import BoolArray, FloatArray, IntArray, real_numbers
 from holdfast.errors import ProblemError
 from holdfast.randomness import Stream
 
@@ -106,10 +106,10 @@ class Scene:
 
 
 def _in_scene(name: str, value: object, shape: tuple[int | None, ...]) -> FloatArray:
-    try:
-        numbers = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ProblemError(f"{name} of a Scene is {value!r:.80}: must be numbers") from error
+    numbers = real_numbers(value)
+    if numbers is None:
+        raise ProblemError(f"{name} of a Scene is {value!r:.80}: must be numbers")
+    numbers = np.array(numbers, dtype=np.float64)
     if numbers.shape == (0,) and len(shape) == 2:
         return np.empty((0, shape[1] or 0))
     fits = len(shape) == numbers.ndim and all(

@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from holdfast.arrays import plain
+from holdfast.config.validation import close_match
 from holdfast.errors import InvalidValueError, UnknownProblemError
 from holdfast.problems.problem import Problem
 
@@ -79,10 +81,14 @@ def make(name: str, **settings: Any) -> Problem:
     planner = {key: settings.pop(key) for key in planner_keys if key in settings}
     model_keys = getattr(getattr(kind, "Model", None), "__struct_fields__", None)
     if model_keys is not None:
+        settings, planner = plain(settings), plain(planner)
+        allowed = [*model_keys, *planner_keys]
         for key in settings:
             if key not in model_keys:
-                allowed = ", ".join([*model_keys, *planner_keys])
-                raise InvalidValueError(f"{name} has no setting {key!r}; allowed: {allowed}")
+                raise InvalidValueError(
+                    f"{name} has no setting {key!r}{close_match(key, allowed)}; allowed: "
+                    f"{', '.join(allowed)}"
+                )
     try:
         problem: Problem = kind.from_settings(settings, planner)
     except msgspec.ValidationError as error:

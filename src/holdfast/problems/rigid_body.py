@@ -19,9 +19,15 @@ import msgspec
 import numpy as np
 
 from holdfast import numerics
-from holdfast.arrays import FloatArray, IntArray
+from holdfast.arrays import FloatArray, IntArray, KeepsReadOnly
 from holdfast.errors import InvalidValueError
-from holdfast.geometry import MAX_NOISE_ATTEMPTS, BoxWorld, DiscWorld, RectangleWorld
+from holdfast.geometry import (
+    MAX_NOISE_ATTEMPTS,
+    BoxWorld,
+    DiscWorld,
+    KernelObject,
+    RectangleWorld,
+)
 from holdfast.problems.problem import ProblemBase
 from holdfast.randomness import NOISE_FREE, Stream
 
@@ -85,7 +91,7 @@ def validated(section: str, settings: StructT) -> StructT:
         raise InvalidValueError(f"{section}: {error}") from error
 
 
-class RigidBodyProblem(ProblemBase):
+class RigidBodyProblem(KeepsReadOnly, ProblemBase):
     """A body that stops at contact; the state is its pose, the task action a change of pose.
 
     It is built of validated settings, of the types ``Model`` and ``StateSpacePlanner``. Every model
@@ -103,7 +109,7 @@ class RigidBodyProblem(ProblemBase):
 
     Model: ClassVar[type[Any]]
     StateSpacePlanner: ClassVar[type[Any]]
-    _path_policy: Any
+    _path_policy: KernelObject
     """The policy as the kernel has it, for ``expected_path``."""
 
     @classmethod
@@ -179,7 +185,7 @@ class RigidBodyProblem(ProblemBase):
         would not count, for it does not follow a policy that a subclass replaces.
         """
         return self.world.follow(
-            self._path_policy, states, stage, offsets, self._collision_tolerance, threads
+            self._path_policy.own, states, stage, offsets, self._collision_tolerance, threads
         )
 
     def _check_sensing_action(self, sensing_action: int) -> None:

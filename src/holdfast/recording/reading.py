@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import FloatArray, IntArray
+from holdfast.arrays import FloatArray, IntArray, whole
 from holdfast.belief import Belief
 from holdfast.config.loader import Configuration
 from holdfast.errors import OutputError
@@ -122,7 +122,8 @@ class RunArrays:
         HoldfastError
             If a trial is decided otherwise now.
         """
-        chosen = sorted(set(self.trials if trials is None else trials))
+        wanted = self.trials if trials is None else [whole("trial", each, 0) for each in trials]
+        chosen = sorted(set(wanted))
         if lacking := set(chosen).difference(self.trials):
             raise OutputError(f"{self.path}: has no trial {min(lacking)}")
         with RecordedRun(self.path, "open") as run:

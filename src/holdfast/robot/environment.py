@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import checked
-from holdfast.arrays import FloatArray
+from holdfast.arrays import FloatArray, KeepsReadOnly, floats, integer, whole
 from holdfast.config.user_code import find_class
 from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import Done, MoveResult
@@ -135,7 +135,7 @@ class RememberingEnvironment(CountingEnvironment, Protocol):
         ...
 
 
-class SimulatedEnvironment:
+class SimulatedEnvironment(KeepsReadOnly):
     """A world simulated from a problem, with its own random streams.
 
     What happens is a function of (seed, trial) and of the task actions performed so far: sensing
@@ -156,8 +156,8 @@ class SimulatedEnvironment:
 
     def __init__(self, problem: Problem, seed: int, trial: int = 0) -> None:
         self._problem = problem
-        self._seed = seed
-        self._trial = trial
+        self._seed = seed = whole("seed", seed, 0, 2**63 - 1)
+        self._trial = trial = whole("trial", trial, 0, 2**32 - 1)
         self.step = 0
         check_sizes(problem)
         self._moves_show = any(
@@ -183,11 +183,13 @@ class SimulatedEnvironment:
             If the sensing action does not exist.
         """
         problem = self._problem
-        if not 0 <= sensing_action < len(problem.sensing_actions):
+        chosen = integer(sensing_action)
+        if chosen is None or not 0 <= chosen < len(problem.sensing_actions):
             raise InvalidValueError(
-                f"sensing action {sensing_action}: {problem.name} has 0 to "
+                f"sensing action {sensing_action!r:.80}: {problem.name} has 0 to "
                 f"{len(problem.sensing_actions) - 1}"
             )
+        sensing_action = chosen
         noise = stream(self._seed, self._trial, self.step, Purpose.WORLD_OBSERVATION)
         if hasattr(problem, "sample_observation"):
             return checked.sample_observation(problem, self.state, sensing_action, noise)
@@ -205,25 +207,23 @@ class SimulatedEnvironment:
         ``sample_move_observation`` says what else the move shows.
         """
         seed, trial, step, problem = self._seed, self._trial, self.step, self._problem
-        before = self.state
-        moved = problem.move(before, task_action, stream(seed, trial, step, Purpose.WORLD_MOTION))
-        self.state = checked.states_of(problem, "move", moved, before.shape)
-        self.step += 1
-        reward = None
+        before, action = self.state, floats("task action", task_action)
+        moved = problem.move(before, action, stream(seed, trial, step, Purpose.WORLD_MOTION))
+        state = checked.states_of(problem, "move", moved, before.shape)
+        reward = motion = observation = None
         if getattr(type(problem), "reward", None) is not ProblemBase.reward:
-            reward = checked.scalar(problem, "reward", problem.reward(self.state, task_action))
-        if not self._moves_show:
-            return reward
-        motion = observation = None
+            reward = checked.scalar(problem, "reward", problem.reward(state, action))
         if hasattr(problem, "measure_motion"):
             noise = stream(seed, trial, step, Purpose.WORLD_MEASURED_MOTION)
-            measured = problem.measure_motion(before, self.state, noise)
+            measured = problem.measure_motion(before, state, noise)
             motion = checked.shown(problem, "measure_motion", measured)
         if hasattr(problem, "sample_move_observation"):
             noise = stream(seed, trial, step, Purpose.WORLD_MOVE_OBSERVATION)
-            drawn = problem.sample_move_observation(self.state, task_action, noise)
+            drawn = problem.sample_move_observation(state, action, noise)
             observation = checked.shown(problem, "sample_move_observation", drawn)
-        return MoveResult(reward, motion, observation)
+        # Only now: a move that fails leaves the world as it was.
+        self.state, self.step = state, step + 1
+        return MoveResult(reward, motion, observation) if self._moves_show else reward
 
     def is_done(self) -> bool:
         """Return whether the true state is a goal."""

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import FloatArray, in_brief
+from holdfast.arrays import FloatArray, floats, in_brief, integer, plain, real_numbers, whole
 from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import Done, Ending, MoveResult
 from holdfast.problems.problem import Problem
@@ -132,7 +132,8 @@ class GymnasiumEnvironment:
         self.environment = _made(env_id, env_arguments)
         spec = self.environment.spec
         self._name = spec.id if spec is not None else type(self.environment.unwrapped).__name__
-        self._seed, self._trial = seed, trial
+        self._seed = seed = whole("seed", seed, 0, 2**63 - 1)
+        self._trial = trial = whole("trial", trial, 0, 2**32 - 1)
 
         self._sensing, self._sensing_noise = self._sensing_readers(sensing, sensing_noise, problem)
         self._action = None if action is None else _function(action, "action")
@@ -161,22 +162,25 @@ class GymnasiumEnvironment:
 
     def perform_sensing(self, sensing_action: int) -> FloatArray:
         """Return what the sensing action shows of the present observation, with its noise."""
+        chosen = integer(sensing_action)
+        count = None if callable(self._sensing) else len(self._sensing)
+        if chosen is None or chosen < 0 or (count is not None and chosen >= count):
+            raise InvalidValueError(
+                f"sensing action {sensing_action!r:.80}: sensing of {self._name} has 0 to "
+                f"{'...' if count is None else count - 1}"
+            )
+        sensing_action = chosen
         if callable(self._sensing):
             shown = self._sensing(self.environment, self._seen, sensing_action)
-        elif 0 <= sensing_action < len(self._sensing):
-            shown = self._vector(self._seen)[self._sensing[sensing_action]]
         else:
-            raise InvalidValueError(
-                f"sensing action {sensing_action}: sensing of {self._name} has 0 to "
-                f"{len(self._sensing) - 1}"
-            )
+            shown = self._vector(self._seen)[self._sensing[sensing_action]]
         noise = self._sensing_noise[sensing_action if len(self._sensing_noise) > 1 else 0]
         return self._noisy(shown, noise, "sensing", Purpose.WORLD_OBSERVATION, self._steps)
 
     def perform(self, task_action: FloatArray) -> MoveResult:
         """Perform one step of gymnasium's; return its reward and what the move has shown."""
         step, before = self._steps, self._seen
-        action = self._translated(np.asarray(task_action, dtype=np.float64))
+        action = self._translated(floats("task action", task_action))
         seen, reward, terminated, truncated, self.info = self.environment.step(action)
         self._seen = copy.deepcopy(seen)
         self._steps += 1
@@ -238,6 +242,8 @@ class GymnasiumEnvironment:
         return None
 
     def _translated(self, task_action: FloatArray) -> Any:
+        from gymnasium import spaces
+
         space = self.environment.action_space
         if self._action is not None:
             action = self._action(self.environment, task_action.copy())
@@ -248,11 +254,11 @@ class GymnasiumEnvironment:
             return action
         limits = _limits(space)
         assert limits is not None
-        low, high, whole = limits
+        low, high, rounds = limits
         if task_action.size != low.size:
             raise EnvironmentFailedError(_misfit(self._name, space, low.size, task_action))
-        within = np.clip(np.rint(task_action) if whole else task_action, low.ravel(), high.ravel())
-        if not low.shape:
+        within = np.clip(np.rint(task_action) if rounds else task_action, low.ravel(), high.ravel())
+        if isinstance(space, spaces.Discrete):
             return int(within[0])
         return within.reshape(low.shape).astype(space.dtype)
 
@@ -273,6 +279,8 @@ class GymnasiumEnvironment:
     def _sensing_readers(
         self, sensing: Any, noise: Any, problem: Problem | None
     ) -> tuple[Callable[..., Any] | list[list[int]], list[FloatArray]]:
+        # An array has as many numbers as the list that it came from.
+        sensing, noise = plain(sensing), plain(noise)
         if callable(sensing) or isinstance(sensing, str):
             readers: Any = _function(sensing, "sensing")
             count = None if problem is None else len(problem.sensing_actions)
@@ -309,7 +317,7 @@ class GymnasiumEnvironment:
     def _indices(self, given: Any, key: str) -> list[int]:
         from gymnasium import spaces
 
-        space = self.environment.observation_space
+        given, space = plain(given), self.environment.observation_space
         try:
             size = spaces.flatdim(space)
         except (NotImplementedError, ValueError) as error:
@@ -320,7 +328,7 @@ class GymnasiumEnvironment:
         if (
             not isinstance(given, Sequence)
             or not given
-            or not all(isinstance(each, int) and 0 <= each < size for each in given)
+            or not all(integer(each) is not None and 0 <= each < size for each in given)
         ):
             raise ConfigurationError(
                 f"environment.arguments.{key} is {given!r:.80}; it must be a list of whole numbers "
@@ -337,7 +345,13 @@ class GymnasiumEnvironment:
     def _noisy(
         self, shown: npt.ArrayLike, deviations: FloatArray, key: str, purpose: Purpose, step: int
     ) -> FloatArray:
-        values = np.array(shown, dtype=np.float64).reshape(-1)
+        numbers = real_numbers(shown)
+        if numbers is None:
+            raise EnvironmentFailedError(
+                f"{key} of {self._name} shows {' '.join(repr(shown).split()):.80}; it must be an "
+                "array of numbers"
+            )
+        values = np.array(numbers, dtype=np.float64).reshape(-1)
         if deviations.size not in (1, values.size):
             raise EnvironmentFailedError(
                 f"{key}_noise of {self._name} is {in_brief(deviations)}: {key} shows "
@@ -393,10 +407,8 @@ def _function(given: Any, key: str) -> Callable[..., Any]:
 
 
 def _deviations(given: Any, key: str) -> FloatArray:
-    try:
-        array = np.array(given, dtype=np.float64).reshape(-1)
-    except (TypeError, ValueError):
-        array = np.empty(0)
+    numbers = real_numbers(given)
+    array = np.empty(0) if numbers is None else np.array(numbers, dtype=np.float64).reshape(-1)
     if not array.size or not (np.isfinite(array) & (array >= 0.0)).all():
         raise ConfigurationError(
             f"environment.arguments.{key} is {given!r:.80}; it must be a standard deviation, a "

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy.typing as npt
 
-from holdfast.arrays import FloatArray
-from holdfast.errors import EnvironmentFailedError, InvalidValueError
+from holdfast.arrays import FloatArray, whole
+from holdfast.errors import EnvironmentFailedError
 from holdfast.outcome import Done, MoveResult
 from holdfast.robot.environment import LATER, Environment, Later
 
@@ -121,10 +121,8 @@ class SenseLater(_Around):
     """
 
     def __init__(self, environment: Environment, moves: int) -> None:
-        if moves < 1:
-            raise InvalidValueError(f"moves is {moves}; it must be at least 1")
         super().__init__(environment)
-        self._moves = moves
+        self._moves = whole("moves", moves, 1)
         self._due: list[tuple[int, npt.ArrayLike]] = []
 
     def perform_sensing(self, sensing_action: int) -> Later:

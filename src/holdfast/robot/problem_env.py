@@ -13,7 +13,6 @@ compared with holdfast's own methods on the same worlds.
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, SupportsIndex
@@ -25,7 +24,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from holdfast import checked, numerics
-from holdfast.arrays import FloatArray, floats_or_none
+from holdfast.arrays import FloatArray, floats_or_none, integer, whole
 from holdfast.belief import Belief, standard_deviation
 from holdfast.config.settings import Method, PlanningSettings, SimulatorSettings, check_settings
 from holdfast.errors import InvalidValueError
@@ -149,11 +148,7 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
         check_settings(self.planner.settings)
         check_problem(built)
         self.problem = built
-        self.max_steps = steps if max_steps is None else max_steps
-        if not (isinstance(self.max_steps, int) and self.max_steps >= 1):
-            raise InvalidValueError(
-                f"max_steps is {self.max_steps!r:.80}; allowed are integers from 1"
-            )
+        self.max_steps = whole("max_steps", steps if max_steps is None else max_steps, 1)
         self._costs = sensing_costs(built, optional=True)
         self._minus_steps = reward == "steps"
         self._with_particles = observation == "particles"
@@ -192,15 +187,18 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; see the class for seeds and ``options``."""
-        super().reset(seed=seed)
-        if seed is not None:
-            self._seed, self._trial = seed, -1
-        elif self._seed < 0:
-            self._seed = int(self.np_random.integers(2**63))
-        self._trial = (options or {}).get("trial", self._trial + 1)
-        self._track = Trial(self.planner, self._seed, self._trial)
-        self._world = SimulatedEnvironment(self.problem, self._seed, self._trial)
-        self._ending = ending_of(self._world.is_done())
+        following = self._trial + 1 if seed is None else 0
+        trial = whole("trial", (options or {}).get("trial", following), 0, 2**32 - 1)
+        own = self._seed if seed is None else whole("seed", seed, 0, 2**63 - 1)
+        if own < 0:
+            own = int(self.np_random.integers(2**63))
+        track = Trial(self.planner, own, trial)
+        world = SimulatedEnvironment(self.problem, own, trial)
+        ending = ending_of(world.is_done())
+        super().reset(seed=None if seed is None else own)
+        # Only now: a reset that is refused leaves the episode and its number as they were.
+        self._seed, self._trial, self._track, self._world = own, trial, track, world
+        self._ending = ending
         self._over = False
         self._last_chosen = {}
         self._sensing_steps = 0
@@ -211,11 +209,11 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
         track, world = self._running()
         if self._over:
             raise gymnasium.error.ResetNeeded("the episode has ended: reset() begins the next one")
-        choice = operator.index(action)
-        if not 0 <= choice < self.planner.num_choices:
+        choice = integer(action)
+        if choice is None or not 0 <= choice < self.planner.num_choices:
             raise InvalidValueError(
-                f"action {choice}: {self.problem.name} has 0 to {self.planner.num_choices - 1} "
-                "(the last is not to sense if sensing_is_optional)"
+                f"action {action!r:.80}: {self.problem.name} has 0 to "
+                f"{self.planner.num_choices - 1} (the last is not to sense if sensing_is_optional)"
             )
         total = 0.0
         if self._ending is None:  # else the trial has begun at the goal

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import FloatArray, real_numbers
+from holdfast.arrays import FloatArray, real_number, real_numbers, whole
 from holdfast.config.settings import LostSettings, OnLost, SimulatorSettings
 from holdfast.errors import EnvironmentFailedError, HeldError, InvalidValueError, ProblemError
 from holdfast.outcome import Ending, MoveResult, TrialResult, ending_of
@@ -152,8 +152,12 @@ def run_trial(
         a reward that is not finite, :class:`EnvironmentFailedError` for anything else than what
         ``is_done`` may return.
     """
-    if not (isinstance(max_steps, int) and max_steps >= 1):
-        raise InvalidValueError(f"max_steps is {max_steps!r}; allowed are integers from 1")
+    if not isinstance(planner, Planner):
+        raise InvalidValueError(
+            f"planner is a {type(planner).__name__}: run_trial takes a planner, as in "
+            "run_trial(Planner(problem))"
+        )
+    max_steps = whole("max_steps", max_steps, 1)
     if environment is None:
         environment = SimulatedEnvironment(planner.problem, seed, trial)
     require_methods(environment, type(environment).__name__)
@@ -169,7 +173,7 @@ def run_trial(
 
     def take_late(method: str) -> None:
         for step, came in late_ones[method]() if method in late_ones else ():
-            late = LateObservation(step, np.array(came, dtype=np.float64))
+            late = LateObservation(step, _reading(environment, method, came))
             found = track.observe_late(late)
             if found is not None:
                 observer.observed_late(LateStep(late, track.state, found[0]))
@@ -188,13 +192,16 @@ def run_trial(
         shown = environment.perform(executed.copy())
         result = shown if isinstance(shown, MoveResult) else MoveResult(shown)
         reward, motion, observation = result
-        if reward is not None and not np.isfinite(reward):
-            raise ProblemError(
-                f"the reward of step {before.step} is {float(reward)}; it must be a finite number"
-            )
+        if reward is not None:
+            reward = real_number(reward)
+            if reward is None or not np.isfinite(reward):
+                raise ProblemError(
+                    f"the reward of step {before.step} is {result.reward!r:.80}; it must be a "
+                    "finite number"
+                )
         info = track.move(
             executed,
-            None if reward is None else float(reward),
+            reward,
             _numbers(environment, "motion", motion),
             _numbers(environment, "observation", observation),
         )
@@ -217,7 +224,7 @@ def _sense(track: Trial, environment: Environment, observer: TrialObserver) -> N
     if sensing_action != planner.no_sensing:
         shown = environment.perform_sensing(sensing_action)
         if shown is not LATER:
-            observation = np.array(shown, dtype=np.float64)
+            observation = _reading(environment, "perform_sensing", shown)
     info, _ = track.observe(sensing_action, observation, sensing_ms)
     observer.sensed(
         SensingStep(before, sensing_action, sensing_info, observation, track.state, info)
@@ -245,6 +252,17 @@ def _act_if_lost(
     if again:
         track.reinitialise()
         observer.reinitialised(track.state)
+
+
+def _reading(environment: Environment, method: str, shown: object) -> FloatArray:
+    """Return a copy of what sensing has shown, checked as for a robot."""
+    numbers = real_numbers(shown)
+    if numbers is None:
+        raise EnvironmentFailedError(
+            f"{type(environment).__name__}: {method} returned {' '.join(repr(shown).split()):.80}; "
+            "an observation must be an array of numbers"
+        )
+    return np.array(numbers, dtype=np.float64)
 
 
 def _numbers(environment: Environment, what: str, shown: npt.ArrayLike | None) -> FloatArray | None:
