@@ -109,6 +109,10 @@ class HeldError(HoldfastError):
     """The robot holds still: its environment failed. The run can be resumed."""
 
 
+class RebootedError(HoldfastError):
+    """The machine was rebooted since the robot last moved; a person must let the run go on."""
+
+
 class UnknownPerformanceError(HoldfastError):
     """The last task action before a crash may or may not have been performed."""
 
