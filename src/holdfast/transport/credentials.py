@@ -118,8 +118,6 @@ def _unreadable(directory: Path, path: Path, role: Role, error: OSError) -> str:
         return f"{text}; this process is user {os.geteuid()}"
     if TlsFiles.of(directory / role).certificate.exists():
         return f"{text}; did you mean {directory / role}?"
-    if directory.with_name(f".{directory.name}.old").exists():
-        return f'{text}; "holdfast keys {directory.parent} --list" brings back what was broken off'
     if isinstance(error, FileNotFoundError):
         return f'{text}; "holdfast keys DIR" makes such files'
     return text
