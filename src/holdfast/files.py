@@ -225,7 +225,7 @@ def replace_file(path: Path, content: bytes, mode: int, *, like: Path | None = N
 
 
 def remove_unfinished_of(directory: Path) -> None:
-    """Remove what killed writers left of a directory and in it; no other process may write there."""
+    """Remove what killed writers left of a directory and in it, where no other process writes."""
     for left in (
         *directory.parent.glob(f".{directory.name}.*.tmp"),
         *directory.glob(".*.tmp"),

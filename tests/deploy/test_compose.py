@@ -204,7 +204,7 @@ def test_a_robot_that_dies_goes_on_but_no_engine_starts_one(site: Site, engine: 
     site.wait_for_health("robot")
 
     # Its process dies, in the midst of a trial: it goes on with nobody there.
-    with site.then("resumed"):
+    with site.then("resumed_trial"):
         site.kill_robot()
 
     # The engine ends and is back, as after an upgrade or a reboot. It has ended both; what a person
