@@ -198,6 +198,10 @@ class CredentialsError(HoldfastError):
     """Credentials cannot be made or used; the message names the file and the reason."""
 
 
+class CredentialsGoneError(CredentialsError):
+    """Credentials are missing or unreadable, have expired, or were revoked."""
+
+
 class FrameError(TransportError):
     """Received bytes are no valid frame; the message completes a sentence about the sender."""
 
