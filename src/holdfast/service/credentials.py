@@ -2,9 +2,9 @@
 
 A tool that renews certificates often cannot send a signal: cert-manager in a cluster only changes
 mounted files. So the event loop checks the files every second. It reads them when they are the same
-in two checks, because a set may be half copied. If credentials cannot be used, the previous ones stay
-in use, and revocations since then are not known: the log, a metric and its alert say so. Where they
-are gone altogether, no new robot should come.
+in two checks, because a set may be half copied. If credentials cannot be used, the previous ones
+stay in use, and revocations since then are not known: the log, a metric and its alert say so. Where
+they are gone altogether, no new robot should come.
 """
 
 from __future__ import annotations
