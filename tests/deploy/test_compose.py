@@ -232,6 +232,34 @@ def test_a_robot_that_dies_goes_on_but_no_engine_starts_one(site: Site, engine: 
     holdfast("compare", "calm", "runs/run", cwd=site.directory)
 
 
+def test_keys_are_rotated_and_a_robot_is_revoked_where_they_are_mounted(
+    site: Site, engine: Engine
+) -> None:
+    site.compose("cloud", "up", "-d")
+    site.wait_for_health("cloud")
+    with site.then("service_appeared", service=site.endpoint):
+        site.compose("robot", "up", "-d")
+    cloud = site.container("cloud")
+
+    def reloaded(count: int) -> bool:
+        log = engine.run("docker", "logs", cloud)
+        return (log.stdout + log.stderr).count("credentials reloaded") == count
+
+    holdfast("keys", "keys", "--rotate", "--service", "service", cwd=site.directory)
+    wait_until(lambda: reloaded(1), "the cloud to read its new key")
+    with site.then("status", to="local_recovery"):
+        holdfast("keys", "keys", "--revoke", "robot", cwd=site.directory)
+        wait_until(lambda: reloaded(2), "the cloud to read the list")
+    site.wait_for_health("cloud")
+
+    for name in ("authority", "certificate", "key"):
+        (site.directory / "keys/service" / f"{name}.pem").unlink()
+    wait_until(
+        lambda: engine.inspect(cloud)["State"]["Health"]["Status"] == "unhealthy",
+        "a cloud without keys to be unhealthy",
+    )
+
+
 def reboot(journal: Path) -> None:
     """Let a run have moved in another boot: that of a machine in a test cannot be changed."""
     with Journal.open(journal) as opened:

@@ -18,6 +18,7 @@ from tests.deploy.machine import USER, Machine, booted
 CLOUD_INIT = ROOT / "deploy/cloud-init"
 EXAMPLE = ROOT / "examples/peg_in_hole_2d.yaml"
 HOLDFAST = Path(sys.executable).with_name("holdfast")
+BOOT_ID = "/proc/sys/kernel/random/boot_id"
 CLOUD, ROBOT = "holdfast-cloud", "holdfast-robot"
 
 MOST_EXPOSED = 20
