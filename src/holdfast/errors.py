@@ -119,6 +119,10 @@ class HeldError(HoldfastError):
     """The robot holds still: its environment failed. The run can be resumed."""
 
 
+class RebootedError(HoldfastError):
+    """The machine was rebooted since the robot last moved; a person must let the run go on."""
+
+
 class UnknownPerformanceError(HoldfastError):
     """The last task action before a crash may or may not have been performed."""
 
@@ -198,6 +202,10 @@ class ServiceProcessError(HoldfastError):
 
 class CredentialsError(HoldfastError):
     """Credentials cannot be made or used; the message names the file and the reason."""
+
+
+class CredentialsGoneError(CredentialsError):
+    """Credentials are missing or unreadable, have expired, or were revoked."""
 
 
 class FrameError(TransportError):

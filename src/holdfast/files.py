@@ -2,7 +2,8 @@
 
 A file is written under a temporary name in the same directory and then renamed. A rename is atomic:
 after a crash, and for every reader, the path holds the old file or the new one, never a part.
-Directories whose files belong together, such as a key and its certificate, appear the same way.
+Directories whose files belong together, such as a key and its certificate, appear the same way. One
+that is there is never swapped for another: who has mounted it would see the old one for ever.
 
 All functions but :func:`read_bounded` raise :class:`~holdfast.errors.OutputError` if the system
 refuses something, or what they would write is there already.
@@ -31,9 +32,9 @@ __all__ = [
     "move_into_place",
     "read_bounded",
     "remove_unfinished",
-    "replace_directory",
+    "remove_unfinished_of",
+    "replace_file",
     "require_free",
-    "restore_directory",
     "write_atomically",
 ]
 
@@ -194,40 +195,48 @@ def create_directory_atomically(path: Path, files: Mapping[str, NewFile]) -> Non
         raise OutputError(f"{path}: cannot be created: {reason}") from error
 
 
-def replace_directory(path: Path, files: Mapping[str, NewFile]) -> None:
-    """Replace a directory; the old one is removed.
+def replace_file(path: Path, content: bytes, mode: int, *, like: Path | None = None) -> None:
+    """Write a file atomically, for whoever could read the one that it replaces.
 
-    No reader sees files of both. If the process is killed meanwhile, the path may be missing until
-    :func:`restore_directory` is called.
+    It gets the owner and permissions of that file, or of ``like``; a new one gets ``mode``, and the
+    owner of its directory. (Only root can give a file to somebody else.)
     """
-    restore_directory(path)
-    new, old = _beside(path)
-    create_directory_atomically(new, files)
-    with _refusals(path, "replaced"):
-        path.rename(old)
-        new.rename(path)
-    _remove_tree(old)
+    temporary = _unfinished(path)
+    with _refusals(path, "written"):
+        try:
+            before = (like or path).stat()
+            mode = stat.S_IMODE(before.st_mode)
+        except FileNotFoundError:
+            before = path.parent.stat()
+        try:
+            flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
+            with os.fdopen(os.open(temporary, flags, 0o600), "wb") as file:
+                if os.geteuid() == 0:
+                    os.fchown(file.fileno(), before.st_uid, before.st_gid)
+                os.fchmod(file.fileno(), mode)
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+            raise
 
 
-def restore_directory(path: Path) -> None:
-    """Complete a replacement whose process was killed, and remove its temporary directories.
-
-    No other process may use the directory meanwhile.
-    """
-    new, old = _beside(path)
-    if old.exists() and not path.exists():
-        with _refusals(path, "restored"):
-            (new if new.exists() else old).rename(path)
-    for name in (path.name, new.name):
-        for unfinished in path.parent.glob(f".{name}.*.tmp"):
-            _remove_tree(unfinished)
-    for left in (new, old):
-        _remove_tree(left)
-
-
-def _beside(path: Path) -> tuple[Path, Path]:
-    """Return the temporary paths of the new and of the old directory."""
-    return path.with_name(f".{path.name}.new"), path.with_name(f".{path.name}.old")
+def remove_unfinished_of(directory: Path) -> None:
+    """Remove what killed writers left of a directory and in it, where no other process writes."""
+    for left in (
+        *directory.parent.glob(f".{directory.name}.*.tmp"),
+        *directory.glob(".*.tmp"),
+    ):
+        if not _UNFINISHED.fullmatch(left.name):
+            continue
+        if left.is_dir():
+            _remove_tree(left)
+        else:
+            with _refusals(left, "removed"):
+                left.unlink()
 
 
 def claim_directory(out: Path | None, parent: Path, name: str) -> Path:

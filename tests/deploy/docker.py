@@ -1,8 +1,9 @@
 """A Docker Engine for tests, the base that no registry hands out here, and the images of the tree.
 
 An engine that runs already is used and left as it is found, but for what it has built. Where none
-runs, root starts one with a directory of its own, and ends it. The images' tags are digests of what
-they are made of, so a tree that has not changed is not built again.
+runs, root starts one with a directory of its own, and ends it (``HOLDFAST_TEST_DOCKER_DATA`` names
+one for its images that stays). The images' tags are digests of what they are made of, so a tree
+that has not changed is not built again.
 """
 
 from __future__ import annotations
@@ -99,9 +100,12 @@ class Engine:
     ----------
     host : str or None
         Of the engine (``unix:///...``); None for the one that the command finds.
+    restart : callable or None
+        Ends it and starts it again; None for one that is not the tests' own.
     """
 
-    def __init__(self, host: str | None = None) -> None:
+    def __init__(self, host: str | None = None, restart: Callable[[], None] | None = None) -> None:
+        self.restart = restart
         self.variables = dict(os.environ)
         if host is not None:
             self.variables["DOCKER_HOST"] = host
@@ -165,31 +169,52 @@ def running_engine() -> Iterator[Engine]:
     if os.geteuid() != 0 or shutil.which("dockerd") is None:
         missing(f"no Docker Engine can be used: {found.stderr.strip()}")
     with tempfile.TemporaryDirectory(prefix="holdfast-docker-", ignore_cleanup_errors=True) as name:
-        directory = Path(name)
-        engine = Engine(f"unix://{directory}/socket")
-        with (directory / "log").open("w") as log:
-            process = subprocess.Popen(
+        own = _OwnEngine(Path(name))
+        try:
+            own.start()
+            yield own.engine
+        finally:
+            own.stop()
+
+
+class _OwnEngine:
+    """An engine of the tests, with its files in a directory."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self._data = os.environ.get("HOLDFAST_TEST_DOCKER_DATA") or directory / "data"
+        self._process: subprocess.Popen[bytes] | None = None
+        self.engine = Engine(f"unix://{directory}/socket", self.restart)
+
+    def start(self) -> None:
+        directory = self._directory
+        with (directory / "log").open("a") as log:
+            process = self._process = subprocess.Popen(
                 [
-                    *("dockerd", "--host", engine.variables["DOCKER_HOST"]),
-                    *("--data-root", directory / "data", "--exec-root", directory / "exec"),
+                    *("dockerd", "--host", self.engine.variables["DOCKER_HOST"]),
+                    *("--data-root", self._data, "--exec-root", directory / "exec"),
                     *("--pidfile", directory / "pid"),
                 ],
                 stdout=log,
                 stderr=subprocess.STDOUT,
             )
-        try:
 
-            def answers() -> bool:
-                if process.poll() is not None:
-                    account = (directory / "log").read_text()[-2000:]
-                    missing(f"dockerd ended with exit code {process.returncode}:\n{account}")
-                return engine.run("docker", "version").returncode == 0
+        def answers() -> bool:
+            if process.poll() is not None:
+                account = (directory / "log").read_text()[-2000:]
+                missing(f"dockerd ended with exit code {process.returncode}:\n{account}")
+            return self.engine.run("docker", "version").returncode == 0
 
-            wait_until(answers, "dockerd to answer")
-            yield engine
-        finally:
-            process.terminate()
-            process.wait(PATIENCE_S)
+        wait_until(answers, "dockerd to answer")
+
+    def stop(self) -> None:
+        if self._process is not None:
+            self._process.terminate()
+            self._process.wait(PATIENCE_S)
+
+    def restart(self) -> None:
+        self.stop()
+        self.start()
 
 
 def build(engine: Engine) -> Images:

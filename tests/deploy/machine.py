@@ -124,8 +124,17 @@ def booted(engine: Engine, user_data: Path, directory: Path) -> Iterator[Machine
         )
         engine.docker("start", name)
         address = str(engine.inspect(name)["NetworkSettings"]["IPAddress"])
-        known = f"UserKnownHostsFile={directory / 'known_hosts'}"
-        yield Machine(engine, name, address, ("ssh", "-i", str(key), "-o", known))
+        known = directory / "known_hosts"
+        option = f"UserKnownHostsFile={known}"
+        machine = Machine(engine, name, address, ("ssh", "-i", str(key), "-o", option))
+        # What a person reads on the console. cloud-init makes it.
+        host_key = "/etc/ssh/ssh_host_ed25519_key.pub"
+        wait_until(
+            lambda: engine.run("docker", "exec", name, "test", "-s", host_key).returncode == 0,
+            "the machine to have made its key",
+        )
+        known.write_text(f"{address} {machine.do(f'cat {host_key}')}\n")
+        yield machine
     finally:
         engine.docker("rm", "-f", "-v", name)
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import csv
 import json
+import os
+import signal
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,6 +16,8 @@ import pytest
 import yaml
 from tests.deploy.docker import ROOT, USER, Engine, Images, give_to, holdfast, wait_until
 from tests.ports import free_port
+
+from holdfast.recording.journal import Journal
 
 COMPOSE = ROOT / "deploy/compose"
 TRIALS = 60
@@ -58,7 +62,7 @@ class Site:
         self.write(f"{role}.yaml", {"services": {role: service}, "networks": networks})
 
     def start_robot_with(self, *options: str) -> None:
-        run = ["run", "/config/robot.yaml", "--out", "/runs/run", "--resume-if-begun"]
+        run = ["run", "/config/robot.yaml", "--out", "/runs/run", "--resume-if-begun", "--restart"]
         self.override("robot", [*run, "--health", "0.0.0.0:8080", *options])
 
     def compose(self, role: str, *words: str) -> str:
@@ -83,6 +87,12 @@ class Site:
 
     def state(self, role: str) -> Any:
         return self.engine.inspect(self.container(role))["State"]
+
+    def kill_robot(self) -> None:
+        """Kill the robot's process, which is not the first one of its container."""
+        first = self.state("robot")["Pid"]
+        (robot,) = Path(f"/proc/{first}/task/{first}/children").read_text().split()
+        os.kill(int(robot), signal.SIGKILL)
 
     def wait_for_health(self, role: str) -> None:
         container = self.container(role)
@@ -182,3 +192,75 @@ def test_the_cloud_is_killed_paused_cut_off_and_moved(site: Site, engine: Engine
     with (site.directory / "runs/run/timings.csv").open() as table:
         deciders = {row["service"] for row in csv.DictReader(table)}
     assert deciders >= {site.endpoint, "cloud_active_sensing_recovery"}
+
+
+def test_a_robot_that_dies_goes_on_but_no_engine_starts_one(site: Site, engine: Engine) -> None:
+    if engine.restart is None:
+        pytest.skip("an engine that is not the tests' own is not restarted")
+    site.compose("cloud", "up", "-d")
+    site.wait_for_health("cloud")
+    with site.then("service_appeared", service=site.endpoint):
+        site.compose("robot", "up", "-d")
+    site.wait_for_health("robot")
+
+    # Its process dies, in the midst of a trial: it goes on with nobody there.
+    with site.then("resumed_trial"):
+        site.kill_robot()
+
+    # The engine ends and is back, as after an upgrade or a reboot. It has ended both; what a person
+    # started again is what moves.
+    engine.restart()
+    site.wait_for_health("cloud")
+    assert site.state("robot")["Status"] == "exited"
+    events = len(site.events())
+    site.compose("robot", "up", "-d")
+    wait_until(lambda: len(site.events()) > events, "the robot to move again")
+    site.compose("robot", "stop", "--timeout", "60")
+
+    # Nor does it after a reboot of the machine, which whoever starts it may not know of.
+    reboot(site.directory / "runs/run/journal.sqlite")
+    site.compose("robot", "up", "-d")
+    engine.docker("wait", site.container("robot"))
+    assert site.state("robot")["ExitCode"] == 5
+    events = len(site.events())
+    site.start_robot_with("--after-reboot")
+    site.compose("robot", "up", "-d")
+    engine.docker("wait", site.container("robot"))
+    assert site.state("robot")["ExitCode"] == 0
+    assert len(site.events()) > events
+    holdfast("run", "calm.yaml", "--out", "calm", cwd=site.directory)
+    holdfast("compare", "calm", "runs/run", cwd=site.directory)
+
+
+def test_keys_are_rotated_and_a_robot_is_revoked_where_they_are_mounted(
+    site: Site, engine: Engine
+) -> None:
+    site.compose("cloud", "up", "-d")
+    site.wait_for_health("cloud")
+    with site.then("service_appeared", service=site.endpoint):
+        site.compose("robot", "up", "-d")
+    cloud = site.container("cloud")
+
+    def reloaded(count: int) -> bool:
+        log = engine.run("docker", "logs", cloud)
+        return (log.stdout + log.stderr).count("credentials reloaded") == count
+
+    holdfast("keys", "keys", "--rotate", "--service", "service", cwd=site.directory)
+    wait_until(lambda: reloaded(1), "the cloud to read its new key")
+    with site.then("status", to="local_recovery"):
+        holdfast("keys", "keys", "--revoke", "robot", cwd=site.directory)
+        wait_until(lambda: reloaded(2), "the cloud to read the list")
+    site.wait_for_health("cloud")
+
+    for name in ("authority", "certificate", "key"):
+        (site.directory / "keys/service" / f"{name}.pem").unlink()
+    wait_until(
+        lambda: engine.inspect(cloud)["State"]["Health"]["Status"] == "unhealthy",
+        "a cloud without keys to be unhealthy",
+    )
+
+
+def reboot(journal: Path) -> None:
+    """Let a run have moved in another boot: that of a machine in a test cannot be changed."""
+    with Journal.open(journal) as opened:
+        opened.set_meta("boot", "another")

@@ -18,6 +18,7 @@ from tests.deploy.machine import USER, Machine, booted
 CLOUD_INIT = ROOT / "deploy/cloud-init"
 EXAMPLE = ROOT / "examples/peg_in_hole_2d.yaml"
 HOLDFAST = Path(sys.executable).with_name("holdfast")
+BOOT_ID = "/proc/sys/kernel/random/boot_id"
 CLOUD, ROBOT = "holdfast-cloud", "holdfast-robot"
 
 MOST_EXPOSED = 20
@@ -189,9 +190,23 @@ def test_faults_under_systemd_change_no_decision(lab: Lab, tmp_path: Path) -> No
     trial = int(status.rpartition(" ")[2])
     machine.wait_for(ROBOT, "StatusText", f"local_recovery, trial {trial + 2}")
 
-    # Both come up again by themselves.
+    # The cloud comes up again by itself. The robot does so only if a person says that it may.
     machine.reboot()
+    machine.do(
+        "echo another > /run/boot_id; mount --bind /run/boot_id /proc/sys/kernel/random/boot_id"
+    )
     machine.wait_for(CLOUD, "ActiveState", "active")
+    assert machine.show(ROBOT, "ActiveState") == "inactive"
+    machine.do(f"! systemctl start {ROBOT}")
+    assert machine.show(ROBOT, "ExecMainStatus") == "5"
+    assert machine.show(ROBOT, "NRestarts") == "0"
+    assert "no robot moves by itself" in machine.do(f"journalctl --unit {ROBOT} --lines 20")
+    machine.do(f"""
+        systemctl set-environment HOLDFAST_AFTER_REBOOT=--after-reboot
+        systemctl restart {ROBOT}""")
+    machine.wait_for(ROBOT, "StatusText", "standard, ")
+    machine.signal(ROBOT, "KILL")  # and goes on after a crash, as before
+    machine.wait_for(ROBOT, "NRestarts", "1")
     machine.wait_for(ROBOT, "StatusText", "standard, ")
 
     machine.do(f"""

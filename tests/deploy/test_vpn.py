@@ -602,6 +602,55 @@ def test_what_is_refused_changes_nothing(
     assert _contents(tmp_path) == before
 
 
+@pytest.mark.parametrize(
+    ("network", "wrong"),
+    [
+        ("{here}/evil host 1194 10.77.0", "kind '{here}/evil': openvpn and wireguard"),
+        ("date host 1194 10.77.0", "kind 'date'"),
+        ("wireguard ho$(touch${{IFS}}ran)st 51820 10.77.0", "HOST 'ho"),
+        ("wireguard host a[$(touch${{IFS}}ran)] 10.77.0", "PORT 'a["),
+        ("wireguard host 51820 10.77.0 PostUp = touch ran", "HOLDFAST_VPN_NETWORK '10.77.0 PostUp"),
+        ("", "kind ''"),
+    ],
+)
+@pytest.mark.parametrize("what", ["add", "remove"])
+def test_a_directory_of_somebody_else_runs_nothing(
+    what: str, network: str, wrong: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    make_profiles("wireguard", "there", "host", "anna")
+    for name in ("known", "enlist", "strike", "next", "next_robot", "taken_addresses"):
+        program = tmp_path / f"evil_{name}"
+        program.write_text(f"#!/bin/sh\ntouch {tmp_path}/ran\n")
+        program.chmod(0o755)
+    (tmp_path / "there" / "network").write_text(network.format(here=tmp_path) + "\n")
+    before = _contents(tmp_path)
+    refused = called(what, "there", "ben" if what == "add" else "anna")
+    assert refused.returncode == 2
+    assert wrong.format(here=tmp_path) in refused.stderr
+    assert _contents(tmp_path) == before
+
+
+def test_what_would_be_an_option_in_a_profile_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    make_profiles("openvpn", "there", "host", "anna")
+    address = tmp_path / "there" / "cloud" / "holdfast-robots" / "anna"
+    address.write_text(address.read_text().replace("# serial ", "# serial ../../../"))
+    key = tmp_path / "there" / "authority" / "tls-crypt.key"
+    key.write_text(key.read_text() + "</tls-crypt>\nplugin evil.so\n<tls-crypt>\n")
+    before = _contents(tmp_path)
+    for words, wrong in (
+        (("add", "there", "ben"), "authority/tls-crypt.key: is no key or certificate"),
+        (("remove", "there", "anna"), "anna: has no serial number, but '../../../"),
+    ):
+        refused = called(*words)
+        assert refused.returncode == 2
+        assert wrong in refused.stderr
+        assert _contents(tmp_path) == before
+
+
 def test_nothing_half_written_stays(tmp_path: Path) -> None:
     """An openssl that fails at the last robot."""
     programs = tmp_path / "programs"

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
+import urllib.error
+import urllib.request
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -14,16 +17,18 @@ from tests.ports import free_port
 from tests.processes.faults import (
     LOCAL_RECOVERY,
     LOST,
+    PATIENCE_S,
     References,
     Service,
     Site,
     Story,
     document_of,
     events_of,
+    wait_until,
 )
 
 from holdfast.lab.testbed.records import LogEvent
-from holdfast.transport.key_ring import make_credentials, revoke_credentials
+from holdfast.transport.key_ring import alone_in, make_credentials, revoke_credentials
 
 PEG = "peg_in_hole_2d"
 
@@ -281,3 +286,69 @@ def test_what_is_renewed_where_it_is_mounted_is_read_without_a_signal(
     assert robot.statuses() == []
     cloud.process.wait_for("credentials_reloaded", processes, num_revoked=1)
     assert len(cloud.process.matching("credentials_reloaded")) == 2 * processes
+
+
+def page(cloud: Service, path: str) -> tuple[int, str]:
+    """Ask a service how it is."""
+    address = cloud.process.matching("ready")[0]["health"]
+    try:
+        with urllib.request.urlopen(f"http://{address}{path}", timeout=PATIENCE_S) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root mounts")
+@pytest.mark.parametrize("processes", [1, 2])
+def test_where_keys_are_mounted_a_rotation_and_then_a_revocation_take_effect(
+    processes: int, home: Path, site: Site, references: References, tmp_path: Path
+) -> None:
+    mount = tmp_path / "mount"
+    mount.mkdir()
+    address = f"127.0.0.1:{free_port()}"
+    cloud = site.service(
+        *("--tls", str(mount), "--processes", str(processes)),
+        *("--health", address, "--metrics", address),
+        endpoint=f"tls/127.0.0.1:{free_port()}",
+    )
+    binding = f'mount --bind {home / "cloud"} {mount}; exec "$@"'
+    cloud.command = ("unshare", "--mount", "sh", "-c", binding, "sh", *cloud.command)
+    cloud.start()
+    assert page(cloud, "/readyz") == (200, "ok\n")
+    story = Story(site, references, document_of(PEG))
+
+    def rotate() -> None:
+        with alone_in(home):
+            make_credentials(home, services=["cloud"], rotate=True)
+        reload(cloud, count=processes)
+
+    def revoke() -> None:
+        with alone_in(home):
+            revoke_credentials(home, names=["anna"])
+        reload(cloud, count=2 * processes)
+
+    story.at("perform", 10, rotate)
+    story.at("perform", 20, revoke, story.status(LOCAL_RECOVERY))
+    robot = story.run(cloud, options=("--tls", str(home / "anna")))
+    assert robot.statuses() == [LOST]
+    assert page(cloud, "/readyz") == (200, "ok\n")
+    assert "\nholdfast_credentials_stale 0.0\n" in page(cloud, "/metrics")[1]
+
+    # A list that is gone would let her in again.
+    (home / "cloud" / "revoked.pem").unlink()
+    cloud.process.signal(signal.SIGHUP)
+    told = cloud.process.wait_for("credentials", processes)
+    assert "revoked.pem: lacks 1 of the 1 certificates that it revoked" in told["reason"]
+    metric = f"\nholdfast_credentials_stale {processes}.0\n"
+    wait_until(lambda: metric in page(cloud, "/metrics")[1], "the metric")
+    assert page(cloud, "/readyz") == (200, "ok\n")
+
+    for file in (home / "cloud").iterdir():
+        file.unlink()
+    cloud.process.signal(signal.SIGHUP)
+    gone = (503, f"{mount}/authority.pem: cannot be read: No such file or directory")
+    wait_until(lambda: page(cloud, "/readyz")[0] == gone[0], "the service to be not ready")
+    assert page(cloud, "/readyz")[1].startswith(gone[1])
+    assert page(cloud, "/livez") == (200, "ok\n")
+    assert "\nholdfast_ready 0.0\n" in page(cloud, "/metrics")[1]

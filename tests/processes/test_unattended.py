@@ -37,6 +37,7 @@ from tests.processes.faults import (
 PEG = "peg_in_hole_2d"
 STARTING, HOLDING, ENDING = "starting", "holding still", "ending"
 HEALTH = ("--health", "0")
+BOOT_ID = "/proc/sys/kernel/random/boot_id"
 
 BEAT_S = 0.05
 WATCHED = {"WATCHDOG_USEC": str(round(2e6 * BEAT_S))}
@@ -139,6 +140,85 @@ class TestOneCommandRepeated:
         assert "another process is using this run" in found[1][1]
         assert "that run has another configuration: simulator.seed is 3 there" in found[2][1]
         story.finish(site.run(story.file, "--resume-if-begun"))
+
+
+def child_of(process: Process) -> int:
+    """Return the id of the process that another one has started."""
+    pid = process.pid
+    (child,) = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return int(child)
+
+
+class TestRestart:
+    """``--restart``, as the first process of a container."""
+
+    OPTIONS = ("--resume-if-begun", "--restart", "--rate", "2000")
+
+    def test_a_robot_that_is_killed_goes_on_with_nobody_there(
+        self, site: Site, references: References
+    ) -> None:
+        document = document_of(PEG, max_steps=60, trials=2)
+        cloud = site.service().start()
+        story = Story(site, references, document)
+
+        def kill() -> None:
+            os.kill(child_of(story.running), signal.SIGKILL)
+
+        story.at("begin", 0, kill)
+        story.at("perform", 30, kill, trial=1, afterwards=True)
+        robot = site.run(story.file, *self.OPTIONS, services=[cloud])
+        assert robot.wait() == 0, robot.account()
+        told = robot.matching("process_ended")
+        assert [event["reason"] for event in told] == ["was ended by SIGKILL"] * 2
+        story.finish(robot)
+
+    @pytest.mark.parametrize("ends", ["the command", "the robot"])
+    def test_what_ends_it_in_order_ends_it_for_good(
+        self, site: Site, references: References, ends: str
+    ) -> None:
+        document = document_of(PEG, max_steps=60)
+        story = Story(site, references, document)
+
+        def end() -> None:
+            pid = story.running.pid if ends == "the command" else child_of(story.running)
+            os.kill(pid, signal.SIGTERM)
+
+        story.at("perform", 30, end)
+        robot = site.run(story.file, *self.OPTIONS)
+        assert robot.wait() == 128 + signal.SIGTERM, robot.account()
+        assert robot.matching("process_ended") == []
+        story.finish(site.run(story.file, *self.OPTIONS))
+
+    def test_a_robot_does_not_outlive_it(self, site: Site, references: References) -> None:
+        document = document_of(PEG, max_steps=60)
+        story = Story(site, references, document)
+        story.at("perform", 30, site.kill_robot)
+        robot = site.run(story.file, *self.OPTIONS)
+        assert robot.wait() == -signal.SIGKILL, robot.account()
+        site.wait_for_nobody()
+        story.finish(site.run(story.file, *self.OPTIONS))
+
+    @pytest.mark.skipif(os.geteuid() != 0, reason="only root mounts")
+    def test_after_a_reboot_it_moves_only_when_told_to(
+        self, site: Site, references: References
+    ) -> None:
+        document = document_of(PEG, max_steps=60)
+        story = Story(site, references, document)
+        story.at("perform", 30, site.kill_robot)
+        robot = site.run(story.file, *self.OPTIONS)
+        assert robot.wait() == -signal.SIGKILL, robot.account()
+        site.wait_for_nobody()
+        performed = story.world.step
+        boot = site.directory / "boot_id"
+        boot.write_text("another\n")
+        booted = ("unshare", "--mount", "sh", "-c", f'mount --bind {boot} {BOOT_ID}; exec "$@"')
+        command = (*booted, "sh", *COMMAND)
+        robot = site.run(story.file, *self.OPTIONS, command=command)
+        assert robot.wait() == 5, robot.account()
+        assert robot.matching("process_ended") == []
+        assert story.world.step == performed
+        options = (*self.OPTIONS, "--after-reboot")
+        story.finish(site.run(story.file, *options, command=command))
 
 
 class TestHealth:

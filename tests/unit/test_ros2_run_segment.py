@@ -12,6 +12,7 @@ from tests.recordings import robot_configuration
 
 from holdfast.config.loader import Configuration
 from holdfast.planning import Planner
+from holdfast.recording import journal_file
 from holdfast.robot.environment import EnvironmentMaker, SimulatedEnvironment, load_environment
 from holdfast.robot.trial import run_trial
 from holdfast.ros.ros2.run_segment import Ending, RunSegment, SegmentResult, World
@@ -35,7 +36,7 @@ class Segments:
         self.on_order: Callable[[RunSegment, int], None] = lambda _, __: None
         self.orders = 0
 
-    def make(self) -> RunSegment:
+    def make(self, *, after_reboot: bool = False) -> RunSegment:
         def order(state: object, effect: object) -> None:
             self.orders += 1
             self.on_order(segment, self.orders)
@@ -45,6 +46,7 @@ class Segments:
             self.path,
             World(self.maker, lambda _: None),
             rate_hz=None,
+            after_reboot=after_reboot,
             sink=NullEventLog(),
             on_order=order,
             on_timing=lambda _: None,
@@ -52,8 +54,8 @@ class Segments:
         )
         return segment
 
-    def run(self) -> SegmentResult:
-        segment = self.make()
+    def run(self, *, after_reboot: bool = False) -> SegmentResult:
+        segment = self.make(after_reboot=after_reboot)
         segment.start()
         assert segment.ended.wait(PATIENCE_S)
         assert segment.outcome is not None
@@ -98,6 +100,24 @@ def test_parts_that_are_paused(segments: Segments) -> None:
         reasons.append(outcome.message)
     assert reasons[0] == "order 1"
     assert len(reasons) > 5
+    assert outcome.ending == Ending.FINISHED
+    assert [trial.digest for trial in outcome.trials] == digests(segments.configuration)
+
+
+def test_after_a_reboot_a_person_has_to_say_so(
+    segments: Segments, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    segments.on_order = lambda segment, count: (
+        segment.pause("for now", PATIENCE_S) if count == 20 else None
+    )
+    assert segments.run().ending == Ending.PAUSED
+    (tmp_path / "boot_id").write_text("another")
+    monkeypatch.setattr(journal_file, "_BOOT_ID", tmp_path / "boot_id")
+    outcome = segments.run()
+    assert (outcome.ending, segments.orders) == (Ending.HELD, 20)
+    assert "no robot moves by itself" in outcome.message
+    assert outcome.message.endswith("(after_reboot)")
+    outcome = segments.run(after_reboot=True)
     assert outcome.ending == Ending.FINISHED
     assert [trial.digest for trial in outcome.trials] == digests(segments.configuration)
 

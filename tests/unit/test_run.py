@@ -15,7 +15,10 @@ from pathlib import Path
 import pytest
 from tests.command_line import Said, run_here
 
+from holdfast.errors import HeldError
+from holdfast.recording import journal_file
 from holdfast.recording.journal import Journal
+from holdfast.robot.process import RobotProcess
 
 PEG = """
 problem: peg_in_hole_2d
@@ -452,3 +455,94 @@ def test_what_a_problem_raises_is_shown_without_our_frames(workplace: Workplace)
         "class Broken(PegInHole2D): pass\n",
     )
     assert workplace.run(*arguments, "--quiet", "--trials", "1").code == 0
+
+
+class TestAfterAReboot:
+    """A robot goes on in another boot of its machine only if a person says so."""
+
+    ROBOT = ("run", "peg.yaml", "--rate", "10000", "--quiet", "--out", "out")
+
+    @pytest.fixture
+    def boot(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+        boot = tmp_path / "boot_id"
+        boot.write_text("1f\n")
+        monkeypatch.setattr(journal_file, "_BOOT_ID", boot)
+        return boot
+
+    def refused(self, workplace: Workplace, *options: str) -> str:
+        said = workplace.run(*self.ROBOT, *options)
+        assert said.code == 5, said
+        return said.stderr
+
+    @pytest.mark.parametrize("resume", ["--resume", "--resume-if-begun"])
+    def test_it_goes_on_only_in_the_same_boot_or_if_told_to(
+        self, workplace: Workplace, boot: Path, resume: str
+    ) -> None:
+        workplace.runs(*self.ROBOT, "--trials", "1")
+        workplace.runs(*self.ROBOT, "--trials", "2", resume)
+        boot.write_text("2e\n")
+        for _ in range(2):  # to be refused changes nothing
+            error = self.refused(workplace, "--trials", "3", resume)
+            assert "out: this machine was rebooted since the robot of this run last moved" in error
+            assert error.rstrip().endswith(" --out out --resume --after-reboot")
+        assert workplace.summary("out")["finished"] == 2
+        workplace.runs(*self.ROBOT, "--trials", "3", resume, "--after-reboot")
+        # A crash in this boot changes nothing.
+        workplace.runs(*self.ROBOT, "--trials", "4", resume)
+        workplace.runs("run", "peg.yaml", "--quiet", "--out", "whole", "--trials", "4")
+        assert workplace.decided("out") == workplace.decided("whole")
+
+    @pytest.mark.parametrize("unknown", ["before", "now", "both"])
+    def test_an_unknown_boot_is_another_one(
+        self, workplace: Workplace, boot: Path, unknown: str
+    ) -> None:
+        known = boot.read_text()
+        if unknown != "now":
+            boot.unlink()
+        workplace.runs(*self.ROBOT, "--trials", "1")
+        boot.write_text(known)
+        if unknown != "before":
+            boot.write_text("")
+        error = self.refused(workplace, "--trials", "2", "--resume-if-begun")
+        assert "nobody knows whether this machine was rebooted" in error
+        workplace.runs(*self.ROBOT, "--trials", "2", "--resume-if-begun", "--after-reboot")
+
+    def test_one_that_ended_before_its_first_step_does_not_begin_either(
+        self, workplace: Workplace, boot: Path
+    ) -> None:
+        def run(*_: object) -> None:
+            raise HeldError("its environment is not there yet")
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(RobotProcess, "run", run)
+            assert workplace.run(*self.ROBOT, "--trials", "1").code == 2
+        boot.write_text("2e\n")
+        for _ in range(2):
+            self.refused(workplace, "--trials", "1", "--resume-if-begun")
+        workplace.runs(*self.ROBOT, "--trials", "1", "--resume-if-begun", "--after-reboot")
+
+    def test_a_run_of_the_release_before_knows_the_boot_of_its_last_steps(
+        self, workplace: Workplace, boot: Path
+    ) -> None:
+        workplace.runs(*self.ROBOT, "--trials", "1")
+        with Journal.open(workplace.directory / "out" / "journal.sqlite") as journal:
+            journal._connection.execute("DELETE FROM meta WHERE key = 'boot'")
+        workplace.runs(*self.ROBOT, "--trials", "2", "--resume")
+        with Journal.open(workplace.directory / "out" / "journal.sqlite") as journal:
+            journal._connection.execute("DELETE FROM meta WHERE key = 'boot'")
+        boot.write_text("2e\n")
+        self.refused(workplace, "--trials", "3", "--resume")
+
+    def test_where_nothing_moves_nobody_is_asked(self, workplace: Workplace, boot: Path) -> None:
+        batch = ("run", "peg.yaml", "--jobs", "1", "--quiet", "--out", "batch")
+        workplace.runs(*batch, "--trials", "1")
+        workplace.runs(*self.ROBOT, "--trials", "1")
+        boot.write_text("2e\n")
+        workplace.runs(*batch, "--trials", "2", "--resume")
+        for resume in ("--resume", "--resume-if-begun"):  # it is complete
+            workplace.runs(*self.ROBOT, "--trials", "1", resume)
+
+    @pytest.mark.parametrize("option", ["--after-reboot", "--restart"])
+    def test_what_has_no_effect_is_refused(self, workplace: Workplace, option: str) -> None:
+        assert f"{option} needs " in workplace.fails(*self.ROBOT, option)
+        assert not (workplace.directory / "out").exists()

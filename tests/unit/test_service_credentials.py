@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import os
 import shutil
+import time
 from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,7 @@ from typing import Any
 import pytest
 
 from holdfast.service.credentials import ServiceCredentials
-from holdfast.transport.key_ring import make_credentials
+from holdfast.transport.key_ring import make_credentials, revoke_credentials
 from holdfast.transport.service_end import StreamServiceTransport
 
 
@@ -60,13 +62,9 @@ class Service:
 
     def renewed(self, days: int = 30) -> Path:
         """Return other credentials; those in use stay where they are."""
-        kept = Path(shutil.copytree(self.own, self.home / "kept"))
-        make_credentials(self.home, services=["cloud"], rotate=True, days=days)
-        new = self.own.rename(self.home / "new")
-        kept.rename(self.own)
-        self.loop.look(2)  # what was moved about is the same as before, and no news
-        self.events.told.clear()
-        return new
+        new = Path(shutil.copytree(self.home, self.home.with_name("new")))
+        make_credentials(new, services=["cloud"], rotate=True, days=days)
+        return new / "cloud"
 
     def copy(self, new: Path, *names: str) -> None:
         for name in names:
@@ -135,3 +133,69 @@ def test_a_copy_that_brings_its_time_along_is_seen(service: Service) -> None:
         os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
     service.loop.look(2)
     assert service.events.names() == ["credentials_reloaded"]
+
+
+def test_what_is_gone_is_said_until_it_is_back(service: Service) -> None:
+    assert service.credentials.why_gone() is None
+    kept = Path(shutil.copytree(service.own, service.home / "kept"))
+    for name in ("authority", "certificate", "key"):
+        (service.own / f"{name}.pem").unlink()
+        service.loop.look(2)
+        assert f"{name}.pem: cannot be read: No such file" in str(service.credentials.why_gone())
+        assert service.credentials.is_stale
+        service.copy(kept, name)
+        service.loop.look(2)
+        assert (service.credentials.why_gone(), service.credentials.is_stale) == (None, False)
+
+
+def test_what_has_expired_meanwhile_is_gone(service: Service) -> None:
+    service.credentials.expires_s = time.time()
+    assert "certificate.pem: has expired" in str(service.credentials.why_gone())
+    assert not service.credentials.is_stale
+
+
+@pytest.mark.parametrize("how", ["expired", "revoked"])
+def test_what_no_robot_would_believe_is_gone(service: Service, how: str) -> None:
+    if how == "expired":
+        past = datetime.now(UTC) - timedelta(hours=36)
+        make_credentials(service.home, services=["cloud"], rotate=True, days=1, now=past)
+    else:
+        revoke_credentials(service.home, names=["cloud"])
+    service.loop.look(3)
+    assert f"certificate.pem: has {'been ' * (how == 'revoked')}{how}" in str(
+        service.credentials.why_gone()
+    )
+
+
+def test_what_is_only_wrong_is_stale_and_not_gone(service: Service) -> None:
+    (service.own / "key.pem").write_text("half a k")
+    service.loop.look(3)
+    assert (service.credentials.why_gone(), service.credentials.is_stale) == (None, True)
+
+
+@pytest.mark.parametrize("left", ["nothing", "an older list"])
+def test_a_list_that_became_shorter_lets_nobody_in_again(service: Service, left: str) -> None:
+    path = service.own / "revoked.pem"
+    revoke_credentials(service.home, serials=[7])
+    older = path.read_bytes()
+    revoke_credentials(service.home, serials=[8])
+    service.loop.look(3)
+    assert service.transport.num_revoked == 2
+    path.unlink()
+    if left == "an older list":
+        path.write_bytes(older)
+    service.loop.look(3)
+    assert service.events.names() == ["credentials_reloaded", "credentials"]
+    assert service.transport.num_revoked == 2
+    assert service.credentials.is_stale
+
+
+def test_another_authority_comes_with_a_list_of_its_own(service: Service, tmp_path: Path) -> None:
+    revoke_credentials(service.home, serials=[7])
+    service.loop.look(3)
+    make_credentials(tmp_path / "other", services=["cloud"])
+    (service.own / "revoked.pem").unlink()
+    service.copy(tmp_path / "other" / "cloud", "authority", "certificate", "key")
+    service.loop.look(3)
+    assert service.events.names() == ["credentials_reloaded"] * 2
+    assert service.transport.num_revoked == 0

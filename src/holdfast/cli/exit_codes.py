@@ -15,6 +15,7 @@ __all__ = [
     "EXIT_CAN_GO_ON",
     "EXIT_DIFFERENT",
     "EXIT_ERROR",
+    "EXIT_REBOOTED",
     "EXIT_SIGNAL",
     "EXIT_WRONG_ANSWER",
     "EndedBySignal",
@@ -35,6 +36,9 @@ EXIT_WRONG_ANSWER = 3
 
 EXIT_CAN_GO_ON = 4
 """An error ended the run; the run can go on once the reason is gone."""
+
+EXIT_REBOOTED = 5
+"""The machine was rebooted; the run goes on once a person says so (``--after-reboot``)."""
 
 EXIT_SIGNAL = 128
 """Added to the number of the signal that ended a run, as shells do it."""

@@ -104,6 +104,7 @@ def run_as_robot(
         on_result,
         rate_hz=options.rate,
         sinks=sinks,
+        after_reboot=options.after_reboot,
         watch=lambda events: RobotWatch(manager, options.health, options.metrics, events),
         view=view,
     )

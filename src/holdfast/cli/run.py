@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 from holdfast.cli.exit_codes import (
     EXIT_CAN_GO_ON,
     EXIT_ERROR,
+    EXIT_REBOOTED,
     EXIT_WRONG_ANSWER,
     ended_by_signals,
     interrupted_by,
@@ -93,7 +94,7 @@ class RunOptions(Options):
     Ctrl-C or a crash loses no trial and no step: the same command with --resume goes on.
     """
 
-    exit_codes: ClassVar = {3: None, 4: None}
+    exit_codes: ClassVar = {3: None, 4: None, 5: None}
     needs_arguments = True
 
     configuration: Path = argument("CONFIG", "Configuration file (YAML) of the run.", location)
@@ -138,6 +139,15 @@ class RunOptions(Options):
     resume_if_begun: bool = flag(
         help="Go on with the run in DIR if it has begun, otherwise begin it; needs --out. For a "
         "unit or container that repeats one command.",
+    )
+    after_reboot: bool = flag(
+        help="Let the robot go on although the machine was rebooted since it last moved; without "
+        "this, a run that is resumed then ends with code 5.",
+    )
+    restart: bool = flag(
+        help="Start the run again when its process dies or fails, but not after the codes 0, 3 and "
+        "5 and a signal that ends it in order; needs --resume-if-begun. For a container, which the "
+        "engine must not restart.",
     )
     quiet: bool = flag(
         "-q",
@@ -207,7 +217,9 @@ class RunOptions(Options):
 
     def resume_command(self, directory: Path) -> str:
         """Return the command that goes on."""
-        words = self.words("out", "resume", "resume_if_begun", "quiet", "view_file")
+        words = self.words(
+            *("out", "resume", "resume_if_begun", "after_reboot", "restart", "quiet", "view_file")
+        )
         out = self.table()["out"].words(directory)
         return shlex.join(["holdfast", "run", *words, *out, "--resume"])
 
@@ -231,6 +243,14 @@ class RunOptions(Options):
 def main(arguments: Sequence[str]) -> int:
     """Run the trials and return the exit code."""
     options = RunOptions.parse("run", arguments)
+    if options.after_reboot and not (options.resume or options.resume_if_begun):
+        raise InvalidValueError("--after-reboot needs --resume or --resume-if-begun")
+    if options.restart:
+        from holdfast.cli.restart import run_until_it_ends
+
+        if not options.resume_if_begun:
+            raise InvalidValueError("--restart needs --resume-if-begun, to go on with what it had")
+        return run_until_it_ends(["run", *options.words("restart")])
     with ended_by_signals():
         return _run(options)
 
@@ -334,8 +354,16 @@ def _run(options: RunOptions) -> int:
             )
             raise
         except HoldfastError as error:
-            from holdfast.errors import LostJournalError, StaleEpochError, UnknownPerformanceError
+            from holdfast.errors import (
+                LostJournalError,
+                RebootedError,
+                StaleEpochError,
+                UnknownPerformanceError,
+            )
 
+            if isinstance(error, RebootedError):
+                command = f"{options.resume_command(directory_path)} --after-reboot"
+                raise RunError(error, command, EXIT_REBOOTED) from error
             cannot_go_on = (
                 isinstance(error, UnknownPerformanceError | LostJournalError)
                 or directory.journal.unfinished_trial() is None

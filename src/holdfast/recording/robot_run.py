@@ -60,6 +60,7 @@ def perform_trials(
     *,
     rate_hz: float | None,
     sinks: Sequence[EventSink],
+    after_reboot: bool = False,
     watch: Callable[[EventSink], RobotWatch] | None = None,
     observer: RobotObserver | None = None,
     view: LiveView | None = None,
@@ -67,13 +68,18 @@ def perform_trials(
     """Run the missing trials one after another; return how many ticks of the rate were missed.
 
     The ``sinks`` get the events, besides the run's own log, and are closed at the end; so is the
-    ``view``, which shows the run while it goes on.
+    ``view``, which shows the run while it goes on. ``after_reboot`` says that a person lets the
+    run go on although the machine was rebooted.
 
     Raises
     ------
+    RebootedError
+        If nobody does.
     HoldfastError
         If the robot holds still and cannot go on.
     """
+    if len(directory.journal.finished()) < configuration.simulator.num_trials:
+        directory.allow_robot(after_reboot=after_reboot)
     with contextlib.ExitStack() as stack:
         log = EventLog(directory.path / EVENTS_NAME, format="json", component="robot")
         journal: StepJournal = directory.journal

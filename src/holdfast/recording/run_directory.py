@@ -21,12 +21,12 @@ import msgspec
 from holdfast import __version__
 from holdfast.config.loader import Configuration
 from holdfast.config.settings import SelectorSettings
-from holdfast.errors import OutputError
+from holdfast.errors import OutputError, RebootedError
 from holdfast.files import write_atomically
 from holdfast.outcome import TrialResult
 from holdfast.recording.fingerprint import difference, fingerprint
 from holdfast.recording.journal import Journal
-from holdfast.recording.journal_file import JOURNAL_NAME, JournalFile, Survives
+from holdfast.recording.journal_file import JOURNAL_NAME, JournalFile, Survives, boot_id
 from holdfast.recording.journal_reader import JournalReader
 from holdfast.recording.tables import RunSummary, SummaryBuilder, csv_lines
 from holdfast.recording.timings import count_answers, count_verified
@@ -71,6 +71,9 @@ OUTPUT_NAMES = (
 _SECTIONS_WITHOUT_DECISIONS = ("offload", "recovery", "lost")
 """Of what ``lost`` does to a belief, each time is in the journal."""
 
+_BOOT = "boot"
+"""Key of the note in which boot of the machine a robot may move."""
+
 _MAX_SUFFIX = 10_000
 
 
@@ -95,10 +98,13 @@ class RunDirectory:
         self.earlier_wall_time_s = float(journal.meta().get("wall_time_s", "0"))
 
     @classmethod
-    def create(cls, path: Path, configuration: Configuration) -> Self:
+    def create(
+        cls, path: Path, configuration: Configuration, notes: Mapping[str, str] | None = None
+    ) -> Self:
         """Claim a directory for a new run; it is made if it is not there.
 
-        A run of which no trial is finished or begun does not keep its directory.
+        A run of which no trial is finished or begun does not keep its directory. ``notes`` are
+        added to those about the run.
 
         Raises
         ------
@@ -113,7 +119,7 @@ class RunDirectory:
         except OSError as error:
             raise OutputError(f"{path}: cannot be made: {error.strerror}") from error
         text = configuration.to_yaml()
-        meta = {"configuration": text} | fingerprint(configuration)
+        meta = {"configuration": text} | fingerprint(configuration) | dict(notes or {})
         survives = configuration.recovery.journal_survives
         journal = _unused_journal(path, survives)
         if taken and journal is None:
@@ -200,8 +206,41 @@ class RunDirectory:
             unused = _unused_journal(path, configuration.recovery.journal_survives)
             if unused is None:
                 return cls.resume(path, configuration)
+            # Whatever repeats the command does not begin it after a reboot, either.
+            notes = {key: value for key, value in unused.meta().items() if key == _BOOT}
             unused.close()
+            return cls.create(path, configuration, notes)
         return cls.create(path, configuration)
+
+    def allow_robot(self, *, after_reboot: bool) -> None:
+        """Let a robot move in this boot of the machine.
+
+        Whatever starts a command again by itself (systemd, Docker, cron) does so after a reboot,
+        too, where the robot may have been moved, or somebody may stand beside it. So the run goes
+        on only in the boot in which it was begun, or in which a person has said ``after_reboot``.
+
+        Raises
+        ------
+        RebootedError
+            If the robot may not move. A boot that is not known is another one.
+        """
+        meta = self.journal.meta()
+        before = meta.get(_BOOT, meta.get("steps_boot"))  # a run of 0.1 has only the second
+        now = boot_id() or ""
+        is_known = bool(before and now)
+        if before is not None and not after_reboot and not (is_known and before == now):
+            what = (
+                "this machine was rebooted since the robot of this run last moved"
+                if is_known
+                else "nobody knows whether this machine was rebooted since the robot of this run "
+                "last moved, because /proc/sys/kernel/random/boot_id could not be read"
+            )
+            raise RebootedError(
+                f"{self.path}: {what}, and after a reboot no robot moves by itself; see whether it "
+                "may, and say so (--after-reboot)"
+            )
+        if before != now:
+            self.journal.set_meta(_BOOT, now)
 
     def complete_summary(self) -> RunSummary | None:
         """Return ``summary.json`` if all trials are finished and it covers them all, else None.

@@ -55,6 +55,7 @@ _EXIT_CODES = {
     2: "an error",
     3: "a service answered otherwise than the robot's own planner",
     4: "an error, but the run can go on",
+    5: "the machine was rebooted, and nobody lets the robot go on",
 }
 
 

@@ -2,16 +2,19 @@
 
 A tool that renews certificates often cannot send a signal: cert-manager in a cluster only changes
 mounted files. So the event loop checks the files every second. It reads them when they are the same
-in two checks, because a set may be half copied. Credentials that cannot be used change nothing.
+in two checks, because a set may be half copied. If credentials cannot be used, the previous ones
+stay in use, and revocations since then are not known: the log, a metric and its alert say so. Where
+they are gone altogether, no new robot should come.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from holdfast.errors import HoldfastError
+from holdfast.errors import CredentialsGoneError, HoldfastError
 from holdfast.runtime.events import EventSink
 from holdfast.transport.credentials import date_text, file_versions, load_credentials
 from holdfast.transport.endpoints import TlsFiles
@@ -33,6 +36,8 @@ class ServiceCredentials:
     ----------
     expires_s : float
         When the certificate in use expires, in seconds since 1970.
+    is_stale : bool
+        Whether they could not be read the last time, so that older ones are in use.
 
     Raises
     ------
@@ -46,7 +51,15 @@ class ServiceCredentials:
         self._warn = warn
         self._used = self._seen = file_versions(self.files)
         self._failure: str | None = None
+        self._gone: str | None = None
+        self.is_stale = False
         self.expires_s = load_credentials(directory, "service", warn=warn).expires_s
+
+    def why_gone(self) -> str | None:
+        """Return what is missing, unreadable, expired or revoked; None if nothing is."""
+        if time.time() >= self.expires_s:
+            return f"{self.files.certificate}: has expired"
+        return self._gone
 
     def watch(
         self,
@@ -78,9 +91,11 @@ class ServiceCredentials:
             failure = f"{error}; the previous ones stay in use"
             if requested or failure != self._failure:
                 events.event("credentials", reason=failure)
-            self._failure = failure
+            self._failure, self.is_stale = failure, True
+            self._gone = str(error) if isinstance(error, CredentialsGoneError) else None
             return
         self._used, self._failure, self.expires_s = read_at, None, read.expires_s
+        self._gone, self.is_stale = None, False
         for text in warnings:
             self._warn(text)
         events.event(

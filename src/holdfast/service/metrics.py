@@ -75,6 +75,10 @@ class ServiceReport(msgspec.Struct):
     """Of processes."""
     certificate_expires_s: float | None = None
     """The earliest end of a certificate in use, in seconds since 1970."""
+    stale_credentials: int = 0
+    """Processes that could not read their changed credentials."""
+    credentials_gone: str | None = None
+    """What of the credentials is missing, unreadable, expired or revoked."""
 
     def without_gauges(self) -> ServiceReport:
         """Return the report of an ended process: its counters, without what it held."""
@@ -87,6 +91,7 @@ def summed(reports: Iterable[ServiceReport]) -> ServiceReport:
     total = ServiceReport()
     for report in reports:
         total.restarts += report.restarts
+        total.stale_credentials += report.stale_credentials
         ends = (total.certificate_expires_s, report.certificate_expires_s)
         total.certificate_expires_s = min((end for end in ends if end is not None), default=None)
         mine, theirs = total.statistics, report.statistics
@@ -144,6 +149,12 @@ class Exposition:
                 "holdfast_certificate_expiry_timestamp_seconds",
                 "When the certificate in use expires, in seconds since 1970.",
                 report.certificate_expires_s,
+            )
+            yield GaugeMetricFamily(
+                "holdfast_credentials_stale",
+                "Processes that could not read changed credentials: they use the previous ones, "
+                "and know of no later revocation.",
+                report.stale_credentials,
             )
         decisions = CounterMetricFamily(
             "holdfast_decisions", "Parts of answers computed.", labels=["kind"]

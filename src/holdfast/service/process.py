@@ -329,7 +329,11 @@ class _ServiceProcess:
         return _exit_status(reason)
 
     def _why_not_ready(self) -> str | None:
-        return "draining" if self._shell.is_draining else None if self._is_serving else "starting"
+        if self._shell.is_draining:
+            return "draining"
+        if not self._is_serving:
+            return "starting"
+        return None if self._credentials is None else self._credentials.why_gone()
 
     def _status(self) -> str:
         sessions = self._shell.statistics().sessions
@@ -339,8 +343,12 @@ class _ServiceProcess:
     def _report(self) -> ServiceReport:
         from holdfast.service.metrics import ServiceReport
 
-        expires_s = None if self._credentials is None else self._credentials.expires_s
-        return ServiceReport(self._shell.statistics(), self._times, certificate_expires_s=expires_s)
+        report = ServiceReport(self._shell.statistics(), self._times)
+        if self._credentials is not None:
+            report.certificate_expires_s = self._credentials.expires_s
+            report.stale_credentials = int(self._credentials.is_stale)
+            report.credentials_gone = self._credentials.why_gone()
+        return report
 
     async def _reported(self) -> ServiceReport:
         return self._report()

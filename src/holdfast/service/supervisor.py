@@ -287,9 +287,9 @@ class Supervisor:
         """Return why no process takes robots; None if one does."""
         if self._stopping:
             return "draining"
-        if any(child.ready for child in self._living()):
-            return None
-        return "starting"
+        serving = [child.report for child in self._living() if child.ready and child.report]
+        gone = [report.credentials_gone for report in serving]
+        return None if None in gone else next(iter(gone), "starting")
 
     def why_not_alive(self) -> str | None:
         """Return which process is stuck; None if none is."""

@@ -230,6 +230,15 @@ def new_key() -> ec.EllipticCurvePrivateKey:
     return ec.generate_private_key(ec.SECP256R1())
 
 
+def key_belongs_to(path: Path, certificate: x509.Certificate) -> bool:
+    """Return whether a file has the key of a certificate."""
+    try:
+        key = load_pem_private_key(read_file(path), None)
+    except (ValueError, TypeError):
+        return False
+    return key.public_key() == certificate.public_key()
+
+
 def public_key_of(certificate: x509.Certificate) -> ec.EllipticCurvePublicKey | None:
     """Return a certificate's key; None if it is not of an elliptic curve."""
     key = certificate.public_key()

@@ -25,7 +25,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from holdfast.errors import CredentialsError, TransportError
+from holdfast.errors import CredentialsError, CredentialsGoneError, TransportError
 from holdfast.transport.endpoints import AUTHORITY_FILE, REVOKED_FILE, Role, TlsFiles
 
 if TYPE_CHECKING:
@@ -77,7 +77,8 @@ def load_credentials(
     CredentialsError
         If the peer would refuse them: a file is missing, unreadable or malformed, the key belongs
         to another certificate, the certificate is not valid now, was signed by another authority,
-        is for the other role, or has not exactly one common name.
+        is for the other role, or has not exactly one common name. The kind is
+        CredentialsGoneError for what is missing, unreadable, expired or revoked.
     """
     directory = Path(directory)
     files = TlsFiles.of(directory)
@@ -86,7 +87,7 @@ def load_credentials(
             with path.open("rb"):
                 pass
         except OSError as error:
-            raise CredentialsError(_unreadable(directory, path, role, error)) from error
+            raise CredentialsGoneError(_unreadable(directory, path, role, error)) from error
     warn_if_open(files.key, warn)
     name, expires_s = _check_handshake(files, role)
     days_left = (expires_s - datetime.now(UTC).timestamp()) / 86_400.0
@@ -118,8 +119,6 @@ def _unreadable(directory: Path, path: Path, role: Role, error: OSError) -> str:
         return f"{text}; this process is user {os.geteuid()}"
     if TlsFiles.of(directory / role).certificate.exists():
         return f"{text}; did you mean {directory / role}?"
-    if directory.with_name(f".{directory.name}.old").exists():
-        return f'{text}; "holdfast keys {directory.parent} --list" brings back what was broken off'
     if isinstance(error, FileNotFoundError):
         return f'{text}; "holdfast keys DIR" makes such files'
     return text
@@ -170,7 +169,8 @@ def _check_handshake(files: TlsFiles, role: Role) -> tuple[str, float]:
             reason = _CRL_ERRORS[error.verify_code]
             raise CredentialsError(f"{authority.with_name(REVOKED_FILE)}: {reason}") from error
         reason = describe_certificate_error(error, role)
-        raise CredentialsError(
+        kind = CredentialsGoneError if error.verify_code in _GONE else CredentialsError
+        raise kind(
             f"{certificate}: {reason}{_renewal_hint(certificate, role, error.verify_code)}"
         ) from error
     except (ssl.SSLError, ValueError) as error:
@@ -189,6 +189,9 @@ _CRL_ERRORS = {
     12: "has expired",
 }
 """Faults of a revocation list, by OpenSSL's error numbers."""
+
+_GONE = (10, 23)
+"""OpenSSL's numbers for a certificate that has expired or was revoked."""
 
 
 def _renewal_hint(certificate: Path, role: Role, verify_code: int) -> str:

@@ -24,6 +24,7 @@ __all__ = [
     "CERTIFICATE_FILE",
     "KEY_FILE",
     "MAX_SOCKET_PATH_BYTES",
+    "NEXT_KEY_FILE",
     "REVOKED_FILE",
     "SCHEMES",
     "Endpoint",
@@ -49,6 +50,9 @@ MAX_SOCKET_PATH_BYTES = 107
 AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE = "authority.pem", "certificate.pem", "key.pem"
 REVOKED_FILE = "revoked.pem"
 """Names of the credentials' files, and of the list of revoked certificates beside them."""
+
+NEXT_KEY_FILE = "key.next.pem"
+"""The key of the next certificate, while ``holdfast keys --rotate`` replaces both."""
 
 _RENAMED = {
     "quic": "over UDP, services are at udp/HOST:PORT",

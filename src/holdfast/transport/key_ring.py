@@ -25,12 +25,12 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from holdfast.errors import CredentialsError
+from holdfast.errors import CredentialsError, OutputError
 from holdfast.files import (
     NewFile,
     create_directory_atomically,
-    replace_directory,
-    restore_directory,
+    remove_unfinished_of,
+    replace_file,
     write_atomically,
 )
 from holdfast.transport.authority import (
@@ -42,6 +42,7 @@ from holdfast.transport.authority import (
     hosts_of,
     is_host,
     is_signed_by,
+    key_belongs_to,
     key_pem,
     new_key,
     normal_host,
@@ -55,6 +56,7 @@ from holdfast.transport.endpoints import (
     AUTHORITY_FILE,
     CERTIFICATE_FILE,
     KEY_FILE,
+    NEXT_KEY_FILE,
     REVOKED_FILE,
     Role,
 )
@@ -125,7 +127,7 @@ class KeyRing(NamedTuple):
 
 @contextlib.contextmanager
 def alone_in(directory: Path, *, warn: Callable[[str], object] = warnings.warn) -> Iterator[None]:
-    """Lock a directory against other processes, and restore what a killed one left unfinished.
+    """Lock a directory against other processes, and complete what a killed one left unfinished.
 
     Takes and raises the same as :func:`make_credentials`.
     """
@@ -146,7 +148,7 @@ def alone_in(directory: Path, *, warn: Callable[[str], object] = warnings.warn) 
             warn(f"{directory}: cannot be locked: {error.strerror}; run one command at a time")
         names = {each.name for each in _recorded(directory).values()}
         for name in filter(_NAME.fullmatch, names - {_AUTHORITY}):
-            restore_directory(directory / name)
+            _complete_rotation(directory / name)
         yield
     finally:
         if is_new:
@@ -173,7 +175,8 @@ def make_credentials(
     ``key.pem``, which appears atomically. Another call adds parties of the same authority. Existing
     files stay, unless ``renew`` or ``rotate`` is set: then a new certificate replaces the old one,
     for the same key or a new one, and for at least the same hosts. The old one stays valid until it
-    expires or is revoked (:func:`revoke_credentials`). The caller holds the lock
+    expires or is revoked (:func:`revoke_credentials`). The directory stays the same one, because a
+    container may have mounted it, and can be used at every moment. The caller holds the lock
     (:func:`alone_in`).
 
     Parameters
@@ -254,7 +257,7 @@ def make_credentials(
     for party in parties:
         place = party.made.directory
         if party.key is None:
-            write_atomically(place / CERTIFICATE_FILE, certificate_pem(party.certificate))
+            replace_file(place / CERTIFICATE_FILE, certificate_pem(party.certificate), _PUBLIC_FILE)
         else:
             files = {
                 AUTHORITY_FILE: NewFile(certificate_pem(authority.certificate), _PUBLIC_FILE),
@@ -263,8 +266,10 @@ def make_credentials(
             }
             if (home / REVOKED_FILE).exists():
                 files[REVOKED_FILE] = NewFile(read_file(home / REVOKED_FILE), _PUBLIC_FILE)
-            put = replace_directory if place.exists() else create_directory_atomically
-            put(place, files)
+            if _first_file_of(place) is None:
+                create_directory_atomically(place, files)
+            else:
+                _rotate(place, files)
     return KeyRing(
         home / AUTHORITY_KEY_FILE,
         authority_is_new,
@@ -320,7 +325,7 @@ def revoke_credentials(
         content = read_file(home / REVOKED_FILE)
         for certificate in _certificates_in(directory):
             # Even without a new entry: an earlier call may have been killed before it copied.
-            write_atomically(certificate.with_name(REVOKED_FILE), content)
+            replace_file(certificate.with_name(REVOKED_FILE), content, _PUBLIC_FILE)
     return tuple(new)
 
 
@@ -436,6 +441,35 @@ def _party(
     certificate = authority.certify(place.name, role, reached_at, public_key, now, end)
     made = MadeCredentials(place.name, role, place, reached_at, end, key is None)
     return _Party(made, certificate, key)
+
+
+def _rotate(place: Path, files: dict[str, NewFile]) -> None:
+    """Replace a party's files one by one; the certificate decides which of the two keys is used."""
+    authority = place / AUTHORITY_FILE
+    if authority.exists() and files[AUTHORITY_FILE].content in read_file(authority):
+        del files[AUTHORITY_FILE]  # it may have a second one, while robots move to that
+    key = files.pop(KEY_FILE)
+    certificate = files.pop(CERTIFICATE_FILE)
+    for name, new in files.items():
+        replace_file(place / name, *new)
+    replace_file(place / NEXT_KEY_FILE, *key, like=place / KEY_FILE)
+    replace_file(place / CERTIFICATE_FILE, *certificate)
+    _complete_rotation(place)
+
+
+def _complete_rotation(place: Path) -> None:
+    """Let the next key take its place if its certificate is there already; else remove it."""
+    remove_unfinished_of(place)
+    next_key = place / NEXT_KEY_FILE
+    if not next_key.exists():
+        return
+    try:
+        if key_belongs_to(next_key, read_certificate(place / CERTIFICATE_FILE)):
+            next_key.replace(place / KEY_FILE)
+        else:
+            next_key.unlink()
+    except OSError as error:
+        raise OutputError(f"{next_key}: cannot be moved: {error.strerror}") from error
 
 
 def _issued(certificate: x509.Certificate) -> Issued:

@@ -367,9 +367,15 @@ class StreamServiceTransport(LinkOwner):
         from holdfast.transport.tls import server_context
 
         context = server_context(tls, self._incarnation)
-        self._revoked = revoked_serials(tls.authority.with_name(REVOKED_FILE))
-        self._trusted = frozenset(context.get_ca_certs(binary_form=True))
-        self._context = context
+        path = tls.authority.with_name(REVOKED_FILE)
+        revoked = revoked_serials(path)
+        trusted = frozenset(context.get_ca_certs(binary_form=True))
+        if self._trusted <= trusted and (absent := self._revoked - revoked):
+            raise TransportError(
+                f"{path}: lacks {len(absent)} of the {len(self._revoked)} certificates that it "
+                "revoked before; a list only grows, so this is an older one, or it is gone"
+            )
+        self._revoked, self._trusted, self._context = revoked, trusted, context
 
     def _make_link(self, endpoint: Endpoint, network: bytes = b"", *, dialled: bool) -> Link:
         tls = None

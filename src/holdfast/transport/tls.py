@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 from holdfast.errors import FrameError, TransportError
 from holdfast.transport.credentials import file_versions, refuse_revoked
-from holdfast.transport.endpoints import AUTHORITY_FILE, TlsFiles
+from holdfast.transport.endpoints import AUTHORITY_FILE, NEXT_KEY_FILE, TlsFiles
 
 __all__ = [
     "REMEDIES",
@@ -113,8 +113,15 @@ def make_context(protocol: int, files: TlsFiles) -> ssl.SSLContext:
     try:
         context.load_verify_locations(cafile=at)
         at = files.certificate
-        # Without the empty password, an encrypted key would ask for one on the terminal.
-        context.load_cert_chain(files.certificate, files.key, password="")
+        try:
+            # Without the empty password, an encrypted key would ask for one on the terminal.
+            context.load_cert_chain(files.certificate, files.key, password="")
+        except ssl.SSLError as error:
+            next_key = files.key.with_name(NEXT_KEY_FILE)
+            if error.reason != "KEY_VALUES_MISMATCH" or not next_key.exists():
+                raise
+            # A rotation is under way, or was killed: the certificate is the new one already.
+            context.load_cert_chain(files.certificate, next_key, password="")
     except (OSError, ssl.SSLError) as error:
         raise TransportError(_why_unusable(files, at, error)) from error
     return context

@@ -356,6 +356,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             read.run_directory,
             world,
             rate_hz=read.own.rate_hz or None,
+            after_reboot=read.own.after_reboot,
             sink=_Events(self, diagnostics, telemetry),
             on_order=on_order,
             on_timing=telemetry.time,

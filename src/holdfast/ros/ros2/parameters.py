@@ -51,6 +51,7 @@ class OwnParameters(msgspec.Struct, frozen=True, kw_only=True):
     rate_hz: Annotated[float, msgspec.Meta(ge=0.0, le=10_000.0)] = 0.0
     frame_id: _Text = "task"
     autostart: bool = False
+    after_reboot: bool = False
     environment: Literal["configuration", "ros", "executive"] = msgspec.field(
         default="configuration", name="environment.kind"
     )
@@ -69,6 +70,7 @@ OWN: Mapping[str, str] = {
     "rate_hz": "task actions a second; 0: as fast as it goes",
     "frame_id": "frame of the poses: the problem's own coordinates",
     "autostart": "whether the node configures and activates itself",
+    "after_reboot": "whether a run goes on although the machine was rebooted since it last moved",
     "environment.kind": "what the robot acts on: configuration (what the file names, else a "
     "simulated world), ros (the user's robot, through ROS), executive (whoever calls ~/decide)",
     "decide_timeout_s": "a call of ~/decide is answered within this time, s",
@@ -91,6 +93,7 @@ _OBJECTS = {
 _FOR_OPTIONS = {
     " (--resume)": "",
     " (--trials)": "",
+    "(--after-reboot)": "(after_reboot)",
     "(--out)": "(run_directory)",
     "give --out": "give run_directory",
 }

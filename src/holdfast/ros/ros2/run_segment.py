@@ -133,6 +133,7 @@ class RunSegment:
         world: World,
         *,
         rate_hz: float | None,
+        after_reboot: bool = False,
         sink: EventSink,
         on_order: Callable[[PlanningState, Act | Sense], None],
         on_timing: Callable[[Timing], None],
@@ -142,6 +143,7 @@ class RunSegment:
         self._path = path
         self.world = world
         self._rate_hz = rate_hz
+        self._after_reboot = after_reboot
         self._sink = sink
         self._on_order = on_order
         self._on_timing = on_timing
@@ -258,6 +260,7 @@ class RunSegment:
                 self.world.maker,
                 on_result,
                 rate_hz=self._rate_hz,
+                after_reboot=self._after_reboot,
                 sinks=[self._sink],
                 observer=observer,
             )
