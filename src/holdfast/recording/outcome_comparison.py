@@ -21,7 +21,7 @@ from holdfast.arrays import FloatArray
 from holdfast.errors import HoldfastError, OutputError
 from holdfast.outcome import TrialResult
 from holdfast.recording.journal_reader import JournalReader
-from holdfast.recording.run_directory import first_difference
+from holdfast.recording.run_directory import first_difference, world_of
 from holdfast.robot.environment import BUILT_IN
 
 __all__ = ["OutcomeComparison", "OutcomeEffect", "RunOutcomes", "compare_outcomes", "effects_of"]
@@ -187,6 +187,8 @@ class _Run(NamedTuple):
     ----------
     world : mapping
         The settings that must be the same for outcomes to be comparable.
+    arguments : mapping
+        Those of a world that is not simulated: they may say no more than how it is reached.
     simulated : bool
         Whether it is a simulated one.
     """
@@ -198,6 +200,7 @@ class _Run(NamedTuple):
     seed: Any
     step_limit: int
     world: Mapping[str, Any]
+    arguments: Mapping[str, Any]
     simulated: bool
 
 
@@ -211,7 +214,10 @@ def _read(path: Path) -> _Run:
     text = meta.get("configuration", "")
     configuration = read(text.encode(), f"the configuration in {journal.path}").data
     simulator = configuration["simulator"]
-    environment = (configuration.get("environment") or {}).get("object")
+    environment = world_of(configuration.get("environment") or {})
+    # An episode of gymnasium follows from seed and trial, too.
+    simulated = environment["object"] is None or environment["object"] in BUILT_IN
+    arguments = environment["arguments"] if simulated else environment.pop("arguments")
     return _Run(
         path=path,
         problem_sources=meta.get("problem_sources"),
@@ -223,10 +229,10 @@ def _read(path: Path) -> _Run:
             "problem": configuration["problem"],
             "model": configuration.get("model"),
             "simulator": {"max_steps": int(simulator["max_steps"])},
-            "environment": {"object": environment},
+            "environment": environment,
         },
-        # An episode of gymnasium follows from seed and trial, too.
-        simulated=environment is None or environment in BUILT_IN,
+        arguments=arguments,
+        simulated=simulated,
     )
 
 
@@ -268,6 +274,10 @@ def _compare(baseline: _Run, other: _Run, *, paired: bool) -> RunOutcomes:
         )
     if other.problem_sources != baseline.problem_sources:
         notes.append("the source of the problem differs")
+    found = first_difference(baseline.arguments, other.arguments, "environment.arguments")
+    if found is not None:
+        key, old, new = found
+        notes.append(f"{key} is {new} here and {old} there: these may be two worlds")
     return RunOutcomes(
         run=str(other.path),
         trials=len(pairs[1]),

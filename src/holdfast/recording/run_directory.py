@@ -46,6 +46,7 @@ __all__ = [
     "configuration_difference",
     "first_difference",
     "latest_default_directory",
+    "world_of",
 ]
 
 CONFIGURATION_NAME = "config.yaml"
@@ -378,11 +379,15 @@ def _compared(configuration: Any) -> Any:
     if isinstance(kept.get("selector"), Mapping):
         defaults = msgspec.json.decode(msgspec.json.encode(SelectorSettings()))
         kept["selector"] = {**defaults, **kept["selector"]}
-    # How a world is reached may change between two parts of a run; which one it is may not.
     environment = kept.pop("environment", None)
     if isinstance(environment, Mapping) and environment.get("object") is not None:
-        kept["environment"] = {"object": environment["object"]}
+        kept["environment"] = world_of(environment)
     return kept
+
+
+def world_of(environment: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what says which world an environment is; the rest is how it is reached."""
+    return {"object": environment.get("object"), "arguments": environment.get("arguments") or {}}
 
 
 def _services_in(text: str) -> tuple[str, ...]:
