@@ -207,6 +207,7 @@ class TestRuns:
         effects = [by_measure(run.effects)["steps"].effect for run in found.runs]
         assert effects == pytest.approx([0.5, 2.0])
         assert f"{runs[1]} against {runs[0]}, 10 trials paired by number:" in found.describe()
+        assert "\n  steps, geometric mean  " in found.describe()
 
     def test_trials_that_one_run_alone_has_are_left_out(self, tmp_path: Path) -> None:
         results = [result_of(trial, 5 + trial) for trial in range(6)]

@@ -130,8 +130,8 @@ class OutcomeComparison(msgspec.Struct, frozen=True, kw_only=True):
                 lines.append(f"  {'  '.join(cells)}".rstrip())
             lines.append("")
         lines.append(
-            "steps: geometric mean; a trial that did not reach the goal counts as its limit, "
-            f"{self.step_limit:,} steps."
+            "steps: the geometric mean fits ratios (the summary has the arithmetic one); a trial "
+            f"that did not reach the goal counts as its limit, {self.step_limit:,} steps."
         )
         lines.append(f"intervals: {self.method}, each by itself.")
         return "\n".join(lines)
@@ -416,9 +416,9 @@ def _row(effect: OutcomeEffect) -> tuple[str, ...]:
     title, unit, of_run, of_effect = {
         "success_rate": ("success", " points", "{:.1%}", "{:+.1f}"),
         "failure_rate": ("failed", " points", "{:.1%}", "{:+.1f}"),
-        "steps": ("steps", " times", "{:.4g}", "{:.3g}"),
-        "reward": ("reward", "", "{:.4g}", "{:+.4g}"),
-        "decision_ms": ("decision time", " times", "{:.3g} ms", "{:.3g}"),
+        "steps": ("steps, geometric mean", " times", "{:.4g}", "{:.3g}"),
+        "reward": ("reward, mean", "", "{:.4g}", "{:+.4g}"),
+        "decision_ms": ("decision time, median", " times", "{:.3g} ms", "{:.3g}"),
     }[effect.measure]
     scale = 100.0 if effect.measure.endswith("_rate") else 1.0
     low_high = "all alike"

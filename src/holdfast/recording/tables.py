@@ -41,6 +41,8 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         None if a finished trial has no reward.
     mean_reward_of_successes : float or None
         Earlier work reports this one.
+    mean_steps : float or None
+        Arithmetic mean; ``compare --outcomes`` takes the geometric one, of which it shows ratios.
     unexplained_observations : int
         Observations that no particle explains.
     lost, suspect_sensors : int
