@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from holdfast.errors import OutputError
+from holdfast.errors import HoldfastError, OutputError
 from holdfast.outcome import DecisionLog, TrialResult
 from holdfast.protocol.records import ActingRecord, ObservedRecord
 from holdfast.recording.compare import Comparison, compare_runs
@@ -278,6 +278,15 @@ class TestRuns:
         found = compare_runs(run_of(tmp_path / "first", []), run_of(tmp_path / "second", []))
         assert not found.identical
         assert "nothing to compare" in found.describe()
+
+    def test_a_configuration_that_repeats_itself_is_refused(self, tmp_path: Path) -> None:
+        """A few lines of aliases stand for billions of values."""
+        lines = ["problem: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+        lines += [f"x{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 30)]
+        for number, text in enumerate(["\n".join(lines), "[" * 2000, "a: *nobody"]):
+            run = run_of(tmp_path / f"run{number}", [result_of(0)], configuration=text)
+            with pytest.raises(HoldfastError, match="the configuration in a journal"):
+                compare_runs(run, run)
 
     def test_what_is_no_run_is_refused(self, tmp_path: Path) -> None:
         run = run_of(tmp_path / "first", [result_of(0)])

@@ -205,6 +205,27 @@ class TestRunDirectory:
         same = of(arguments={"id": "Moon-v0", "gravity": -10.0}, timeout_ms=20.0, directory="/srv")
         RunDirectory.resume(out, same).close()
 
+    @pytest.mark.parametrize("name", [*OUTPUT_NAMES, "recovery.log", "journal.sqlite-wal"])
+    def test_nothing_is_written_through_a_link(self, tmp_path: Path, name: str) -> None:
+        configuration = configuration_of(tmp_path)
+        mine = tmp_path / "mine"
+        out = tmp_path / "out"
+        RunDirectory.create(out, configuration).close()
+        if (out / name).exists():
+            (out / name).rename(mine)
+        else:
+            mine.write_text("half a line")
+        before = mine.read_bytes()
+        (out / name).symlink_to(mine)
+        (out / "new").mkdir()
+        (out / "new" / name).symlink_to(tmp_path / "missing")
+        with pytest.raises(OutputError, match=rf"{name}: is no file but a link"):
+            RunDirectory.resume(out, configuration)
+        with pytest.raises(OutputError, match=rf"{name}: is no file but a link"):
+            RunDirectory.create(out / "new", configuration)
+        assert mine.read_bytes() == before
+        assert not (tmp_path / "missing").exists()
+
     def test_a_damaged_journal_is_neither_resumed_nor_taken_over(self, tmp_path: Path) -> None:
         configuration = configuration_of(tmp_path)
         out = tmp_path / "out"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-
 from tests.recordings import result_of
 
 from holdfast.cli.terminal import counted, duration, print_summary, progress_line

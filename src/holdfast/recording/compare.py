@@ -21,7 +21,7 @@ import msgspec
 from holdfast.outcome import Decisions, SensingDecision, TaskDecision
 from holdfast.protocol.records import ActingRecord, ObservedRecord, decisions_of
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
-from holdfast.recording.run_directory import configuration_difference
+from holdfast.recording.run_directory import configuration_difference, recorded_configuration
 
 __all__ = ["Comparison", "Difference", "compare_runs", "difference_of_decisions"]
 
@@ -136,10 +136,8 @@ def _difference_of_runs(
     first: Mapping[str, str], second: Mapping[str, str], notes: list[str]
 ) -> Difference | None:
     """Return how the runs differ as wholes; what changes no decision is only noted."""
-    import yaml
-
     texts = [meta.get("configuration", "") for meta in (first, second)]
-    configurations: list[Any] = [yaml.safe_load(text) for text in texts]
+    configurations: list[Any] = [recorded_configuration(text) for text in texts]
     for what, keys in (("problem", ("problem",)), ("seed", ("simulator", "seed"))):
         one, other = (_value(configuration, keys) for configuration in configurations)
         if one != other:

@@ -21,7 +21,11 @@ from holdfast.arrays import FloatArray
 from holdfast.errors import HoldfastError, OutputError
 from holdfast.outcome import TrialResult
 from holdfast.recording.journal_reader import JournalReader
-from holdfast.recording.run_directory import first_difference, world_of
+from holdfast.recording.run_directory import (
+    first_difference,
+    recorded_configuration,
+    world_of,
+)
 from holdfast.robot.environment import BUILT_IN
 
 __all__ = ["OutcomeComparison", "OutcomeEffect", "RunOutcomes", "compare_outcomes", "effects_of"]
@@ -205,14 +209,11 @@ class _Run(NamedTuple):
 
 
 def _read(path: Path) -> _Run:
-    from holdfast.config.yaml_document import read
-
     with JournalReader.read_run(path, "compare") as journal:
         meta = journal.meta()
         results = {result.trial: result for result in journal.results()}
         journal.require_unchanged()
-    text = meta.get("configuration", "")
-    configuration = read(text.encode(), f"the configuration in {journal.path}").data
+    configuration = recorded_configuration(meta.get("configuration", ""))
     simulator = configuration["simulator"]
     environment = world_of(configuration.get("environment") or {})
     # An episode of gymnasium follows from seed and trial, too.
