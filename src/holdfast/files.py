@@ -133,7 +133,8 @@ def write_atomically(path: Path, content: bytes | Iterable[str]) -> None:
     temporary = _unfinished(path)
     with _refusals(path, "written"):
         try:
-            with temporary.open("wb") as file:
+            temporary.unlink(missing_ok=True)
+            with temporary.open("xb") as file:  # never through a link that somebody has left there
                 file.writelines(pieces)
                 file.flush()
                 os.fsync(file.fileno())

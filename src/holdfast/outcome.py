@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections.abc import Iterator
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 
 import msgspec
 import numpy as np
@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from holdfast.arrays import FloatArray
 from holdfast.errors import InvalidValueError
-from holdfast.printable import printable
+from holdfast.printable import one_line
 from holdfast.problem_attributes import sensing_costs
 
 __all__ = [
@@ -80,7 +80,7 @@ def ending_of(done: object) -> Ending | None:
     if isinstance(done, str) and done == "failed":
         return Ending("failed")
     if isinstance(done, Ending) and isinstance(done.reason, str) and done.outcome in _OUTCOMES:
-        reason = printable(" ".join(done.reason.split()), keep="")
+        reason = one_line(done.reason)
         return Ending(done.outcome, reason[:MAX_REASON])
     raise InvalidValueError(f"returned {done!r:.80}; it must return {DONE_VALUES}")
 
@@ -148,7 +148,7 @@ class Decisions(msgspec.Struct, frozen=True):
         The trial's digest is the hash of these bytes.
     """
 
-    action_size: int
+    action_size: Annotated[int, msgspec.Meta(ge=0)]
     log: bytes
 
     def __repr__(self) -> str:

@@ -1,13 +1,17 @@
-r"""Untrusted text, escaped for a terminal.
+r"""Untrusted text, escaped for a terminal or a spreadsheet.
 
 A terminal executes control characters: an escape sequence in a service's message, a key of a file
 or an exception's text can clear the screen, set the window's title, or overwrite an error message.
-So untrusted text is escaped before it is printed: ``\x1b[2J``.
+So untrusted text is escaped before it is printed: ``\x1b[2J``. A newline in what a peer says would
+begin a line that looks like one of ours; its words are made one line where they come in.
+
+A spreadsheet takes a cell that begins with ``=``, ``+``, ``-`` or ``@`` for a formula, which may
+run a program. An apostrophe before it says that it is a text.
 """
 
 from __future__ import annotations
 
-__all__ = ["printable"]
+__all__ = ["cell", "one_line", "printable"]
 
 
 def printable(text: str, *, keep: str = "\n\t") -> str:
@@ -20,3 +24,22 @@ def printable(text: str, *, keep: str = "\n\t") -> str:
         else letter.encode("unicode_escape").decode()
         for letter in text
     )
+
+
+def one_line(text: str) -> str:
+    """Return the text on one line, with every other unprintable character escaped."""
+    return printable(" ".join(text.split()), keep="")
+
+
+def cell(value: object) -> object:
+    """Return a value for a CSV table; of a text that a spreadsheet would run, with an apostrophe.
+
+    Texts of numbers stay as they are.
+    """
+    if not isinstance(value, str) or not value.startswith(("=", "+", "-", "@", "\t", "\r")):
+        return value
+    try:
+        numbers = [float(each) for each in value.split()]
+    except ValueError:
+        return f"'{value}"
+    return value if numbers else f"'{value}"

@@ -49,9 +49,9 @@ def test_outcomes(runs: Path) -> None:
     assert columns.split() == ["baseline", "run", "effect", "95%", "interval"]
     assert [row.split("  ")[1] for row in rows[:4]] == [
         "success",
-        "steps",
-        "reward",
-        "decision time",
+        "steps, geometric mean",
+        "reward, mean",
+        "decision time, median",
     ]
     assert rows[-2].endswith("counts as its limit, 40 steps.")
 

@@ -97,3 +97,24 @@ def test_a_full_one_is_an_error(tmp_path: Path) -> None:
     assert done.stderr == (
         "holdfast: error: the standard output cannot be written: No space left on device\n"
     )
+
+
+def test_a_path_that_the_encoding_of_the_streams_lacks(tmp_path: Path) -> None:
+    """A unit or cron job in the C locale."""
+    (tmp_path / "größe.yaml").write_text(CONFIGURATION)
+    for arguments, code in (
+        (("run", "größe.yaml", "--jobs", "1", "--out", "größe"), 0),
+        (("run", "größe.yaml", "--jobs", "1", "--out", "größe"), 2),
+    ):
+        done = subprocess.run(
+            [*COMMAND, *arguments],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONIOENCODING": "ascii:strict"},
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+        assert (done.returncode, "Traceback" in done.stderr) == (code, False), done.stderr
+        assert "gr\\xf6\\xdfe" in done.stderr
+    assert (tmp_path / "größe" / "summary.json").is_file()

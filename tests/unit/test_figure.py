@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -34,6 +36,18 @@ class TestFigure:
         for edge in (picture[0], picture[-1], picture[:, 0], picture[:, -1]):
             assert (edge == 1.0).all()
         assert (picture < 1.0).any()
+
+    def test_it_is_the_same_whatever_the_user_has_set(self, tmp_path: Path) -> None:
+        """LaTeX, which need not be installed, and the look of the user's other figures."""
+        configuration = load(EXAMPLES / "capsule_robot.yaml", overrides={"simulator.max_steps": 12})
+        record = record_trial(configuration, trial=0).record
+        trial_figure(configuration, record, tmp_path / "plain.png")
+        theirs: Any = {"text.usetex": True, "font.size": 30.0, "savefig.dpi": 20}
+        with mpl.rc_context(theirs):
+            trial_figure(configuration, record, tmp_path / "trial.png")
+            assert mpl.rcParams["font.size"] == 30.0
+        plain, picture = ((tmp_path / name).read_bytes() for name in ("plain.png", "trial.png"))
+        assert plain == picture
 
     @pytest.mark.parametrize(
         ("method", "label"),

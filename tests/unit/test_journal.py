@@ -597,6 +597,7 @@ class TestDamage:
         """SQLite keeps a type with each value: a flipped bit can make it any."""
         path = copy_of(killed, tmp_path)
         with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as connection:
+            made = connection.execute("SELECT sql, name FROM sqlite_schema").fetchall()
             connection.execute("PRAGMA writable_schema = ON")
             # As it is after damage: no constraint and no affinity has seen the value.
             for declared in ("value TEXT NOT NULL", "trial INTEGER NOT NULL"):
@@ -607,7 +608,9 @@ class TestDamage:
         with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as connection:
             connection.execute("UPDATE meta SET value = ? WHERE key = 'epoch'", (value,))
             connection.execute("UPDATE steps SET trial = ?", (value,))
-        with Journal.open(path) as journal:
+            connection.execute("PRAGMA writable_schema = ON")
+            connection.executemany("UPDATE sqlite_schema SET sql = ? WHERE name = ?", made)
+        with Journal.open(path, check=False) as journal:
             with pytest.raises(OutputError, match="its note 'epoch' has a wrong checksum"):
                 journal.meta()
             with pytest.raises(OutputError, match=r"journal is damaged .*its session|its note"):

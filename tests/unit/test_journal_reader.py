@@ -7,16 +7,19 @@ import shutil
 import sqlite3
 from pathlib import Path
 
+import msgspec
 import pytest
 from tests.recordings import failed, result_of, without_decisions
 
 from holdfast.config.loader import load
 from holdfast.errors import OutputError
+from holdfast.outcome import Decisions
 from holdfast.planning import Planner
 from holdfast.protocol.records import (
     replay,
 )
 from holdfast.recording.journal import Journal
+from holdfast.recording.journal_reader import TABLES, JournalReader
 from holdfast.robot.trial import run_trial
 
 BEFORE_OUTCOMES = Path(__file__).parent / "data" / "journal_before_outcomes.sqlite"
@@ -119,9 +122,53 @@ class TestJournal:
         with contextlib.closing(sqlite3.connect(path)) as connection:
             connection.execute("CREATE TABLE other (value INTEGER)")
         before = path.read_bytes()
-        with pytest.raises(OutputError, match="no such table: meta"):
+        with pytest.raises(OutputError, match="'other' in it is no table of a journal"):
             Journal.open(path)
         assert path.read_bytes() == before
+
+    @pytest.mark.parametrize("table", sorted(TABLES))
+    @pytest.mark.parametrize(
+        "statements",
+        [
+            "DROP TABLE {0}; CREATE VIEW {0} AS WITH RECURSIVE n(trial) AS "
+            "(SELECT 0 UNION ALL SELECT trial + 1 FROM n) SELECT trial, trial AS key, "
+            "trial AS value, trial AS checksum, trial AS sequence, trial AS result FROM n",
+            "CREATE TRIGGER t AFTER INSERT ON {0} BEGIN DELETE FROM meta; END",
+            "ALTER TABLE {0} ADD COLUMN more BLOB AS (zeroblob(900000000))",
+            "CREATE INDEX i ON {0} ({1}) WHERE {1} LIKE '%a%b%c%d%e%'",
+        ],
+        ids=["view", "trigger", "computed column", "index"],
+    )
+    def test_what_is_no_plain_table_of_a_journal_is_asked_nothing(
+        self, tmp_path: Path, table: str, statements: str
+    ) -> None:
+        """Somebody else's file may compute without end, or write, when it is read."""
+        path = tmp_path / "journal.sqlite"
+        Journal.create(path, {}).close()
+        with contextlib.closing(sqlite3.connect(path)) as connection:
+            if table == "kept_steps":
+                connection.execute(TABLES[table])
+            column = "result_checksum" if table == "trials" else "checksum"
+            connection.executescript(statements.format(table, column))
+        for opens in (Journal.open, JournalReader.read):
+            with pytest.raises(OutputError, match="is no table of a journal"):
+                opens(path)
+
+    def test_decisions_that_never_end_or_lack_their_steps(self, tmp_path: Path) -> None:
+        """Checksums have no key: whoever writes a journal can have them right."""
+        result = result_of(0)
+        assert result.decisions is not None
+        endless = Decisions(-2, b"A" + bytes(8))
+        for number, decisions in enumerate([endless, result.decisions]):
+            path = tmp_path / f"{number}.sqlite"
+            steps = 10**15 if decisions is result.decisions else 0
+            bad = msgspec.structs.replace(
+                result, decisions=decisions, steps=steps, digest=decisions.digest()
+            )
+            with Journal.create(path, {}) as journal:
+                journal.add(bad)
+            with JournalReader.read(path) as reader, pytest.raises(OutputError, match="damaged"):
+                list(reader.results(with_decisions=True))
 
     def test_another_version_is_refused(self, tmp_path: Path) -> None:
         path = tmp_path / "journal.sqlite"

@@ -102,6 +102,18 @@ def performed(step: int) -> Record:
     return PerformedRecord(step, 0.5)
 
 
+def test_what_cannot_be_handed_over_ends_the_view_alone(
+    views: Any, file: Path, notes: list[str]
+) -> None:
+    del file
+    view = views(keep)
+    view.records(0, [object()])
+    view.records(0, [performed(0)])
+    (note,) = notes
+    assert "the view has ended: " in note
+    assert note.endswith("; the run goes on without it")
+
+
 def test_all_messages_arrive_in_their_order(views: Any, file: Path, notes: list[str]) -> None:
     view = views(keep)
     timing = Timing(0, 0, "task", "tcp/a:1", "standard", 1.0, 2.0, 3.0)

@@ -181,7 +181,7 @@ class TestText:
     def test_a_service_cannot_write_a_line_of_its_own_or_move_the_cursor(self) -> None:
         line = line_of("text", "refused", reason="no\n12:00:00 robot well\x1b[2J\x9b1A\u2028")
         assert line.isprintable()
-        assert "\\x1b[2J\\x9b1A\\u2028" in line
+        assert "\\x1b[2J\\x9b1A" in line
 
     def test_not_a_number_is_said(self) -> None:
         line = line_of("text", "hedge", waited_ms=float("nan"), share=float("inf"))

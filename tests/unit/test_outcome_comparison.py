@@ -58,11 +58,13 @@ def run_of(
     seed: int = 5,
     limit: int = LIMIT,
     trials: int | None = None,
+    environment: str = "",
 ) -> Path:
     path.mkdir()
     text = CONFIGURATION.format(
         tolerance=tolerance, trials=trials or len(results), seed=seed, limit=limit
     )
+    text += environment
     with Journal.create(path / "journal.sqlite", {"configuration": text}) as journal:
         for result in results:
             journal.add(result)
@@ -205,6 +207,7 @@ class TestRuns:
         effects = [by_measure(run.effects)["steps"].effect for run in found.runs]
         assert effects == pytest.approx([0.5, 2.0])
         assert f"{runs[1]} against {runs[0]}, 10 trials paired by number:" in found.describe()
+        assert "\n  steps, geometric mean  " in found.describe()
 
     def test_trials_that_one_run_alone_has_are_left_out(self, tmp_path: Path) -> None:
         results = [result_of(trial, 5 + trial) for trial in range(6)]
@@ -243,3 +246,22 @@ class TestRuns:
         runs = [run_of(tmp_path / name, [result_of(0, 5)]) for name in ("first", "second")]
         with pytest.raises(OutputError, match="intervals need at least 2"):
             compare_outcomes(runs)
+
+
+def test_runs_of_other_arguments_of_a_world_are_not_paired(tmp_path: Path) -> None:
+    """A gymnasium world is its arguments; those of one's own robot may be a port."""
+
+    def of(name: str, world: str, gravity: float) -> Path:
+        section = f"environment: {{object: {world}, arguments: {{gravity: {gravity}}}}}\n"
+        results = [result_of(trial, 20) for trial in range(12)]
+        return run_of(tmp_path / name, results, environment=section)
+
+    baseline = of("first", "gymnasium", -10.0)
+    for paired in (True, False):
+        with pytest.raises(
+            OutputError, match=r"environment\.arguments\.gravity is -4\.0 here and -10\.0 there"
+        ):
+            compare_outcomes([baseline, of(f"{paired}", "gymnasium", -4.0)], paired=paired)
+    mine = [of("mine", "arm:Arm", -10.0), of("other", "arm:Arm", -4.0)]
+    (found,) = compare_outcomes(mine).runs
+    assert any("environment.arguments.gravity is -4.0 here" in note for note in found.notes)

@@ -12,9 +12,12 @@ from msgspec import structs
 
 from holdfast.cli import _print_defect, main
 from holdfast.cli.terminal import print_summary, progress_line
-from holdfast.printable import printable
+from holdfast.printable import cell, one_line, printable
+from holdfast.protocol.messages import Refused, decode_reply, encode
 from holdfast.recording.tables import SummaryBuilder
+from holdfast.runtime.log_lines import json_line, text_line
 from holdfast.runtime.logs import EventLog
+from holdfast.transport.frames import read_goodbye
 
 HOSTILE = "\x1b[2J\x1b]0;title\x07\r\x9b1A\u202e\x7f"
 SEEN = "\\x1b[2J\\x1b]0;title\\x07\\r\\x9b1A\\u202e\\x7f"
@@ -24,6 +27,31 @@ def test_what_is_shown() -> None:
     assert printable("as it is, ä, 字, µ") == "as it is, ä, 字, µ"
     assert printable(f"one\n\ttwo {HOSTILE}") == f"one\n\ttwo {SEEN}"
     assert printable("a\nb", keep="") == "a\\nb"
+
+
+FORGED = "busy\n2026-01-01 robot status  up\x85\u2028\u2029\x1c\r\x0b ok \u061c\U000e0001\u202e"
+
+
+def test_what_a_peer_says_is_one_line() -> None:
+    """Wherever it goes: a note, an error, the log of a robot or of ROS."""
+    refused = decode_reply(encode(Refused(1, FORGED[:40], FORGED)))
+    assert isinstance(refused, Refused)
+    goodbye = read_goodbye(FORGED.encode())
+    line = text_line(0, "robot", FORGED, {FORGED: FORGED, "reason": FORGED, "list": [FORGED]})
+    as_json = json_line(0, "robot", FORGED, {FORGED: FORGED, "list": [FORGED]})
+    for text in (refused.code, refused.text, goodbye, line[:-1], as_json[:-1], one_line(FORGED)):
+        assert text.isprintable(), text
+        assert len(text.splitlines()) == 1
+    # One that is broken by the terminal looks like two.
+    assert "   " not in text_line(0, "robot", "status", {"reason": f"a{' ' * 90}b"})[60:]
+    assert json.loads(as_json)[FORGED] == FORGED
+
+
+def test_a_spreadsheet_runs_no_cell() -> None:
+    for text in ("=1+1", "+cmd|' /C calc'!A0", "-2+3", "@SUM(1)", "\t=1", "\r", "-"):
+        assert cell(text) == f"'{text}"
+    for value in ("-1.5", "-1.5 2.0 -inf", "+3", "1=1", "tcp/a:1", "", None, -1.5, True):
+        assert cell(value) is value
 
 
 PROBLEM = f"""

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from holdfast.errors import OutputError
+from holdfast.errors import HoldfastError, OutputError
 from holdfast.outcome import DecisionLog, TrialResult
 from holdfast.protocol.records import ActingRecord, ObservedRecord
 from holdfast.recording.compare import Comparison, compare_runs
@@ -81,6 +81,7 @@ def run_of(
     configuration: str = CONFIGURATION,
     version: str = "1.0",
     unfinished: int | None = None,
+    action: bytes = b"\0" * 16,
 ) -> Path:
     directory.mkdir()
     meta = {"configuration": configuration, "holdfast_version": version, "problem_sources": "{}"}
@@ -90,7 +91,7 @@ def run_of(
         if unfinished is not None:
             journal.append(
                 unfinished,
-                [ObservedRecord(0, 1, b"\0" * 8, b"\0" * 32, 0.5), ActingRecord(0, b"\0" * 16)],
+                [ObservedRecord(0, 1, b"\0" * 8, b"\0" * 32, 0.5), ActingRecord(0, action)],
             )
     return directory
 
@@ -249,12 +250,10 @@ class TestRuns:
     def test_an_unfinished_trial(self, tmp_path: Path) -> None:
         first = run_of(tmp_path / "first", [result_of(0), result_of(1)])
         second = run_of(tmp_path / "second", [result_of(0)], unfinished=1)
-        third = run_of(tmp_path / "third", [result_of(0)], unfinished=1)
-        unfinished = "unfinished, 1 task action so far"
+        unfinished = "unfinished, 1 sensing action and 1 task action so far"
         for one, other, states in (
             (first, second, ("finished", unfinished)),
             (second, first, (unfinished, "finished")),
-            (second, third, (unfinished, unfinished)),
         ):
             found = compare_runs(one, other)
             assert found.trials == 1
@@ -262,10 +261,32 @@ class TestRuns:
             assert found.difference.trial == 1
             assert (found.difference.first, found.difference.second) == states
 
+    def test_a_trial_that_is_unfinished_in_both_runs(self, tmp_path: Path) -> None:
+        """A killed run decided the same as itself, as far as it goes."""
+        killed = run_of(tmp_path / "killed", [], unfinished=0)
+        found = compare_runs(killed, killed)
+        assert found.identical
+        assert (found.trials, found.sensing_actions, found.task_actions) == (0, 1, 1)
+        assert found.notes == ("trial 0 is unfinished in both runs: compared as far as it goes",)
+        other = run_of(tmp_path / "other", [], unfinished=0, action=bytes(15) + b"\x3f")
+        difference = compare_runs(killed, other).difference
+        assert difference is not None
+        assert (difference.what, difference.trial, difference.step) == ("task action[1]", 0, 0)
+        assert difference.first != difference.second
+
     def test_runs_without_a_trial_are_not_the_same(self, tmp_path: Path) -> None:
         found = compare_runs(run_of(tmp_path / "first", []), run_of(tmp_path / "second", []))
         assert not found.identical
         assert "nothing to compare" in found.describe()
+
+    def test_a_configuration_that_repeats_itself_is_refused(self, tmp_path: Path) -> None:
+        """A few lines of aliases stand for billions of values."""
+        lines = ["problem: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+        lines += [f"x{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 30)]
+        for number, text in enumerate(["\n".join(lines), "[" * 2000, "a: *nobody"]):
+            run = run_of(tmp_path / f"run{number}", [result_of(0)], configuration=text)
+            with pytest.raises(HoldfastError, match="the configuration in a journal"):
+                compare_runs(run, run)
 
     def test_what_is_no_run_is_refused(self, tmp_path: Path) -> None:
         run = run_of(tmp_path / "first", [result_of(0)])

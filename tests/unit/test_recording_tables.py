@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 
 import msgspec
@@ -21,6 +22,14 @@ from holdfast.recording.timings import AnswerCounts
 
 
 class TestTables:
+    def test_a_reason_is_no_formula_and_stays_in_its_row(self) -> None:
+        """An environment, or the journal of somebody else, may say anything."""
+        for reason, written in (("=HYPERLINK(1)", "'=HYPERLINK(1)"), ("a\n=1\r", "a\n=1\r")):
+            result = msgspec.structs.replace(result_of(0), reason=reason)
+            (row,) = csv.DictReader(io.StringIO("".join(csv_lines([result])), newline=""))
+            assert row["reason"] == written
+            assert float(row["reward"]) == result.reward
+
     @pytest.mark.parametrize("trials", [1, 2, 10, 1000])
     def test_wilson_interval_is_that_of_scipy(self, trials: int) -> None:
         for successes in {0, 1, trials // 3, trials - 1, trials}:

@@ -255,10 +255,36 @@ def test_a_figure_that_a_problem_fails_to_describe(workplace: Workplace) -> None
         "        return {}['scene']\n",
     )
     arguments = ("peg.yaml", "--problem", "unseen:Unseen", "--out", "out", "--jobs", "1")
-    said = workplace.run("run", *arguments, "--quiet", figures=True)
-    assert said.code == 2
-    assert "the figure of trial 0: unseen:Unseen raised KeyError: 'scene'" in said.stderr
+    said = workplace.runs("run", *arguments, figures=True)
+    assert "note: no figure, because it cannot be drawn: unseen:Unseen raised" in said.stderr
+    assert "KeyError: 'scene'" in said.stderr
+    assert "Traceback" not in said.stderr
     assert workplace.summary("out")["finished"] == 6
+
+
+@pytest.mark.parametrize("error", [KeyError("a"), ValueError("b"), OSError(28, "full")])
+@pytest.mark.parametrize(
+    ("function", "says"),
+    [
+        ("holdfast.recording.figure.trial_figure", "figure, because it cannot be drawn: "),
+        ("holdfast.cli.run.print_summary", "summary, because of "),
+        ("holdfast.recording.belief_remarks.belief_remarks", "remarks on the beliefs, because of "),
+    ],
+)
+def test_what_a_finished_run_can_do_without_may_fail(
+    workplace: Workplace,
+    monkeypatch: pytest.MonkeyPatch,
+    function: str,
+    says: str,
+    error: BaseException,
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(function, fail)
+    said = workplace.runs("run", "peg.yaml", "--out", "out", "--trials", "1", figures=True)
+    assert f"note: no {says}" in said.stderr
+    assert workplace.summary("out")["finished"] == 1
 
 
 def test_a_directory_that_cannot_be_made(workplace: Workplace) -> None:

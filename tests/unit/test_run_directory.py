@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tests.recordings import configuration_of, result_of
@@ -182,6 +183,48 @@ class TestRunDirectory:
         robot = replace(configuration, environment=EnvironmentSettings(object="arm:Arm"))
         with pytest.raises(OutputError, match=r"environment.* is not given there .*arm:Arm"):
             RunDirectory.resume(out, robot)
+
+    @pytest.mark.parametrize("name", ["gymnasium", "arm:Arm"])
+    def test_other_arguments_of_the_environment_are_another_world(
+        self, tmp_path: Path, name: str
+    ) -> None:
+        """Gravity and noise are arguments; what only says how the world is reached may change."""
+
+        def of(**settings: Any) -> Configuration:
+            environment = EnvironmentSettings(object=name, **settings)
+            return replace(configuration_of(tmp_path), environment=environment)
+
+        out = tmp_path / "out"
+        RunDirectory.create(out, of(arguments={"id": "Moon-v0", "gravity": -10.0})).close()
+        text = (out / "config.yaml").read_text()
+        with pytest.raises(
+            OutputError, match=r"environment\.arguments\.gravity is -10\.0 there and -4\.0 here"
+        ):
+            RunDirectory.resume(out, of(arguments={"id": "Moon-v0", "gravity": -4.0}))
+        assert (out / "config.yaml").read_text() == text
+        same = of(arguments={"id": "Moon-v0", "gravity": -10.0}, timeout_ms=20.0, directory="/srv")
+        RunDirectory.resume(out, same).close()
+
+    @pytest.mark.parametrize("name", [*OUTPUT_NAMES, "recovery.log", "journal.sqlite-wal"])
+    def test_nothing_is_written_through_a_link(self, tmp_path: Path, name: str) -> None:
+        configuration = configuration_of(tmp_path)
+        mine = tmp_path / "mine"
+        out = tmp_path / "out"
+        RunDirectory.create(out, configuration).close()
+        if (out / name).exists():
+            (out / name).rename(mine)
+        else:
+            mine.write_text("half a line")
+        before = mine.read_bytes()
+        (out / name).symlink_to(mine)
+        (out / "new").mkdir()
+        (out / "new" / name).symlink_to(tmp_path / "missing")
+        with pytest.raises(OutputError, match=rf"{name}: is no file but a link"):
+            RunDirectory.resume(out, configuration)
+        with pytest.raises(OutputError, match=rf"{name}: is no file but a link"):
+            RunDirectory.create(out / "new", configuration)
+        assert mine.read_bytes() == before
+        assert not (tmp_path / "missing").exists()
 
     def test_a_damaged_journal_is_neither_resumed_nor_taken_over(self, tmp_path: Path) -> None:
         configuration = configuration_of(tmp_path)

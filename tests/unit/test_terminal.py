@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from tests.recordings import result_of
 
-from holdfast.cli.terminal import counted, duration, progress_line
+from holdfast.cli.terminal import counted, duration, print_summary, progress_line
+from holdfast.recording.tables import SummaryBuilder
 
 
 @pytest.mark.parametrize(
@@ -13,6 +15,18 @@ from holdfast.cli.terminal import counted, duration, progress_line
 )
 def test_a_duration(seconds: float, text: str) -> None:
     assert duration(seconds) == text
+
+
+def test_the_summary_says_which_mean_of_the_steps_it_has(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """``compare --outcomes`` has another, of which ratios can be taken."""
+    summary = SummaryBuilder()
+    for trial in (0, 1):
+        summary.add(result_of(trial))
+    built = summary.build(problem="peg", seed=1, version="1", trials=2, wall_time_s=1.0)
+    print_summary(built)
+    assert f"{built.mean_steps:.4g}  (arithmetic mean)" in capsys.readouterr().out
 
 
 def test_a_count() -> None:

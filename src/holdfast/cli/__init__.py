@@ -27,6 +27,7 @@ def main() -> None:
         signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     from holdfast.cli.streams import (
         end_with_reader,
+        escape_unencodable,
         ignore_unwritable_stderr,
         replace_closed_streams,
     )
@@ -34,6 +35,7 @@ def main() -> None:
     from holdfast.runtime.descriptors import allow_descriptors
 
     replace_closed_streams()
+    escape_unencodable()
     ignore_unwritable_stderr()
     sys.excepthook = _print_defect
     arguments = sys.argv[1:]

@@ -19,9 +19,9 @@ from holdfast.cli.exit_codes import (
     interrupted_by,
 )
 from holdfast.cli.overrides import Override, combined, parse_assignment
-from holdfast.cli.run_figure import draw_figure
+from holdfast.cli.run_figure import Remark, draw_figure
 from holdfast.cli.terminal import RunDisplay, counted, print_files, print_summary
-from holdfast.errors import HoldfastError, InvalidValueError, RunError
+from holdfast.errors import HoldfastError, InvalidValueError, RunError, UnwritableOutputError
 from holdfast.files import require_free
 from holdfast.printable import printable
 from holdfast.recording.view_target import ViewTarget, require_rerun, viewer_url
@@ -335,14 +335,17 @@ def _run(options: RunOptions) -> int:
                 raise
             display.stop()
             summary = directory.write_tables(perf_counter() - started)
-            if not quiet:
-                print_summary(summary)
-            if robot.missed_ticks:
-                were = "was" if robot.missed_ticks == 1 else "were"
-                notes.note(f"{counted(robot.missed_ticks, 'tick')} of --rate {were} missed")
-            for service, reason in robot.refusals.items():
-                notes.note(f"{service} was asked no more: {reason}")
-            _note_idle_services(configuration, summary, robot, notes)
+            remark: Remark | None = None
+            with notes.instead_of_errors("summary"):
+                if not quiet:
+                    print_summary(summary)
+            with notes.instead_of_errors("notes"):
+                if robot.missed_ticks:
+                    were = "was" if robot.missed_ticks == 1 else "were"
+                    notes.note(f"{counted(robot.missed_ticks, 'tick')} of --rate {were} missed")
+                for service, reason in robot.refusals.items():
+                    notes.note(f"{service} was asked no more: {reason}")
+                _note_idle_services(configuration, summary, robot, notes)
             with notes.while_it_lasts(f"drawing {FIGURE_NAME} ..."):
                 remark = draw_figure(configuration, directory, recorder)
         except KeyboardInterrupt as interruption:
@@ -377,8 +380,10 @@ def _run(options: RunOptions) -> int:
             print_files(directory_path)
         if remark is not None:
             notes.note(remark.text)
-        for text in belief_remarks(configuration.problem, configuration.planning, recorder.record):
-            notes.note(f"in trial {recorder.trial}, {text}")
+        with notes.instead_of_errors("remarks on the beliefs"):
+            problem, record = configuration.problem, recorder.record
+            for text in belief_remarks(problem, configuration.planning, record):
+                notes.note(f"in trial {recorder.trial}, {text}")
         if summary.unverified_answers:
             notes.note(
                 f"{summary.unverified_answers} questions that were drawn to be answered by the "
@@ -496,6 +501,18 @@ class _Notes:
             self._event("note", reason=text)
         else:
             sys.stderr.write(f"note: {printable(text)}\n")
+
+    @contextlib.contextmanager
+    def instead_of_errors(self, what: str) -> Iterator[None]:
+        """Note that something fails which a finished run can do without."""
+        try:
+            yield
+        except UnwritableOutputError:
+            raise
+        except Exception as error:  # noqa: BLE001
+            from holdfast.config.user_code import in_words
+
+            self.note(f"no {what}, because of {in_words(error)}")
 
     def ended_early(self, how: str, kept: str, command: str) -> None:
         """Print how a run was interrupted, what is kept, and how to go on."""

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import contextlib
 import csv
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from holdfast.cli.exit_codes import EXIT_WRONG_ANSWER
 from holdfast.cli.terminal import duration
-from holdfast.errors import DecidedOtherwiseError, HoldfastError
+from holdfast.errors import DecidedOtherwiseError
 
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
@@ -26,7 +27,15 @@ if TYPE_CHECKING:
     from holdfast.recording.run_directory import RunDirectory
     from holdfast.robot.environment import Environment
 
-__all__ = ["Deviation", "Remark", "Repetition", "draw_figure", "repeat", "wrong_service"]
+__all__ = [
+    "Deviation",
+    "Remark",
+    "Repetition",
+    "draw_figure",
+    "own_backend",
+    "repeat",
+    "wrong_service",
+]
 
 _LONGEST_REPETITION_S = 30.0
 """A trial that took longer is not run again for its figure."""
@@ -73,7 +82,31 @@ class Repetition(NamedTuple):
 def draw_figure(
     configuration: Configuration, directory: RunDirectory, recorder: Recorder
 ) -> Remark | None:
-    """Draw the recorder's trial, which is finished, and return a remark if there is one."""
+    """Draw the recorder's trial, which is finished, and return a remark if there is one.
+
+    The trials are in the journal, and a figure is none of them: that it cannot be drawn, for
+    whatever reason, is a remark.
+    """
+    remarks: list[Remark] = []
+    try:
+        _draw_figure(configuration, directory, recorder, remarks.append)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # noqa: BLE001 - matplotlib, the disk and the user's own code
+        from holdfast.config.user_code import describe_problem_error
+
+        why = describe_problem_error(configuration.problem_name, error)
+        remarks.append(Remark(f"no figure, because it cannot be drawn: {why}"))
+    # What was found of a service comes first.
+    return max(remarks, key=lambda each: each.exit_code, default=None)
+
+
+def _draw_figure(
+    configuration: Configuration,
+    directory: RunDirectory,
+    recorder: Recorder,
+    remark: Callable[[Remark], None],
+) -> None:
     from holdfast.recording.run_directory import FIGURE_NAME
 
     trial, path = recorder.trial, directory.path / FIGURE_NAME
@@ -82,49 +115,56 @@ def draw_figure(
         result = next(each for each in directory.journal.results() if each.trial == trial)
         if configuration.environment.object is not None:
             if path.exists():
-                return None
+                return
             make_world = _recorded_world(directory, result)
             if make_world is None:
-                return Remark(
-                    f"no figure, because trial {trial} ended in an earlier part of the run, which "
-                    "did not keep its observations"
+                remark(
+                    Remark(
+                        f"no figure, because trial {trial} ended in an earlier part of the run, "
+                        "which did not keep its observations"
+                    )
                 )
+                return
         again_s = 1e-3 * result.mean_sensing_ms * result.sensing_decisions
         if again_s > _LONGEST_REPETITION_S:
-            return Remark(
-                f"no figure, because trial {trial} would have to be run again for it, "
-                f"with {duration(again_s)} of sensing decisions"
+            remark(
+                Remark(
+                    f"no figure, because trial {trial} would have to be run again for it, "
+                    f"with {duration(again_s)} of sensing decisions"
+                )
             )
+            return
     try:
-        from holdfast.recording.figure import trial_figure
+        with own_backend():
+            from holdfast.recording.figure import trial_figure
     except ImportError as error:
         if error.name is None or error.name.split(".")[0] != "matplotlib":
             raise
-        return Remark("no figure, because matplotlib is not installed: pip install matplotlib")
+        remark(Remark("no figure, because matplotlib is not installed: pip install matplotlib"))
+        return
 
-    remark = None
+    if recorder.record.result is None:
+        kept = directory.journal.decisions(trial)
+        world = None if make_world is None else make_world()
+        found = repeat(configuration, kept, trial, world, recorder=recorder)
+        if found.deviation is not None:
+            remark(_remark_on(found, configuration, directory, kept, trial, make_world))
+        if found.error is not None:
+            return
+        if make_world is not None:
+            recorder.record.result = result  # it alone has the reward of the last step
+    trial_figure(configuration, recorder.record, path)
+
+
+@contextlib.contextmanager
+def own_backend() -> Iterator[None]:
+    """Let matplotlib be imported whatever backend the environment names, which may not be there."""
+    named = os.environ.pop("MPLBACKEND", None)
     try:
-        if recorder.record.result is None:
-            kept = directory.journal.decisions(trial)
-            world = None if make_world is None else make_world()
-            found = repeat(configuration, kept, trial, world, recorder=recorder)
-            if found.deviation is not None:
-                remark = _remark_on(found, configuration, directory, kept, trial, make_world)
-            if found.error is not None:
-                return remark
-            if make_world is not None:
-                recorder.record.result = result  # it alone has the reward of the last step
-        trial_figure(configuration, recorder.record, path)
-    except (HoldfastError, KeyboardInterrupt):
-        raise
-    except BaseException as error:
-        from holdfast.config.user_code import account_of_user_error
-
-        account = account_of_user_error(error, configuration.problem_name)
-        if account is None:
-            raise
-        raise HoldfastError(f"the figure of trial {trial}: {account}") from error
-    return remark
+        yield
+    finally:
+        if named is not None:
+            os.environ["MPLBACKEND"] = named
 
 
 def _recorded_world(

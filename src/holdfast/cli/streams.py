@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = [
     "EXIT_UNREAD",
     "end_with_reader",
+    "escape_unencodable",
     "ignore_unwritable_stderr",
     "replace_closed_streams",
 ]
@@ -41,6 +42,13 @@ def replace_closed_streams() -> None:
             if stream.fileno() != descriptor:
                 os.dup2(stream.fileno(), descriptor)
             setattr(sys, name, stream)
+
+
+def escape_unencodable() -> None:
+    """Escape what the streams' encoding lacks, such as the ü of a path where that is ASCII."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def ignore_unwritable_stderr() -> None:

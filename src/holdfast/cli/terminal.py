@@ -257,7 +257,7 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
             value += f"  (successful trials: {summary.mean_reward_of_successes:.4g})"
         rows.append(("mean reward", value))
     if summary.mean_steps is not None:
-        rows.append(("mean steps", f"{summary.mean_steps:.4g}"))
+        rows.append(("mean steps", f"{summary.mean_steps:.4g}  (arithmetic mean)"))
     if summary.sensing_ms_median is not None:
         rows.append(
             (

@@ -30,6 +30,7 @@ from holdfast import numerics
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import PlanningSettings
 from holdfast.errors import MessageError
+from holdfast.printable import one_line
 
 __all__ = [
     "CHECKSUM_SIZE",
@@ -423,9 +424,13 @@ def decode_reply(payload: bytes) -> Reply:
     """
     content = _checked_content(payload)
     try:
-        return _REPLY_DECODER.decode(content)
+        reply = _REPLY_DECODER.decode(content)
     except Exception as error:
         raise MessageError("malformed", f"{len(payload)} bytes are no reply: {error}") from error
+    if isinstance(reply, Refused):
+        # A peer's words go into logs and messages, where a line of theirs would look like ours.
+        return Refused(reply.number, one_line(reply.code), one_line(reply.text))
+    return reply
 
 
 def numbers_of(data: bytes) -> FloatArray | None:

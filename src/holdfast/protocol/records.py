@@ -7,7 +7,7 @@ the last task action was still performed; only the environment can.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TypeAlias
 
 import msgspec
@@ -15,6 +15,7 @@ import msgspec
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import LostSettings
 from holdfast.errors import InvalidValueError, MessageError, RecordError
+from holdfast.outcome import SensingDecision, TaskDecision
 from holdfast.planning import ObservationInfo, Planner
 from holdfast.protocol.messages import (
     MAX_INPUTS,
@@ -37,6 +38,7 @@ __all__ = [
     "Record",
     "ReinitialisedRecord",
     "TrialHistory",
+    "decisions_of",
     "decode_record",
     "encode_record",
     "has_shown",
@@ -274,6 +276,16 @@ def has_shown(record: Record) -> bool:
     if isinstance(record, PerformedRecord):
         return bool(record.motion or record.observation)
     return isinstance(record, LateRecord)
+
+
+def decisions_of(records: Sequence[Record]) -> Iterator[SensingDecision | TaskDecision]:
+    """Yield the decisions among records."""
+    for record in records:
+        if isinstance(record, ObservedRecord):
+            yield SensingDecision(record.step, record.sensing_action, record.digest)
+        elif isinstance(record, ActingRecord):
+            action = decode_floats(record.action, len(record.action) // 8)
+            yield TaskDecision(record.step, tuple(action.tolist()))
 
 
 def reinitialised_after(records: Sequence[Record]) -> frozenset[int]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from itertools import zip_longest
 from pathlib import Path
@@ -19,9 +19,9 @@ from typing import Any
 import msgspec
 
 from holdfast.outcome import Decisions, SensingDecision, TaskDecision
-from holdfast.protocol.records import ActingRecord
+from holdfast.protocol.records import ActingRecord, ObservedRecord, decisions_of
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
-from holdfast.recording.run_directory import configuration_difference
+from holdfast.recording.run_directory import configuration_difference, recorded_configuration
 
 __all__ = ["Comparison", "Difference", "compare_runs", "difference_of_decisions"]
 
@@ -136,10 +136,8 @@ def _difference_of_runs(
     first: Mapping[str, str], second: Mapping[str, str], notes: list[str]
 ) -> Difference | None:
     """Return how the runs differ as wholes; what changes no decision is only noted."""
-    import yaml
-
     texts = [meta.get("configuration", "") for meta in (first, second)]
-    configurations: list[Any] = [yaml.safe_load(text) for text in texts]
+    configurations: list[Any] = [recorded_configuration(text) for text in texts]
     for what, keys in (("problem", ("problem",)), ("seed", ("simulator", "seed"))):
         one, other = (_value(configuration, keys) for configuration in configurations)
         if one != other:
@@ -176,7 +174,13 @@ def _compare_trials(
     for number in sorted(numbers):
         if not all(number in each for each in finished):
             one, other = map(_state_of, (number, number), finished, begun)
-            return Difference(what="state of the trial", trial=number, first=one, second=other)
+            if one != other:
+                return Difference(what="state of the trial", trial=number, first=one, second=other)
+            found = _compare_unfinished(begun, number, same)
+            if found is not None:
+                return found
+            notes.append(f"trial {number} is unfinished in both runs: compared as far as it goes")
+            continue
         result, counterpart = map(next, results)
         assert result.decisions is not None
         assert counterpart.decisions is not None
@@ -196,7 +200,7 @@ def _compare_trials(
                 f"the world answered otherwise: trial {number} has {outcomes[0]} in the first run "
                 f"and {outcomes[1]} in the second"
             )
-    if not same:
+    if not any(same.values()):
         return Difference(
             what="number of finished trials: nothing to compare", first="0", second="0"
         )
@@ -207,9 +211,28 @@ def _state_of(number: int, finished: set[int], begun: UnfinishedTrial | None) ->
     if number in finished:
         return "finished"
     if begun is not None and begun.trial == number:
+        looked = sum(isinstance(record, ObservedRecord) for record in begun.records)
         acted = sum(isinstance(record, ActingRecord) for record in begun.records)
-        return f"unfinished, {_counted(acted, 'task action')} so far"
+        return (
+            f"unfinished, {_counted(looked, 'sensing action')} and "
+            f"{_counted(acted, 'task action')} so far"
+        )
     return f"not in this run, which has {_counted(len(finished), 'finished trial')}"
+
+
+def _compare_unfinished(
+    begun: Sequence[UnfinishedTrial | None], trial: int, same: Counter[str]
+) -> Difference | None:
+    """Return where the same number of decisions of an unfinished trial first differ."""
+    decided = [[] if each is None else list(decisions_of(each.records)) for each in begun]
+    for decision, counterpart in zip(*decided, strict=True):
+        found = _difference_of_decision(decision, counterpart)
+        if found is not None:
+            step, what, values = found
+            return Difference(what=what, trial=trial, step=step, first=values[0], second=values[1])
+        kind = "sensing_actions" if isinstance(decision, SensingDecision) else "task_actions"
+        same[kind] += 1
+    return None
 
 
 def difference_of_decisions(first: Decisions, second: Decisions, trial: int) -> Difference | None:

@@ -16,6 +16,7 @@ from typing import Any, Self, TextIO
 
 from holdfast.arrays import FloatArray
 from holdfast.belief import Belief
+from holdfast.printable import cell
 from holdfast.problem_attributes import choice_labels
 from holdfast.problems.problem import Problem
 from holdfast.recording.facts import (
@@ -85,7 +86,9 @@ class CsvSink:
             lineterminator="\n",
         )
         self._steps.writeheader()
-        self._beliefs.writerow(["trial", "step", "when", "particle", *self._labels, "weight"])
+        self._beliefs.writerow(
+            ["trial", "step", "when", "particle", *map(cell, self._labels), "weight"]
+        )
         self._events.writerow(["time", "event", "trial", "fields"])
 
     def __enter__(self) -> Self:
@@ -140,8 +143,8 @@ class CsvSink:
                         int(result.success),
                         result.steps,
                         result.reward,
-                        result.digest,
-                        result.reason,
+                        cell(result.digest),
+                        cell(result.reason),
                     )
                 ),
             ]
@@ -150,7 +153,8 @@ class CsvSink:
     def happened(self, fact: EventFact) -> None:
         """Write an event."""
         fields = json.dumps(fact.fields, ensure_ascii=False)
-        self._events.writerow([_seconds(fact.time_ns), fact.name, fact.fields.get("trial"), fields])
+        trial = fact.fields.get("trial")
+        self._events.writerow(map(cell, [_seconds(fact.time_ns), fact.name, trial, fields]))
 
     def _write_step(self, trial: int, step: int, fact: TaskFact | None) -> None:
         sensing, self._sensing = self._sensing, None
@@ -183,7 +187,7 @@ class CsvSink:
                 **_cells("action_{}", fact.action),
                 **_decider_cells("action", fact.decider),
             }
-        self._steps.writerow(row)
+        self._steps.writerow({name: cell(value) for name, value in row.items()})
 
     def _write_belief(self, trial: int, step: int, when: str, belief: Belief | None) -> None:
         if belief is None:

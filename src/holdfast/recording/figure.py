@@ -108,7 +108,9 @@ def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) 
     scene: Scene | None = checked.scene(problem)
     num_panels = problem.state_size + 2
     height = max(6.2, 1.12 * num_panels + 1.6)
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context():
+        mpl.rcdefaults()  # a figure looks the same whatever the user's matplotlibrc says
+        mpl.rcParams.update(STYLE)
         figure = Figure(figsize=(_WIDTH if scene else 8.0, height), layout="constrained")
         FigureCanvasAgg(figure)
         figure.suptitle(_title(configuration, record), x=0.012, ha="left", fontsize=12.0)

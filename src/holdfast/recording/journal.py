@@ -43,24 +43,14 @@ from holdfast.recording.journal_file import (
     open_here,
     synchronize_directory,
 )
-from holdfast.recording.journal_reader import SCHEMA_VERSION, SESSION_SIZE, JournalReader
+from holdfast.recording.journal_reader import (
+    SCHEMA_VERSION,
+    SESSION_SIZE,
+    TABLES,
+    JournalReader,
+)
 
 __all__ = ["Journal"]
-
-_SCHEMA = (
-    "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, checksum BLOB NOT NULL) "
-    "WITHOUT ROWID",
-    "CREATE TABLE trials (trial INTEGER PRIMARY KEY, result BLOB NOT NULL, "
-    "result_checksum BLOB NOT NULL, decisions BLOB NOT NULL, decisions_checksum BLOB NOT NULL)",
-    "CREATE TABLE steps (sequence INTEGER PRIMARY KEY, trial INTEGER NOT NULL, "
-    "record BLOB NOT NULL, checksum BLOB NOT NULL)",
-)
-
-_KEPT_STEPS = (
-    "CREATE TABLE IF NOT EXISTS kept_steps "
-    "(trial INTEGER PRIMARY KEY, records BLOB NOT NULL, checksum BLOB NOT NULL)"
-)
-"""Not in every journal, so that those without it are still journals of this version."""
 
 _MAX_EPOCH = 2**32 - 1
 
@@ -118,8 +108,8 @@ class Journal(JournalReader):
             journal = cls(unfinished, JournalFile(unfinished).connect(create=True))
             try:
                 with journal._transaction():
-                    for statement in _SCHEMA:
-                        journal._connection.execute(statement)
+                    for table in ("meta", "trials", "steps"):
+                        journal._connection.execute(TABLES[table])
                     journal._note(_first_rows(meta))
             finally:
                 journal._connection.close()
@@ -405,7 +395,8 @@ class Journal(JournalReader):
             )
             if unfinished is not None and unfinished.trial == trial:
                 kept = self._encode([encode_record(record) for record in unfinished.records])
-                self._connection.execute(_KEPT_STEPS)
+                if not self._has_kept_steps():
+                    self._connection.execute(TABLES["kept_steps"])
                 self._connection.execute(
                     "INSERT INTO kept_steps VALUES (?, ?, ?)",
                     (trial, kept, of_trials(trial, 2, kept)),

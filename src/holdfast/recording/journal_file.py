@@ -58,6 +58,9 @@ _CHECKSUM_SIZE = 8
 _NUMBERS = struct.Struct("<qq")
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _BUSY_TIMEOUT_S = 1.0
+_MAX_ROW_BYTES = 2**29
+"""Of a file that somebody else has made; a trial of a million steps has a tenth of it."""
+
 _PAGE_BYTES = 1024
 """A step writes whole pages; larger ones take longer to write and to checksum."""
 
@@ -168,6 +171,7 @@ class JournalFile:
             )
         except sqlite3.Error as error:
             raise OutputError(f"{path}: cannot be opened: {error}") from error
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MAX_ROW_BYTES)
         try:
             if create:
                 connection.execute(f"PRAGMA page_size = {_PAGE_BYTES}")
@@ -232,6 +236,7 @@ class JournalFile:
         except OutputError as error:
             assert copy is not None
             raise OutputError(str(error).replace(str(copy.path), str(path))) from error
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MAX_ROW_BYTES)
         connection.execute("PRAGMA query_only = ON")
         return connection
 

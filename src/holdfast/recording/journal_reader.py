@@ -29,10 +29,22 @@ from holdfast.recording.journal_file import (
     of_trials,
 )
 
-__all__ = ["SCHEMA_VERSION", "SESSION_SIZE", "JournalReader", "UnfinishedTrial"]
+__all__ = ["SCHEMA_VERSION", "SESSION_SIZE", "TABLES", "JournalReader", "UnfinishedTrial"]
 
 SCHEMA_VERSION = 3
 """Raised whenever the tables or their content change form."""
+
+TABLES = {
+    "meta": "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, checksum BLOB NOT NULL) "
+    "WITHOUT ROWID",
+    "trials": "CREATE TABLE trials (trial INTEGER PRIMARY KEY, result BLOB NOT NULL, "
+    "result_checksum BLOB NOT NULL, decisions BLOB NOT NULL, decisions_checksum BLOB NOT NULL)",
+    "steps": "CREATE TABLE steps (sequence INTEGER PRIMARY KEY, trial INTEGER NOT NULL, "
+    "record BLOB NOT NULL, checksum BLOB NOT NULL)",
+    "kept_steps": "CREATE TABLE kept_steps "
+    "(trial INTEGER PRIMARY KEY, records BLOB NOT NULL, checksum BLOB NOT NULL)",
+}
+"""The statements that make the tables. Not every journal has the last."""
 
 SESSION_SIZE = 16
 """Bytes that identify a run."""
@@ -149,6 +161,11 @@ class JournalReader:
 
     def _require_version(self) -> None:
         with self._errors():
+            # In somebody else's file a name may stand for a view, a trigger may write, and a
+            # column may be computed, without end. Nothing is asked of it before this.
+            for name, sql in self._connection.execute("SELECT name, sql FROM sqlite_schema"):
+                if sql != TABLES.get(name, ""):
+                    raise self._damaged(f"{name!r:.80} in it is no table of a journal")
             row = self._connection.execute(
                 "SELECT value FROM meta WHERE key = 'schema_version'"
             ).fetchone()
@@ -298,6 +315,9 @@ class JournalReader:
                     decisions = self.decisions(trial)
                     if decisions.digest() != result.digest:
                         raise self._damaged(f"trial {trial} has decisions with another digest")
+                    # Which of the two is wrong is not known, but arrays are as long as the first.
+                    if result.steps > len(decisions.log):
+                        raise self._damaged(f"trial {trial} has more steps than decisions")
                     result = msgspec.structs.replace(result, decisions=decisions)
                 yield result
 
@@ -313,14 +333,15 @@ class JournalReader:
                 raise self._damaged(f"the decisions of trial {trial} have a wrong checksum")
             return _DECISIONS_DECODER.decode(row[0])
 
+    def _has_kept_steps(self) -> bool:
+        found = self._connection.execute("SELECT 1 FROM sqlite_schema WHERE name = 'kept_steps'")
+        return found.fetchone() is not None
+
     def kept_steps(self, trial: int) -> list[Record] | None:
         """Return the records of a finished trial whose steps were kept, None if they were not."""
         with self._errors():
-            has_table = self._connection.execute(
-                "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = 'kept_steps'"
-            ).fetchone()
             row = (
-                has_table
+                self._has_kept_steps()
                 and self._connection.execute(
                     "SELECT records, checksum FROM kept_steps WHERE trial = ?", (trial,)
                 ).fetchone()

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import msgspec
 
+from holdfast.config.user_code import in_words
 from holdfast.errors import ViewError
 from holdfast.outcome import TrialResult
 from holdfast.protocol.events import Timing
@@ -160,7 +161,12 @@ class LiveView:
         with self._lock:
             if not self._open:
                 return
-            data = self._encode(message)
+            try:
+                data = self._encode(message)
+            except Exception as error:  # noqa: BLE001 - the robot goes on without its view
+                self._open = False
+                self._tell(f"the view has ended: {in_words(error)}; the run goes on without it")
+                return
             self._waiting.append(len(data).to_bytes(HEADER_BYTES, "little") + data)
             self._waiting_bytes += HEADER_BYTES + len(data)
             self._write()

@@ -21,7 +21,11 @@ from holdfast.arrays import FloatArray
 from holdfast.errors import HoldfastError, OutputError
 from holdfast.outcome import TrialResult
 from holdfast.recording.journal_reader import JournalReader
-from holdfast.recording.run_directory import first_difference
+from holdfast.recording.run_directory import (
+    first_difference,
+    recorded_configuration,
+    world_of,
+)
 from holdfast.robot.environment import BUILT_IN
 
 __all__ = ["OutcomeComparison", "OutcomeEffect", "RunOutcomes", "compare_outcomes", "effects_of"]
@@ -130,8 +134,8 @@ class OutcomeComparison(msgspec.Struct, frozen=True, kw_only=True):
                 lines.append(f"  {'  '.join(cells)}".rstrip())
             lines.append("")
         lines.append(
-            "steps: geometric mean; a trial that did not reach the goal counts as its limit, "
-            f"{self.step_limit:,} steps."
+            "steps: the geometric mean fits ratios (the summary has the arithmetic one); a trial "
+            f"that did not reach the goal counts as its limit, {self.step_limit:,} steps."
         )
         lines.append(f"intervals: {self.method}, each by itself.")
         return "\n".join(lines)
@@ -187,6 +191,8 @@ class _Run(NamedTuple):
     ----------
     world : mapping
         The settings that must be the same for outcomes to be comparable.
+    arguments : mapping
+        Those of a world that is not simulated: they may say no more than how it is reached.
     simulated : bool
         Whether it is a simulated one.
     """
@@ -198,20 +204,21 @@ class _Run(NamedTuple):
     seed: Any
     step_limit: int
     world: Mapping[str, Any]
+    arguments: Mapping[str, Any]
     simulated: bool
 
 
 def _read(path: Path) -> _Run:
-    from holdfast.config.yaml_document import read
-
     with JournalReader.read_run(path, "compare") as journal:
         meta = journal.meta()
         results = {result.trial: result for result in journal.results()}
         journal.require_unchanged()
-    text = meta.get("configuration", "")
-    configuration = read(text.encode(), f"the configuration in {journal.path}").data
+    configuration = recorded_configuration(meta.get("configuration", ""))
     simulator = configuration["simulator"]
-    environment = (configuration.get("environment") or {}).get("object")
+    environment = world_of(configuration.get("environment") or {})
+    # An episode of gymnasium follows from seed and trial, too.
+    simulated = environment["object"] is None or environment["object"] in BUILT_IN
+    arguments = environment["arguments"] if simulated else environment.pop("arguments")
     return _Run(
         path=path,
         problem_sources=meta.get("problem_sources"),
@@ -223,10 +230,10 @@ def _read(path: Path) -> _Run:
             "problem": configuration["problem"],
             "model": configuration.get("model"),
             "simulator": {"max_steps": int(simulator["max_steps"])},
-            "environment": {"object": environment},
+            "environment": environment,
         },
-        # An episode of gymnasium follows from seed and trial, too.
-        simulated=environment is None or environment in BUILT_IN,
+        arguments=arguments,
+        simulated=simulated,
     )
 
 
@@ -268,6 +275,10 @@ def _compare(baseline: _Run, other: _Run, *, paired: bool) -> RunOutcomes:
         )
     if other.problem_sources != baseline.problem_sources:
         notes.append("the source of the problem differs")
+    found = first_difference(baseline.arguments, other.arguments, "environment.arguments")
+    if found is not None:
+        key, old, new = found
+        notes.append(f"{key} is {new} here and {old} there: these may be two worlds")
     return RunOutcomes(
         run=str(other.path),
         trials=len(pairs[1]),
@@ -406,9 +417,9 @@ def _row(effect: OutcomeEffect) -> tuple[str, ...]:
     title, unit, of_run, of_effect = {
         "success_rate": ("success", " points", "{:.1%}", "{:+.1f}"),
         "failure_rate": ("failed", " points", "{:.1%}", "{:+.1f}"),
-        "steps": ("steps", " times", "{:.4g}", "{:.3g}"),
-        "reward": ("reward", "", "{:.4g}", "{:+.4g}"),
-        "decision_ms": ("decision time", " times", "{:.3g} ms", "{:.3g}"),
+        "steps": ("steps, geometric mean", " times", "{:.4g}", "{:.3g}"),
+        "reward": ("reward, mean", "", "{:.4g}", "{:+.4g}"),
+        "decision_ms": ("decision time, median", " times", "{:.3g} ms", "{:.3g}"),
     }[effect.measure]
     scale = 100.0 if effect.measure.endswith("_rate") else 1.0
     low_high = "all alike"

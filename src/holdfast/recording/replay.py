@@ -26,8 +26,7 @@ from holdfast.config.loader import Configuration
 from holdfast.errors import DecidedOtherwiseError, EndOfRecordsError, HoldfastError
 from holdfast.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
 from holdfast.planning import Planner, PlanningState, digest
-from holdfast.protocol.messages import decode_floats
-from holdfast.protocol.records import ActingRecord, ObservedRecord, reinitialised_after
+from holdfast.protocol.records import decisions_of, reinitialised_after
 from holdfast.recording.facts import (
     Decider,
     EventFact,
@@ -167,13 +166,7 @@ class RecordedRun:
 
     def _replay_unfinished(self, begun: UnfinishedTrial, output: _Output, clock: StepClock) -> int:
         trial = begun.trial
-        expected: list[SensingDecision | TaskDecision] = []
-        for record in begun.records:
-            if isinstance(record, ObservedRecord):
-                expected.append(SensingDecision(record.step, record.sensing_action, record.digest))
-            elif isinstance(record, ActingRecord):
-                action = decode_floats(record.action, self.configuration.problem.action_size)
-                expected.append(TaskDecision(record.step, tuple(action.tolist())))
+        expected = list(decisions_of(begun.records))
         steps = sum(isinstance(decision, TaskDecision) for decision in expected)
         simulated = self._simulated_world(trial) if self.world_is_simulated else None
         world = RecordedEnvironment(trial, begun.records, simulated=simulated)

@@ -11,7 +11,12 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from holdfast.protocol.events import Timing, VerificationNoted
-from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME, VERIFICATION_NAME
+from holdfast.recording.run_directory import (
+    EVENTS_NAME,
+    RECOVERY_LOG_NAME,
+    TIMINGS_NAME,
+    VERIFICATION_NAME,
+)
 from holdfast.recording.timings import EventTable, count_verified
 from holdfast.robot.links import make_links
 from holdfast.robot.process import RobotProcess, StepJournal
@@ -29,9 +34,7 @@ if TYPE_CHECKING:
     from holdfast.robot.health import RobotWatch
     from holdfast.runtime.events import EventSink
 
-__all__ = ["RECOVERY_LOG_NAME", "RobotObserver", "perform_trials"]
-
-RECOVERY_LOG_NAME = "recovery.log"
+__all__ = ["RobotObserver", "perform_trials"]
 
 
 class RobotObserver(NamedTuple):

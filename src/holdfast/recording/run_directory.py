@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import stat
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -37,6 +38,7 @@ __all__ = [
     "FIGURE_NAME",
     "JOURNAL_NAME",
     "OUTPUT_NAMES",
+    "RECOVERY_LOG_NAME",
     "SUMMARY_NAME",
     "TIMINGS_NAME",
     "TRIALS_NAME",
@@ -46,6 +48,8 @@ __all__ = [
     "configuration_difference",
     "first_difference",
     "latest_default_directory",
+    "recorded_configuration",
+    "world_of",
 ]
 
 CONFIGURATION_NAME = "config.yaml"
@@ -55,6 +59,7 @@ SUMMARY_NAME = "summary.json"
 TIMINGS_NAME = "timings.csv"
 VERIFICATION_NAME = "verification.csv"
 TRIALS_NAME = "trials.csv"
+RECOVERY_LOG_NAME = "recovery.log"
 
 OUTPUT_NAMES = (
     TRIALS_NAME,
@@ -118,6 +123,7 @@ class RunDirectory:
             raise OutputError(f"{path}: is a file, not a directory") from error
         except OSError as error:
             raise OutputError(f"{path}: cannot be made: {error.strerror}") from error
+        _require_plain_files(path)
         text = configuration.to_yaml()
         meta = {"configuration": text} | fingerprint(configuration) | dict(notes or {})
         survives = configuration.recovery.journal_survives
@@ -159,6 +165,7 @@ class RunDirectory:
             raise OutputError(f"{path}: there is no such directory, so no run to resume")
         if not (path / JOURNAL_NAME).is_file():
             raise OutputError(f"{path}: holds no {JOURNAL_NAME}, so no run to resume")
+        _require_plain_files(path)
         try:
             _require_writable_directory(path)
             JournalFile(path / JOURNAL_NAME).require_writable()
@@ -373,6 +380,22 @@ def _require_writable_directory(path: Path) -> None:
         raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
 
 
+def _require_plain_files(path: Path) -> None:
+    """Raise OutputError if a run would write elsewhere, through a link or into a device.
+
+    A directory may be somebody else's, copied or unpacked.
+    """
+    journal = JournalFile(path / JOURNAL_NAME)
+    names = {*OUTPUT_NAMES, RECOVERY_LOG_NAME, journal.log.name, journal.count.name}
+    for name in sorted(names):
+        with contextlib.suppress(FileNotFoundError):
+            if not stat.S_ISREG((path / name).lstat().st_mode):
+                raise OutputError(
+                    f"{path / name}: is no file but a link, directory or device; a run writes "
+                    "into its own directory alone: remove it"
+                )
+
+
 def _require_same_code(path: Path, there: Mapping[str, str], here: Mapping[str, str]) -> None:
     what = difference(there, here)
     if what is not None:
@@ -397,10 +420,14 @@ def configuration_difference(first: str, second: str) -> tuple[str, str, str] | 
 
     With both values, for a person; None if there is none.
     """
-    import yaml
+    return first_difference(*(_compared(recorded_configuration(text)) for text in (first, second)))
 
-    # Both were written by us, so the same plain loader reads both in the same way.
-    return first_difference(_compared(yaml.safe_load(first)), _compared(yaml.safe_load(second)))
+
+def recorded_configuration(text: str) -> Any:
+    """Return a configuration from a journal, as plain data; somebody else may have written it."""
+    from holdfast.config.yaml_document import read
+
+    return read(text.encode(), "the configuration in a journal").data
 
 
 def _compared(configuration: Any) -> Any:
@@ -417,17 +444,19 @@ def _compared(configuration: Any) -> Any:
     if isinstance(kept.get("selector"), Mapping):
         defaults = msgspec.json.decode(msgspec.json.encode(SelectorSettings()))
         kept["selector"] = {**defaults, **kept["selector"]}
-    # How a world is reached may change between two parts of a run; which one it is may not.
     environment = kept.pop("environment", None)
     if isinstance(environment, Mapping) and environment.get("object") is not None:
-        kept["environment"] = {"object": environment["object"]}
+        kept["environment"] = world_of(environment)
     return kept
 
 
-def _services_in(text: str) -> tuple[str, ...]:
-    import yaml
+def world_of(environment: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what says which world an environment is; the rest is how it is reached."""
+    return {"object": environment.get("object"), "arguments": environment.get("arguments") or {}}
 
-    match yaml.safe_load(text):
+
+def _services_in(text: str) -> tuple[str, ...]:
+    match recorded_configuration(text):
         case {"offload": {"services": [*services]}}:
             return tuple(map(str, services))
     return ()

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from holdfast.outcome import TRIAL_COLUMNS, TrialResult
+from holdfast.printable import cell
 from holdfast.recording.timings import AnswerCounts, VerificationCounts
 
 __all__ = ["RunSummary", "SummaryBuilder", "csv_lines", "wilson_interval"]
@@ -41,6 +42,8 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         None if a finished trial has no reward.
     mean_reward_of_successes : float or None
         Earlier work reports this one.
+    mean_steps : float or None
+        Arithmetic mean; ``compare --outcomes`` takes the geometric one, of which it shows ratios.
     unexplained_observations : int
         Observations that no particle explains.
     lost, suspect_sensors : int
@@ -104,16 +107,16 @@ def csv_lines(results: Iterable[TrialResult]) -> Iterator[str]:
     yield ",".join(TRIAL_COLUMNS) + "\n"
     for result in results:
         values = (getattr(result, column) for column in TRIAL_COLUMNS)
-        cells = (
+        texts = (
             "" if value is None else str(int(value)) if isinstance(value, bool) else str(value)
             for value in values
         )
-        yield ",".join(map(_quoted, cells)) + "\n"
+        yield ",".join(map(_quoted, map(str, map(cell, texts)))) + "\n"
 
 
-def _quoted(cell: str) -> str:
+def _quoted(text: str) -> str:
     """Return a cell as RFC 4180 writes it."""
-    return '"' + cell.replace('"', '""') + '"' if "," in cell or '"' in cell else cell
+    return '"' + text.replace('"', '""') + '"' if set(text) & set(',"\r\n') else text
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:

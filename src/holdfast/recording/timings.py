@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from holdfast.errors import OutputError
+from holdfast.printable import cell
 from holdfast.protocol.events import Timing, VerificationNoted
 
 __all__ = [
@@ -74,7 +75,7 @@ class EventTable:
         """Add a row."""
         seconds, rest_ns = divmod(self._clock(), 1_000_000_000)
         moment = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(seconds))
-        cells = [f"{each:.3f}" if isinstance(each, float) else each for each in event]
+        cells = [f"{each:.3f}" if isinstance(each, float) else cell(each) for each in event]
         try:
             self._writer.writerow([*cells, f"{moment}.{rest_ns // 1000:06d}Z"])
         except OSError as error:

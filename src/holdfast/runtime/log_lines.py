@@ -7,14 +7,13 @@ size, text with control characters and numbers that are not finite still make on
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable, Mapping
 from typing import Literal, TypeAlias
 
 import msgspec
 
-from holdfast.printable import printable
+from holdfast.printable import one_line
 
 __all__ = ["LINES", "MAX_LINE_BYTES", "LogFormat", "fields_as_text", "json_line", "text_line"]
 
@@ -29,9 +28,6 @@ MAX_VALUE_CHARACTERS = 800
 _ROBOT = "robot"
 _COMPONENT_WIDTH = 8
 _EVENT_WIDTH = 18
-
-_TERMINAL_CONTROLS = re.compile("[\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
-"""Control characters above ASCII, line separators and changes of the text's direction."""
 
 _UNITS = {"_ms": "ms", "_us": "µs", "_s": "s", "_hz": "Hz", "_bytes": "bytes"}
 """Endings of field names, and how the text form writes them."""
@@ -99,11 +95,16 @@ def fields_as_text(fields: Mapping[str, object]) -> str:
 
 
 def _json(value: object) -> str:
-    """Encode plain data; numbers that are not finite become null, control characters escapes."""
+    """Encode plain data; numbers that are not finite become null, what is unprintable escapes."""
     text = msgspec.json.encode(value).decode()
     if text.isprintable():
         return text
-    return _TERMINAL_CONTROLS.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+    return "".join(each if each.isprintable() else _escaped(each) for each in text)
+
+
+def _escaped(letter: str) -> str:
+    units = letter.encode("utf-16-be").hex()
+    return "".join(f"\\u{units[at : at + 4]}" for at in range(0, len(units), 4))
 
 
 def _plain(key: str, value: object) -> object:
@@ -174,9 +175,8 @@ def _value(value: object, *, milliseconds: bool = False) -> str:
 
 
 def _readable(text: str, limit: int = MAX_VALUE_CHARACTERS) -> str:
-    """Return a text on one line, with control characters escaped."""
-    text = _bounded(text, limit)
-    return printable(text.replace("\n", " ").replace("\t", " "), keep="")
+    """Return a text on one line; many spaces would break it where a terminal does."""
+    return one_line(_bounded(text, limit))
 
 
 LINES: dict[LogFormat, Callable[[int, str, str, Mapping[str, object]], str]] = {

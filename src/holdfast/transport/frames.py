@@ -18,7 +18,7 @@ import msgspec
 
 from holdfast import __version__
 from holdfast.errors import FrameError, TransportError
-from holdfast.printable import printable
+from holdfast.printable import one_line
 from holdfast.transport.endpoints import Role, check_name
 
 __all__ = [
@@ -122,8 +122,8 @@ def encode_goodbye(reason: str) -> bytes:
 
 
 def read_goodbye(payload: bytes) -> str:
-    """Return the reason in a goodbye, printable; empty if there is none."""
-    return printable(payload.decode(errors="replace"))
+    """Return the reason in a goodbye, on one line; empty if there is none."""
+    return one_line(payload.decode(errors="replace"))
 
 
 def decode_hello(payload: bytes) -> Hello:
@@ -137,7 +137,7 @@ def decode_hello(payload: bytes) -> Hello:
     version = _decoded(payload, _Version)
     if version.version != WIRE_VERSION:
         raise FrameError(
-            f"is holdfast {printable(version.release[:40])} with version {version.version} of "
+            f"is holdfast {one_line(version.release[:40])} with version {version.version} of "
             f"the wire; here is holdfast {__version__} with version {WIRE_VERSION}: install "
             "the same release at both ends"
         )
@@ -159,7 +159,7 @@ def _decoded(payload: bytes, form: type[_Form]) -> _Form:
     try:
         return msgspec.msgpack.decode(payload, type=form)
     except Exception as error:  # noqa: BLE001 - decoding may raise anything
-        raise FrameError(f"sends a malformed hello: {printable(str(error))}") from None
+        raise FrameError(f"sends a malformed hello: {one_line(str(error))}") from None
 
 
 class FrameDecoder:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.cli.exit_codes import EXIT_DIFFERENT, ended_by_signals, interrupted_by
+from holdfast.config.user_code import in_words
 from holdfast.config.validation import close_match
 from holdfast.errors import HoldfastError, OptionError, RunError
 from holdfast.printable import printable
@@ -255,13 +256,16 @@ def _run(options: ChaosOptions) -> bool:
 
 def _draw(directory: Path, summary: ChaosSummary, outcomes: Sequence[TrialOutcome]) -> str | None:
     """Draw the figures, and return a note if that is not possible."""
+    from holdfast.cli.run_figure import own_backend
+
     try:
-        from holdfast.lab.chaos.figure import draw_figures
-    except ImportError as error:
-        if error.name is None or error.name.split(".")[0] != "matplotlib":
-            raise
-        return "no figures, because matplotlib is not installed: pip install matplotlib"
-    draw_figures(directory, summary, outcomes)
+        with own_backend():
+            from holdfast.lab.chaos.figure import draw_figures
+        draw_figures(directory, summary, outcomes)
+    except Exception as error:  # noqa: BLE001 - the series is finished, with figures or without
+        if isinstance(error, ImportError) and (error.name or "").split(".")[0] == "matplotlib":
+            return "no figures, because matplotlib is not installed: pip install matplotlib"
+        return f"no figures, because they cannot be drawn: {in_words(error)}"
     return None
 
 
