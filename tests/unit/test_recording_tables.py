@@ -50,6 +50,7 @@ class TestTables:
             "digest",
             "lost",
             "suspect_sensors",
+            "missing_observations",
             "outcome",
             "reason",
         )
@@ -88,6 +89,15 @@ class TestTables:
         summary = builder.build(problem="p", seed=5, version="1", trials=3, wall_time_s=2.0)
         assert (summary.lost, summary.suspect_sensors) == (3, 1)
         assert dict(_summary_rows(summary))["lost"].startswith("3 times, 1 suspect sensor (")
+
+    def test_missing_observations_are_told_if_there_are_any(self) -> None:
+        builder = SummaryBuilder()
+        for trial, missing in enumerate([2, 0, 1]):
+            result = msgspec.structs.replace(result_of(trial), sensing_decisions=5)
+            builder.add(msgspec.structs.replace(result, missing_observations=missing))
+        summary = builder.build(problem="p", seed=5, version="1", trials=3, wall_time_s=2.0)
+        assert summary.missing_observations == 3
+        assert dict(_summary_rows(summary))["no reading"] == "3 of 15 looks had no observation"
 
     def test_failures_are_no_successes_and_told_if_there_are_any(self) -> None:
         builder = SummaryBuilder()

@@ -266,6 +266,9 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
                 f"({counted(summary.sensing_decisions, 'decision')})",
             )
         )
+    if summary.missing_observations:
+        shown = f"{summary.missing_observations:,} of {counted(summary.sensing_decisions, 'look')}"
+        rows.append(("no reading", f"{shown} had no observation"))
     if summary.unexplained_observations:
         deviations = f"{VALIDATION_GATE_SQUARED**0.5:g}"
         number, looks = summary.unexplained_observations, summary.sensing_decisions

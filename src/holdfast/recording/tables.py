@@ -41,6 +41,8 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         None if a finished trial has no reward.
     mean_reward_of_successes : float or None
         Earlier work reports this one.
+    missing_observations : int
+        Sensing actions without an observation.
     unexplained_observations : int
         Observations that no particle explains.
     lost, suspect_sensors : int
@@ -74,6 +76,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     mean_reward_of_successes: float | None
     mean_steps: float | None
     sensing_decisions: int
+    missing_observations: int = 0
     unexplained_observations: int
     lost: int = 0
     suspect_sensors: int = 0
@@ -153,6 +156,7 @@ class SummaryBuilder:
         self._reward_of_successes: float | None = 0.0
         self._steps = 0
         self._sensing_decisions = 0
+        self._missing = 0
         self._unexplained = 0
         self._lost = 0
         self._suspect_sensors = 0
@@ -170,6 +174,7 @@ class SummaryBuilder:
         self._failures += result.failed
         self._steps += result.steps
         self._sensing_decisions += result.sensing_decisions
+        self._missing += result.missing_observations
         self._unexplained += result.unexplained_observations
         self._lost += result.lost
         self._suspect_sensors += result.suspect_sensors
@@ -208,6 +213,7 @@ class SummaryBuilder:
             mean_reward_of_successes=_mean(self._reward_of_successes, self._successes),
             mean_steps=self._steps / count if count else None,
             sensing_decisions=self._sensing_decisions,
+            missing_observations=self._missing,
             unexplained_observations=self._unexplained,
             lost=self._lost,
             suspect_sensors=self._suspect_sensors,
