@@ -20,7 +20,13 @@ from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
 from holdfast.robot.environment import SimulatedEnvironment
 
-__all__ = ["concentrated_state", "recorded_trial", "settings_for", "with_sensing"]
+__all__ = [
+    "concentrated_state",
+    "default_settings",
+    "recorded_trial",
+    "settings_for",
+    "with_sensing",
+]
 
 SEED = 0
 MAX_STEPS = 500
@@ -33,6 +39,12 @@ def settings_for(num_particles: int, threads: int, **sensing: Any) -> PlanningSe
         selector=SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
     )
     return with_sensing(settings, num_cores=threads, **sensing)
+
+
+def default_settings(num_particles: int, threads: int) -> PlanningSettings:
+    """Return what a user has who sets neither method nor estimator."""
+    particle_filter = ParticleFilterSettings(num_particles=num_particles)
+    return with_sensing(PlanningSettings(particle_filter=particle_filter), num_cores=threads)
 
 
 def with_sensing(settings: PlanningSettings, **sensing: Any) -> PlanningSettings:

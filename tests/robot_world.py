@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from holdfast.arrays import FloatArray
 from holdfast.config.settings import (
     LostSettings,
     OffloadSettings,
@@ -58,10 +59,10 @@ from holdfast.protocol.messages import (
     SensingAnswer,
     SessionConfiguration,
     TaskAnswer,
-    decode_floats,
     decode_request,
     encode,
     encode_floats,
+    numbers_of,
 )
 from holdfast.protocol.records import ActingRecord, Record, replay
 from holdfast.protocol.robot import Robot
@@ -135,7 +136,7 @@ class SmallService:
                 while state.step < item.step:
                     action, _ = planner.choose_task_action(state)
                     state = planner.advance(state, action)
-                shown = decode_floats(item.observation, len(item.observation) // 8)
+                shown = numbers_of(item.observation)
                 state, _ = planner.observe(state, item.sensing_action, shown)
         return state if digest(state)[:DIGEST_SIZE] == request.digest else None
 
@@ -327,8 +328,9 @@ class World:
             elif isinstance(effect, Abandon):
                 self.calls.pop(effect.call, None)
             elif isinstance(effect, Sense):
-                shown = self.environment.perform_sensing(effect.sensing_action)
-                self.after(0.001, self.later(Sensed(effect.step, shown)))
+                shown: FloatArray | None = self.environment.perform_sensing(effect.sensing_action)
+                sensed = Sensed(effect.step, shown, no_reading=shown is None)
+                self.after(0.001, self.later(sensed))
             elif isinstance(effect, Act):
                 self.act(effect)
             elif isinstance(effect, Launch):

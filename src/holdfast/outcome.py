@@ -290,6 +290,8 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     recoveries : int
         Times that the local service took over, in all processes that had a part in the trial; 0
         with the planner in process.
+    missing_observations : int
+        Sensing actions without an observation: there was no reading, or it had not come yet.
     unexplained_observations : int
         Observations that no particle of the belief explained.
     lost, suspect_sensors : int
@@ -317,6 +319,7 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     digest: str
     lost: int = 0
     suspect_sensors: int = 0
+    missing_observations: int = 0
     sensing_ms: tuple[float, ...]
     decisions: Decisions | None = None
 

@@ -73,6 +73,8 @@ class Trial:
     num_inputs : int
         What led to the state besides task actions: observations and choices not to sense, moves
         that have shown something, late observations, reinitialisations.
+    num_missing : int
+        Sensing actions that were performed and have no observation (so far, if it comes late).
     num_unexplained : int
         Observations that no particle explains.
     lost_test : LostTest
@@ -97,6 +99,7 @@ class Trial:
         self.rewards = RewardAccount(planner.problem)
         self.num_sensed = 0
         self.num_inputs = 0
+        self.num_missing = 0
         self.num_unexplained = 0
         self.lost_test = LostTest(false_alarm_rate)
         self.alarm: Verdict | None = None
@@ -117,7 +120,7 @@ class Trial:
     ) -> tuple[ObservationInfo, bytes]:
         """Fold in a sensing action; return what was found, and the digest of the state after it.
 
-        Without an observation it comes late, or never.
+        Without an observation it comes late, or never: there was no reading.
         """
         planner, before = self.planner, self.state
         after, info = planner.observe(before, sensing_action, observation)
@@ -128,6 +131,7 @@ class Trial:
         self._keep(_Sensed(sensing_action, observation), before if awaited else None)
         self.state = after
         self.num_sensed += performed
+        self.num_missing += awaited
         self.num_inputs += 1
         self._judge(sensing_action, None if observation is None else info)
         self.sensing_ms.append(sensing_ms)
@@ -187,6 +191,7 @@ class Trial:
         self._before |= again
         self._drop_settled()
         self.state = state
+        self.num_missing -= 1
         self.num_inputs += 1
         self._judge(sensed.sensing_action, info, of_old_belief=of_old_belief)
         reached = self.planner.digest(state)
@@ -222,6 +227,7 @@ class Trial:
             sensing_decisions=self.num_sensed,
             mean_sensing_ms=sum(sensing_ms) / len(sensing_ms) if sensing_ms else 0.0,
             recoveries=self.recoveries,
+            missing_observations=self.num_missing,
             unexplained_observations=self.num_unexplained,
             lost=self.lost_test.num_lost,
             suspect_sensors=self.lost_test.num_suspect,

@@ -19,6 +19,9 @@ from holdfast import LATER, MoveResult, ProblemBase, SimulatedEnvironment, numer
 STATES = 2  # where it is, and the bias of its encoder
 LATE = 4
 """Moves from a look to its picture."""
+NO_READING: dict[int, Any] = {6: None, 12: np.array([np.nan]), 21: None}
+NOT_LATE_EITHER = (15,)
+"""Steps at which a look has no reading: found at once, and with a later move."""
 
 
 class Rover(ProblemBase):
@@ -67,7 +70,7 @@ class Rover(ProblemBase):
 
 
 class Robot:
-    """The rover; each second look comes late.
+    """The rover; each second look comes late, and some give no reading.
 
     ``kill_at`` names the steps at which, in the midst of the move, the process whose id is in the
     file ``victim`` is killed: the service's, or the robot's own.
@@ -89,6 +92,8 @@ class Robot:
     def perform_sensing(self, sensing_action: int) -> Any:
         step = self._world.step
         shown = self._world.perform_sensing(sensing_action)
+        if step in NO_READING:
+            return NO_READING[step]
         if step // 3 % 2 == 0:
             return shown
         looks = [line for line in self._looks.read_text().splitlines() if line]
@@ -97,11 +102,13 @@ class Robot:
         self._looks.write_text("\n".join(looks))
         return LATER
 
-    def late_observations(self) -> list[tuple[int, list[float]]]:
+    def late_observations(self) -> list[tuple[int, list[float] | None]]:
         now = self._world.step
         looks = (line.split() for line in self._looks.read_text().splitlines())
         return [
-            (int(step), [float.fromhex(value)]) for step, value in looks if int(step) + LATE == now
+            (int(step), None if int(step) in NOT_LATE_EITHER else [float.fromhex(value)])
+            for step, value in looks
+            if int(step) + LATE == now
         ]
 
     def perform(self, task_action: Any) -> Any:

@@ -227,7 +227,7 @@ class Meddling:
         self._controller = controller
         self._step = 0
 
-    def perform_sensing(self, sensing_action: int) -> FloatArray | Later:
+    def perform_sensing(self, sensing_action: int) -> FloatArray | Later | None:
         return self._environment.perform_sensing(sensing_action)
 
     def perform(self, task_action: FloatArray) -> float | MoveResult | None:

@@ -1,16 +1,18 @@
-"""Moves that show something and looks that come late, through services and crashes.
+"""Moves that show something, looks that come late or show nothing, through services and crashes.
 
 The decisions are those of a run in process that nothing disturbs.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import yaml
 from tests.processes.faults import LOST, Service, Site, assert_identical, events_of
+from tests.processes.rover import NO_READING, NOT_LATE_EITHER
 
 from holdfast.recording.reading import open_run
 
@@ -63,8 +65,15 @@ def test_in_process(reference: Path) -> None:
         assert [motion.size for motion in trial.motions] == [1] * STEPS
         assert [shown.size for shown in trial.move_observations] == [1] * STEPS
         sizes = [shown.size for shown in trial.observations]
+        assert trial.sensing_steps.tolist() == list(range(0, STEPS, 3))
         # That of the last sensing step, 39, would come after the end.
-        assert sizes == [1] * (len(sizes) - 1) + [0]
+        without = {*NO_READING, *NOT_LATE_EITHER, 39}
+        assert sizes == [int(step not in without) for step in range(0, STEPS, 3)]
+        assert trial.result is not None
+        assert trial.result.missing_observations == len(without)
+    told = [event for event in events_of(reference) if event["event"] == "no_reading"]
+    assert [event.get("taken", event["step"]) for event in told] == [6, 12, 15, 21] * 2
+    assert json.loads((reference / "summary.json").read_text())["missing_observations"] == 10
 
 
 def test_through_a_service(site: Site, reference: Path) -> None:

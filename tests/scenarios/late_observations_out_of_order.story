@@ -52,6 +52,7 @@ late step=27 moves=none
    0.2706  robot    hears of call 6: its end
    0.2778  robot    performs task actions 24 to 26
    0.3084  robot    performs sensing action 0 of step 27
+   0.3094  robot    no_reading trial=0 step=27 sensing_action=0 reason=the belief stays as it is
    0.3094  robot    asks cloud-1, call 7
    0.3124  robot    hears of call 7: TaskAnswer
    0.3124  robot    performs task action 27

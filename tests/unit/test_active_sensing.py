@@ -9,7 +9,7 @@ import pytest
 
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import CheckpointError
-from holdfast.planning import digest
+from holdfast.planning import Planner, digest
 from holdfast.ros.active_sensing import (
     ActiveSensing,
     DecisionRequest,
@@ -56,6 +56,23 @@ def test_what_nobody_can_answer_is_said() -> None:
             state=state._replace(belief=type(state.belief).uniform(np.zeros((3, 3)))),
         )
     )
+
+
+def test_nan_is_no_reading() -> None:
+    service = ActiveSensing(configuration())
+    state = service.answer(DecisionRequest(RequestKind.INITIALIZE, seed=3, trial=1)).state
+    assert state is not None
+    answer = service.answer(
+        DecisionRequest(
+            RequestKind.CHOOSE_TASK_ACTIONS, state=state, observation=np.array([np.nan])
+        )
+    )
+    used = configuration()
+    planner = Planner(used.problem, used.planning)
+    expected, _ = planner.observe(state, 0, None)
+    assert answer.error is ErrorCode.OK
+    action, _ = planner.choose_task_action(expected)
+    assert np.array_equal(answer.task_actions[0], action)
 
 
 def test_another_configuration_is_told_by_its_digest_but_not_by_its_seed() -> None:

@@ -25,7 +25,13 @@ from holdfast.protocol.events import (
     Sensed,
 )
 from holdfast.randomness import Stream
-from holdfast.robot.environment import LATER, Environment, EnvironmentMaker, SimulatedEnvironment
+from holdfast.robot.environment import (
+    LATER,
+    Environment,
+    EnvironmentMaker,
+    MissingReadings,
+    SimulatedEnvironment,
+)
 from holdfast.robot.environment_runner import (
     EnvironmentRunner,
     InlineRunner,
@@ -97,15 +103,24 @@ class Bench:
         resumed: bool = False,
         timeout_ms: float = 1e3 * PATIENCE_S,
         problem: Any = None,
+        missing: MissingReadings | None = None,
     ) -> OnLoop:
         make = environment if callable(environment) else lambda: environment
         problem = problem or PegInHole2D()
         runner: EnvironmentRunner
         if self.kind == "inline":
-            runner = InlineRunner(make, problem, self.deliver, "robot", resumed=resumed)
+            runner = InlineRunner(
+                make, problem, self.deliver, "robot", resumed=resumed, missing=missing
+            )
         else:
             runner = ThreadedRunner(
-                make, problem, self.deliver, "robot", timeout_ms, resumed=resumed
+                make,
+                problem,
+                self.deliver,
+                "robot",
+                timeout_ms,
+                resumed=resumed,
+                missing=missing,
             )
         return self.drive(runner)
 
@@ -344,7 +359,6 @@ class TestFailures:
     @pytest.mark.parametrize(
         ("method", "answer", "expected"),
         [
-            ("perform_sensing", None, "returned None; it must return an array of shape (1,)"),
             ("perform_sensing", 0.5, "returned 0.5; it must return an array of shape (1,)"),
             ("perform_sensing", [0.5, 0.5], "returned [0.5, 0.5]; it must return an array of sha"),
             ("perform_sensing", [], "returned []; it must return an array of shape (1,)"),
@@ -352,7 +366,7 @@ class TestFailures:
             ("perform_sensing", [[1], [1, 2]], "it must return an array of shape (1,)"),
             ("perform_sensing", [1j], "returned [1j]; it must return an array of shape (1,)"),
             ("perform_sensing", np.zeros((1, 1)), "returned an array of shape (1, 1): array([[0.]"),
-            ("perform_sensing", [float("nan")], "returned [nan]; it must return finite numbers"),
+            ("perform_sensing", [float("inf")], "returned [inf]; it must return finite numbers"),
             ("perform_sensing", [float("inf")], "returned [inf]; it must return finite numbers"),
             ("perform", float("nan"), "returned nan; it must return a finite number, the reward"),
             (
@@ -695,6 +709,42 @@ class TestShown:
         ((step, observation),) = acted.late
         assert (step, observation.tolist()) == (0, [1.5])
 
+    @pytest.mark.parametrize("nothing", [None, [np.nan], np.full(3, np.nan), float("nan")])
+    def test_no_reading(self, nothing: Any, bench: Bench) -> None:
+        """At once, or of an earlier step; what is NaN in a part is an error, not a reading."""
+        robot = self.late_robot([(0, nothing), (1, [1.5])])
+        robot.answers["perform_sensing"] = nothing
+        runner = bench.begin(robot)
+        runner.sense(0, 1)
+        assert bench.event() == Sensed(0, None, no_reading=True)
+        runner.perform(0, ACTION)
+        acted = bench.event()
+        assert isinstance(acted, Acted)
+        assert (acted.no_reading, [late.step for late in acted.late]) == ((0,), [1])
+        robot.answers["perform_sensing"] = [np.nan, 1.0]
+        runner.sense(1, 1)
+        assert "an array of shape (1,), or None" in bench.failure().text
+
+    def test_too_many_in_a_row_stop_the_run(self, bench: Bench) -> None:
+        """An observation, late or not, begins the count anew; what is still to come does not."""
+        robot = self.late_robot()
+        runner = bench.begin(robot, missing=MissingReadings(2))
+
+        def sense(shown: Any) -> EnvironmentEvent:
+            robot.answers["perform_sensing"] = shown
+            runner.sense(0, 1)
+            return bench.event()
+
+        for shown in (None, None, [1.0], None, LATER, None):
+            assert isinstance(sense(shown), Sensed)
+        failed = sense(None)
+        assert isinstance(failed, EnvironmentFailed)
+        assert failed.text == (
+            "robot: perform_sensing gave no reading 3 times in a row; "
+            "environment.max_missing_in_a_row allows 2"
+        )
+        assert not failed.action_in_doubt
+
     def test_later_needs_a_way_to_come(self, bench: Bench) -> None:
         runner = bench.begin(Robot(perform_sensing=LATER))
         runner.sense(0, 1)
@@ -725,7 +775,7 @@ class TestShown:
             ([3.0], "a list of (step, observation)"),
             ([(0.5, [1.0])], "a whole number >= 0"),
             ([(0, "far")], "a list of (step, observation) with observations of shape (n,)"),
-            ([(0, [np.nan])], "finite numbers"),
+            ([(0, [np.nan, 1.0])], "finite numbers"),
         ],
     )
     def test_what_cannot_come_late(self, late: Any, message: str, bench: Bench) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from holdfast.errors import EnvironmentFailedError
 from holdfast.problems.registry import problem_class
+from holdfast.robot.environment import MissingReadings
 from holdfast.ros.executive import DecideCode, DecideRequest, DecisionHandover, ExecutiveEnvironment
 
 FOREVER_S = 60.0
@@ -128,7 +129,7 @@ def test_after_a_crash_the_call_before_is_known_as_such(
             DecideRequest(0, 1, np.zeros(4)),
             "observation of 4 values: sensing action 0 of peg_in_hole_2d",
         ),
-        (DecideRequest(0, 1, np.array([np.nan])), "observation[0] is nan: must be a finite number"),
+        (DecideRequest(0, 1, np.array([np.inf])), "observation[0] is inf: must be a finite number"),
         (DecideRequest(0, 1, observation(), np.inf), "reward inf: must be a finite number"),
         (
             DecideRequest(0, 1, observation(), done=True),
@@ -148,6 +149,15 @@ def test_a_bad_answer_changes_nothing(robot: Robot, call: DecideRequest, message
     assert reply.code == DecideCode.BAD_REQUEST
     assert message in reply.message
     assert not sensed.done()
+    meeting.end(DecideCode.ENDED, "over")
+
+
+def test_nan_is_no_reading(robot: Robot) -> None:
+    meeting = executive()
+    sensed = robot.ask(ExecutiveEnvironment(meeting).perform_sensing, 0)
+    assert meeting.call(DecideRequest(), FOREVER_S).code == DecideCode.OK
+    meeting.call(DecideRequest(0, 1, np.array([np.nan])), 0.0)
+    assert MissingReadings().is_missing("decide", sensed.result())
     meeting.end(DecideCode.ENDED, "over")
 
 

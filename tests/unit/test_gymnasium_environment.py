@@ -17,7 +17,12 @@ import holdfast as hf
 from holdfast.config.loader import load
 from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import MoveResult
-from holdfast.robot.environment import CountingEnvironment, RememberingEnvironment, load_environment
+from holdfast.robot.environment import (
+    CountingEnvironment,
+    MissingReadings,
+    RememberingEnvironment,
+    load_environment,
+)
 from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
 
 CAR = "MountainCarContinuous-v0"
@@ -254,6 +259,10 @@ class TestWhatIsShown:
         environment = counter(sensing=sense)
         environment.perform(RIGHT)
         assert environment.perform_sensing(1).tolist() == [3.0, 1.0]
+
+    def test_a_function_may_have_no_reading(self) -> None:
+        environment = counter(sensing=lambda *_: None, sensing_noise=[[0.1, 0.2], [0.1, 0.2]])
+        assert MissingReadings().is_missing("counter", environment.perform_sensing(1))
 
     def test_dictionaries_are_flattened_as_gymnasium_does(self) -> None:
         environment = counter(sensing=[[0, 2, 3]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -76,6 +77,27 @@ def test_each_observation_comes_so_many_moves_later(moves: int) -> None:
 def test_a_late_robot_gets_there_all_the_same() -> None:
     result, _ = run(SenseLater(world(), 3), 500)
     assert result.success
+
+
+@pytest.mark.parametrize("make", [SenseInBackground, lambda robot: SenseLater(robot, 2)])
+def test_no_reading_may_be_found_late(make: Callable[[Any], Any]) -> None:
+    """The belief stays as it is; the observation just does not come."""
+
+    class Blind(SimulatedEnvironment):
+        def perform_sensing(self, sensing_action: int) -> Any:
+            return None
+
+    planner = planner_of()
+    state, steps = planner.init(5), 21
+    while state.step < steps:
+        if planner.needs_sensing(state):
+            state, _ = planner.observe(state, planner.choose_sensing_action(state)[0], None)
+        state = planner.advance(state, planner.choose_task_action(state)[0])
+    result, noting = run(make(Blind(PegInHole2D(), 5, 0)), steps)
+    assert result.decisions is not None
+    assert result.decisions.log.endswith(planner.digest(state))
+    assert noting.late == []
+    assert result.missing_observations == len(noting.sensed_at) == 7
 
 
 def test_no_moves_are_no_lateness() -> None:

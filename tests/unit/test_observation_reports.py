@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -55,6 +56,34 @@ def in_process(on_lost: OnLost) -> TrialResult:
         environment=Kidnapped(PROBLEM, SIMULATOR.seed, 0),
         lost=LostSettings(on_lost=on_lost),
     )
+
+
+class Blinking(SimulatedEnvironment):
+    """Every second look has no reading."""
+
+    def perform_sensing(self, sensing_action: int) -> Any:
+        return None if self.step % 8 else super().perform_sensing(sensing_action)
+
+
+def test_what_gave_no_reading_is_told_and_counted() -> None:
+    """And services decide as the loop in process does."""
+    world = World(simulator=SimulatorSettings(num_trials=1, max_steps=200, seed=12))
+    world.environment_class = Blinking
+    world.start()
+    world.run()
+    (result,) = world.results
+    told = [e.fields for _, e in world.trace if isinstance(e, LogEvent) and e.name == "no_reading"]
+    assert result.missing_observations > 10
+    assert len(told) == 10
+    assert [each["step"] for each in told] == list(range(4, 84, 8))
+    assert told[0]["sensing_action"] in range(3)
+    assert str(told[-1]["reason"]).endswith("further ones of this trial are counted only")
+    assert world.robot.reports.counts["no_reading"] == result.missing_observations
+    expected = run_trial(
+        Planner(PROBLEM, PLANNING), 12, max_steps=200, environment=Blinking(PROBLEM, 12, 0)
+    )
+    assert result.digest == expected.digest
+    assert result.missing_observations == expected.missing_observations
 
 
 def test_a_lost_robot_is_told_and_goes_on() -> None:

@@ -59,6 +59,7 @@ class TestTables:
             "digest",
             "lost",
             "suspect_sensors",
+            "missing_observations",
             "outcome",
             "reason",
         )
@@ -97,6 +98,30 @@ class TestTables:
         summary = builder.build(problem="p", seed=5, version="1", trials=3, wall_time_s=2.0)
         assert (summary.lost, summary.suspect_sensors) == (3, 1)
         assert dict(_summary_rows(summary))["lost"].startswith("3 times, 1 suspect sensor (")
+
+    @pytest.mark.parametrize(("unexplained", "is_advised"), [(5, False), (6, True)])
+    def test_unexplained_observations_lead_to_advice_above_the_share_of_a_sound_belief(
+        self, unexplained: int, is_advised: bool
+    ) -> None:
+        builder = SummaryBuilder()
+        builder.add(
+            msgspec.structs.replace(
+                result_of(0), sensing_decisions=100, unexplained_observations=unexplained
+            )
+        )
+        summary = builder.build(problem="p", seed=5, version="1", trials=1, wall_time_s=2.0)
+        said = " ".join(value for _, value in _summary_rows(summary))
+        assert f"{unexplained} of 100 observations over 8 sigma" in said
+        assert ("take more particles" in said) == is_advised
+
+    def test_missing_observations_are_told_if_there_are_any(self) -> None:
+        builder = SummaryBuilder()
+        for trial, missing in enumerate([2, 0, 1]):
+            result = msgspec.structs.replace(result_of(trial), sensing_decisions=5)
+            builder.add(msgspec.structs.replace(result, missing_observations=missing))
+        summary = builder.build(problem="p", seed=5, version="1", trials=3, wall_time_s=2.0)
+        assert summary.missing_observations == 3
+        assert dict(_summary_rows(summary))["no reading"] == "3 of 15 looks had no observation"
 
     def test_failures_are_no_successes_and_told_if_there_are_any(self) -> None:
         builder = SummaryBuilder()

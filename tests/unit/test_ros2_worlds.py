@@ -19,6 +19,7 @@ def parameters(tmp_path: Path, kind: str) -> NodeParameters:
         "configuration": str(EXAMPLE),
         "run_directory": str(tmp_path),
         "environment.kind": kind,
+        "environment.max_missing_in_a_row": 3,
     }
     return read_parameters(values)
 
@@ -40,6 +41,7 @@ def test_an_executives_world_ends_its_calls_when_interrupted(tmp_path: Path) -> 
     environment = world.maker(3, resumed=True, performed=[np.zeros(3)])
     assert isinstance(environment, ExecutiveEnvironment)
     assert environment.steps_performed() == 1
+    assert world.maker.max_missing_in_a_row == 3
     assert world.handover is not None
     world.interrupt("the node was deactivated")
     reply = world.handover.call(DecideRequest(), 0.0)

@@ -13,7 +13,7 @@ from holdfast.errors import InvalidValueError, TransportError
 from holdfast.outcome import SensingDecision, TaskDecision
 from holdfast.planning import Planner
 from holdfast.protocol.status import Status
-from holdfast.robot.environment import LATER, Environment, SimulatedEnvironment
+from holdfast.robot.environment import Environment, SimulatedEnvironment
 from holdfast.robot.trial import run_trial
 from holdfast.ros.active_sensing import (
     ActiveSensing,
@@ -62,7 +62,7 @@ def decisions(
         ).sensing_action
         made.append(chosen)
         observation = environment.perform_sensing(chosen)
-        assert observation is not LATER
+        assert isinstance(observation, np.ndarray)
         answer = client.decide(
             DecisionRequest(
                 RequestKind.CHOOSE_TASK_ACTIONS,

@@ -6,6 +6,7 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from holdfast.arrays import FloatArray
@@ -109,6 +110,55 @@ class TestOneTrial:
                     max_steps=simulator.max_steps,
                     environment=world,
                 )
+
+    @pytest.mark.parametrize("nothing", [None, np.array([np.nan])])
+    def test_without_a_reading_the_belief_stays(self, nothing: Any, tmp_path: Path) -> None:
+        """And the trial is the one of a planner that is told None there."""
+        configuration = configuration_of(tmp_path)
+        problem, planning = configuration.problem, configuration.planning
+
+        class Blinks(SimulatedEnvironment):
+            def perform_sensing(self, sensing_action: int) -> Any:
+                return nothing if self.step % 2 else super().perform_sensing(sensing_action)
+
+        planner = Planner(problem, planning)
+        world = Blinks(problem, 3, 0)
+        result = run_trial(planner, 3, max_steps=40, environment=world)
+        state, world = planner.init(3), Blinks(problem, 3, 0)
+        missing = 0
+        while not world.is_done() and state.step < 40:
+            if planner.needs_sensing(state):
+                chosen, _ = planner.choose_sensing_action(state)
+                shown = world.perform_sensing(chosen)
+                missing += shown is nothing
+                state, _ = planner.observe(state, chosen, None if shown is nothing else shown)
+            action, _ = planner.choose_task_action(state)
+            world.perform(action)
+            state = planner.advance(state, action)
+        assert result.decisions is not None
+        assert result.decisions.log.endswith(planner.digest(state))
+        assert result.missing_observations == missing > 0
+        assert result.sensing_decisions > missing
+
+    def test_a_robot_without_any_reading_is_stopped(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path)
+
+        class Blind(SimulatedEnvironment):
+            def perform_sensing(self, sensing_action: int) -> Any:
+                return None
+
+        planner = Planner(configuration.problem, configuration.planning)
+        with pytest.raises(
+            EnvironmentFailedError,
+            match=r"Blind: perform_sensing gave no reading 3 times in a row; "
+            r"environment\.max_missing_in_a_row allows 2",
+        ):
+            run_trial(
+                planner,
+                3,
+                environment=Blind(configuration.problem, 3, 0),
+                max_missing_in_a_row=2,
+            )
 
     def test_other_trials_and_seeds_decide_otherwise(self, tmp_path: Path) -> None:
         configuration = configuration_of(tmp_path)

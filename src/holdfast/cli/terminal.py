@@ -234,6 +234,7 @@ def _verified_text(summary: RunSummary) -> str:
 
 def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
     from holdfast.belief import VALIDATION_GATE_SQUARED
+    from holdfast.lost import MAX_OUTSIDE
     from holdfast.protocol.question import OWN_PLANNER
 
     rows = []
@@ -266,6 +267,9 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
                 f"({counted(summary.sensing_decisions, 'decision')})",
             )
         )
+    if summary.missing_observations:
+        shown = f"{summary.missing_observations:,} of {counted(summary.sensing_decisions, 'look')}"
+        rows.append(("no reading", f"{shown} had no observation"))
     if summary.unexplained_observations:
         deviations = f"{VALIDATION_GATE_SQUARED**0.5:g}"
         number, looks = summary.unexplained_observations, summary.sensing_decisions
@@ -273,7 +277,7 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
         shown = counted(looks, "observation") if number <= looks else "the looks and moves"
         far = f"{number:,} of {shown} over {deviations} sigma from every particle"
         rows.append(("unexplained", far))
-        if summary.unexplained_observations * 100 > summary.sensing_decisions:
+        if number > MAX_OUTSIDE * looks:  # more than the test of a lost robot allows for
             remedy = "take more particles (particle_filter.num_particles), or check the model"
             rows.append(("", remedy))
     if summary.lost or summary.suspect_sensors:

@@ -345,6 +345,8 @@ class EnvironmentSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
     sense_in_background : bool
         Whether the robot goes on while it senses; ``perform_sensing`` and ``perform`` then run at
         the same time.
+    max_missing_in_a_row : int
+        How often in a row sensing may give no reading before the run stops.
     """
 
     object: Text | None = None
@@ -352,6 +354,7 @@ class EnvironmentSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
     arguments: dict[str, Any] = msgspec.field(default_factory=dict)
     timeout_ms: Milliseconds = 60_000.0
     sense_in_background: bool = False
+    max_missing_in_a_row: Annotated[int, msgspec.Meta(ge=0, le=1_000_000)] = 20
 
 
 class PlanningSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

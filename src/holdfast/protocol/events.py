@@ -87,11 +87,12 @@ TransportEvent: TypeAlias = ServiceAppeared | ServiceVanished | ReplyReceived | 
 class Sensed(NamedTuple):
     """A sensing action was performed; the observation is finite and read-only.
 
-    None if it comes later: with a task action.
+    None if it comes later (with a task action), or never: ``no_reading``.
     """
 
     step: int
     observation: FloatArray | None
+    no_reading: bool = False
 
 
 class Acted(NamedTuple):
@@ -105,6 +106,8 @@ class Acted(NamedTuple):
         What the move has shown.
     late : tuple of LateObservation
         Observations of earlier steps that have come meanwhile.
+    no_reading : tuple of int
+        Earlier steps of which it is known now that no observation will come.
     """
 
     step: int
@@ -113,6 +116,7 @@ class Acted(NamedTuple):
     motion: FloatArray | None = None
     observation: FloatArray | None = None
     late: tuple[LateObservation, ...] = ()
+    no_reading: tuple[int, ...] = ()
 
 
 class EnvironmentReady(NamedTuple):

@@ -20,6 +20,8 @@ __all__ = ["ObservationReports", "held_error"]
 _MAX_REPORTS = 10
 """Bound on reports of each kind per trial; all are counted."""
 
+_COUNTED_ONLY = "; further ones of this trial are counted only"
+
 _FAR = f"more than {VALIDATION_GATE_SQUARED**0.5:g} standard deviations from every particle"
 
 _WHY = {
@@ -42,8 +44,9 @@ class ObservationReports:
         self._effects = effects
         self._lost = lost
         self.counts: Counter[str] = Counter()
-        self._unused_of: int | None = None
-        self._num_unused = 0
+        # Of the trial that was heard of last.
+        self._trial: int | None = None
+        self._reported: Counter[str] = Counter()
 
     def observed(
         self, trial: Trial, step: int, info: ObservationInfo, **of_what: object
@@ -63,7 +66,7 @@ class ObservationReports:
                 **of_what,
                 **({} if distance is None else {"deviations": distance}),
                 reason=("no particle can have made it" if distance is None else _FAR)
-                + ("; further ones of this trial are counted only" if more else ""),
+                + (_COUNTED_ONLY if more else ""),
             )
         alarm = trial.alarm
         if alarm is None:
@@ -74,27 +77,35 @@ class ObservationReports:
 
     def late_unused(self, trial: Trial, taken: int) -> None:
         """Report that an observation of an earlier step came and none of that step is awaited."""
-        number = trial.state.trial
-        if number != self._unused_of:
-            self._unused_of, self._num_unused = number, 0
-        self._num_unused += 1
-        self.counts["late_unused"] += 1
-        if self._num_unused <= _MAX_REPORTS:
-            more = self._num_unused == _MAX_REPORTS
-            self._effects.report(
-                "late_unused",
-                trial=number,
-                step=trial.state.step,
-                taken=taken,
-                reason="no observation of that step is awaited: it has come before, was given up, "
-                "or nothing was sensed there"
-                + ("; further ones of this trial are counted only" if more else ""),
-            )
+        self._bounded(
+            trial,
+            "late_unused",
+            "no observation of that step is awaited: it has come before, was given up, or nothing "
+            "was sensed there",
+            taken=taken,
+        )
+
+    def no_reading(self, trial: Trial, **of_what: object) -> None:
+        """Report that sensing in a step, this one unless ``taken`` says, gave no reading."""
+        self._bounded(trial, "no_reading", "the belief stays as it is", **of_what)
 
     def reinitialised(self, trial: Trial) -> None:
         """Report that the belief of a lost robot has begun anew."""
         self.counts["reinitialised"] += 1
         self._effects.report("reinitialised", trial=trial.state.trial, step=trial.state.step)
+
+    def _bounded(self, trial: Trial, name: str, reason: str, **fields: object) -> None:
+        """Count an event, and report it unless there were many of its kind in this trial."""
+        number = trial.state.trial
+        if number != self._trial:
+            self._trial = number
+            self._reported.clear()
+        self.counts[name] += 1
+        self._reported[name] += 1
+        if self._reported[name] <= _MAX_REPORTS:
+            if self._reported[name] == _MAX_REPORTS:
+                reason += _COUNTED_ONLY
+            self._effects.report(name, trial=number, step=trial.state.step, **fields, reason=reason)
 
     def _raised(self, trial: Trial, step: int, alarm: Verdict) -> None:
         is_lost = alarm.kind == "lost"

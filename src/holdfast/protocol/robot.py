@@ -102,15 +102,11 @@ class Robot:
         self._computed_ms = 0.0
         self._timed_provenance: Provenance | None = None
         self._unwritten: list[Record] = []
-        self._pausing = self._stopped = False
+        self._pausing = self._stopped = self.has_decided = False
         self._next_tick: float | None = None
         self._asleep_until: float | None = None
-        self._recoveries_counted = 0
-        self._reported_ticks = 0
         self._report_ticks_at = 0.0
-        self.missed_ticks = 0
-        self.num_performed = 0
-        self.has_decided = False
+        self._recoveries_counted = self._reported_ticks = self.missed_ticks = self.num_performed = 0
 
     @property
     def status(self) -> Status:
@@ -310,6 +306,8 @@ class Robot:
             self._stop(error)
             return
         self._write(record)
+        if event.no_reading:
+            self.reports.no_reading(history, sensing_action=sensing_action)
         state = history.state
         self._judge(step, info, sensing_action=sensing_action)
         self._hold_if_lost()
@@ -343,6 +341,8 @@ class Robot:
             self._fold_move(event)
             for late in event.late:
                 self._came_late(late)
+            for step in event.no_reading:
+                self.reports.no_reading(self._current_history, taken=step)
             self._hold_if_lost()
         except HoldfastError as error:
             self._stop(error)

@@ -44,6 +44,8 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         Earlier work reports this one.
     mean_steps : float or None
         Arithmetic mean; ``compare --outcomes`` takes the geometric one, of which it shows ratios.
+    missing_observations : int
+        Sensing actions without an observation.
     unexplained_observations : int
         Observations that no particle explains.
     lost, suspect_sensors : int
@@ -77,6 +79,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     mean_reward_of_successes: float | None
     mean_steps: float | None
     sensing_decisions: int
+    missing_observations: int = 0
     unexplained_observations: int
     lost: int = 0
     suspect_sensors: int = 0
@@ -156,6 +159,7 @@ class SummaryBuilder:
         self._reward_of_successes: float | None = 0.0
         self._steps = 0
         self._sensing_decisions = 0
+        self._missing = 0
         self._unexplained = 0
         self._lost = 0
         self._suspect_sensors = 0
@@ -173,6 +177,7 @@ class SummaryBuilder:
         self._failures += result.failed
         self._steps += result.steps
         self._sensing_decisions += result.sensing_decisions
+        self._missing += result.missing_observations
         self._unexplained += result.unexplained_observations
         self._lost += result.lost
         self._suspect_sensors += result.suspect_sensors
@@ -211,6 +216,7 @@ class SummaryBuilder:
             mean_reward_of_successes=_mean(self._reward_of_successes, self._successes),
             mean_steps=self._steps / count if count else None,
             sensing_decisions=self._sensing_decisions,
+            missing_observations=self._missing,
             unexplained_observations=self._unexplained,
             lost=self._lost,
             suspect_sensors=self._suspect_sensors,

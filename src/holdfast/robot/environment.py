@@ -20,7 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import checked
-from holdfast.arrays import FloatArray, KeepsReadOnly, floats, integer, whole
+from holdfast.arrays import FloatArray, KeepsReadOnly, floats, integer, real_numbers, whole
+from holdfast.config.settings import EnvironmentSettings
 from holdfast.config.user_code import find_class
 from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import Done, MoveResult
@@ -38,6 +39,7 @@ __all__ = [
     "EnvironmentMaker",
     "LateSensingEnvironment",
     "Later",
+    "MissingReadings",
     "ObservationSizes",
     "RememberingEnvironment",
     "SimulatedEnvironment",
@@ -71,11 +73,12 @@ LATER = Later.LATER
 class Environment(Protocol):
     """A world that can be sensed and moved."""
 
-    def perform_sensing(self, sensing_action: int) -> FloatArray | Later:
+    def perform_sensing(self, sensing_action: int) -> FloatArray | Later | None:
         """Perform a sensing action and return the observation, shape ``(observation_size,)``.
 
-        Or :data:`LATER`: the robot goes on, and :meth:`LateSensingEnvironment.late_observations`
-        returns it when it is there.
+        None, or NaN in every component, is no reading: the belief stays as it is. Or :data:`LATER`:
+        the robot goes on, and :meth:`LateSensingEnvironment.late_observations` returns it when it
+        is there.
         """
         ...
 
@@ -100,11 +103,11 @@ class Environment(Protocol):
 class LateSensingEnvironment(Environment, Protocol):
     """An environment whose sensing takes time: it returns :data:`LATER`."""
 
-    def late_observations(self) -> Sequence[tuple[int, npt.ArrayLike]]:
+    def late_observations(self) -> Sequence[tuple[int, npt.ArrayLike | None]]:
         """Return what has come since the last call; asked after each task action.
 
-        Each entry is a step and an observation. The step says when the sensing action was
-        performed: it is the number of task actions that this trial had had then.
+        Each entry is a step and an observation, None for no reading. The step says when the sensing
+        action was performed: it is the number of task actions that this trial had had then.
         """
         ...
 
@@ -245,6 +248,41 @@ def require_methods(environment: object, name: str) -> None:
         )
 
 
+class MissingReadings:
+    """Tells no reading from an observation, and bounds how many come without one in a row.
+
+    Parameters
+    ----------
+    max_in_a_row : int
+        ``environment.max_missing_in_a_row``.
+    """
+
+    def __init__(self, max_in_a_row: int = EnvironmentSettings().max_missing_in_a_row) -> None:
+        self._max_in_a_row = max_in_a_row
+        self._in_a_row = 0
+
+    def is_missing(self, called: str, shown: object) -> bool:
+        """Return whether sensing has given no reading: None, or NaN in every component.
+
+        Raises
+        ------
+        EnvironmentFailedError
+            If it has given none too often in a row; ``called`` is the method in the message.
+        """
+        if shown is not None:
+            numbers = real_numbers(shown)
+            if numbers is None or not numbers.size or not np.isnan(numbers).all():
+                self._in_a_row = 0
+                return False
+        self._in_a_row += 1
+        if self._in_a_row > self._max_in_a_row:
+            raise EnvironmentFailedError(
+                f"{called} gave no reading {self._in_a_row} times in a row; "
+                f"environment.max_missing_in_a_row allows {self._max_in_a_row}"
+            )
+        return True
+
+
 class ObservationSizes(dict[int, "int | None"]):
     """Numbers that a problem expects of each sensing action; None where it does not say."""
 
@@ -295,6 +333,8 @@ class EnvironmentMaker:
         Keyword arguments for the class.
     sense_in_background : bool
         Whether the robot goes on while it senses.
+    max_missing_in_a_row : int
+        Of :class:`MissingReadings`.
 
     Raises
     ------
@@ -312,8 +352,10 @@ class EnvironmentMaker:
         arguments: Mapping[str, Any] | None = None,
         *,
         sense_in_background: bool = False,
+        max_missing_in_a_row: int = EnvironmentSettings().max_missing_in_a_row,
     ) -> None:
         self.name = name
+        self.max_missing_in_a_row = max_missing_in_a_row
         self._sense_in_background = sense_in_background
         self.problem = problem
         self.timeout_ms = timeout_ms
@@ -405,6 +447,7 @@ def load_environment(configuration: Configuration) -> EnvironmentMaker:
             found,
             settings.arguments,
             sense_in_background=settings.sense_in_background,
+            max_missing_in_a_row=settings.max_missing_in_a_row,
         )
     except ConfigurationError as error:
         raise ConfigurationError(f"{configuration.path}: {error}") from error

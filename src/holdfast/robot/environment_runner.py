@@ -35,7 +35,13 @@ from holdfast.protocol.events import (
     Sensed,
 )
 from holdfast.protocol.messages import MAX_ACTION_SIZE
-from holdfast.robot.environment import LATER, Environment, EnvironmentMaker, ObservationSizes
+from holdfast.robot.environment import (
+    LATER,
+    Environment,
+    EnvironmentMaker,
+    MissingReadings,
+    ObservationSizes,
+)
 from holdfast.runtime.pool import ThreadPool
 from holdfast.tracking import LateObservation
 
@@ -65,7 +71,13 @@ def make_runner(
     if maker.simulated:
         return InlineRunner(make, maker.problem, deliver, maker.name, resumed=resumed)
     return ThreadedRunner(
-        make, maker.problem, deliver, maker.name, maker.timeout_ms, resumed=resumed
+        make,
+        maker.problem,
+        deliver,
+        maker.name,
+        maker.timeout_ms,
+        resumed=resumed,
+        missing=MissingReadings(maker.max_missing_in_a_row),
     )
 
 
@@ -97,7 +109,9 @@ class EnvironmentRunner(abc.ABC):
         name: str,
         *,
         resumed: bool = False,
+        missing: MissingReadings | None = None,
     ) -> None:
+        self._missing = MissingReadings() if missing is None else missing
         self._make = make
         self._deliver = deliver
         self._name = name
@@ -148,7 +162,7 @@ class EnvironmentRunner(abc.ABC):
             if count and callable(ask):
                 self._method = "last_move"
                 last = self._moved(count - 1, ask())
-            late = self._late()
+            late, _ = self._late()
         self._method = "is_done"
         return EnvironmentReady(self._ending(environment.is_done()), count, last, late)
 
@@ -159,6 +173,8 @@ class EnvironmentRunner(abc.ABC):
         if shown is LATER:
             self._require_late_observations()
             return Sensed(step, None)
+        if self._missing.is_missing(self._called("perform_sensing"), shown):
+            return Sensed(step, None, no_reading=True)
         return Sensed(step, self._observation(sensing_action, shown))
 
     def _require_late_observations(self) -> None:
@@ -175,7 +191,8 @@ class EnvironmentRunner(abc.ABC):
         # A copy: the robot's own record of the action must stay what it is.
         action = np.array(task_action, dtype=np.float64)
         acted = self._performed = self._moved(step, self.environment.perform(action))
-        acted = self._performed = acted._replace(late=self._late())
+        late, no_reading = self._late()
+        acted = self._performed = acted._replace(late=late, no_reading=no_reading)
         self._method = "is_done"
         return acted._replace(ending=self._ending(self.environment.is_done()))
 
@@ -245,7 +262,7 @@ class EnvironmentRunner(abc.ABC):
         size = self._sizes[sensing_action]
         array = real_numbers(value)
         if array is None or array.ndim != 1 or array.size < 1 or size not in (None, array.size):
-            raise self._unusable(value, f"an array of shape ({size or 'n'},)")
+            raise self._unusable(value, f"an array of shape ({size or 'n'},), or None")
         return self._finite(array, value)
 
     def _reward(self, value: object) -> float | None:
@@ -272,26 +289,29 @@ class EnvironmentRunner(abc.ABC):
             raise self._unusable(value, need)
         return self._finite(array, value)
 
-    def _late(self) -> tuple[LateObservation, ...]:
-        """Ask for observations of earlier steps."""
+    def _late(self) -> tuple[tuple[LateObservation, ...], tuple[int, ...]]:
+        """Ask for observations of earlier steps, and of which steps there is no reading."""
         ask = getattr(self.environment, "late_observations", None)
         if not callable(ask):
-            return ()
+            return (), ()
         self._method = "late_observations"
         value = ask()
         need = "a list of (step, observation)"
         if not isinstance(value, Sequence) or isinstance(value, str):
             raise self._unusable(value, need)
-        late = []
+        late, no_reading = [], []
         for entry in value:
             if not isinstance(entry, tuple | list) or len(entry) != 2:
                 raise self._unusable(value, need)
             step = self._count(entry[0])
+            if self._missing.is_missing(self._called("late_observations"), entry[1]):
+                no_reading.append(step)
+                continue
             array = real_numbers(entry[1])
             if array is None or array.ndim != 1 or not 1 <= array.size <= MAX_ACTION_SIZE:
                 raise self._unusable(value, f"{need} with observations of shape (n,)")
             late.append(LateObservation(step, self._finite(array, value)))
-        return tuple(late)
+        return tuple(late), tuple(no_reading)
 
     def _finite(self, array: npt.NDArray[Any], value: object) -> FloatArray:
         finite = np.array(array, dtype=np.float64)
@@ -347,8 +367,9 @@ class ThreadedRunner(EnvironmentRunner):
         timeout_ms: float,
         *,
         resumed: bool = False,
+        missing: MissingReadings | None = None,
     ) -> None:
-        super().__init__(make, problem, deliver, name, resumed=resumed)
+        super().__init__(make, problem, deliver, name, resumed=resumed, missing=missing)
         self._timeout_ms = timeout_ms
         self._thread = ThreadPool(1, "environment")
         self._current: _Call | None = None

@@ -63,7 +63,7 @@ class GymnasiumEnvironment:
     sensing : sequence of coordinates, or function
         What each sensing action shows: coordinates of gymnasium's present observation, a list for
         each sensing action. Or ``function(environment, observation, sensing_action)``, which
-        returns an array.
+        returns an array, or None for no reading.
     action : function, optional
         ``function(environment, task_action)`` returns gymnasium's action. Without it, for a Box
         the task action is clipped to its limits, and its coordinates fill the Box in order; for
@@ -174,6 +174,8 @@ class GymnasiumEnvironment:
             shown = self._sensing(self.environment, self._seen, sensing_action)
         else:
             shown = self._vector(self._seen)[self._sensing[sensing_action]]
+        if shown is None:
+            return np.full(1, np.nan)  # no reading
         noise = self._sensing_noise[sensing_action if len(self._sensing_noise) > 1 else 0]
         return self._noisy(shown, noise, "sensing", Purpose.WORLD_OBSERVATION, self._steps)
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["RobotMetrics"]
 
 _COUNTERS = (
+    ("no_reading", "missing_observations", "Sensing actions that gave no reading."),
     ("unexplained", "unexplained_observations", "Observations that no particle explains."),
     ("lost", "lost", "Times that the robot was found lost."),
     ("sensor_suspect", "sensor_suspects", "Times that a sensing action was found suspect."),

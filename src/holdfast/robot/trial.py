@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast.arrays import FloatArray, real_number, real_numbers, whole
-from holdfast.config.settings import LostSettings, OnLost, SimulatorSettings
+from holdfast.config.settings import EnvironmentSettings, LostSettings, OnLost, SimulatorSettings
 from holdfast.errors import EnvironmentFailedError, HeldError, InvalidValueError, ProblemError
 from holdfast.outcome import Ending, MoveResult, TrialResult, ending_of
 from holdfast.planning import (
@@ -32,6 +32,7 @@ from holdfast.protocol.messages import MAX_ACTION_SIZE
 from holdfast.robot.environment import (
     LATER,
     Environment,
+    MissingReadings,
     SimulatedEnvironment,
     require_methods,
 )
@@ -50,8 +51,8 @@ __all__ = [
 class SensingStep(NamedTuple):
     """A sensing action, its observation, and the states before and after it.
 
-    There is no observation if it comes later, or if the choice was not to sense
-    (``planner.no_sensing``).
+    There is no observation if it comes later, if there was no reading, or if the choice was not to
+    sense (``planner.no_sensing``).
     """
 
     before: PlanningState
@@ -124,6 +125,7 @@ def run_trial(
     environment: Environment | None = None,
     observer: TrialObserver = NULL_OBSERVER,
     lost: LostSettings = _LOST_BY_DEFAULT,
+    max_missing_in_a_row: int = EnvironmentSettings().max_missing_in_a_row,
     reinitialised_after: Collection[int] | None = None,
 ) -> TrialResult:
     """Run one trial until it is done, has failed, or has had ``max_steps``.
@@ -140,6 +142,8 @@ def run_trial(
         By default simulated from the problem.
     lost : LostSettings
         When the robot counts as lost, and what it does then.
+    max_missing_in_a_row : int
+        How often in a row sensing may give no reading; once more is an EnvironmentFailedError.
     reinitialised_after : collection of int, optional
         Of a recorded trial: after how many inputs the belief was begun anew; instead of ``lost``.
 
@@ -162,6 +166,8 @@ def run_trial(
         environment = SimulatedEnvironment(planner.problem, seed, trial)
     require_methods(environment, type(environment).__name__)
     track = Trial(planner, seed, trial, lost.false_alarm_rate)
+    missing = MissingReadings(max_missing_in_a_row)
+    name = type(environment).__name__
     observer.trial_began(environment, track.state)
 
     # Only a recorded world has the first two.
@@ -173,6 +179,8 @@ def run_trial(
 
     def take_late(method: str) -> None:
         for step, came in late_ones[method]() if method in late_ones else ():
+            if missing.is_missing(f"{name}: {method}", came):
+                continue
             late = LateObservation(step, _reading(environment, method, came))
             found = track.observe_late(late)
             if found is not None:
@@ -182,7 +190,7 @@ def run_trial(
     ending = _ask_done(environment)
     while ending is None and track.state.step < max_steps:
         if planner.needs_sensing(track.state):
-            _sense(track, environment, observer)
+            _sense(track, environment, observer, missing)
             _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
         take_late("late_before_choosing")
         before = track.state
@@ -215,7 +223,9 @@ def run_trial(
     return ended
 
 
-def _sense(track: Trial, environment: Environment, observer: TrialObserver) -> None:
+def _sense(
+    track: Trial, environment: Environment, observer: TrialObserver, missing: MissingReadings
+) -> None:
     planner, before = track.planner, track.state
     started = perf_counter()
     sensing_action, sensing_info = planner.choose_sensing_action(before)
@@ -223,7 +233,8 @@ def _sense(track: Trial, environment: Environment, observer: TrialObserver) -> N
     observation = None
     if sensing_action != planner.no_sensing:
         shown = environment.perform_sensing(sensing_action)
-        if shown is not LATER:
+        called = f"{type(environment).__name__}: perform_sensing"
+        if shown is not LATER and not missing.is_missing(called, shown):
             observation = _reading(environment, "perform_sensing", shown)
     info, _ = track.observe(sensing_action, observation, sensing_ms)
     observer.sensed(

@@ -89,7 +89,7 @@ class DecisionRequest(NamedTuple):
     sensing_action : int
         The sensing action that was performed.
     observation : array of shape (observation_size,)
-        Its result.
+        Its result; NaN in every component is no reading.
     """
 
     kind: int
@@ -199,8 +199,10 @@ class ActiveSensing:
             entropies = _NO_ENTROPIES if info.entropies is None else info.entropies
             return DecisionAnswer(ErrorCode.OK, "", self.configuration, state, chosen, entropies)
         if needs_sensing:
-            none = request.sensing_action == planner.no_sensing and not request.observation.size
-            observation = None if none else request.observation
+            shown = request.observation
+            chosen_not_to = request.sensing_action == planner.no_sensing and not shown.size
+            no_reading = bool(shown.size) and bool(np.isnan(shown).all())
+            observation = None if chosen_not_to or no_reading else shown
             state, _ = planner.observe(state, request.sensing_action, observation)
         elif request.observation.size:
             raise InvalidValueError(

@@ -197,7 +197,8 @@ class DecisionHandover:
                 f"observation of {call.observation.size} values: sensing action "
                 f"{due.sensing_action} of {self._problem.name} has {size or 'at least 1'}"
             )
-        if not np.isfinite(call.observation).all():
+        # NaN in every component is no reading, as for any environment.
+        if not np.isfinite(call.observation).all() and not np.isnan(call.observation).all():
             place = int(np.argmin(np.isfinite(call.observation)))
             raise InvalidValueError(
                 f"observation[{place}] is {call.observation[place]}: must be a finite number"
@@ -251,8 +252,16 @@ class ExecutiveEnvironment:
 class ExecutiveMaker(EnvironmentMaker):
     """Makes the environment of each trial; a decision may take the executive ``timeout_ms``."""
 
-    def __init__(self, executive: DecisionHandover, problem: Problem, timeout_ms: float) -> None:
-        super().__init__("the executive", problem, 0, timeout_ms)
+    def __init__(
+        self,
+        executive: DecisionHandover,
+        problem: Problem,
+        timeout_ms: float,
+        max_missing_in_a_row: int,
+    ) -> None:
+        super().__init__(
+            "the executive", problem, 0, timeout_ms, max_missing_in_a_row=max_missing_in_a_row
+        )
         self.simulated = False
         self._executive = executive
 

@@ -130,8 +130,10 @@ class Ros2Environment:
 
     # -- what the robot's loop calls -------------------------------------------------------------
 
-    def perform_sensing(self, sensing_action: int) -> FloatArray:
+    def perform_sensing(self, sensing_action: int) -> FloatArray | None:
         """Perform a sensing action and return the observation, shape ``(observation_size,)``.
+
+        None if all of it is NaN: messages say so that there was no reading.
 
         Raises EnvironmentFailedError if the robot does not answer in time, refuses, or returns no
         valid observation.
@@ -176,10 +178,13 @@ class Ros2Environment:
                 f"{shown_by} showed {observation.size} numbers ({key}) for sensing action "
                 f"{sensing_action} ({label}); {self._problem.name} needs {size or 'some'}"
             )
+        if np.isnan(observation).all():
+            return None
         if not np.isfinite(observation).all():
             raise EnvironmentFailedError(
                 f"{shown_by} showed {in_brief(observation)} ({key}) for sensing action "
-                f"{sensing_action} ({label}); an observation must be finite"
+                f"{sensing_action} ({label}); an observation must be finite, or NaN in every "
+                "component, which is no reading"
             )
         return observation
 

@@ -10,8 +10,8 @@ service_suspected, unreachable, no_datagrams, insecure, credentials,
 late_replies, waiting, holding, resumed, busy, refused, malformed_reply, disagreement,
 wrong_answer, not_deterministic, verification_failed, distrusted,
 limits_unknown, verifying, prefetch_unused, unexplained, lost, sensor_suspect, reinitialised,
-late_unused, resumed_trial, performed_unseen, trial, missed_ticks, stopped, note, interrupted,
-offers.
+late_unused, no_reading, resumed_trial, performed_unseen, trial, missed_ticks, stopped, note,
+interrupted, offers.
 Of a service: ready, session_opened, session_taken_over, restored, state_diverged, refused, busy,
 evicted, robot_connected, robot_disconnected, link_refused, credentials, credentials_reloaded,
 stopping, process_ended, process_started, ros_master, ros_shutdown. Of both: defect.
@@ -55,6 +55,7 @@ _WARNINGS = frozenset(
         "unreachable",
         "holding",
         "unexplained",
+        "no_reading",
         "lost",
         "sensor_suspect",
         "reinitialised",

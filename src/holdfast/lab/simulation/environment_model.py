@@ -155,6 +155,10 @@ class EnvironmentModel:
         """Return whether something was sensed in a step, and came late."""
         return step in self._lateness and self._reference.steps[step].sensing_action is not None
 
+    def will_come(self, step: int) -> bool:
+        """Return whether what was sensed in a step comes later, instead of never."""
+        return bool(self._of(step))
+
     def _of(self, step: int) -> list[_Coming]:
         delays = self._lateness.get(step, ())
         return [_Coming(step, step + moves) for moves in delays if moves is not None]
@@ -320,10 +324,13 @@ class EnvironmentModel:
             if step.reward is not None:
                 reward = (reward or 0.0) + step.reward
         sensed = sum(step.sensing_action is not None for step in reference.steps)
+        late = sum(self._is_late(step) for step in self._lateness if step < len(reference.steps))
+        missing = late - len({delivery.taken for delivery in self._deliveries})
         for name, said, true in (
             ("success", result.success, self.done),
             ("sensing decisions", result.sensing_decisions, sensed),
             ("unexplained observations", result.unexplained_observations, reference.unexplained),
+            ("missing observations", result.missing_observations, missing),
             ("times lost", result.lost if self._reinitialises else reference.lost, reference.lost),
             ("reward", result.reward if rewards_are_known else reward, reward),
         ):

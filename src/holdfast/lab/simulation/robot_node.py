@@ -490,7 +490,8 @@ class RobotNode:
         shown = self._environment.sense(step, sensing_action)
         if shown is None:
             self._world.sensed_late(step)
-        self._happens(process, self._heard, Sensed(step, shown))
+        no_reading = shown is None and not self._environment.will_come(step)
+        self._happens(process, self._heard, Sensed(step, shown, no_reading))
 
     def _performs(self, process: int, step: int, action: FloatArray) -> None:
         if self._is_gone(process):

@@ -100,10 +100,11 @@ def make_world(connections: Any, parameters: NodeParameters) -> World:
     # Other threads than the robot's use it.
     problem = Configuration.from_plain(configuration.plain()).problem
     timeout_ms = configuration.environment.timeout_ms
+    missing = configuration.environment.max_missing_in_a_row
     if parameters.own.environment == "executive":
         handover = DecisionHandover(problem, configuration.planning.sensing_interval)
         return World(
-            ExecutiveMaker(handover, configuration.problem, timeout_ms),
+            ExecutiveMaker(handover, configuration.problem, timeout_ms, missing),
             functools.partial(handover.end, DecideCode.ENDED),
             interrupt_at_once=True,
             handover=handover,
@@ -114,7 +115,14 @@ def make_world(connections: Any, parameters: NodeParameters) -> World:
     # Invalid parameters are reported now, not when a trial begins.
     RobotInterface(parameters.mapping, problem.sensing_actions, problem.action_size)
     make: Any = functools.partial(make_ros_environment, connections, parameters.mapping)
-    maker = EnvironmentMaker("the robot", problem, configuration.simulator.seed, timeout_ms, make)
+    maker = EnvironmentMaker(
+        "the robot",
+        problem,
+        configuration.simulator.seed,
+        timeout_ms,
+        make,
+        max_missing_in_a_row=missing,
+    )
     return World(maker, lambda _: connections.cancel())
 
 
