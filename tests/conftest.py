@@ -36,6 +36,7 @@ REAL = (
     DEPLOY,
     ROS,
     "processes/",
+    "contracts/test_datagram_addresses.py",
     "contracts/test_datagram_links.py",
     "contracts/test_dialer.py",
     "contracts/test_listener.py",

@@ -30,6 +30,7 @@ from tests.wire import (
     LAST,
     MAGIC,
     MESSAGE,
+    PATIENCE_S,
     PING,
     REPLY,
     Frame,
@@ -226,8 +227,8 @@ class Intruder:
     def _send_datagrams(self) -> None:
         """Say everything in datagrams, too: sealed with its own keys, in its own name and others'.
 
-        A service answers wherever the last datagram of a robot has come from. So what comes here
-        and is not sealed for this end was meant for another robot.
+        It proves its address, as a robot does. What comes here and is not of its association was
+        meant for another robot.
         """
         host, _, port = self._endpoint.removeprefix("udp/").rpartition(":")
         self.links += 1
@@ -238,8 +239,10 @@ class Intruder:
             datagrams.connect((host, int(port)))
             link.say(hello_of(incarnation=f"intruder-{self.links}"))
             handed_over = next(frame for frame in link.until_the_end() if frame.kind == KEYS)
-            own, *keys = struct.unpack_from(">I32s32s", handed_over.payload)
+            own, to_service, to_robot = struct.unpack_from(">I32s32s", handed_over.payload)
             counters = itertools.count()
+            keys = to_service, to_robot
+            self._prove_address(datagrams, own, to_service, to_robot, counters)
             names = [own, *((own + step) % 2**32 for step in range(-20, 20) if step), 0, 2**32 - 1]
             for name, message, key in itertools.product(names, self._messages, keys):
                 if name != own and len(message.data) > 200:
@@ -256,6 +259,27 @@ class Intruder:
                     answer = datagrams.recv(65_536)
                     if int.from_bytes(answer[:4], "big") != own:
                         self.told.append("a datagram for another robot")
+
+    @staticmethod
+    def _prove_address(
+        datagrams: socket.socket,
+        own: int,
+        to_service: bytes,
+        to_robot: bytes,
+        counters: Iterator[int],
+    ) -> None:
+        """Have the service probe this address, and send back what the probe holds."""
+
+        def send(message: bytes) -> None:
+            header = struct.pack(">II", own, next(counters))
+            datagrams.send(header + AESGCM(to_service).encrypt(bytes(4) + header, message, None))
+
+        send(b"\4\0" + bytes(8))
+        datagrams.settimeout(PATIENCE_S)
+        probe = datagrams.recv(65_536)
+        send(b"\5\0" + AESGCM(to_robot).decrypt(bytes(4) + probe[:8], probe[8:], None)[2:])
+        send(b"\4\0" + bytes(8))
+        assert len(datagrams.recv(65_536)) == len(probe)  # the echo: it is answered from now on
 
     def _call(self, number: int, request: bytes) -> bytes:
         """Return the frame of a call; over udp it is what else would be a datagram."""

@@ -152,13 +152,11 @@ async def test_a_killed_service_is_known_by_its_closed_port(site: Site, keys: Pa
             robot.start(inbox)
             await until(lambda: robot.sends_datagrams("cloud"))
             link = robot._services["cloud"].current
-            assert isinstance(link, RobotDatagramLink) and link._cipher is not None
+            assert isinstance(link, RobotDatagramLink)
             await at_rest(link)
-            sealing, before = link._cipher, link._cipher._counter
             await asyncio.to_thread(stream.impair, Impairment(silent=True))
             await asyncio.to_thread(cloud.kill)
             robot.call("cloud", 1, b"is anybody there?")
             await inbox.wait_for(ServiceVanished("cloud", inbox.incarnations()[0]), CallEnded(1))
             assert link.reason == "is gone: its port is closed"
-            assert sealing._counter == before + 1
             await robot.close()

@@ -7,14 +7,15 @@ datagram delays nothing but itself. Where none gets through, everything goes on 
 For its owner the link is like any other: it takes and delivers frames of calls, and is lost once:
 
 - at once when the other end closes the stream, which the system does for a process that dies;
-- when the service's host reports that its port is closed, and quotes a datagram that was sent there
-  lately. Anybody can send such a report (ICMP has no keys), but only an observer of the path can
-  quote a datagram, and an observer can reset a stream as well;
+- a round trip after a report that the service's port is closed, unless a datagram comes meanwhile.
+  Anybody who sees the datagrams can send such a report (ICMP has no keys), so it only has the robot
+  probe the path;
 - when nothing comes for the lease on either path.
 
 It is not lost when the stream breaks in another way while datagrams still come, for instance
 because the robot's address has changed. Then it goes on with datagrams alone (``without_stream``),
-while its owner makes another link. A service replies to the address of the newest datagram.
+while its owner makes another link. A service replies to the address that was proved last
+(:mod:`~holdfast.transport.return_path`).
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ from holdfast.transport.datagram_cipher import AssociationKeys, DatagramCipher, 
 from holdfast.transport.datagram_sockets import DATAGRAMS_AT_ONCE, LARGEST_DATAGRAM, DatagramSocket
 from holdfast.transport.endpoints import Endpoint, Role
 from holdfast.transport.exchanges import (
+    ECHO,
     MESSAGE_OVERHEAD,
+    PROBE,
     ReceivedReply,
     RobotExchange,
     ServiceExchange,
@@ -52,6 +55,7 @@ from holdfast.transport.link_defects import ends_link
 from holdfast.transport.link_settings import SLICE_S, LinkSettings
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.redundancy import Paths
+from holdfast.transport.return_path import SECRET_BYTES, ReturnPath
 from holdfast.transport.schemes import Scheme
 from holdfast.transport.tls import TlsStream
 
@@ -76,7 +80,7 @@ _STREAM_SILENT_LEASES: Final = 3.0
 _BLOCKED_AFTER_S: Final = 3.0
 """Without a datagram from the service for this long, datagrams count as blocked."""
 
-_VERIFYING_PROBES: Final = 3
+_VERIFYING_PROBES: Final = 5
 _PROBE_DISTANCE_S: Final = 0.003
 _PROBES_BEFORE_NEW_SOCKET: Final = 2
 
@@ -90,6 +94,9 @@ _ERROR: Final = struct.Struct("=I")
 _ERROR_BYTES: Final = 512
 _QUOTED_BYTES: Final = 32
 """Of a datagram: eight that can be guessed and 24 encrypted ones. None of ours is shorter."""
+
+_BROKEN: Final = "has broken the connection, and answers no datagram"
+_CLOSED: Final = "is gone: its port is closed"
 
 _REMEMBERED_DATAGRAMS: Final = 64
 """More than are in flight at a time."""
@@ -119,7 +126,6 @@ class _DatagramLink(Link):
         self._due_at = float("inf")
         self._due: asyncio.TimerHandle | None = None
         self._datagram_heard_at = self._datagram_sent_at = float("-inf")
-        self._peer_address: Any = None
         self._backlog: deque[bytes] = deque()  # messages that wait for the scheduler
         self._num_dropped = 0
         self._paths = Paths(self._send_datagram, self._send_on_stream, self._num_lost)
@@ -130,15 +136,21 @@ class _DatagramLink(Link):
         self.send(encode_frame(MESSAGE, number, message))
 
     def _send_datagram(self, message: bytes) -> None:
+        datagram = self._encrypted(message)
+        if datagram is not None:
+            self._put(datagram)
+
+    def _encrypted(self, message: bytes) -> bytes | None:
+        """Return the datagram of a message; None if nothing can be sent any more."""
         if self._ended or self._cipher is None:
-            return
+            return None
         try:
             datagram = self._cipher.encrypt(message)
         except KeysExhaustedError as error:
             self.end(f"needs a new link: {error}")
-            return
+            return None
         self._datagram_sent_at = self._loop.time()
-        self._put(datagram)
+        return datagram
 
     def _put(self, datagram: bytes) -> None:
         raise NotImplementedError
@@ -158,11 +170,11 @@ class _DatagramLink(Link):
         message = cipher.decrypt(datagram)
         if message is None:
             return
-        if cipher.window.newest > newest:
-            # A held-back older datagram must not redirect the replies.
-            self._peer_address = address
         now = self._datagram_heard_at = self._loop.time()
         self._lease_ends_at = max(self._lease_ends_at, now + self._peer_lease_s)
+        self._note_address(message, address, now, newest=cipher.window.newest > newest)
+        if self.ended:
+            return
         # Charged after decryption: forged datagrams must not use up the owner's slices.
         backlog, scheduler = self._backlog, self._settings.scheduler
         if not backlog and scheduler.may_run(self.owner, now):
@@ -176,6 +188,9 @@ class _DatagramLink(Link):
             self._num_dropped += 1
             if self._num_dropped >= _MAX_DROPPED:
                 self.refuse(_OVERRUN)
+
+    def _note_address(self, message: bytes, address: Any, now: float, *, newest: bool) -> None:
+        """Take note of where an authentic datagram has come from."""
 
     @ends_link
     def _handle_backlog(self) -> None:
@@ -269,7 +284,9 @@ class RobotDatagramLink(_DatagramLink):
         super().__init__(owner, settings, speaks_first=True, tls=tls)
         self._exchange = RobotExchange(self._paths)
         self._socket: socket.socket | None = None
+        self._service_address: Any = None
         self._sent: deque[bytes] = deque(maxlen=_REMEMBERED_DATAGRAMS)
+        self._verifies = False
         self._blocked_since: float | None = None
 
     @property
@@ -309,7 +326,7 @@ class RobotDatagramLink(_DatagramLink):
             AssociationKeys(association, to_service, to_robot), service=False
         )
         address = self._transport.get_extra_info("peername")
-        self._peer_address = (address[0], port or address[1], *address[2:])
+        self._service_address = (address[0], port or address[1], *address[2:])
         self._blocked_since = self._loop.time()
         self._open_socket()
         self._exchange.begin(self._loop.time())
@@ -320,12 +337,12 @@ class RobotDatagramLink(_DatagramLink):
     def _open_socket(self) -> None:
         """Open a socket, from the address that the robot has now."""
         self._close_socket()
-        family = socket.AF_INET6 if len(self._peer_address) == 4 else socket.AF_INET
+        family = socket.AF_INET6 if len(self._service_address) == 4 else socket.AF_INET
         opened = socket.socket(family, socket.SOCK_DGRAM)
         try:
             opened.setblocking(False)
             # A connected socket gets datagrams of this peer only, and its ICMP errors.
-            opened.connect(self._peer_address)
+            opened.connect(self._service_address)
             opened.setsockopt(*_REPORTS_ERRORS[family], 1)
         except OSError:
             opened.close()
@@ -365,7 +382,7 @@ class RobotDatagramLink(_DatagramLink):
                 if self._failed(error):
                     continue
                 return
-            self.take_datagram(datagram, self._peer_address)
+            self.take_datagram(datagram, self._service_address)
 
     def _failed(self, error: OSError) -> bool:
         """Handle a socket's error; return whether it is about an earlier datagram."""
@@ -382,8 +399,7 @@ class RobotDatagramLink(_DatagramLink):
             about_earlier = True
             refused = any(_ERROR.unpack_from(each)[0] == errno.ECONNREFUSED for *_, each in errors)
             if refused and quoted in self._sent and self._exchange.open:
-                self.end("is gone: its port is closed", abort=True)
-                return False
+                self._loop.call_soon(self._verify_path, _CLOSED)
         if not about_earlier and error.errno in _ADDRESS_GONE:
             self._close_socket()
         return about_earlier
@@ -401,32 +417,37 @@ class RobotDatagramLink(_DatagramLink):
             else:
                 self._owner.on_frame(self, Frame(LAST if last else REPLY, call, payload))
 
-    def _verify_path(self) -> None:
-        """Probe, and end the link if no datagram is answered."""
-        now = self._loop.time()
-        for k in range(_VERIFYING_PROBES):
-            self._loop.call_later(k * _PROBE_DISTANCE_S, self._probe)
-        self._loop.call_later(
-            self._exchange.round_trip.timeout_s + _VERIFYING_PROBES * _PROBE_DISTANCE_S,
-            self._end_if_unanswered,
-            now,
-        )
-
-    def _probe(self) -> None:
-        if not self._ended:
-            self._exchange.probe(self._loop.time())
+    def _verify_path(self, reason: str) -> None:
+        """Probe, and end the link for this reason if no datagram comes."""
+        if not self._verifies:
+            self._verifies = True
+            if self._socket is not None:
+                self._readable(self._socket)  # what lies there came before
+            self._verify(reason, self._loop.time(), _VERIFYING_PROBES)
 
     @ends_link
-    def _end_if_unanswered(self, since: float) -> None:
-        if not self._ended and self._datagram_heard_at <= since:
-            self.end("has broken the connection, and answers no datagram", abort=True)
+    def _verify(self, reason: str, since: float, num_probes: int) -> None:
+        if num_probes > 0 and not self._ended:
+            if self._socket is None:
+                self._open_socket()
+            # A report of a router is no reason to take another socket.
+            self._exchange.probe(self._loop.time(), counted=reason is not _CLOSED)
+            # The last one has time to be answered, even if this process has stood still.
+            wait_s = _PROBE_DISTANCE_S if num_probes > 1 else self._exchange.round_trip.timeout_s
+            self._loop.call_later(wait_s, self._verify, reason, since, num_probes - 1)
+            return
+        self._verifies = False
+        if self._socket is not None:
+            self._readable(self._socket)
+        if self._datagram_heard_at <= since:
+            self.end(reason, abort=True)
 
     # -- the stream breaks -----------------------------------------------------------------------
 
     def _detach(self) -> bool:
         if not self._exchange.open or not super()._detach():
             return False
-        self._verify_path()
+        self._verify_path(_BROKEN)
         self._owner.on_stream_lost(self)
         return True
 
@@ -434,7 +455,7 @@ class RobotDatagramLink(_DatagramLink):
         now = self._loop.time()
         due = now >= self._datagram_sent_at + 0.9 * self._ping_interval_s
         if due and (self._exchange.open or self.without_stream):
-            self._probe()
+            self._exchange.probe(now)
         super()._tick()
         if self._exchange.open:
             self._blocked_since = None
@@ -471,6 +492,7 @@ class ServiceDatagramLink(_DatagramLink):
         self._exchange = ServiceExchange(self._paths)
         self._sockets = sockets
         self._socket: DatagramSocket | None = None
+        self._return_path = ReturnPath()
 
     @property
     def unsent_bytes(self) -> int:
@@ -525,9 +547,24 @@ class ServiceDatagramLink(_DatagramLink):
         if arrived is not None:
             self._owner.on_frame(self, Frame(CALL, arrived.number, arrived.payload))
 
+    def _note_address(self, message: bytes, address: Any, now: float, *, newest: bool) -> None:
+        if message[:1] == bytes((ECHO,)):
+            self._return_path.echoed(message[-SECRET_BYTES:], address, now)
+            return
+        for probe in self._return_path.heard(address, now, newest=newest):
+            lost = min(255, self._num_lost())
+            datagram = self._encrypted(bytes((PROBE, lost)) + probe.secret)
+            if datagram is not None and self._socket is not None:
+                self._socket.send(datagram, probe.address)
+
+    def _send_datagram(self, message: bytes) -> None:
+        # Without an address nothing is encrypted: a counter that goes nowhere would count as lost.
+        if self._return_path.address is not None:
+            super()._send_datagram(message)
+
     def _put(self, datagram: bytes) -> None:
-        if self._socket is not None and self._peer_address is not None:
-            self._socket.send(datagram, self._peer_address)
+        if self._socket is not None:
+            self._socket.send(datagram, self._return_path.address)
 
     @ends_link
     def _flush(self) -> None:
@@ -536,6 +573,9 @@ class ServiceDatagramLink(_DatagramLink):
     def _notify_owner(self) -> None:
         if self._socket is not None and self._cipher is not None:
             self._socket.remove(self._cipher.association)
+            if self._socket.is_idle:
+                self._socket.close()
+                self._sockets.pop(self._socket.address, None)
         super()._notify_owner()
 
 

@@ -33,6 +33,7 @@ class DatagramSocket:
     """
 
     def __init__(self, address: Any) -> None:
+        self.address = address
         self._loop = asyncio.get_running_loop()
         self._links: dict[int, ServiceDatagramLink] = {}
         family = socket.AF_INET6 if len(address) == 4 else socket.AF_INET
@@ -61,6 +62,11 @@ class DatagramSocket:
     def remove(self, association: int) -> None:
         """Take no more datagrams of an association."""
         self._links.pop(association, None)
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether no link uses it."""
+        return not self._links
 
     def send(self, datagram: bytes, address: Any) -> None:
         """Send a datagram; it may be lost here as well as anywhere."""

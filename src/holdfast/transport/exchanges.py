@@ -33,7 +33,8 @@ A message is::
     reply:     number (4), index (2) with two bits for "last" and "end without payload", then the
                payload
     working:   number (4): the request has come, and there is no reply yet that the robot lacks
-    probe, echo: 8 bytes that are sent back
+    probe, echo: 8 bytes that are sent back. The robot probes the path, the service an address
+               (:mod:`~holdfast.transport.return_path`)
 """
 
 from __future__ import annotations
@@ -48,19 +49,21 @@ from holdfast.transport.datagram_cipher import KNOWN_AFTER, LOSS_SAMPLE, OVERHEA
 from holdfast.transport.redundancy import MAX_TIMEOUT_S, Paths, RedundantSender, RoundTripEstimator
 
 __all__ = [
+    "ECHO",
     "KEEP_ALIVE_S",
     "MAX_CACHED_REQUESTS",
     "MAX_DATAGRAM_BYTES",
     "MAX_PAYLOAD_BYTES",
     "MAX_REORDERED_BYTES",
     "MESSAGE_OVERHEAD",
+    "PROBE",
     "ReceivedReply",
     "ReceivedRequest",
     "RobotExchange",
     "ServiceExchange",
 ]
 
-_REQUEST, _REPLY, _WORKING, _PROBE, _ECHO, _HEDGE = range(1, 7)
+_REQUEST, _REPLY, _WORKING, PROBE, ECHO, _HEDGE = range(1, 7)
 
 _REQUEST_HEAD: Final = struct.Struct(">IIH")
 _REPLY_HEAD: Final = struct.Struct(">IH")
@@ -201,9 +204,11 @@ class RobotExchange:
             if request.call == call:
                 del self._requests[number]
 
-    def probe(self, now: float) -> None:
-        """Check at once whether datagrams get through."""
-        self._sender.send_unbudgeted(_PROBE, _PROBE_HEAD.pack(now))
+    def probe(self, now: float, *, counted: bool = True) -> None:
+        """Check at once whether datagrams get through; ``counted`` if a reply is due."""
+        self._sender.send_unbudgeted(PROBE, _PROBE_HEAD.pack(now))
+        if not counted:
+            return
         if self._first_probes > 0:
             self._first_probes -= 1
             self._probe_at = now + _FIRST_PROBE_INTERVAL_S
@@ -219,13 +224,19 @@ class RobotExchange:
         """
         if len(message) < 2:
             return []
+        kind, body = message[0], message[2:]
+        if kind == PROBE:
+            # It shows that both directions work, but not that replies come to this address.
+            if datagram and len(body) == _PROBE_HEAD.size:
+                self.unanswered_probes = 0
+                self._sender.send_unbudgeted(ECHO, body)
+            return []
         if datagram:
             self.open = True
             self.unanswered_probes = self._unheard = 0
             if not self._first_probes:
                 self._probe_at = now + KEEP_ALIVE_S
         self._sender.num_lost = message[1]
-        kind, body = message[0], message[2:]
         if kind == _REPLY and len(body) >= _REPLY_HEAD.size:
             number, index = _REPLY_HEAD.unpack_from(body)
             request = self._requests.get(number)
@@ -237,7 +248,7 @@ class RobotExchange:
                 request.heard = True
                 request.timeout_s = max(request.timeout_s, _PROGRESS_INTERVAL_S)
                 request.due_at = now + request.timeout_s
-        elif kind == _ECHO and len(body) == _PROBE_HEAD.size:
+        elif kind == ECHO and len(body) == _PROBE_HEAD.size:
             self._hedges = False
             round_trip_s = now - _PROBE_HEAD.unpack(body)[0]
             if self.round_trip.smoothed_s is None and 0.0 <= round_trip_s <= 60.0:
@@ -388,8 +399,8 @@ class ServiceExchange:
         # Copying a large message would delay all others.
         view = message if len(message) < _LARGE_BYTES else cast(bytes, memoryview(message))
         kind, body = message[0], view[2:]
-        if kind == _PROBE and len(body) == _PROBE_HEAD.size and datagram:
-            self._sender.send_unbudgeted(_ECHO, body)
+        if kind == PROBE and len(body) == _PROBE_HEAD.size and datagram:
+            self._sender.send_unbudgeted(ECHO, body)
         hedge = kind == _HEDGE and not datagram
         if not (hedge or kind == _REQUEST) or len(body) < _REQUEST_HEAD.size:
             return None
