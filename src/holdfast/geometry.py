@@ -118,7 +118,7 @@ class _World:
             actions.reshape(-1, dimension),
             np.ascontiguousarray(standard_deviation, dtype=np.float64),
             tolerance,
-            stream.words,
+            stream.for_motion(),
             next_states.reshape(-1, dimension),
         )
         if not moved:
@@ -189,7 +189,7 @@ class _World:
             actions,
             np.ascontiguousarray(standard_deviation, dtype=np.float64),
             tolerance,
-            [stream.words for stream in streams],
+            [stream.for_motion() for stream in streams],
             threads,
             next_states,
         )
@@ -219,7 +219,7 @@ class _World:
         num_unplaced = self._kernel.draw_free(
             np.ascontiguousarray(mean, dtype=np.float64),
             np.ascontiguousarray(standard_deviation, dtype=np.float64),
-            stream.words,
+            stream.for_motion(),
             states,
         )
         return states, int(num_unplaced)

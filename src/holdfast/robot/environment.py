@@ -206,29 +206,26 @@ class SimulatedEnvironment:
         """
         seed, trial, step, problem = self._seed, self._trial, self.step, self._problem
         before = self.state
-        moved = problem.move(before, task_action, stream(seed, trial, step, Purpose.WORLD_MOTION))
-        self.state = checked.states_of(problem, "move", moved, before.shape)
+        noise = stream(seed, trial, step, Purpose.WORLD_MOTION)
+        self.state = checked.move(problem, before, task_action, noise)
         self.step += 1
         reward = None
         if getattr(type(problem), "reward", None) is not ProblemBase.reward:
-            reward = checked.scalar(problem, "reward", problem.reward(self.state, task_action))
+            reward = checked.reward(problem, self.state, task_action)
         if not self._moves_show:
             return reward
         motion = observation = None
         if hasattr(problem, "measure_motion"):
             noise = stream(seed, trial, step, Purpose.WORLD_MEASURED_MOTION)
-            measured = problem.measure_motion(before, self.state, noise)
-            motion = checked.shown(problem, "measure_motion", measured)
+            motion = checked.measured_motion(problem, before, self.state, noise)
         if hasattr(problem, "sample_move_observation"):
             noise = stream(seed, trial, step, Purpose.WORLD_MOVE_OBSERVATION)
-            drawn = problem.sample_move_observation(self.state, task_action, noise)
-            observation = checked.shown(problem, "sample_move_observation", drawn)
+            observation = checked.move_observation(problem, self.state, task_action, noise)
         return MoveResult(reward, motion, observation)
 
     def is_done(self) -> bool:
         """Return whether the true state is a goal."""
-        problem = self._problem
-        return checked.truth(problem, "is_goal", problem.is_goal(self.state))
+        return checked.is_goal(self._problem, self.state)
 
     def steps_performed(self) -> int:
         """Return the number of task actions performed, those of :meth:`after` included."""
@@ -263,9 +260,7 @@ class ObservationSizes(dict[int, "int | None"]):
 
 
 def _initial_state(problem: Problem, random: Stream) -> FloatArray:
-    drawn = problem.initial_states(random, 1)
-    shape = (1, problem.state_size)
-    state: FloatArray = checked.states_of(problem, "initial_states", drawn, shape)[0]
+    state: FloatArray = checked.initial_states(problem, random, 1)[0]
     return state
 
 
