@@ -341,7 +341,7 @@ def resample(belief: Belief, stream: Stream) -> Belief:
     times: Carpenter, Clifford and Fearnhead (1999), "Improved particle filter for nonlinear
     problems".
     """
-    indices = _kernel.systematic_resample(belief.weights, float(stream.uniform()))
+    indices = _kernel.systematic_resample(belief.weights, float(stream.anew().uniform()))
     states = belief.states[indices]
     states.setflags(write=False)
     return Belief(states, uniform_weights(belief.weights.shape[0]))

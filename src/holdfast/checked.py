@@ -2,8 +2,10 @@
 
 A problem is a user's own code, and NumPy forgives much: a mean without its last axis broadcasts to
 something, a variance for one coordinate of two to something else, and the decisions are quietly
-wrong. So every array that a problem returns passes through here. One that does not fit is an error
-that names the function, what it returned and what was needed.
+wrong. So every call of a problem's function passes through here. A result that does not fit is an
+error that names the function, what it returned and what was needed. Every array is copied as it
+comes: a function may return the same buffer each time. A stream that a function was given ends with
+the call. And a user's function runs in the floating-point mode of who called holdfast.
 """
 
 from __future__ import annotations
@@ -17,30 +19,35 @@ import numpy.typing as npt
 from holdfast import _kernel
 from holdfast.arrays import BoolArray, FloatArray, IntArray, floats, in_brief
 from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.floating_mode import as_caller
 from holdfast.problem_attributes import has_own, name_of
+from holdfast.randomness import Stream
 
 __all__ = [
     "executed_action",
     "expected_move",
     "expected_path",
     "goals",
+    "initial_states",
+    "is_goal",
     "known_state_return",
     "log_likelihood",
+    "measured_motion",
+    "move",
     "move_each",
     "move_log_likelihood",
+    "move_observation",
     "moved_by_measurement",
     "next_stage",
     "next_stages",
     "policy",
     "prediction",
+    "reinitial_states",
     "require_usable",
+    "reward",
     "rewards",
     "sample_observation",
-    "scalar",
     "scene",
-    "shown",
-    "states_of",
-    "truth",
 ]
 
 MAX_OBSERVATION_SIZE = 1024
@@ -54,7 +61,7 @@ def prediction(
     The mean has the shape ``(..., observation_size)``, and the variance that or
     ``(observation_size,)``. Whether they are finite is left to :func:`require_usable`.
     """
-    mean: FloatArray = problem.observation_mean(states, sensing_action)
+    mean: FloatArray = _ask(problem, "observation_mean", states, sensing_action)
     leading = states.shape[:-1]
     if not _is_float_array(mean) or mean.ndim != states.ndim or mean.shape[:-1] != leading:
         what = f"observation_mean of sensing action {sensing_action}"
@@ -64,13 +71,15 @@ def prediction(
             f"observation_mean of {name_of(problem)} has {mean.shape[-1]} coordinates: allowed are "
             f"1 to {MAX_OBSERVATION_SIZE}"
         )
-    variance: FloatArray = problem.observation_variance(states, sensing_action)
+    # Before the next call, which may return the same buffer.
+    mean = mean.copy()
+    variance: FloatArray = _ask(problem, "observation_variance", states, sensing_action)
     one = mean.shape[-1:]
     if not isinstance(variance, np.ndarray) or variance.shape not in (one, mean.shape):
         need = one if mean.ndim == 1 else f"{one} or {mean.shape}"
         what = f"observation_variance of sensing action {sensing_action}"
         raise _misfit(problem, what, variance, need)
-    return mean, variance
+    return mean, variance.copy()
 
 
 def require_usable(
@@ -93,18 +102,18 @@ def require_usable(
 
 
 def sample_observation(
-    problem: Any, state: FloatArray, sensing_action: int, stream: object
+    problem: Any, state: FloatArray, sensing_action: int, stream: Stream
 ) -> FloatArray:
     """Return an observation that was drawn in one state, shape ``(observation_size,)``."""
-    drawn = problem.sample_observation(state, sensing_action, stream)
-    return shown(problem, f"sample_observation of sensing action {sensing_action}", drawn)
+    drawn = _ask(problem, "sample_observation", state, sensing_action, stream, streams=(stream,))
+    return _shown(problem, f"sample_observation of sensing action {sensing_action}", drawn)
 
 
 def log_likelihood(
     problem: Any, states: FloatArray, sensing_action: int, observation: FloatArray
 ) -> FloatArray:
     """Return the log-likelihoods of an observation, shape ``(num_particles,)``."""
-    found = problem.log_likelihood(states, sensing_action, observation)
+    found = _ask(problem, "log_likelihood", states, sensing_action, observation)
     under = f"under sensing action {sensing_action}"
     return _likelihoods(problem, "log_likelihood", found, states, observation, under)
 
@@ -119,7 +128,7 @@ def move_log_likelihood(
             f"a move has shown {in_brief(observation)}, but {name_of(problem)} has no "
             f"{function}(states, action, observation) that could fold it in"
         )
-    found = problem.move_log_likelihood(states, task_action, observation)
+    found = _ask(problem, function, states, task_action, observation)
     return _likelihoods(problem, function, found, states, observation, "after a move")
 
 
@@ -141,7 +150,7 @@ def _likelihoods(
 
 
 def moved_by_measurement(
-    problem: Any, states: FloatArray, motion: npt.ArrayLike, stream: object
+    problem: Any, states: FloatArray, motion: npt.ArrayLike, stream: Stream
 ) -> FloatArray:
     """Return states moved by a measured motion, with the noise of the measurement, read-only."""
     measured = floats("motion", motion).reshape(-1).copy()
@@ -154,11 +163,29 @@ def moved_by_measurement(
             f"{function}(states, motion, stream) that could move the belief by it"
         )
     measured.setflags(write=False)
-    moved = problem.move_by_measurement(states, measured, stream)
-    return states_of(problem, function, moved, states.shape)
+    moved = _ask(problem, function, states, measured, stream, streams=(stream,))
+    return _states(problem, function, moved, states.shape)
 
 
-def shown(problem: Any, function: str, value: object) -> FloatArray:
+def measured_motion(
+    problem: Any, before: FloatArray, after: FloatArray, stream: Stream
+) -> FloatArray:
+    """Return the measurement of a true move, shape ``(n,)``."""
+    function = "measure_motion"
+    drawn = _ask(problem, function, before, after, stream, streams=(stream,))
+    return _shown(problem, function, drawn)
+
+
+def move_observation(
+    problem: Any, state: FloatArray, action: FloatArray, stream: Stream
+) -> FloatArray:
+    """Return what comes with a move into one state, shape ``(n,)``."""
+    function = "sample_move_observation"
+    drawn = _ask(problem, function, state, action, stream, streams=(stream,))
+    return _shown(problem, function, drawn)
+
+
+def _shown(problem: Any, function: str, value: object) -> FloatArray:
     """Return what a function of the problem says that the world shows, shape ``(n,)``."""
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu" or value.ndim != 1:
         raise _misfit(problem, function, value, "(n,)")
@@ -167,23 +194,23 @@ def shown(problem: Any, function: str, value: object) -> FloatArray:
             f"{function} of {name_of(problem)} returned {in_brief(value)} of {value.size} "
             f"coordinates: need 1 to {MAX_OBSERVATION_SIZE}, all of them finite"
         )
-    return value
+    return value.copy()
 
 
 def policy(problem: Any, states: FloatArray, stage: int | IntArray) -> FloatArray:
     """Return the commanded actions, shape ``(..., action_size)``."""
     shape = (*states.shape[:-1], problem.action_size)
-    return _array(problem, "policy", problem.policy(states, stage), shape)
+    return _array(problem, "policy", _ask(problem, "policy", states, stage), shape)
 
 
 def executed_action(problem: Any, commanded: FloatArray) -> FloatArray:
     """Return the executed actions, of the shape of ``commanded``."""
-    return _array(problem, "execute", problem.execute(commanded), commanded.shape)
+    return _array(problem, "execute", _ask(problem, "execute", commanded), commanded.shape)
 
 
 def next_stage(problem: Any, estimate: FloatArray, stage: int) -> int:
     """Return the stage that follows."""
-    value = _single(problem, "next_stage", problem.next_stage(estimate, stage))
+    value = _single(problem, "next_stage", _ask(problem, "next_stage", estimate, stage))
     # A comparison with NaN is false.
     if not 0 <= value < problem.num_stages:
         raise ProblemError(
@@ -195,22 +222,22 @@ def next_stage(problem: Any, estimate: FloatArray, stage: int) -> int:
 
 def next_stages(problem: Any, states: FloatArray, stages: IntArray) -> IntArray:
     """Return the stages that follow, one for each state."""
-    following = problem.next_stage(states, stages)
+    following = _ask(problem, "next_stage", states, stages)
     return _stages(problem, "next_stage", following, states)
 
 
 def expected_move(
-    problem: Any, states: FloatArray, actions: FloatArray, noise_free: object
+    problem: Any, states: FloatArray, actions: FloatArray, noise_free: Stream
 ) -> FloatArray:
     """Return where executed actions lead without noise, of the shape of ``states``, read-only.
 
     A problem without ``expected_move`` is asked for its ``move`` with the stream ``noise_free``.
     """
     if has_own(problem, "expected_move", ("move",)):
-        found = problem.expected_move(states, actions)
+        found = _ask(problem, "expected_move", states, actions)
         moved = _array(problem, "expected_move", found, states.shape)
     else:
-        found = problem.move(states, actions, noise_free)
+        found = _ask(problem, "move", states, actions, noise_free)
         moved = _array(problem, "move", found, states.shape)
     # The caller checks that the actions there are finite, once for many steps.
     moved.setflags(write=False)
@@ -221,7 +248,7 @@ def expected_path(
     problem: Any, states: FloatArray, stage: int, offsets: Sequence[int], threads: int
 ) -> tuple[FloatArray, IntArray]:
     """Return the states and stages after each number of steps, the states read-only."""
-    found = problem.expected_path(states, stage, offsets, threads)
+    found = _ask(problem, "expected_path", states, stage, offsets, threads)
     if not isinstance(found, tuple) or len(found) != 2:
         raise _returned(problem, "expected_path", found, "a tuple of two arrays")
     states_at = _array(problem, "expected_path", found[0], (len(offsets), *states.shape))
@@ -232,54 +259,72 @@ def expected_path(
 
 def rewards(problem: Any, states: FloatArray, actions: FloatArray) -> FloatArray:
     """Return the rewards of executed actions that led to many states."""
-    return _finite(problem, "reward", problem.reward(states, actions), states.shape[:-1])
+    found = _ask(problem, "reward", states, actions)
+    return _finite(problem, "reward", found, states.shape[:-1])
 
 
 def goals(problem: Any, states: FloatArray) -> BoolArray:
     """Return which of many states are goals."""
-    reached = problem.is_goal(states)
+    reached = _ask(problem, "is_goal", states)
     shape = states.shape[:-1]
     if not isinstance(reached, np.ndarray) or reached.dtype != np.bool_ or reached.shape != shape:
         raise ProblemError(
             f"is_goal of {name_of(problem)}, asked of {states.shape[0]} states at once, returned "
             f"{reached!r:.80}: need as many truth values"
         )
-    return reached
+    return reached.copy()
 
 
 def known_state_return(problem: Any, states: FloatArray, stages: IntArray) -> FloatArray | None:
     """Return the problem's own returns of acting in known states; None if it has none."""
-    function = getattr(problem, "known_state_return", None)
-    if function is None:
+    function = "known_state_return"
+    if getattr(problem, function, None) is None:
         return None
     rows = np.ascontiguousarray(states).reshape(-1, states.shape[-1])
     rows.setflags(write=False)
     own_stages = np.ascontiguousarray(stages).reshape(-1)
     own_stages.setflags(write=False)
-    values = _finite(problem, "known_state_return", function(rows, own_stages), rows.shape[:1])
+    values = _finite(problem, function, _ask(problem, function, rows, own_stages), rows.shape[:1])
     return values.reshape(stages.shape)
 
 
-def states_of(
-    problem: Any, function: str, states: FloatArray, shape: tuple[int, ...]
-) -> FloatArray:
-    """Return states that a function of the problem made, read-only from now on."""
-    _array(problem, function, states, shape)
+def initial_states(problem: Any, stream: Stream, count: int) -> FloatArray:
+    """Return states drawn from the initial belief, shape ``(count, state_size)``, read-only."""
+    drawn = _ask(problem, "initial_states", stream, count, streams=(stream,))
+    return _states(problem, "initial_states", drawn, (count, problem.state_size))
+
+
+def reinitial_states(problem: Any, states: FloatArray, stream: Stream) -> FloatArray:
+    """Return the states of a belief that is begun anew, of the shape of ``states``, read-only."""
+    function = "reinitial_states"
+    if getattr(problem, function, None) is None:
+        return initial_states(problem, stream, states.shape[0])
+    drawn = _ask(problem, function, states, stream, streams=(stream,))
+    return _states(problem, function, drawn, states.shape)
+
+
+def move(problem: Any, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
+    """Return the states after executed actions, of the shape of ``states``, read-only."""
+    moved = _ask(problem, "move", states, actions, stream, streams=(stream,))
+    return _states(problem, "move", moved, states.shape)
+
+
+def _states(problem: Any, function: str, found: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+    states = _array(problem, function, found, shape)
     if not _kernel.all_finite(states):
         rows = states.reshape(-1, shape[-1])
         bad = int(np.argmin(np.isfinite(rows).all(axis=-1)))
         where = in_brief(rows[bad])
         raise ProblemError(f"{function} of {name_of(problem)} put particle {bad} at {where}")
-    contiguous = np.ascontiguousarray(states)
-    contiguous.setflags(write=False)
-    return contiguous
+    states.setflags(write=False)
+    return states
 
 
 def move_each(
     problem: Any,
     states: FloatArray,
     actions: FloatArray,
-    streams: Sequence[object],
+    streams: Sequence[Stream],
     threads: int,
 ) -> FloatArray:
     """Return b beliefs moved, each by its own action and with its own stream, read-only.
@@ -288,23 +333,23 @@ def move_each(
     counts if the problem has a ``move_each``.
     """
     if has_own(problem, "move_each", ("move",)):
-        moved = problem.move_each(states, actions, streams, threads)
-        return states_of(problem, "move_each", moved, states.shape)
+        moved = _ask(problem, "move_each", states, actions, streams, threads, streams=streams)
+        return _states(problem, "move_each", moved, states.shape)
     together = np.empty(states.shape)
     for row, (own, action, stream) in enumerate(zip(states, actions, streams, strict=True)):
-        together[row] = states_of(problem, "move", problem.move(own, action, stream), own.shape)
+        together[row] = move(problem, own, action, stream)
     together.setflags(write=False)
     return together
 
 
-def scalar(problem: Any, function: str, value: object) -> float:
-    """Return one number that a function of the problem gave for one state."""
-    return float(_single(problem, function, value))
+def reward(problem: Any, state: FloatArray, action: FloatArray) -> float:
+    """Return the reward of one executed action that led to one state."""
+    return float(_single(problem, "reward", _ask(problem, "reward", state, action)))
 
 
 def scene(problem: Any) -> Any:
     """Return the problem's drawing, a ``Scene`` or None; its coordinates are those of a state."""
-    drawn = problem.scene()
+    drawn = _ask(problem, "scene")
     if drawn is None:
         return None
     indices = (*drawn.axes, *(() if drawn.angle is None else (drawn.angle,)))
@@ -316,23 +361,31 @@ def scene(problem: Any) -> Any:
     return drawn
 
 
-def truth(problem: Any, function: str, value: object) -> bool:
-    """Return what a function of the problem says of one state: true or false, or 1 or 0."""
-    single = _single(problem, function, value)
+def is_goal(problem: Any, state: FloatArray) -> bool:
+    """Tell whether one state is a goal: true or false, or 1 or 0."""
+    single = _single(problem, "is_goal", _ask(problem, "is_goal", state))
     if single not in (0, 1):
-        raise ProblemError(f"{function} of {name_of(problem)} is {single!r}: must be True or False")
+        raise ProblemError(f"is_goal of {name_of(problem)} is {single!r}: must be True or False")
     return bool(single)
+
+
+def _ask(problem: Any, function: str, *arguments: object, streams: Sequence[Stream] = ()) -> Any:
+    """Call a function of the problem; ``streams`` are those among its arguments."""
+    found = as_caller(getattr(problem, function), *arguments)
+    for stream in streams:
+        stream.end()
+    return found
 
 
 def _array(problem: Any, function: str, value: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     if not _is_float_array(value) or value.shape != shape:
         raise _misfit(problem, function, value, shape)
-    return value
+    return value.copy()
 
 
 def _finite(problem: Any, function: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
     values = _array(problem, function, value, shape)
-    if not _kernel.all_finite(np.ascontiguousarray(values)):
+    if not _kernel.all_finite(values):
         raise ProblemError(
             f"{function} of {name_of(problem)} returned {in_brief(values)}: all must be finite"
         )
@@ -350,7 +403,7 @@ def _stages(problem: Any, function: str, stages: Any, states: FloatArray) -> Int
             f"{function} of {name_of(problem)} has the stage {stages[bad]} for state "
             f"{in_brief(states[bad])}: allowed are 0 to {problem.num_stages - 1}"
         )
-    return stages
+    return stages.copy()
 
 
 def _single(problem: Any, function: str, value: object) -> Any:

@@ -301,9 +301,12 @@ class _Rollouts:
         all_actions = np.concatenate([actions, for_clouds], axis=1)
         _read_only(before, all_actions)
         moved = np.stack(
-            [problem.move(*each, motion) for each in zip(before, all_actions, strict=True)]
+            [
+                # The same noise for each of the J: its stream begins anew.
+                checked.move(problem, states, own_actions, motion.anew())
+                for states, own_actions in zip(before, all_actions, strict=True)
+            ]
         )
-        moved = checked.states_of(problem, "move", moved, before.shape)
         self._states = moved[:, :count]
         self._clouds = moved[:, count:].reshape(self._clouds.shape)
         if self._counts_steps:

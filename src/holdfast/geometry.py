@@ -136,7 +136,7 @@ class _World(KeepsReadOnly):
             actions.reshape(-1, dimension),
             np.ascontiguousarray(standard_deviation, dtype=np.float64),
             tolerance,
-            stream.words,
+            stream.for_motion(),
             next_states.reshape(-1, dimension),
         )
         if not moved:
@@ -207,7 +207,7 @@ class _World(KeepsReadOnly):
             actions,
             np.ascontiguousarray(standard_deviation, dtype=np.float64),
             tolerance,
-            [stream.words for stream in streams],
+            [stream.for_motion() for stream in streams],
             threads,
             next_states,
         )
@@ -237,7 +237,7 @@ class _World(KeepsReadOnly):
         num_unplaced = self._kernel.own.draw_free(
             np.ascontiguousarray(mean, dtype=np.float64),
             np.ascontiguousarray(standard_deviation, dtype=np.float64),
-            stream.words,
+            stream.for_motion(),
             states,
         )
         return states, int(num_unplaced)

@@ -170,8 +170,8 @@ class Planner:
         check_problem(problem)
         check_settings(self.settings)
         count = self.settings.particle_filter.num_particles
-        drawn = problem.initial_states(stream(seed, trial, 0, Purpose.INITIAL_BELIEF), count)
-        states = checked.states_of(problem, "initial_states", drawn, (count, problem.state_size))
+        random = stream(seed, trial, 0, Purpose.INITIAL_BELIEF)
+        states = checked.initial_states(problem, random, count)
         return PlanningState(seed, trial, 0, 0, False, Belief(states, uniform_weights(count)))
 
     def check(self, state: PlanningState) -> None:
@@ -318,17 +318,9 @@ class Planner:
             If the problem breaks its contract.
         """
         self._require_size(state)
-        problem, shape = self.problem, state.belief.states.shape
         random = stream(state.seed, state.trial, state.step, Purpose.REINITIALISATION)
-        own = getattr(problem, "reinitial_states", None)
-        if own is not None:
-            states = checked.states_of(
-                problem, "reinitial_states", own(state.belief.states, random), shape
-            )
-        else:
-            drawn = problem.initial_states(random, shape[0])
-            states = checked.states_of(problem, "initial_states", drawn, shape)
-        return state._replace(belief=Belief(states, uniform_weights(shape[0])))
+        states = checked.reinitial_states(self.problem, state.belief.states, random)
+        return state._replace(belief=Belief(states, uniform_weights(states.shape[0])))
 
     def choose_task_action(self, state: PlanningState) -> tuple[FloatArray, TaskInfo]:
         """Choose the next task action: the policy's for the estimate, within the limits of a step.
@@ -386,9 +378,7 @@ class Planner:
         states, weights = state.belief
         random = stream(state.seed, state.trial, state.step, Purpose.PREDICTION)
         if motion is None:
-            moved = checked.states_of(
-                problem, "move", problem.move(states, action, random), states.shape
-            )
+            moved = checked.move(problem, states, action, random)
         else:
             moved = checked.moved_by_measurement(problem, states, motion, random)
         belief = Belief(moved, weights)

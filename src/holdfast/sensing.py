@@ -140,7 +140,7 @@ def choose_sensing_action(
             )
         return selector.sensing_action, SensingInfo(None, None, 0, 0)
     if selector.method == "random":
-        return int(float(selection.uniform()) * choices), SensingInfo(None, None, 0, 0)
+        return int(float(selection.anew().uniform()) * choices), SensingInfo(None, None, 0, 0)
 
     if selector.method == "expected_return":
         return _greatest_return(problem, settings, belief, stage, hypotheses)
@@ -450,7 +450,7 @@ def _general_hypotheses(
 
 def _stratified(weights: FloatArray, samples: int, stream: Stream) -> list[int]:
     """Draw one particle from each ``samples``-th of the cumulated weight."""
-    positions = (np.arange(samples) + stream.uniform(samples)) / samples
+    positions = (np.arange(samples) + stream.anew().uniform(samples)) / samples
     # np.cumsum adds one by one, in order, unlike np.sum.
     found = np.searchsorted(np.cumsum(weights), positions, side="right")
     last = int(np.flatnonzero(weights)[-1])

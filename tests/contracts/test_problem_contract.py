@@ -5,6 +5,8 @@ A problem of your own can be put through the same checks: register it, and it is
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -15,13 +17,13 @@ from holdfast.randomness import Purpose, stream
 
 SEED = 11
 LEADING_SHAPES = [(), (1,), (13,), (3, 5), (2, 3, 4), (0,)]
-INITIAL = stream(SEED, 0, 0, Purpose.INITIAL_BELIEF)
+initial = partial(stream, SEED, 0, 0, Purpose.INITIAL_BELIEF)  # anew at each call
 OF_EXPERIMENTS = [
     "holdfast.lab.studies.light_dark:LightDark",
     "holdfast.lab.studies.busy_room:BusyRoom",
     "holdfast.lab.studies.vdp_tag:VdpTag",
 ]
-MOTION = stream(SEED, 0, 0, Purpose.PREDICTION)
+motion = partial(stream, SEED, 0, 0, Purpose.PREDICTION)  # anew at each call
 
 
 @pytest.fixture(scope="module", params=[*registry.names(), *OF_EXPERIMENTS])
@@ -34,10 +36,10 @@ def problem(request: pytest.FixtureRequest) -> Problem:
 def some_states(problem: Problem, leading: tuple[int, ...]) -> FloatArray:
     """Return states from all along the way: started, then moved by the policy for a while."""
     count = int(np.prod(leading, dtype=int))
-    states = problem.initial_states(INITIAL, count)
+    states = problem.initial_states(initial(), count)
     for step in range(30):
         actions = problem.execute(problem.policy(states, 0))
-        states = problem.move(states, actions, MOTION.substream(step))
+        states = problem.move(states, actions, motion().substream(step))
     return states.reshape(*leading, problem.state_size)
 
 
@@ -64,14 +66,14 @@ def test_attributes(problem: Problem) -> None:
 
 
 def test_initial_states(problem: Problem) -> None:
-    states = problem.initial_states(INITIAL, 50)
+    states = problem.initial_states(initial(), 50)
     assert states.shape == (50, problem.state_size)
     assert states.dtype == np.float64
     assert np.isfinite(states).all()
     assert len(np.unique(states, axis=0)) == 50
-    assert problem.initial_states(INITIAL, 50).tobytes() == states.tobytes()
-    assert problem.initial_states(INITIAL, 20).tobytes() == states[:20].tobytes()
-    assert problem.initial_states(INITIAL.substream(1), 50).tobytes() != states.tobytes()
+    assert problem.initial_states(initial(), 50).tobytes() == states.tobytes()
+    assert problem.initial_states(initial(), 20).tobytes() == states[:20].tobytes()
+    assert problem.initial_states(initial().substream(1), 50).tobytes() != states.tobytes()
 
 
 @pytest.mark.parametrize("leading", LEADING_SHAPES)
@@ -80,7 +82,7 @@ def test_shapes_and_kinds(problem: Problem, leading: tuple[int, ...]) -> None:
     stages = some_stages(problem, leading)
     actions = problem.policy(states, stages)
     executed = problem.execute(actions)
-    moved = problem.move(states, executed, MOTION)
+    moved = problem.move(states, executed, motion())
     for array, size in (
         (actions, problem.action_size),
         (executed, problem.action_size),
@@ -148,23 +150,23 @@ def test_one_stage_for_a_belief_each(problem: Problem) -> None:
 def test_motion_is_a_function_of_state_action_and_stream(problem: Problem) -> None:
     states = some_states(problem, (64,))
     actions = problem.execute(problem.policy(states, 0))
-    moved = problem.move(states, actions, MOTION)
-    assert problem.move(states, actions, MOTION).tobytes() == moved.tobytes()
-    assert problem.move(states, actions, MOTION.substream(7)).tobytes() != moved.tobytes()
+    moved = problem.move(states, actions, motion())
+    assert problem.move(states, actions, motion()).tobytes() == moved.tobytes()
+    assert problem.move(states, actions, motion().substream(7)).tobytes() != moved.tobytes()
     # The first particles move as they would without the others.
-    assert problem.move(states[:9], actions[:9], MOTION).tobytes() == moved[:9].tobytes()
+    assert problem.move(states[:9], actions[:9], motion()).tobytes() == moved[:9].tobytes()
     # One action for all is that action for each.
-    shared = problem.move(states, actions[0], MOTION)
-    repeated = problem.move(states, np.tile(actions[0], (64, 1)), MOTION)
+    shared = problem.move(states, actions[0], motion())
+    repeated = problem.move(states, np.tile(actions[0], (64, 1)), motion())
     assert shared.tobytes() == repeated.tobytes()
 
 
 def test_the_noise_has_the_stated_variance(problem: Problem) -> None:
     # Of particles that start in one place, many are free to move: their spread is the noise's.
     count = 4000
-    start = problem.initial_states(INITIAL, 1)
+    start = problem.initial_states(initial(), 1)
     spread = problem.move(
-        np.repeat(start, count, axis=0), np.zeros(problem.action_size), MOTION
+        np.repeat(start, count, axis=0), np.zeros(problem.action_size), motion()
     ).var(axis=0)
     # Walls can only cut the noise off. Five standard errors above is one false alarm in 10^6.
     spread = spread[: problem.action_size]  # of what is acted on
@@ -173,7 +175,7 @@ def test_the_noise_has_the_stated_variance(problem: Problem) -> None:
 
 
 def test_limits_are_limits(problem: Problem) -> None:
-    commanded = INITIAL.normal((200, problem.action_size))
+    commanded = initial().normal((200, problem.action_size))
     executed = problem.execute(commanded)
     np.testing.assert_allclose(problem.execute(executed), executed, rtol=1e-15)
     larger = np.abs(problem.execute(1e6 * commanded))
@@ -203,21 +205,21 @@ def test_nothing_changes_its_arguments(problem: Problem) -> None:
     problem.next_stage(states, stages)
     problem.reward(states, actions)
     problem.is_goal(states)
-    moved = problem.move(states, actions, MOTION)
+    moved = problem.move(states, actions, motion())
     assert not np.shares_memory(moved, states)
 
 
 def test_the_task_can_be_done(problem: Problem) -> None:
     """With the state known, the policy reaches the goal in most trials."""
     trials = 20
-    states = problem.initial_states(INITIAL, trials)
+    states = problem.initial_states(initial(), trials)
     stages: int | IntArray = np.zeros(trials, dtype=np.int64)
     done = np.zeros(trials, dtype=bool)
     assert not problem.is_goal(states).any()
     for step in range(1500):
         stages = problem.next_stage(states, stages)
         actions = problem.execute(problem.policy(states, stages))
-        states = problem.move(states, actions, MOTION.substream(step))
+        states = problem.move(states, actions, motion().substream(step))
         done |= problem.is_goal(states)
         if done.all():
             break
@@ -249,6 +251,6 @@ def test_the_defaults_can_be_written_out_and_read_in(problem: Problem) -> None:
     )
     states = some_states(problem, (10,))
     assert again.policy(states, 0).tobytes() == problem.policy(states, 0).tobytes()
-    assert again.initial_states(INITIAL, 10).tobytes() == (
-        problem.initial_states(INITIAL, 10).tobytes()
+    assert again.initial_states(initial(), 10).tobytes() == (
+        problem.initial_states(initial(), 10).tobytes()
     )

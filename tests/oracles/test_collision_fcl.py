@@ -7,6 +7,8 @@ left out, and the 9,000 compared must hold many of both answers.
 
 from __future__ import annotations
 
+from functools import partial
+
 import fcl
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from holdfast.randomness import Purpose, stream
 
 NUM_POSES = 3000
 MARGIN = 2e-6
-STREAM = stream(3, 0, 0, Purpose.WORLD_MOTION)
+fresh = partial(stream, 3, 0, 0, Purpose.WORLD_MOTION)  # anew at each call
 
 RECTANGLES = [(-3.0, -2.0, -1.0, -1.5), (0.5, -1.0, 0.7, 2.0), (-2.0, 1.0, -1.0, 2.0)]
 BOXES = [
@@ -76,7 +78,7 @@ def flat_obstacles() -> list[fcl.CollisionObject]:
 
 
 def test_disc() -> None:
-    positions = STREAM.substream(0).normal((NUM_POSES, 2)) * 2.0
+    positions = fresh().substream(0).normal((NUM_POSES, 2)) * 2.0
     poses = np.zeros((NUM_POSES, 6))
     poses[:, :2] = positions
     ours = DiscWorld(0.4, RECTANGLES).collides(positions)
@@ -84,7 +86,7 @@ def test_disc() -> None:
 
 
 def test_rectangle() -> None:
-    states = STREAM.substream(1).normal((NUM_POSES, 3)) * np.array([2.0, 2.0, 3.0])
+    states = fresh().substream(1).normal((NUM_POSES, 3)) * np.array([2.0, 2.0, 3.0])
     poses = np.zeros((NUM_POSES, 6))
     poses[:, [0, 1, 3]] = states
     ours = RectangleWorld(0.6, 1.4, RECTANGLES).collides(states)
@@ -95,7 +97,7 @@ def test_rectangle() -> None:
 
 @pytest.mark.parametrize("angle_scale", [3.0, 0.05], ids=["any angles", "nearly parallel"])
 def test_box(angle_scale: float) -> None:
-    poses = STREAM.substream(2).normal((NUM_POSES // 2, 6))
+    poses = fresh().substream(2).normal((NUM_POSES // 2, 6))
     poses *= np.array([2.0] * 3 + [angle_scale] * 3)
     ours = BoxWorld((0.6, 1.0, 1.6), BOXES).collides(poses)
     smaller = fcl.Box(0.6 - MARGIN, 1.0 - MARGIN, 1.6 - MARGIN)

@@ -150,7 +150,8 @@ def test_beliefs_are_moved_as_one_after_the_other(name: str) -> None:
     streams = [stream(63, 0, step, Purpose.PREDICTION) for step in range(3)]
     alone = np.stack([problem.move(*each) for each in zip(states, actions, streams, strict=True)])
     for threads in (1, 2, 0):
-        together = problem.move_each(states, actions, streams, threads)
+        anew = [each.anew() for each in streams]
+        together = problem.move_each(states, actions, anew, threads)
         assert together.tobytes() == alone.tobytes()
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -31,7 +33,7 @@ from holdfast.lab.studies.vdp_trials import intercept, run_vdp_tag_trials, to_ne
 from holdfast.randomness import Purpose, Stream, stream
 
 SEED = 8101
-DRAW = stream(SEED, 0, 0, Purpose.SELECTION)
+fresh = partial(stream, SEED, 0, 0, Purpose.SELECTION)  # anew at each call
 SMALL = PursuitSettings(
     num_particles=48,
     num_places=16,
@@ -60,7 +62,7 @@ def test_lengths_of_ways(
 
 
 def test_no_way_is_shorter_than_a_straight_one() -> None:
-    ends = DRAW.normal((2, 500, 2))
+    ends = fresh().normal((2, 500, 2))
     straight = np.sqrt(((ends[0] - ends[1]) ** 2).sum(axis=-1))
     assert (way_length(ends[0], ends[1]) >= straight * (1.0 - 1e-12)).all()
 
@@ -79,7 +81,7 @@ def test_the_value_of_a_plan() -> None:
 
 
 def test_the_chance_of_a_tag_is_that_of_a_gaussian_in_a_disc() -> None:
-    points = 0.05 * DRAW.normal((100_000, 2))
+    points = 0.05 * fresh().normal((100_000, 2))
     share = (np.sqrt((points**2).sum(axis=1)) < 0.1).mean()
     # Five standard errors: one false alarm in a million seeds.
     assert abs(chance_of_tag(1) - share) < 5.0 * np.sqrt(0.12 / 100_000)
@@ -128,8 +130,8 @@ def test_rules_are_asked_about_the_belief_after_the_step() -> None:
         seen.append(belief)
         return True
 
-    targets = np.array([1.5, 0.5]) + 0.01 * DRAW.normal((100, 2))
-    steps, looks = Pursuit(rule, SMALL).decide(belief_of(targets), [DRAW])
+    targets = np.array([1.5, 0.5]) + 0.01 * fresh().normal((100, 2))
+    steps, looks = Pursuit(rule, SMALL).decide(belief_of(targets), [fresh()])
     (belief,) = seen
     np.testing.assert_array_equal(looks, [1])
     np.testing.assert_allclose(belief.states[:, :2], np.tile(steps, (48, 1)), atol=1e-12)
@@ -139,23 +141,23 @@ def test_rules_are_asked_about_the_belief_after_the_step() -> None:
 
 def test_rules_that_look_at_nothing() -> None:
     problem = VdpTag()
-    belief = Belief.uniform(problem.initial_states(DRAW, 10))
-    assert not never(problem, belief, DRAW)
-    assert always(problem, belief, DRAW)
-    drawn = [by_chance(0.3)(problem, belief, DRAW.substream(i)) for i in range(1000)]
+    belief = Belief.uniform(problem.initial_states(fresh(), 10))
+    assert not never(problem, belief, fresh())
+    assert always(problem, belief, fresh())
+    drawn = [by_chance(0.3)(problem, belief, fresh().substream(i)) for i in range(1000)]
     # Five standard errors.
     assert abs(np.mean(drawn) - 0.3) < 5.0 * np.sqrt(0.21 / 1000)
 
 
 def test_a_selector_looks_for_enough_nats() -> None:
     problem = VdpTag()
-    belief = Belief.uniform(problem.initial_states(DRAW, 60))
+    belief = Belief.uniform(problem.initial_states(fresh(), 60))
     sensing = ActiveSensingSettings(num_observation_samples=8, num_cores=1)
     planning = PlanningSettings(
         selector=SelectorSettings(method="state_entropy"), active_sensing=sensing
     )
-    assert by_selector(planning, -50.0)(problem, belief, DRAW)
-    assert not by_selector(planning, 50.0)(problem, belief, DRAW)
+    assert by_selector(planning, -50.0)(problem, belief, fresh())
+    assert not by_selector(planning, 50.0)(problem, belief, fresh())
 
 
 def test_a_selector_that_knows_the_price_is_asked_what_is_best() -> None:
@@ -169,12 +171,12 @@ def test_a_selector_that_knows_the_price_is_asked_what_is_best() -> None:
     )
     # Where the target is known, a look is not worth five.
     known = np.tile([1.0, 1.0, -1.5, -0.5], (40, 1))
-    assert not by_selector(planning)(problem, Belief.uniform(known), DRAW)
+    assert not by_selector(planning)(problem, Belief.uniform(known), fresh())
 
 
 def test_a_look_is_not_worth_its_price_where_all_is_known() -> None:
     targets = np.tile([1.5, 0.5], (100, 1))
-    _, looks = Pursuit(None, SMALL).decide(belief_of(targets), [DRAW])
+    _, looks = Pursuit(None, SMALL).decide(belief_of(targets), [fresh()])
     np.testing.assert_array_equal(looks, [0])
 
 
@@ -183,14 +185,14 @@ def test_a_target_within_one_step_is_tagged() -> None:
     following = target_flow(targets)
     beliefs = belief_of(targets)
     beliefs[0, :, :2] = following[0] + toward(np.array([-1.0, 1.0]))
-    steps, _ = Pursuit(None, SMALL).decide(beliefs, [DRAW])
+    steps, _ = Pursuit(None, SMALL).decide(beliefs, [fresh()])
     reached = stop_at_barriers(beliefs[0, 0, :2], steps[0])
     assert np.sqrt(((reached - following[0]) ** 2).sum()) < 0.1
 
 
 def test_decisions_do_not_depend_on_the_company() -> None:
-    beliefs = np.stack([VdpTag().initial_states(DRAW.substream(i), 100) for i in range(3)])
-    draws = [DRAW.substream(10 + i) for i in range(3)]
+    beliefs = np.stack([VdpTag().initial_states(fresh().substream(i), 100) for i in range(3)])
+    draws = [fresh().substream(10 + i) for i in range(3)]
     steps, looks = Pursuit(None, SMALL).decide(beliefs, draws)
     for i in range(3):
         own_step, own_look = Pursuit(None, SMALL).decide(beliefs[i : i + 1], draws[i : i + 1])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -19,7 +21,7 @@ from holdfast.belief import (
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.randomness import Purpose, stream
 
-STREAM = stream(21, 0, 0, Purpose.RESAMPLING)
+fresh = partial(stream, 21, 0, 0, Purpose.RESAMPLING)  # anew at each call
 
 
 class Direct:
@@ -58,7 +60,9 @@ class General(Direct):
 
 
 def some_belief(count: int = 50, size: int = 2) -> Belief:
-    return Belief.weighted(STREAM.normal((count, size)), STREAM.substream(1).uniform(count) + 0.01)
+    return Belief.weighted(
+        fresh().normal((count, size)), fresh().substream(1).uniform(count) + 0.01
+    )
 
 
 class TestMaking:
@@ -298,7 +302,7 @@ class TestBadInput:
 class TestResample:
     def test_counts(self) -> None:
         belief = some_belief(200)
-        after = resample(belief, STREAM)
+        after = resample(belief, fresh())
         assert after.weights.tolist() == [1.0 / 200.0] * 200
         shares = 200 * belief.weights
         for n, state in enumerate(belief.states):
@@ -306,8 +310,8 @@ class TestResample:
             assert np.floor(shares[n] - 1e-9) <= copies <= np.ceil(shares[n] + 1e-9)
 
     def test_equal_weights_stay_as_they_are(self) -> None:
-        belief = Belief.uniform(STREAM.normal((100, 3)))
-        after = resample(belief, STREAM)
+        belief = Belief.uniform(fresh().normal((100, 3)))
+        after = resample(belief, fresh())
         assert after.states.tobytes() == belief.states.tobytes()
         assert not np.shares_memory(after.states, belief.states)
 
@@ -318,7 +322,7 @@ class TestResample:
         Any other number of [0, 1) would be as good for a filter, but decide otherwise.
         """
         belief = some_belief(40)
-        draws = STREAM.substream(substream)
+        draws = fresh().substream(substream)
         teeth = (np.arange(40) + draws.uniform()) / 40
         found = np.searchsorted(np.cumsum(belief.weights), teeth, side="right")
         np.testing.assert_array_equal(resample(belief, draws).states, belief.states[found])
@@ -334,7 +338,7 @@ class TestResample:
         belief = Belief.weighted(np.arange(12.0).reshape(-1, 1), weights)
         copies = np.zeros(count)
         for index in range(tosses):
-            drawn = resample(belief, STREAM.substream(index)).states[:, 0].astype(np.int64)
+            drawn = resample(belief, fresh().substream(index)).states[:, 0].astype(np.int64)
             copies += np.bincount(drawn, minlength=count)
         share = count * belief.weights
         coin = share - np.floor(share)
@@ -345,10 +349,10 @@ class TestResample:
         """A tooth drawn at random is a draw from the belief: chi-square at 1e-6."""
         belief = Belief.weighted(np.arange(5.0).reshape(-1, 1), [0.07, 0.4, 0.13, 0.25, 0.15])
         offsets = 6000
-        teeth = (STREAM.substream(10**6).uniform(offsets) * 5).astype(np.int64)
+        teeth = (fresh().substream(10**6).uniform(offsets) * 5).astype(np.int64)
         drawn = np.array(
             [
-                resample(belief, STREAM.substream(index)).states[tooth, 0]
+                resample(belief, fresh().substream(index)).states[tooth, 0]
                 for index, tooth in enumerate(teeth.tolist())
             ]
         ).astype(np.int64)
@@ -357,5 +361,5 @@ class TestResample:
 
     def test_the_same_stream_draws_the_same(self) -> None:
         belief = some_belief()
-        first, second = resample(belief, STREAM), resample(belief, STREAM)
+        first, second = resample(belief, fresh()), resample(belief, fresh())
         assert first.states.tobytes() == second.states.tobytes()

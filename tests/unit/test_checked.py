@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from tests.line_problem import SETTINGS, Line
 
 from holdfast import checked
 from holdfast.arrays import FloatArray
+from holdfast.config.settings import ActiveSensingSettings, SelectorSettings
 from holdfast.errors import ProblemError
 from holdfast.planning import Planner
+from holdfast.randomness import Stream
 from holdfast.robot.environment import SimulatedEnvironment
 
 
@@ -165,3 +168,87 @@ def test_an_account_of_what_is_wrong_is_short(attribute: str, value: object, mes
         run_a_step(problem)
     assert "\n" not in str(refused.value)
     assert len(str(refused.value)) < 300
+
+
+class Rough(Line):
+    """A problem whose functions draw several times, as a user of NumPy writes it."""
+
+    def __init__(self) -> None:
+        self.drawn: dict[str, list[Any]] = {}
+
+    def note(self, function: str, *draws: FloatArray) -> None:
+        self.drawn.setdefault(function, []).append([draw.tobytes() for draw in draws])
+
+    def initial_states(self, stream: Stream, count: int) -> FloatArray:
+        first, second = stream.normal(size=count), stream.normal(size=count)
+        self.note("initial_states", first, second)
+        return np.asarray(np.stack([first, second], axis=-1))
+
+    def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
+        draws = [0.1 * stream.normal(size=states.shape) for _ in range(3)]
+        self.note("move", *draws)
+        return states + actions + draws[0] + draws[1] + draws[2]
+
+    def expected_move(self, states: FloatArray, actions: FloatArray) -> FloatArray:
+        return states + actions
+
+    def log_likelihood(
+        self, states: FloatArray, sensing_action: int, observation: FloatArray
+    ) -> FloatArray:
+        away = states[:, sensing_action] - observation[0]
+        return -50.0 * away * away
+
+    def sample_observation(
+        self, state: FloatArray, sensing_action: int, stream: Stream
+    ) -> FloatArray:
+        wrong, noise = stream.random(1), stream.normal(size=1)
+        self.note("sample_observation", wrong, noise)
+        return np.where(wrong < 0.1, 0.0, state[[sensing_action]] + 0.1 * noise)
+
+
+class TestStreams:
+    def test_each_call_has_a_stream_that_begins_anew_and_goes_on(self) -> None:
+        once, again = Rough(), Rough()
+        for problem in (once, again):
+            run_a_step(problem)
+            run_a_step(problem)
+        assert set(once.drawn) == {"initial_states", "move", "sample_observation"}
+        for function, calls in once.drawn.items():
+            assert all(len(set(draws)) == len(draws) for draws in calls), function
+            # The second run of the step drew what the first one did, and so did another problem.
+            half = len(calls) // 2
+            assert calls[:half] == calls[half:]
+        assert again.drawn == once.drawn
+
+    @pytest.mark.parametrize("method", ["path_entropy", "expected_return", "action_entropy"])
+    @pytest.mark.parametrize("kind", [Rough, Line])
+    def test_a_state_has_one_next_decision(self, method: Any, kind: Any) -> None:
+        settings = msgspec.structs.replace(
+            SETTINGS,
+            active_sensing=ActiveSensingSettings(num_cores=1, horizon=1 + (method[0] == "a")),
+            selector=SelectorSettings(method=method, rollout_steps=20, rollout_reward="steps"),
+        )
+        planner = Planner(kind(), settings)
+        state = planner.init(4)
+        choices = {repr(planner.choose_sensing_action(state)) for _ in range(3)}
+        assert len(choices) == 1
+
+    def test_noise_is_the_same_after_every_sensing_action(self) -> None:
+        problem = Rough()
+        selector = SelectorSettings(method="expected_return", rollout_steps=2, rollout_looks=1)
+        planner = Planner(problem, msgspec.structs.replace(SETTINGS, selector=selector))
+        planner.choose_sensing_action(planner.init(4))
+        moves = problem.drawn["move"]
+        assert moves
+        assert moves[0::2] == moves[1::2]
+
+    def test_one_that_is_kept_is_refused(self) -> None:
+        class Keeping(Line):
+            def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
+                self.kept = getattr(self, "kept", stream)
+                return states + actions + self.kept.normal(size=states.shape)
+
+        environment = SimulatedEnvironment(Keeping(), 0, 0)
+        environment.perform(np.zeros(1))
+        with pytest.raises(ProblemError, match="kept from an earlier call cannot be drawn from"):
+            environment.perform(np.zeros(1))

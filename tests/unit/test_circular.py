@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,24 +26,24 @@ from holdfast.errors import ProblemError
 from holdfast.problems.problem import ProblemBase
 from holdfast.randomness import Purpose, Stream, stream
 
-STREAM = stream(77, 0, 0, Purpose.HYPOTHESES)
+fresh = partial(stream, 77, 0, 0, Purpose.HYPOTHESES)  # anew at each call
 
 
 def headings(count: int, middle: float = np.pi, spread: float = 0.4) -> FloatArray:
     """Return headings about one, between -pi and pi, as robots keep them."""
-    return numerics.wrapped(middle + spread * STREAM.normal(count))
+    return numerics.wrapped(middle + spread * fresh().normal(count))
 
 
 class TestBeliefs:
     def test_a_mean_is_the_direction_of_the_mean_vector(self) -> None:
-        angles = STREAM.normal((50, 3)) * [0.3, 2.0, 9.0]
-        weights = STREAM.substream(1).uniform(50)
+        angles = fresh().normal((50, 3)) * [0.3, 2.0, 9.0]
+        weights = fresh().substream(1).uniform(50)
         weights /= weights.sum()
         expected = np.angle(weights @ np.exp(1j * angles))
         np.testing.assert_allclose(mean_angles(angles, weights), expected, atol=1e-13)
 
     def test_headings_about_pi_mean_pi(self) -> None:
-        states = np.stack([STREAM.normal(400), headings(400)], axis=1)
+        states = np.stack([fresh().normal(400), headings(400)], axis=1)
         belief = Belief.uniform(states)
         mean = estimate(belief, circular=(1,))
         assert mean[0] == estimate(belief)[0]
@@ -51,7 +52,7 @@ class TestBeliefs:
         assert standard_deviation(belief)[1] > 2.0
 
     def test_whole_turns_change_nothing(self) -> None:
-        states = np.stack([STREAM.normal(60), headings(60)], axis=1)
+        states = np.stack([fresh().normal(60), headings(60)], axis=1)
         turned = states.copy()
         turned[::3, 1] += 2.0 * np.pi
         turned[::5, 1] -= 4.0 * np.pi
@@ -90,7 +91,7 @@ class TestEntropies:
     @pytest.mark.parametrize("middle", [0.0, 3.0, np.pi, -2.5])
     def test_as_with_distances_on_the_circle(self, dimension: int, middle: float) -> None:
         """Exact where the angles leave a gap, but for rounding."""
-        points = STREAM.substream(dimension).normal((200, dimension))
+        points = fresh().substream(dimension).normal((200, dimension))
         points[:, -1] = headings(200, middle, 0.6)
         estimator = hf.NearestNeighbor(4, 1e-12)
         circular = (dimension - 1,)
@@ -100,8 +101,8 @@ class TestEntropies:
     @pytest.mark.parametrize("dimension", [1, 2])
     def test_all_around_the_circle_the_cut_costs_little(self, dimension: int) -> None:
         """What is lost beside it, over 50 seeds: 0.000 and 0.021 nats on average, 0.04 at most."""
-        points = STREAM.substream(dimension).normal((200, dimension))
-        points[:, -1] = np.pi * (2.0 * STREAM.substream(9).uniform(200) - 1.0)
+        points = fresh().substream(dimension).normal((200, dimension))
+        points[:, -1] = np.pi * (2.0 * fresh().substream(9).uniform(200) - 1.0)
         circular = (dimension - 1,)
         found = hf.entropy(points, estimator=hf.NearestNeighbor(4, 1e-12), circular=circular)
         assert abs(np.subtract(found, brute_force_entropy(points, circular, 4))) < 0.05
@@ -116,7 +117,7 @@ class TestEntropies:
             )
 
     def test_the_covariance_of_small_angles_is_that_of_their_vectors(self) -> None:
-        points = np.stack([STREAM.normal(500), headings(500, np.pi, 0.05)], axis=1)
+        points = np.stack([fresh().normal(500), headings(500, np.pi, 0.05)], axis=1)
         vectors = embedded(points, (1,))
         assert vectors.shape == (500, 3)
         assert vectors[:, 1:].var(axis=0).sum() == pytest.approx(0.0025, rel=0.2)
@@ -223,7 +224,7 @@ class TestChoices:
 
 class TestObservations:
     def test_an_innovation_is_the_shorter_way_round(self) -> None:
-        belief = Belief.uniform(np.stack([headings(80), headings(80), STREAM.normal(80)], axis=1))
+        belief = Belief.uniform(np.stack([headings(80), headings(80), fresh().normal(80)], axis=1))
         found, info = update(Turret(np.pi), belief, 0, [np.pi])
         far = numerics.wrapped(belief.states[:, 0] - np.pi)
         expected = np.exp(-0.5 * far**2 / 0.01)
@@ -245,7 +246,7 @@ class TestObservations:
         """Of one particle in front of the cut and one behind; both explain what is between them."""
         predicted = np.array([[3.1, -3.1, 0.0]])
         weights = np.full(3, 1.0 / 3.0)
-        rows = (weights, [1], predicted, np.array([[0.01]]), 8, STREAM.words)
+        rows = (weights, [1], predicted, np.array([[0.01]]), 8, fresh().words)
         found = _kernel.hypothetical_weights(*rows, [1], False).reshape(8, 3)
         assert (found[:, :2].min(axis=1) > 0.05).sum() >= 5  # two thirds of eight begin there
         apart = _kernel.hypothetical_weights(*rows, [], False).reshape(8, 3)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ from holdfast.randomness import Purpose, Stream, stream
 
 World = DiscWorld | RectangleWorld | BoxWorld
 
-STREAM = stream(20, 1, 2, Purpose.PREDICTION)
+fresh = partial(stream, 20, 1, 2, Purpose.PREDICTION)  # anew at each call
 GROUND = [(-FAR, -FAR, FAR, 0.0)]
 SLOT = [
     (-FAR, -FAR, -0.6, 0.0),
@@ -138,7 +140,7 @@ class TestBox:
             (1.0, 2.0, 1.0),
             [(0.0, 0.0, -1.0, 1.0, 1.0, 1.0), (-3.0, -2.0, -1.0, -1.0, -1.0, 1.0)],
         )
-        poses = STREAM.normal((2000, 3)) * np.array([2.0, 2.0, 3.0])
+        poses = fresh().normal((2000, 3)) * np.array([2.0, 2.0, 3.0])
         poses_3d = np.zeros((2000, 6))
         poses_3d[:, [0, 1, 3]] = poses
         expected = flat.collides(poses)
@@ -211,19 +213,19 @@ class TestMove:
         self, case: tuple[World, FloatArray, FloatArray, FloatArray]
     ) -> None:
         world, mean, deviation, action = case
-        states, unplaced = world.draw_free(mean, deviation, 60, STREAM.substream(9))
+        states, unplaced = world.draw_free(mean, deviation, 60, fresh().substream(9))
         assert unplaced == 0
-        actions = action * (1.0 + STREAM.substream(8).normal(states.shape))
+        actions = action * (1.0 + fresh().substream(8).normal(states.shape))
         assert 5 < world.collides(states + actions).sum() < 60  # some stop, some do not
-        moved = world.move(states, actions, deviation, 1e-3, STREAM)
-        expected = reference_move(world, states, actions, deviation, 1e-3, STREAM)
+        moved = world.move(states, actions, deviation, 1e-3, fresh())
+        expected = reference_move(world, states, actions, deviation, 1e-3, fresh())
         assert moved.tobytes() == expected.tobytes()
 
     def test_stays_free(self, case: tuple[World, FloatArray, FloatArray, FloatArray]) -> None:
         world, mean, deviation, action = case
-        states, _ = world.draw_free(mean, deviation, 500, STREAM)
+        states, _ = world.draw_free(mean, deviation, 500, fresh())
         for step in range(5):
-            states = world.move(states, action, deviation, 1e-3, STREAM.substream(step))
+            states = world.move(states, action, deviation, 1e-3, fresh().substream(step))
         assert not world.collides(states).any()
 
     def test_a_particle_does_not_depend_on_the_others_or_on_threads(
@@ -231,28 +233,30 @@ class TestMove:
     ) -> None:
         world, mean, deviation, action = case
         count = 5000  # above the kernel's threshold for threads
-        states, _ = world.draw_free(mean, deviation, count, STREAM)
-        few, _ = world.draw_free(mean, deviation, 300, STREAM)
+        states, _ = world.draw_free(mean, deviation, count, fresh())
+        few, _ = world.draw_free(mean, deviation, 300, fresh())
         assert states[:300].tobytes() == few.tobytes()
-        moved = world.move(states, action, deviation, 1e-3, STREAM)
-        fewer = world.move(states[:300], action, deviation, 1e-3, STREAM)
+        moved = world.move(states, action, deviation, 1e-3, fresh())
+        fewer = world.move(states[:300], action, deviation, 1e-3, fresh())
         assert moved[:300].tobytes() == fewer.tobytes()
 
     def test_stops_at_contact_within_the_tolerance(self) -> None:
         world = DiscWorld(0.1, GROUND)
-        moved = world.move(np.array([0.0, 0.5]), np.array([1.0, -1.0]), np.zeros(2), 1e-3, STREAM)
+        moved = world.move(np.array([0.0, 0.5]), np.array([1.0, -1.0]), np.zeros(2), 1e-3, fresh())
         assert 0.1 <= moved[1] <= 0.1 + 1e-3
         assert moved[0] == pytest.approx(0.5 - moved[1])
 
     def test_free_action_without_noise_is_added_exactly(self) -> None:
         world = RectangleWorld(1.0, 2.0, GROUND)
         state, action = np.array([0.3, 5.1, 0.7]), np.array([0.1, -0.1, 0.1])
-        moved = world.move(state, action, np.zeros(3), 1e-3, STREAM)
+        moved = world.move(state, action, np.zeros(3), 1e-3, fresh())
         np.testing.assert_array_equal(moved, state + action)
 
     def test_a_tiny_tolerance_ends(self) -> None:
         world = DiscWorld(0.1, GROUND)
-        moved = world.move(np.array([0.0, 0.5]), np.array([0.0, -1.0]), np.zeros(2), 1e-300, STREAM)
+        moved = world.move(
+            np.array([0.0, 0.5]), np.array([0.0, -1.0]), np.zeros(2), 1e-300, fresh()
+        )
         assert moved[1] == pytest.approx(0.1, abs=1e-15)
 
     def test_noise_far_from_obstacles_is_gaussian(self) -> None:
@@ -260,7 +264,7 @@ class TestMove:
         deviation = np.array([0.2, 0.5])
         count = 20_000
         noise = world.move(
-            np.tile([0.0, 100.0], (count, 1)), np.zeros(2), deviation, 1e-3, STREAM
+            np.tile([0.0, 100.0], (count, 1)), np.zeros(2), deviation, 1e-3, fresh()
         ) - np.array([0.0, 100.0])
         # Five standard errors: a false alarm in less than one of 10^6 choices of the seed.
         assert (np.abs(noise.mean(axis=0)) < 5 * deviation / np.sqrt(count)).all()
@@ -271,7 +275,7 @@ class TestMove:
         world = DiscWorld(0.1, GROUND)
         count = 20_000
         states = np.tile([0.0, 0.1], (count, 1))  # touching the ground
-        height = world.move(states, np.zeros(2), np.array([0.05, 0.05]), 1e-3, STREAM)[:, 1] - 0.1
+        height = world.move(states, np.zeros(2), np.array([0.05, 0.05]), 1e-3, fresh())[:, 1] - 0.1
         mean = 0.05 * np.sqrt(2 / np.pi)
         standard_error = 0.05 * np.sqrt((1 - 2 / np.pi) / count)
         assert (height >= 0.0).all()
@@ -285,19 +289,19 @@ class TestMove:
             (-FAR, 0.1, FAR, FAR),
         ]
         world = DiscWorld(0.099, cage)
-        moved = world.move(np.zeros(2), np.array([0.0005, 0.0]), np.full(2, 4.0), 1e-3, STREAM)
+        moved = world.move(np.zeros(2), np.array([0.0005, 0.0]), np.full(2, 4.0), 1e-3, fresh())
         np.testing.assert_array_equal(moved, [0.0005, 0.0])
 
     def test_a_start_in_collision_without_a_way_out_stays(self) -> None:
         world = DiscWorld(0.1, GROUND)
         state = np.array([0.0, -50.0])
-        moved = world.move(state, np.array([0.1, 0.1]), np.full(2, 0.1), 1e-3, STREAM)
+        moved = world.move(state, np.array([0.1, 0.1]), np.full(2, 0.1), 1e-3, fresh())
         np.testing.assert_array_equal(moved, state)
 
     def test_inputs_are_not_changed(self) -> None:
         world = DiscWorld(0.1, GROUND)
         states, actions = np.full((4, 2), 1.0), np.full((4, 2), 0.1)
-        world.move(states, actions, np.full(2, 0.1), 1e-3, STREAM)
+        world.move(states, actions, np.full(2, 0.1), 1e-3, fresh())
         assert (states == 1.0).all()
         assert (actions == 0.1).all()
 
@@ -317,19 +321,19 @@ class TestMove:
         self, states: tuple[int, ...], actions: tuple[int, ...], result: tuple[int, ...]
     ) -> None:
         world = DiscWorld(0.1, GROUND)
-        state_values = 10.0 + STREAM.normal(states)
-        action_values = STREAM.substream(1).normal(actions)
-        moved = world.move(state_values, action_values, np.zeros(2), 1e-3, STREAM)
+        state_values = 10.0 + fresh().normal(states)
+        action_values = fresh().substream(1).normal(actions)
+        moved = world.move(state_values, action_values, np.zeros(2), 1e-3, fresh())
         np.testing.assert_array_equal(moved, state_values + action_values)
         assert moved.shape == result
 
     def test_arrays_in_any_memory_order(self) -> None:
         world = RectangleWorld(1.0, 2.0, SLOT)
-        states = np.array([0.0, 3.0, 0.0]) + 0.1 * STREAM.normal((50, 3))
+        states = np.array([0.0, 3.0, 0.0]) + 0.1 * fresh().normal((50, 3))
         action, deviation = np.full(3, -0.1), np.full(3, 0.1)
-        expected = world.move(states, action, deviation, 1e-3, STREAM)
+        expected = world.move(states, action, deviation, 1e-3, fresh())
         strided = np.asfortranarray(states)
-        moved = world.move(strided, action, deviation, 1e-3, STREAM)
+        moved = world.move(strided, action, deviation, 1e-3, fresh())
         assert moved.tobytes() == expected.tobytes()
 
 
@@ -337,10 +341,10 @@ class TestDrawFree:
     def test_takes_the_first_free_draw(self) -> None:
         world = RectangleWorld(1.0, 2.0, GROUND)
         mean, deviation = np.array([0.0, 1.2, 0.0]), np.array([1.0, 1.0, 1.0])
-        states, unplaced = world.draw_free(mean, deviation, 40, STREAM)
+        states, unplaced = world.draw_free(mean, deviation, 40, fresh())
         assert unplaced == 0
         draws = np.array(
-            [mean + deviation * STREAM.substream(a).normal((40, 3)) for a in range(30)]
+            [mean + deviation * fresh().substream(a).normal((40, 3)) for a in range(30)]
         )
         free = ~world.collides(draws)
         assert free.any(axis=0).all()
@@ -349,12 +353,12 @@ class TestDrawFree:
 
     def test_counts_what_it_cannot_place(self) -> None:
         world = DiscWorld(0.1, GROUND)
-        states, unplaced = world.draw_free(np.array([0.0, -9.0]), np.full(2, 0.1), 17, STREAM)
+        states, unplaced = world.draw_free(np.array([0.0, -9.0]), np.full(2, 0.1), 17, fresh())
         assert unplaced == 17
         np.testing.assert_array_equal(states, np.tile([0.0, -9.0], (17, 1)))
 
     def test_none(self) -> None:
-        states, unplaced = DiscWorld(0.1, GROUND).draw_free(np.ones(2), np.ones(2), 0, STREAM)
+        states, unplaced = DiscWorld(0.1, GROUND).draw_free(np.ones(2), np.ones(2), 0, fresh())
         assert states.shape == (0, 2)
         assert unplaced == 0
 
@@ -370,38 +374,38 @@ class TestRefusals:
         with pytest.raises(InvalidValueError, match=r"states\[1, 0\]"):
             self.world.collides(wrong)
         with pytest.raises(InvalidValueError, match=r"states\[1, 0\]"):
-            self.world.move(wrong, good, deviation, 1e-3, STREAM)
+            self.world.move(wrong, good, deviation, 1e-3, fresh())
         with pytest.raises(InvalidValueError, match=r"actions\[1, 0\]"):
-            self.world.move(good, wrong, deviation, 1e-3, STREAM)
+            self.world.move(good, wrong, deviation, 1e-3, fresh())
         with pytest.raises(InvalidValueError, match=r"standard_deviation\[1\]"):
-            self.world.move(good, good, np.array([1.0, bad]), 1e-3, STREAM)
+            self.world.move(good, good, np.array([1.0, bad]), 1e-3, fresh())
         with pytest.raises(InvalidValueError, match=r"mean\[0\]"):
-            self.world.draw_free(np.array([bad, 1.0]), deviation, 3, STREAM)
+            self.world.draw_free(np.array([bad, 1.0]), deviation, 3, fresh())
 
     @pytest.mark.parametrize("tolerance", [0.0, -1.0, 1.0, np.nan])
     def test_tolerance(self, tolerance: float) -> None:
         with pytest.raises(InvalidValueError, match="tolerance"):
-            self.world.move(np.ones(2), np.ones(2), np.ones(2), tolerance, STREAM)
+            self.world.move(np.ones(2), np.ones(2), np.ones(2), tolerance, fresh())
 
     def test_negative_deviation(self) -> None:
         with pytest.raises(InvalidValueError, match="must not be negative"):
-            self.world.move(np.ones(2), np.ones(2), np.array([1.0, -1.0]), 1e-3, STREAM)
+            self.world.move(np.ones(2), np.ones(2), np.array([1.0, -1.0]), 1e-3, fresh())
         with pytest.raises(InvalidValueError, match="must not be negative"):
-            self.world.draw_free(np.ones(2), np.array([1.0, -1.0]), 3, STREAM)
+            self.world.draw_free(np.ones(2), np.array([1.0, -1.0]), 3, fresh())
 
     def test_shapes(self) -> None:
         with pytest.raises(InvalidValueError, match=r"shape \(3, 4\)"):
             self.world.collides(np.ones((3, 4)))
         with pytest.raises(InvalidValueError, match=r"shape \(3,\)"):
-            self.world.move(np.ones((3, 2)), np.ones(3), np.ones(2), 1e-3, STREAM)
+            self.world.move(np.ones((3, 2)), np.ones(3), np.ones(2), 1e-3, fresh())
         with pytest.raises(InvalidValueError, match="does not broadcast"):
-            self.world.move(np.ones((3, 2)), np.ones((4, 2)), np.ones(2), 1e-3, STREAM)
+            self.world.move(np.ones((3, 2)), np.ones((4, 2)), np.ones(2), 1e-3, fresh())
         with pytest.raises(InvalidValueError, match="standard_deviation"):
-            self.world.move(np.ones((3, 2)), np.ones(2), np.ones(3), 1e-3, STREAM)
+            self.world.move(np.ones((3, 2)), np.ones(2), np.ones(3), 1e-3, fresh())
         with pytest.raises(InvalidValueError, match="mean"):
-            self.world.draw_free(np.ones(3), np.ones(2), 3, STREAM)
+            self.world.draw_free(np.ones(3), np.ones(2), 3, fresh())
         with pytest.raises(InvalidValueError, match="count: -1"):
-            self.world.draw_free(np.ones(2), np.ones(2), -1, STREAM)
+            self.world.draw_free(np.ones(2), np.ones(2), -1, fresh())
 
     @pytest.mark.parametrize("size", [0.0, -1.0, np.nan, np.inf])
     def test_sizes(self, size: float) -> None:

@@ -7,6 +7,7 @@ eleven more bits or sixty more; where they have none, the accuracy cannot be jud
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +17,7 @@ from holdfast import numerics
 from holdfast.arrays import FloatArray
 from holdfast.randomness import Purpose, stream
 
-STREAM = stream(5, 0, 0, Purpose.PREDICTION)
+fresh = partial(stream, 5, 0, 0, Purpose.PREDICTION)  # anew at each call
 COUNT = 200_000
 
 has_long_double = pytest.mark.skipif(
@@ -34,7 +35,7 @@ def units_in_the_last_place(
 
 
 def uniform(low: float, high: float, index: int = 0) -> FloatArray:
-    return low + (high - low) * STREAM.substream(index).uniform(COUNT)
+    return low + (high - low) * fresh().substream(index).uniform(COUNT)
 
 
 @has_long_double
@@ -61,8 +62,8 @@ class TestAccuracy:
 
     def test_log_of_every_order_of_magnitude(self) -> None:
         """From the smallest subnormal number to the largest of all."""
-        exponents = (STREAM.substream(2).uniform(COUNT) * 2098).astype(np.int64) - 1074
-        x = np.ldexp(1.0 + STREAM.substream(3).uniform(COUNT), exponents)
+        exponents = (fresh().substream(2).uniform(COUNT) * 2098).astype(np.int64) - 1074
+        x = np.ldexp(1.0 + fresh().substream(3).uniform(COUNT), exponents)
         x = np.concatenate([x[np.isfinite(x)], [5e-324, 2.0**-1022, np.finfo(np.float64).max]])
         assert units_in_the_last_place(numerics.log, np.log, x) < 2.0
 
@@ -83,7 +84,7 @@ class TestAccuracy:
             assert units_in_the_last_place(numerics.cos, np.cos, x) < 2.0
 
     def test_tiny_angles(self) -> None:
-        x = np.ldexp(1.0 + STREAM.uniform(1000), -np.arange(1000))
+        x = np.ldexp(1.0 + fresh().uniform(1000), -np.arange(1000))
         assert units_in_the_last_place(numerics.sin, np.sin, x) < 2.0
         assert units_in_the_last_place(numerics.cos, np.cos, x) < 2.0
 
@@ -146,7 +147,7 @@ class TestForm:
     @pytest.mark.parametrize("name", ["exp", "log", "sin", "cos"])
     def test_shapes(self, name: str) -> None:
         function = getattr(numerics, name)
-        x = np.abs(STREAM.normal((3, 5, 7)))
+        x = np.abs(fresh().normal((3, 5, 7)))
         result = function(x)
         assert result.shape == x.shape
         assert result.dtype == np.float64
@@ -161,14 +162,14 @@ class TestForm:
     @pytest.mark.parametrize("name", ["exp", "log", "sin", "cos"])
     def test_elements_do_not_depend_on_their_place(self, name: str) -> None:
         function = getattr(numerics, name)
-        x = STREAM.normal(40) * 5.0
+        x = fresh().normal(40) * 5.0
         whole = function(x)
         for first in range(9):
             for last in range(first, 40, 3):
                 assert function(x[first:last]).tobytes() == whole[first:last].tobytes()
 
     def test_sum(self) -> None:
-        x = STREAM.normal((10, 7))
+        x = fresh().normal((10, 7))
         assert numerics.sum(x) == numerics.sum(x.reshape(-1))
         assert numerics.sum([1, 2, 3]) == 6.0
         assert numerics.sum([]) == 0.0
@@ -176,8 +177,8 @@ class TestForm:
         assert np.isnan(numerics.sum([1.0, np.nan]))
 
     def test_weighted_mean(self) -> None:
-        rows = STREAM.normal((50, 3))
-        weights = STREAM.substream(1).uniform(50)
+        rows = fresh().normal((50, 3))
+        weights = fresh().substream(1).uniform(50)
         weights /= weights.sum()
         mean = numerics.weighted_mean(rows, weights)
         np.testing.assert_allclose(mean, np.average(rows, axis=0, weights=weights), atol=1e-15)
@@ -185,7 +186,7 @@ class TestForm:
         assert numerics.weighted_mean(strided, weights).tobytes() == mean.tobytes()
 
     def test_arguments_are_not_changed(self) -> None:
-        x = STREAM.normal(20)
+        x = fresh().normal(20)
         x.setflags(write=False)
         for function in (numerics.exp, numerics.log, numerics.sin, numerics.cos):
             assert not np.shares_memory(function(x), x)
@@ -200,7 +201,7 @@ class TestAngles:
         assert np.isnan(numerics.arctan2([np.nan, 1.0], [1.0, np.nan])).all()
 
     def test_shapes_broadcast(self) -> None:
-        y = STREAM.normal((4, 1, 3))
+        y = fresh().normal((4, 1, 3))
         found = numerics.arctan2(y, 1.0)
         assert found.shape == y.shape
         assert numerics.arctan2(y, np.ones((5, 1))).shape == (4, 5, 3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from holdfast.errors import InvalidValueError
 from holdfast.problems.peg_in_hole_2d import PegInHole2D, PegInHole2DModel
 from holdfast.randomness import Purpose, stream
 
-STREAM = stream(5, 0, 0, Purpose.INITIAL_BELIEF)
+fresh = partial(stream, 5, 0, 0, Purpose.INITIAL_BELIEF)  # anew at each call
 
 
 def action(problem: Any, *state: float, stage: int = 0) -> list[float]:
@@ -63,7 +64,7 @@ class TestPegInHole2D:
 
     def test_initial_spread(self) -> None:
         # x is the one coordinate that the ground hardly cuts off.
-        states = self.problem.initial_states(STREAM, 20_000)
+        states = self.problem.initial_states(fresh(), 20_000)
         assert states[:, 0].mean() == pytest.approx(4.0, abs=5 * np.sqrt(2.0 / 20_000))
         assert states[:, 0].var() == pytest.approx(2.0, rel=5 * np.sqrt(2.0 / 20_000))
 
@@ -78,4 +79,4 @@ class TestPegInHole2D:
     def test_a_start_in_the_ground_is_refused_with_its_keys(self) -> None:
         model = PegInHole2DModel(init_mean=(5.0, -20.0, 0.0), init_cov=(0.1, 0.1, 0.1))
         with pytest.raises(InvalidValueError, match=r"init_mean.*init_cov.*7 of 7"):
-            PegInHole2D(model).initial_states(STREAM, 7)
+            PegInHole2D(model).initial_states(fresh(), 7)

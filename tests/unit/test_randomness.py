@@ -7,21 +7,33 @@ seed were drawn anew.
 
 from __future__ import annotations
 
+import copy
 import itertools
+import pickle
+from collections.abc import Callable
+from functools import partial
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from holdfast import _kernel
-from holdfast.errors import InvalidValueError
-from holdfast.randomness import Purpose, Stream, stream
+from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.geometry import DiscWorld
+from holdfast.randomness import NOISE_FREE, NoiseFreeStream, Purpose, Stream, stream
 
 SAMPLE = 200_000
-NAMED = stream(12, 3, 4, Purpose.PREDICTION)
+named = partial(stream, 12, 3, 4, Purpose.PREDICTION)  # anew at each call
 
 GOLDEN_UNIFORM = ["0x1.f5ffc4fe43eadp-1", "0x1.191f6d04e75b5p-1", "0x1.b5b448943e518p-4"]
 GOLDEN_NORMAL = ["-0x1.562eb41142b4ap+1", "-0x1.b3e1ab7e0d64fp-1", "0x1.d872a84e8b3a0p-10"]
+GOLDEN_LATER = [
+    "0x1.873934e776fc0p-7",
+    "0x1.b7f0b9607e8a0p-4",
+    "0x1.26b96ba7abac6p-2",
+    "0x1.3002581272d4cp-3",
+]
 
 
 class TestNames:
@@ -71,9 +83,9 @@ class TestNames:
 
     def test_equal_names_are_equal(self) -> None:
         assert stream(1, 2, 3, Purpose.SELECTION) == stream(1, 2, 3, Purpose.SELECTION)
-        assert len({NAMED, stream(12, 3, 4, Purpose.PREDICTION), NAMED.substream(0)}) == 2
-        assert NAMED.words != NAMED
-        assert repr(NAMED) == f"Stream({NAMED.words})"
+        assert len({named(), stream(12, 3, 4, Purpose.PREDICTION), named().substream(0)}) == 2
+        assert named().words != named()
+        assert repr(named()) == f"Stream({named().words})"
 
     @pytest.mark.parametrize("seed", [-1, 2**63, 2**64])
     def test_seed_out_of_range(self, seed: int) -> None:
@@ -88,45 +100,45 @@ class TestNames:
     @pytest.mark.parametrize("index", [-1, 2**32])
     def test_substream_out_of_range(self, index: int) -> None:
         with pytest.raises(InvalidValueError, match=rf"substream index {index}: .*{2**32 - 1}"):
-            NAMED.substream(index)
+            named().substream(index)
 
 
 class TestDraws:
     @pytest.mark.parametrize("kind", ["normal", "uniform"])
-    def test_a_draw_depends_on_its_place_alone(self, kind: str) -> None:
-        draw = getattr(NAMED, kind)
+    def test_a_first_draw_depends_on_its_place_alone(self, kind: str) -> None:
+        def draw(*shape: object) -> Any:
+            return getattr(named(), kind)(*shape)
+
         many = draw(1000)
         for count in (0, 1, 2, 3, 8, 15, 16, 17, 999):
             assert draw(count).tobytes() == many[:count].tobytes()
         assert draw((10, 20, 5)).tobytes() == many.tobytes()
         assert draw((10, 20, 5)).shape == (10, 20, 5)
         assert draw().shape == ()
-        assert draw(()).item() == many[0]
+        assert draw(()).item() == draw() == many[0]
         assert draw((0, 3)).shape == (0, 3)
 
-    def test_asking_changes_nothing(self) -> None:
-        before = NAMED.words
-        first = NAMED.normal(10)
-        NAMED.uniform(3)
-        NAMED.substream(1).normal(5)
-        first_again = NAMED.normal(10)
-        assert NAMED.words == before
-        assert first_again.tobytes() == first.tobytes()
-        # The array belongs to the caller.
+    def test_the_array_belongs_to_the_caller(self) -> None:
+        first = named().normal(10)
+        kept = first.tobytes()
         first[:] = 0.0
-        assert NAMED.normal(10).tobytes() == first_again.tobytes()
+        assert named().normal(10).tobytes() == kept
 
     def test_golden_numbers(self) -> None:
         """The first numbers of one stream, as every machine must give them."""
-        named = stream(1, 2, 3, Purpose.INITIAL_BELIEF)
-        assert [value.hex() for value in named.uniform(3).tolist()] == GOLDEN_UNIFORM
-        assert [value.hex() for value in named.normal(3).tolist()] == GOLDEN_NORMAL
+        of_all = partial(stream, 1, 2, 3, Purpose.INITIAL_BELIEF)
+        assert [value.hex() for value in of_all().uniform(3).tolist()] == GOLDEN_UNIFORM
+        assert [value.hex() for value in of_all().normal(3).tolist()] == GOLDEN_NORMAL
+        going_on = of_all()
+        first, *later = (going_on.uniform(2) for _ in range(3))
+        assert [value.hex() for value in first.tolist()] == GOLDEN_UNIFORM[:2]
+        assert [value.hex() for value in np.ravel(later).tolist()] == GOLDEN_LATER
 
 
 class TestDistribution:
     def test_uniform(self) -> None:
         """Kolmogorov and Smirnov's test at 1e-6, and chi-square of the high and the low bits."""
-        values = NAMED.uniform(SAMPLE)
+        values = named().uniform(SAMPLE)
         assert (values >= 0.0).all()
         assert (values < 1.0).all()
         assert stats.kstest(values, "uniform").pvalue > 1e-6
@@ -136,7 +148,7 @@ class TestDistribution:
 
     def test_normal(self) -> None:
         """Kolmogorov and Smirnov's test, and four moments, each at 1e-6 (4.9 sigma)."""
-        values = NAMED.normal(SAMPLE)
+        values = named().normal(SAMPLE)
         assert stats.kstest(values, "norm").pvalue > 1e-6
         # Standard errors of the sample moments of a standard normal: var(x^n) / N.
         for power, mean, variance in ((1, 0.0, 1.0), (2, 1.0, 2.0), (3, 0.0, 15.0), (4, 3.0, 96.0)):
@@ -147,7 +159,7 @@ class TestDistribution:
 
     def test_neighbours_are_independent(self) -> None:
         """Correlations at lags 1 to 8, of values and of squares, each at 1e-6 (4.9 sigma)."""
-        values = NAMED.normal(SAMPLE)
+        values = named().normal(SAMPLE)
         for sample in (values, (values**2 - 1.0) / np.sqrt(2.0)):
             for lag in range(1, 9):
                 correlation = float((sample[lag:] * sample[:-lag]).mean())
@@ -163,7 +175,7 @@ class TestDistribution:
         elif what == "purposes":
             streams = [stream(seed, 0, 0, p) for seed in range(625) for p in Purpose]
         else:
-            streams = [NAMED.substream(n) for n in range(5000)]
+            streams = [named().substream(n) for n in range(5000)]
         values = np.array([named.normal(4) for named in streams])
         for column in values.T:
             assert stats.kstest(column, "norm").pvalue > 1e-6
@@ -172,3 +184,258 @@ class TestDistribution:
         assert abs(correlation) < 4.9 / np.sqrt(len(values))
         across = np.corrcoef(values.T)[np.triu_indices(4, 1)]
         assert np.abs(across).max() < 4.9 / np.sqrt(len(values))
+
+
+class TestGoingOn:
+    """A stream goes on, as a NumPy generator does."""
+
+    DRAWS: ClassVar[dict[str, Callable[[Stream], Any]]] = {
+        "normal": lambda own: own.normal(6),
+        "standard_normal": lambda own: own.standard_normal(size=(2, 3)),
+        "random": lambda own: own.random(6),
+        "uniform": lambda own: own.uniform(-1.0, 1.0, 6),
+        "integers": lambda own: own.integers(2**50, size=6),
+        "choice": lambda own: own.choice(2**20, 6),
+        "order": lambda own: own.choice(1000, 6, replace=False),
+    }
+
+    @pytest.mark.parametrize("kind", DRAWS)
+    def test_no_draw_repeats_another(self, kind: str) -> None:
+        own, other = named(), named()
+        draws = [np.ravel(self.DRAWS[kind](own)) for _ in range(20)]
+        assert len({draw.tobytes() for draw in draws}) == 20
+        assert [draw.tobytes() for draw in draws] == [
+            np.ravel(self.DRAWS[kind](other)).tobytes() for _ in range(20)
+        ]
+
+    def test_two_draws_share_no_bits(self) -> None:
+        """Whatever is drawn: no uniform number, of which a normal one is made, occurs twice."""
+        own = named()
+        first, second, third = own.uniform(40), own.normal(40), own.uniform(40)
+        assert not set(first) & set(third)
+        for uniforms in (first, third):
+            radius, angle = (
+                np.sqrt(-2.0 * np.log(1.0 - uniforms[::2])),
+                2.0 * np.pi * uniforms[1::2],
+            )
+            made = np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])
+            assert np.abs(made[:, np.newaxis] - second).min() > 1e-9
+
+    def test_later_draws_run_into_no_other_stream(self) -> None:
+        streams = [
+            stream(seed, trial, step, purpose)
+            for seed, trial, step in itertools.product((0, 1), (0, 1), (0, 1))
+            for purpose in Purpose
+        ]
+        streams += [own.substream(index) for own in streams for index in (0, 1, 2)]
+        values = np.concatenate([own.uniform(10) for own in streams for _ in range(4)])
+        assert len(np.unique(values)) == len(values)
+        assert all(purpose < 2**29 for purpose in Purpose)
+
+    def test_a_substream_is_named_and_not_drawn(self) -> None:
+        own = named()
+        before = own.substream(3).normal(4)
+        own.normal(4)
+        assert own.substream(3).normal(4).tobytes() == before.tobytes()
+
+    def test_anew_begins_again(self) -> None:
+        own = named()
+        first, _ = own.normal(4), own.normal(4)
+        assert own.anew().normal(4).tobytes() == first.tobytes()
+
+    def test_a_copy_goes_on_where_the_original_is(self) -> None:
+        own = named()
+        own.normal(4)
+        for again in (copy.deepcopy(own), pickle.loads(pickle.dumps(own))):
+            assert again == own
+            assert again.normal(4).tobytes() == copy.copy(own).normal(4).tobytes()
+
+    def test_a_world_goes_on_too(self) -> None:
+        world, own = DiscWorld(0.1, ()), named()
+        still, deviation = np.zeros((5, 2)), np.ones(2)
+        moved = [world.move(still, np.zeros(2), deviation, 1e-3, own) for _ in range(3)]
+        drawn = [world.draw_free(np.zeros(2), deviation, 5, own)[0] for _ in range(3)]
+        each = world.move_each(
+            np.zeros((2, 5, 2)), np.zeros((2, 2)), deviation, 1e-3, [own, own], 1
+        )
+        every = [*moved, *drawn, *each, own.normal((5, 2)), own.normal((5, 2))]
+        assert len(np.unique(every)) == np.size(every)
+        # A draw before does not change the first motion.
+        other = named()
+        other.normal(3)
+        assert (
+            world.move(still, np.zeros(2), deviation, 1e-3, other).tobytes() == moved[0].tobytes()
+        )
+
+    def test_one_that_has_ended_gives_nothing(self) -> None:
+        own = named()
+        own.normal()
+        own.end()
+        for draw in (own.normal, own.random, own.for_motion, lambda: own.substream(0)):
+            with pytest.raises(ProblemError, match=r"for the one call .* kept from an earlier"):
+                draw()
+
+
+class TestParameters:
+    """NumPy's parameters, and nothing that means one thing there and another one here."""
+
+    def test_normal(self) -> None:
+        standard = named().normal((4, 3))
+        for found in (
+            named().normal(size=(4, 3)),
+            named().normal(shape=(4, 3)),
+            named().normal(0.0, 1.0, (4, 3)),
+            named().normal(0.0, size=(4, 3)),
+            named().normal(scale=1, size=[4, 3]),
+            named().normal(np.zeros((4, 3)), 1.0),
+            named().standard_normal((4, 3)),
+        ):
+            assert found.tobytes() == standard.tobytes()
+        deviations = np.array([0.1, 1.0, 10.0])
+        found = named().normal(5.0, deviations, (4, 3))
+        assert found.tobytes() == (5.0 + deviations * standard).tobytes()
+        assert named().normal(loc=np.arange(3.0)).shape == (3,)
+        assert named().normal(7.0, 0.0) == 7.0
+        # One number is a number, as NumPy's.
+        assert isinstance(named().normal(1.0, 2.0), float)
+        assert isinstance(named().random(), float)
+
+    def test_uniform(self) -> None:
+        standard = named().random((4, 3))
+        assert named().uniform((4, 3)).tobytes() == standard.tobytes()
+        assert named().uniform(size=(4, 3)).tobytes() == standard.tobytes()
+        found = named().uniform(-1.0, [1.0, 2.0, 3.0], (4, 3))
+        assert found.tobytes() == (-1.0 + np.array([2.0, 3.0, 4.0]) * standard).tobytes()
+        assert named().uniform(high=np.array([2.0, 4.0])).shape == (2,)
+
+    @pytest.mark.parametrize("kind", ["normal", "uniform"])
+    @pytest.mark.parametrize(
+        ("positional", "keywords"),
+        [
+            ((4.0,), {}),
+            ((np.zeros(3),), {}),
+            (([4, 3],), {}),
+            ((True,), {}),
+            ((None,), {}),
+            ((4,), {"second": 0.5}),
+            (((4, 3),), {"second": 0.5}),
+            ((4,), {"first": 0.5}),
+        ],
+    )
+    def test_what_may_be_a_shape_or_a_parameter_is_refused(
+        self, kind: str, positional: tuple[Any, ...], keywords: dict[str, float]
+    ) -> None:
+        names = {"normal": ("loc", "scale"), "uniform": ("low", "high")}[kind]
+        given = {names[which == "second"]: value for which, value in keywords.items()}
+        with pytest.raises(
+            InvalidValueError, match=rf"{kind}\(.*: is this the shape, or {names[0]}\?"
+        ):
+            getattr(named(), kind)(*positional, **given)
+
+    @pytest.mark.parametrize(
+        ("call", "message"),
+        [
+            (lambda own: own.normal(0.0, 1.0, 3, 4), "loc, scale and size, each of them once"),
+            (lambda own: own.normal(0.0, 1.0, scale=2.0), "loc, scale and size, each of them once"),
+            (lambda own: own.normal(0.0, -1.0), r"scale is -1\., must be >= 0"),
+            (lambda own: own.normal(0.0, np.nan), "scale is nan, must be >= 0"),
+            (lambda own: own.normal("a", size=2), "loc 'a': must be numbers"),
+            (
+                lambda own: own.normal(np.zeros(3), 1.0, 4),
+                r"size \(4,\) does not fit loc and scale",
+            ),
+            (lambda own: own.normal(size=-1), "shape -1: no extent may be negative"),
+            (lambda own: own.normal(size=2.0), r"size 2\.0: must be an integer"),
+            (lambda own: own.normal(size=(2**20, 2**20)), r"at most 2\*\*33 numbers"),
+            (lambda own: own.uniform(1.0, 0.0), r"high less low is -1\., must be >= 0"),
+            (lambda own: own.uniform(0.0, np.inf), "high less low is inf, must be >= 0 and finite"),
+            (lambda own: own.integers(0), "from 0 to 0: a range must have 1"),
+            (lambda own: own.integers(3, 3), "from 3 to 3: a range must have 1"),
+            (lambda own: own.integers(-1, 2**53), "range must have 1 to"),
+            (lambda own: own.integers(2.5), r"high 2\.5: must be integers"),
+            (lambda own: own.integers(2**63 - 1, 2**63), "must be integers from"),
+            (lambda own: own.choice(0), "from 0 to 0: a range must have 1"),
+            (lambda own: own.choice(3, 4, replace=False), "4 of 3 without replacement"),
+            (lambda own: own.choice(2, p=[0.5, 0.6]), r"p \[0\.5 0\.6\]: must be 2 probabilities"),
+            (lambda own: own.choice(2, p=[1.5, -0.5]), "must be 2 probabilities"),
+            (lambda own: own.choice(3, p=[0.5, 0.5]), "must be 3 probabilities"),
+            (lambda own: own.choice(2, 1, False, [0.5, 0.5]), "p does not go with replace=False"),
+        ],
+    )
+    def test_what_is_out_of_bounds_is_named(
+        self, call: Callable[[Stream], object], message: str
+    ) -> None:
+        with pytest.raises(InvalidValueError, match=message):
+            call(named())
+
+
+class TestIntegersAndChoices:
+    def test_integers_are_within_their_range(self) -> None:
+        drawn = named().integers(-3, 4, 1000)
+        assert drawn.dtype == np.int64
+        assert set(drawn.tolist()) == set(range(-3, 4))
+        assert set(named().integers(3, size=1000, endpoint=True).tolist()) == set(range(4))
+        assert named().integers([1, 10], [2, 11]).tolist() == [1, 10]
+        assert named().integers(5, 6).item() == 5
+        assert named().integers(np.array([], dtype=np.int64), 5).shape == (0,)
+
+    @pytest.mark.parametrize("count", [6, 10, 2**52 + 1, 3 * 2**51])
+    def test_no_integer_is_favoured(self, count: int) -> None:
+        """Chi-square of three parts at 1e-6. Of 2**53 numbers, up to half are rejected here.
+
+        Without rejection the first third of 3 * 2**51 would come twice as often as the others.
+        """
+        drawn = named().integers(count, size=60_000)
+        assert drawn.min() >= 0
+        assert drawn.max() < count
+        part = -(-count // 3)
+        shares = np.array([part, part, count - 2 * part]) / count
+        counts = np.bincount(drawn // part, minlength=3)
+        assert stats.chisquare(counts, len(drawn) * shares).pvalue > 1e-6
+
+    def test_choices(self) -> None:
+        """Chi-square at 1e-6."""
+        letters = np.array(["a", "b", "c"])
+        drawn = named().choice(letters, 30_000, p=[0.2, 0.0, 0.8])
+        counts = [int((drawn == letter).sum()) for letter in letters]
+        assert counts[1] == 0
+        assert stats.chisquare(counts[::2], [6000.0, 24000.0]).pvalue > 1e-6
+        assert named().choice(["left", "right"]) in {"left", "right"}
+        rows = named().choice(np.arange(12).reshape(4, 3), (2, 5))
+        assert rows.shape == (2, 5, 3)
+
+    def test_an_order_is_as_likely_as_any_other(self) -> None:
+        """Chi-square of the 24 orders of 4 at 1e-6."""
+        own = named()
+        orders = [tuple(own.choice(4, 4, replace=False).tolist()) for _ in range(6000)]
+        assert set(orders) == set(itertools.permutations(range(4)))
+        counts = [orders.count(order) for order in set(orders)]
+        assert stats.chisquare(counts).pvalue > 1e-6
+
+
+class TestWithoutNoise:
+    def test_everything_is_at_the_middle(self) -> None:
+        own = NoiseFreeStream()
+        assert own.normal((2, 3)).tolist() == np.zeros((2, 3)).tolist()
+        assert own.normal(2.0, 0.5, 2).tolist() == [2.0, 2.0]
+        assert own.standard_normal() == 0.0
+        assert own.random(2).tolist() == own.uniform(2).tolist() == [0.5, 0.5]
+        assert own.uniform(-1.0, 3.0) == 1.0
+        assert own.integers(0, 10) == 4
+        assert own.integers(5, size=2).tolist() == [2, 2]
+        assert own.choice(["a", "b", "c"]) == "b"
+        assert own.choice(3, p=[0.1, 0.2, 0.7]) == 2
+        assert sorted(own.choice(5, 5, replace=False).tolist()) == list(range(5))
+
+    def test_it_does_not_end(self) -> None:
+        NOISE_FREE.end()
+        assert NOISE_FREE.normal() == 0.0
+        assert NOISE_FREE.anew() is NOISE_FREE
+
+    @pytest.mark.parametrize("kind", ["normal", "random", "standard_normal", "uniform"])
+    def test_who_waits_for_another_number_is_told(self, kind: str) -> None:
+        own = NoiseFreeStream(limit=3)
+        for _ in range(3):
+            getattr(own, kind)()
+        with pytest.raises(ProblemError, match="draws again and again"):
+            getattr(own, kind)()

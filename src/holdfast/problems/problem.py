@@ -11,17 +11,17 @@ A function is called with any of these and returns the same leading shape, as fl
 that it is given are read-only: make a new one instead of changing them.
 
 Two threads never use one instance at the same time, but a run has several instances, and each may
-be called with anything in any order. So what an instance keeps from one call to the next (a buffer,
-a cache) must not change what it returns.
+be called with anything in any order. So what an instance keeps from one call to the next (a cache)
+must not change what it returns. It may return the same buffer each time: results are copied.
 
 Observations are Gaussian, by :meth:`Problem.observation_mean` and
 :meth:`Problem.observation_variance`, unless the problem has the two methods of
 :class:`GeneralObservationProblem`. What an action does without noise follows from
 :meth:`Problem.move`, unless the problem has a method of :class:`ExpectedMotionProblem`.
 
-Random numbers come from the :class:`~holdfast.randomness.Stream` that a function is given:
-``stream.normal(shape)`` and ``stream.uniform(shape)``. A stream gives the same numbers each time
-it is asked; for further ones ask ``stream.substream(1)``, ``stream.substream(2)``, ...
+Random numbers come from the :class:`~holdfast.randomness.Stream` that a function is given. It has
+methods of a NumPy ``Generator``, goes on as one does, and begins anew in each call of a function;
+with the call it ends, and must not be kept.
 
 To have the same decisions, bit for bit, on every machine, a problem uses only operations that IEEE
 754 defines exactly (``+ - * /``, ``np.sqrt``, comparisons, ``np.where``) and takes ``exp``,
@@ -273,7 +273,7 @@ class ExpectedMotionProblem(Protocol):
         """Return the states after executed ``actions`` if nothing is random, as ``states``.
 
         A problem that does not have this is asked for its ``move`` with the stream
-        :data:`~holdfast.randomness.NOISE_FREE`: there normal deviates are 0 and uniform ones 0.5. A
+        :data:`~holdfast.randomness.NOISE_FREE`, whose numbers are all at the middle. A
         problem needs the method if it draws otherwise (from ``stream.words``, or again and again
         until something fits). It may have it to be faster.
         """

@@ -211,27 +211,24 @@ class SimulatedEnvironment(KeepsReadOnly):
         """
         seed, trial, step, problem = self._seed, self._trial, self.step, self._problem
         before, action = self.state, floats("task action", task_action)
-        moved = problem.move(before, action, stream(seed, trial, step, Purpose.WORLD_MOTION))
-        state = checked.states_of(problem, "move", moved, before.shape)
+        noise = stream(seed, trial, step, Purpose.WORLD_MOTION)
+        state = checked.move(problem, before, action, noise)
         reward = motion = observation = None
         if getattr(type(problem), "reward", None) is not ProblemBase.reward:
-            reward = checked.scalar(problem, "reward", problem.reward(state, action))
+            reward = checked.reward(problem, state, action)
         if hasattr(problem, "measure_motion"):
             noise = stream(seed, trial, step, Purpose.WORLD_MEASURED_MOTION)
-            measured = problem.measure_motion(before, state, noise)
-            motion = checked.shown(problem, "measure_motion", measured)
+            motion = checked.measured_motion(problem, before, state, noise)
         if hasattr(problem, "sample_move_observation"):
             noise = stream(seed, trial, step, Purpose.WORLD_MOVE_OBSERVATION)
-            drawn = problem.sample_move_observation(state, action, noise)
-            observation = checked.shown(problem, "sample_move_observation", drawn)
+            observation = checked.move_observation(problem, state, action, noise)
         # Only now: a move that fails leaves the world as it was.
         self.state, self.step = state, step + 1
         return MoveResult(reward, motion, observation) if self._moves_show else reward
 
     def is_done(self) -> bool:
         """Return whether the true state is a goal."""
-        problem = self._problem
-        return checked.truth(problem, "is_goal", problem.is_goal(self.state))
+        return checked.is_goal(self._problem, self.state)
 
     def steps_performed(self) -> int:
         """Return the number of task actions performed, those of :meth:`after` included."""
@@ -301,9 +298,7 @@ class ObservationSizes(dict[int, "int | None"]):
 
 
 def _initial_state(problem: Problem, random: Stream) -> FloatArray:
-    drawn = problem.initial_states(random, 1)
-    shape = (1, problem.state_size)
-    state: FloatArray = checked.states_of(problem, "initial_states", drawn, shape)[0]
+    state: FloatArray = checked.initial_states(problem, random, 1)[0]
     return state
 
 

@@ -373,8 +373,7 @@ def _ranges(problem: Problem, max_steps: int) -> tuple[FloatArray, FloatArray, F
     Robots that know their state follow the policy, with the motion's noise. Ranges must be the same
     in each episode and on every machine, so they are a function of the problem alone.
     """
-    states = problem.initial_states(_scouts_stream(0, Purpose.INITIAL_BELIEF), _SCOUTS)
-    states = checked.states_of(problem, "initial_states", states, (_SCOUTS, problem.state_size))
+    states = checked.initial_states(problem, _scouts_stream(0, Purpose.INITIAL_BELIEF), _SCOUTS)
     stages = np.zeros(_SCOUTS, dtype=np.int64)
     low, high = states.min(axis=0), states.max(axis=0)
     largest = np.zeros(problem.action_size)
@@ -383,8 +382,8 @@ def _ranges(problem: Problem, max_steps: int) -> tuple[FloatArray, FloatArray, F
         actions = checked.policy(problem, states, stages)
         largest = np.maximum(largest, np.abs(actions).max(axis=0))
         executed = checked.executed_action(problem, actions)
-        moved = problem.move(states, executed, _scouts_stream(step, Purpose.PREDICTION))
-        states = checked.states_of(problem, "move", moved, states.shape)
+        noise = _scouts_stream(step, Purpose.PREDICTION)
+        states = checked.move(problem, states, executed, noise)
         low, high = np.minimum(low, states.min(axis=0)), np.maximum(high, states.max(axis=0))
         if checked.goals(problem, states).all():
             break
