@@ -13,7 +13,7 @@ from holdfast.cli.exit_codes import ended_by_signals
 from holdfast.cli.terminal import counted, progress_line
 from holdfast.config.user_code import account_of_user_error
 from holdfast.errors import HoldfastError, OptionError, OutputError
-from holdfast.files import directory_beside, move_into_place, require_free
+from holdfast.files import directory_beside, move_into_place, require_free, shown_path
 from holdfast.printable import printable
 from holdfast.runtime.command_line import (
     MAX_TRIALS,
@@ -127,8 +127,8 @@ def _export(options: ExportOptions) -> None:
         require_free(mcap, "--mcap", directory=False)
     if tables is not None:
         require_free(tables, "--csv", directory=True)
-        if mcap is not None and mcap.absolute() == tables.absolute():
-            raise OptionError(f"--mcap and --csv are both {mcap}; give two places")
+        if mcap == tables:
+            raise OptionError(f"--mcap and --csv are both {shown_path(mcap)}; give two places")
     from holdfast.recording.replay import RecordedRun
 
     with RecordedRun(path) as recorded:
@@ -138,7 +138,7 @@ def _export(options: ExportOptions) -> None:
         sys.stderr.write(f"note: {printable(note)}\n")
     for place in (mcap, tables):
         if place is not None:
-            sys.stdout.write(printable(f"{place}  {size_of(place)}\n"))
+            sys.stdout.write(printable(f"{shown_path(place)}  {size_of(place)}\n"))
     sys.stdout.flush()
 
 
@@ -208,7 +208,7 @@ def replay_trials(
 ) -> None:
     """Write the facts of trials to sinks, and show the progress."""
     line = progress_line(len(trials), quiet=quiet)
-    line.start(f"{counted(len(trials), 'trial')} of {recorded.path}", 0, _NOTE)
+    line.start(f"{counted(len(trials), 'trial')} of {shown_path(recorded.path)}", 0, _NOTE)
     try:
         for finished, _ in enumerate(recorded.replay(trials, sinks, rate_hz), start=1):
             after_each()

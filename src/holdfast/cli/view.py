@@ -17,7 +17,7 @@ from holdfast.cli.export import (
     trials_option,
 )
 from holdfast.errors import InvalidValueError, OptionError, ViewError
-from holdfast.files import directory_beside, move_into_place, require_free
+from holdfast.files import directory_beside, move_into_place, require_free, shown_path
 from holdfast.printable import printable
 from holdfast.recording.view_target import ViewTarget, require_rerun, viewer_url
 from holdfast.runtime.command_line import (
@@ -106,5 +106,5 @@ def _view(options: ViewOptions) -> None:
     for note in () if options.quiet else notes:
         sys.stderr.write(f"note: {printable(note)}\n")
     if save is not None:
-        sys.stdout.write(printable(f"{save}  {size_of(save)}\n"))
+        sys.stdout.write(printable(f"{shown_path(save)}  {size_of(save)}\n"))
         sys.stdout.flush()

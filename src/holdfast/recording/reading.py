@@ -95,7 +95,7 @@ class RunArrays:
     Attributes
     ----------
     path : Path
-        Its directory, or its journal.
+        Its directory, or its journal; absolute.
     trials : tuple of int
         Numbers of all its trials, the one that was begun and not finished included.
     results : dict of arrays
@@ -142,7 +142,7 @@ def open_run(path: str | Path) -> RunArrays:
     HoldfastError
         If its problem cannot be built any more.
     """
-    run = Path(path)
+    run = Path(path).absolute()  # the problem's own code may change the current directory
     with RecordedRun(run, "open") as recorded:
         configuration, trials = recorded.configuration, recorded.trials
     with JournalReader.read_run(run, "open") as journal:
