@@ -301,7 +301,8 @@ def require_free(path: Path, option: str, *, directory: bool) -> None:
 def _require_empty(path: Path, option: str) -> None:
     if any(path.iterdir()):
         raise OutputError(
-            f"{shown_path(path)}: holds files already; remove it, or choose another directory ({option})"
+            f"{shown_path(path)}: holds files already; remove it, or choose another directory "
+            f"({option})"
         )
 
 

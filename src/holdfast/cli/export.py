@@ -36,6 +36,7 @@ __all__ = [
     "chosen_trials",
     "main",
     "notes_about",
+    "problem_directory_option",
     "rate_option",
     "replay_trials",
     "size_of",
@@ -79,6 +80,16 @@ def rate_option() -> Any:
     )
 
 
+def problem_directory_option() -> Any:
+    """Declare where the module of a run's own problem lies."""
+    return option(
+        metavar="DIR",
+        read=location,
+        help="Where the module of the run's problem lies, if that is module:Class: its code is "
+        "run. Code that a record names is not run without.",
+    )
+
+
 class ExportOptions(Options):
     """Write a recorded run as other programs read it; the run is not changed.
 
@@ -104,6 +115,7 @@ class ExportOptions(Options):
         help="Write DIR: trials.csv, steps.csv, beliefs.csv and events.csv.",
     )
     trials: range | None = trials_option()
+    problem_directory: Path | None = problem_directory_option()
     rate: float = rate_option()
     quiet: bool = flag("-q", help="Show no progress.")
 
@@ -131,7 +143,7 @@ def _export(options: ExportOptions) -> None:
             raise OptionError(f"--mcap and --csv are both {shown_path(mcap)}; give two places")
     from holdfast.recording.replay import RecordedRun
 
-    with RecordedRun(path) as recorded:
+    with RecordedRun(path, problem_directory=options.problem_directory) as recorded:
         trials = chosen_trials(recorded, wanted)
         notes = _write(recorded, trials, options)
     for note in () if options.quiet else notes:

@@ -11,6 +11,7 @@ from holdfast.cli.exit_codes import ended_by_signals
 from holdfast.cli.export import (
     chosen_trials,
     notes_about,
+    problem_directory_option,
     rate_option,
     replay_trials,
     size_of,
@@ -52,6 +53,7 @@ class ViewOptions(Options):
         metavar="HOST:PORT",
         help="Show it in the viewer that listens there; Rerun's port is 9876.",
     )
+    problem_directory: Path | None = problem_directory_option()
     rate: float = rate_option()
     quiet: bool = flag("-q", help="Show no progress.")
 
@@ -78,7 +80,8 @@ def _view(options: ViewOptions) -> None:
     from holdfast.recording.replay import RecordedRun
     from holdfast.recording.rerun_sink import RerunSink
 
-    with RecordedRun(options.run, "view") as recorded, ExitStack() as stack:
+    own = options.problem_directory
+    with RecordedRun(options.run, "view", problem_directory=own) as recorded, ExitStack() as stack:
         trials = chosen_trials(recorded, options.trials)
         notes = notes_about(recorded, trials, options.rate)
         made = None

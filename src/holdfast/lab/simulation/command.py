@@ -92,7 +92,8 @@ def main(arguments: Sequence[str]) -> int:
     if options.schedule is not None:
         if options.seeds is not None or options.story:
             raise OptionError(
-                f"--schedule {shown_path(options.schedule)} is a run by itself; leave --seeds and --story out"
+                f"--schedule {shown_path(options.schedule)} is a run by itself; leave --seeds and "
+                "--story out"
             )
         with ended_by_signals():
             good = _run_file(Path(shown_path(options.schedule)), shrink=options.shrink)
