@@ -7,6 +7,7 @@ import csv
 import io
 import itertools
 import json
+import re
 import resource
 import shutil
 import signal
@@ -733,6 +734,32 @@ class TestOwnCode:
         assert not of_topic(messages, "/holdfast/truth")
         assert len(of_topic(messages, "/holdfast/task_action")) == 12
         assert len(of_topic(messages, "/holdfast/estimate")) == (13 if kept else 5)
+
+    def test_a_clock_that_was_set_while_it_ran(
+        self, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    ) -> None:
+        """A board that boots in 1970, until it hears from a time server."""
+        run = make_run(capsys, tmp_path, PEG, "--rate", "5000")
+        timings, events = run / "timings.csv", run / "events.jsonl"
+        export(capsys, tmp_path, "--csv", "before")
+        for table in (timings, events):
+            lines = table.read_text().splitlines(keepends=True)
+            early = [re.sub(r"20\d\d-\d\d-\d\dT\d\d", "1970-01-01T00", line) for line in lines]
+            half = len(lines) // 2
+            table.write_text("".join(early[:half] + lines[half:]))
+        said = export(capsys, tmp_path, "--csv", "after")
+        assert "note: the robot's clock was set by +" in said.stderr
+        for name in ("steps.csv", "events.csv", "trials.csv"):
+            before, after = (rows_of(tmp_path / place / name) for place in ("before", "after"))
+            assert len(before) == len(after) > 0
+            for row, shifted in zip(before, after, strict=True):
+                for key in row:
+                    if key.endswith("time") or key in ("began", "ended"):
+                        # The last reading of the clock counts, so nothing has moved.
+                        known = float(row[key] or 0)
+                        assert float(shifted[key] or 0) == pytest.approx(known, abs=1.0)
+                    else:
+                        assert shifted[key] == row[key]
 
     def test_a_run_that_was_copied_from_the_robot(
         self, capsys: pytest.CaptureFixture[str], tmp_path: Path

@@ -249,6 +249,8 @@ def notes_about(recorded: RecordedRun, trials: Sequence[int], rate_hz: float) ->
             lacking = counted(len(untimed), "trial")
             why = f"{TIMINGS_NAME} lacks {lacking} from {untimed[0]} on; all have one clock"
         notes.append(f"{why}, so every step takes {1.0 / rate_hz:g} s (--rate)")
+    else:
+        notes += recorded.clock_notes
     blind = [trial for trial in trials if not recorded.beliefs_known(trial)]
     if blind:
         notes.append(

@@ -46,8 +46,16 @@ from holdfast.recording.facts import (
 from holdfast.recording.fingerprint import difference, fingerprint
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.recording.recorded_environment import RecordedEnvironment
+from holdfast.recording.run_clock import RunClock
 from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME
-from holdfast.recording.step_times import NS_PER_S, StepClock, TrialTimes, read_events, trial_ends
+from holdfast.recording.step_times import (
+    NS_PER_S,
+    StepClock,
+    TrialTimes,
+    dated,
+    read_events,
+    trial_ends,
+)
 from holdfast.recording.timings import rows_by_trial
 from holdfast.robot.environment import Environment, SimulatedEnvironment
 from holdfast.robot.trial import LateStep, SensingStep, TaskStep, TrialObserver, run_trial
@@ -73,6 +81,8 @@ class RecordedRun:
     untimed : tuple of int
         Trials that the table of times lacks although it has others; then no fact has the robot's
         times.
+    clock_notes : tuple of str
+        How the robot's wall clock was set while it ran.
 
     Raises
     ------
@@ -103,8 +113,21 @@ class RecordedRun:
             if self.unfinished is not None:
                 trials.add(self.unfinished)
             self.trials = tuple(sorted(trials))
-            self._rows = rows_by_trial(directory / TIMINGS_NAME)
-            self._events = read_events(directory / EVENTS_NAME)
+            rows = rows_by_trial(directory / TIMINGS_NAME)
+            events = read_events(directory / EVENTS_NAME)
+            clock = RunClock(
+                [(event.stamp, event.time_ns) for event in events]
+                + [(row.stamp, row.time_ns) for each in rows.values() for row in each.values()]
+            )
+            self.clock_notes = clock.notes
+            self._rows = {
+                trial: {
+                    key: row._replace(time_ns=clock.time_ns(row.stamp, row.time_ns))
+                    for key, row in each.items()
+                }
+                for trial, each in rows.items()
+            }
+            self._events = dated(events, clock)
             self._ends = trial_ends(self._events)
             # All facts have one clock: if one trial has no times, those of the others are of no
             # use. A trial in which nothing was decided needs none.
