@@ -3,9 +3,9 @@
 A carriage goes to a lamp, by which it sees where it is, and back into the dark to its mark. At the
 reversal its drive takes up 0.4 m of play, so commands are performed that move nothing, and a belief
 that is moved by commands is off by that. An encoder on the carriage shows it: ``perform`` returns
-the measured motion, and ``move_by_measurement`` moves the belief by it. In ``steps.csv``
-of ``holdfast export RUN --csv DIR`` the lines after the reversal (``stage`` 1) have an
-``action_0`` of -0.1 and a ``motion`` of about 0::
+the measured motion, and ``move_by_measurement`` moves the belief by it. In ``steps.csv`` of
+``holdfast export RUN --csv DIR --problem-directory examples`` the lines after the reversal
+(``stage`` 1) have an ``action_0`` of -0.1 and a ``motion`` of about 0::
 
     holdfast run examples/backlash.yaml
     holdfast run examples/backlash.yaml --set 'environment.arguments={encoder: false}'

@@ -89,6 +89,10 @@ class OutputError(HoldfastError):
     """The output of a run cannot be written or read, or does not belong to this run."""
 
 
+class UntrustedCodeError(HoldfastError):
+    """A recorded run names code, and its reader has not said that it may be run."""
+
+
 class ServiceRefusedError(HoldfastError):
     """Every available service refuses to decide, and a retry would not help."""
 

@@ -31,14 +31,21 @@ __all__ = [
     "directory_beside",
     "move_into_place",
     "read_bounded",
+    "remember_directory",
     "remove_unfinished",
     "remove_unfinished_of",
     "replace_file",
     "require_free",
+    "restore_directory",
+    "shown_path",
+    "started_in",
     "write_atomically",
 ]
 
 _MAX_DEFAULT_DIRECTORIES = 10_000
+
+_started_in: Path | None = None
+"""Where the command was started; the code of a problem or robot may change the directory later."""
 
 _UNFINISHED = re.compile(r"\..+\.\d+\.tmp")
 _LONGEST_WRITE_S = 600.0
@@ -107,13 +114,34 @@ def _read_pipe(descriptor: int, most: int, *, named: bool) -> bytes:
     return bytes(content)
 
 
+def remember_directory() -> None:
+    """Remember the current directory as the one in which the user has started the command."""
+    global _started_in
+    with contextlib.suppress(OSError):  # it was removed
+        _started_in = Path.cwd()
+
+
+def started_in() -> Path | None:
+    """Return where the command was started, None if that is not known or not there any more."""
+    return _started_in if _started_in is not None and _started_in.is_dir() else None
+
+
+def shown_path(path: Path) -> str:
+    """Return a path as the user, who is where the command was started, can write it."""
+    if _started_in is not None and path.is_relative_to(_started_in):
+        return str(path.relative_to(_started_in))
+    return str(path)
+
+
 @contextlib.contextmanager
 def _refusals(path: Path, what: str) -> Iterator[None]:
     """Turn the system's refusals into errors about the path."""
     try:
         yield
     except OSError as error:
-        raise OutputError(f"{path}: cannot be {what}: {error.strerror or error}") from error
+        raise OutputError(
+            f"{shown_path(path)}: cannot be {what}: {error.strerror or error}"
+        ) from error
 
 
 def write_atomically(path: Path, content: bytes | Iterable[str]) -> None:
@@ -246,6 +274,7 @@ def claim_directory(out: Path | None, parent: Path, name: str) -> Path:
     It is ``out``, which may exist if it is empty; or ``name`` in ``parent``, which is created if
     missing, with a number if it exists.
     """
+    parent = parent.absolute()
     with _refusals(out or parent, "made"):
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
@@ -269,15 +298,21 @@ def require_free(path: Path, option: str, *, directory: bool) -> None:
         if directory and path.is_dir():
             _require_empty(path, option)
         elif path.is_symlink() or path.exists():
-            raise OutputError(f"{path}: exists already; remove it, or choose another ({option})")
+            raise OutputError(
+                f"{shown_path(path)}: exists already; remove it, or choose another ({option})"
+            )
         elif not path.parent.is_dir():
-            raise OutputError(f"{path}: cannot be made: there is no directory {path.parent}")
+            raise OutputError(
+                f"{shown_path(path)}: cannot be made: there is no directory "
+                f"{shown_path(path.parent)}"
+            )
 
 
 def _require_empty(path: Path, option: str) -> None:
     if any(path.iterdir()):
         raise OutputError(
-            f"{path}: holds files already; remove it, or choose another directory ({option})"
+            f"{shown_path(path)}: holds files already; remove it, or choose another directory "
+            f"({option})"
         )
 
 

@@ -43,7 +43,7 @@ class Brew(Options):
 
 def test_values_and_defaults() -> None:
     brew = Brew.parse("brew", ["bag", "--cups=3", "anna", "--no-lid", "-c", "4", "ben"])
-    assert (brew.beans, brew.guests, brew.cups) == (Path("bag"), ("anna", "ben"), 4)
+    assert (brew.beans, brew.guests, brew.cups) == (Path("bag").absolute(), ("anna", "ben"), 4)
     assert (brew.heat, brew.mill, brew.milk, brew.lid) == (None, "fine", False, False)
     assert brew.words() == ["bag", "anna", "ben", "--cups", "4", "--no-lid"]
     assert brew.words("guests", "cups") == ["bag", "--no-lid"]
@@ -51,7 +51,11 @@ def test_values_and_defaults() -> None:
 
 def test_words_after_two_dashes_are_no_options() -> None:
     brew = Brew.parse("brew", ["--cups", "3", "--", "-b", "--milk", "--", "-3"])
-    assert (brew.beans, brew.guests, brew.milk) == (Path("-b"), ("--milk", "--", "-3"), False)
+    assert (brew.beans, brew.guests, brew.milk) == (
+        Path("-b").absolute(),
+        ("--milk", "--", "-3"),
+        False,
+    )
 
 
 def test_words_with_a_dash_in_front_are_read_again() -> None:
@@ -65,7 +69,8 @@ def test_the_command_that_goes_on_can_be_given() -> None:
     run = RunOptions.parse("run", ["--out=-o", "--", "-x.yaml"])
     words = shlex.split(run.resume_command(Path("-o")))[2:]
     again = RunOptions.parse("run", words)
-    assert (again.configuration, again.out, again.resume) == (Path("-x.yaml"), Path("-o"), True)
+    places = (Path("-x.yaml").absolute(), Path("-o").absolute())
+    assert (again.configuration, again.out, again.resume) == (*places, True)
 
 
 def test_a_bad_address_is_named_once() -> None:
@@ -125,9 +130,9 @@ def test_words_give_the_same_options_again(command: str) -> None:
         if each.is_flag
         else ("a", "b")
         if each.many and each.read is str
-        else (Path("p"), Path("q"))
+        else (Path("p").absolute(), Path("q").absolute())
         if each.many and each.read is location
-        else Path("p")
+        else Path("p").absolute()
         if each.read is location
         else each.default
         for name, each in options.table().items()

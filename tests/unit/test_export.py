@@ -7,10 +7,12 @@ import csv
 import io
 import itertools
 import json
+import re
 import resource
 import shutil
 import signal
 import sqlite3
+import sys
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,8 +31,10 @@ from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.typesys import Stores, get_typestore
 from tests.command_line import Said, run_here
 
+import holdfast as hf
 from holdfast.belief import Belief
 from holdfast.config.loader import Configuration, load
+from holdfast.errors import UntrustedCodeError
 from holdfast.outcome import SensingDecision, TaskDecision, TrialResult
 from holdfast.planning import Planner
 from holdfast.problems.registry import BUILT_IN
@@ -603,6 +607,10 @@ class TestTimes:
         assert "status" not in {row["event"] for row in second}
 
 
+MINE = ("--problem-directory", ".")
+"""Says that the code of the run's problem may run."""
+
+
 class TestOwnCode:
     @pytest.mark.parametrize(
         ("pose", "positions"),
@@ -621,7 +629,7 @@ class TestOwnCode:
     ) -> None:
         (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", pose))
         make_run(capsys, tmp_path, PEG.replace("peg_in_hole_2d", "cart:Cart"))
-        said = export(capsys, tmp_path, "--mcap", "run.mcap")
+        said = export(capsys, tmp_path, "--mcap", "run.mcap", *MINE)
         messages = by_mcap(tmp_path / "run.mcap")
         tables = of_topic(messages, "/holdfast/belief")
         clouds = of_topic(messages, "/holdfast/particle_cloud")
@@ -638,12 +646,51 @@ class TestOwnCode:
             found = np.array([numbers(each)[:3] for each in cloud.data.poses])
             assert np.array_equal(found, states[:, :1] * np.array(positions))
 
+    def test_code_that_a_record_names_is_not_run_unasked(
+        self,
+        capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch,
+        tmp_path: Path,
+    ) -> None:
+        """Wherever a module of that name lies: where it did, beside the journal, or here."""
+        (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", ""))
+        run = make_run(capsys, tmp_path, PEG.replace("peg_in_hole_2d", "cart:Cart"))
+        ran = tmp_path / "ran"
+        source = f"open({str(ran)!r}, 'w')\n"
+        for place in (tmp_path, run):
+            (place / "cart.py").write_text(source + OWN_PROBLEM.replace("POSE", ""))
+        for command in (["export", "run", "--csv", "tables"], ["view", "run", "--save", "a.rrd"]):
+            said = run_here(capsys, tmp_path, *command)
+            assert said.code == 2
+            assert "its problem is cart:Cart, and the code that a record names" in said.stderr
+            assert f"--problem-directory {tmp_path}" in said.stderr
+        with pytest.raises(UntrustedCodeError, match=r"open_run\(\.\.\., problem_directory="):
+            hf.open_run(run)
+        assert run_here(capsys, tmp_path, "compare", "run", "run").code == 0
+        assert not ran.exists()
+        (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", ""))
+        export(capsys, tmp_path, "--csv", "tables", "--problem-directory", str(tmp_path))
+        monkeypatch.setattr(sys, "path", sys.path.copy())
+        opened = hf.open_run(run, problem_directory=tmp_path)
+        assert len(list(opened.read())) == len(opened.trials)
+        sys.modules.pop("cart", None)
+        assert not ran.exists()
+
+    def test_a_module_is_looked_for_only_where_the_caller_says(
+        self, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    ) -> None:
+        (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", ""))
+        make_run(capsys, tmp_path, PEG.replace("peg_in_hole_2d", "cart:Cart"))
+        (tmp_path / "elsewhere").mkdir()
+        options = ("--csv", "tables", "--problem-directory", "elsewhere")
+        assert "there is no module cart" in export(capsys, tmp_path, *options, code=2).stderr
+
     def test_a_pose_that_cannot_be(
         self, capsys: pytest.CaptureFixture[str], tmp_path: Path
     ) -> None:
         (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", 'pose = ("z", "angle")'))
         make_run(capsys, tmp_path, PEG.replace("peg_in_hole_2d", "cart:Cart"))
-        said = export(capsys, tmp_path, "--mcap", "run.mcap", code=2)
+        said = export(capsys, tmp_path, "--mcap", "run.mcap", *MINE, code=2)
         assert "pose[1] of cart is 'angle': allowed are x, y, z, roll" in said.stderr
         assert not (tmp_path / "run.mcap").exists()
 
@@ -688,6 +735,32 @@ class TestOwnCode:
         assert len(of_topic(messages, "/holdfast/task_action")) == 12
         assert len(of_topic(messages, "/holdfast/estimate")) == (13 if kept else 5)
 
+    def test_a_clock_that_was_set_while_it_ran(
+        self, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    ) -> None:
+        """A board that boots in 1970, until it hears from a time server."""
+        run = make_run(capsys, tmp_path, PEG, "--rate", "5000")
+        timings, events = run / "timings.csv", run / "events.jsonl"
+        export(capsys, tmp_path, "--csv", "before")
+        for table in (timings, events):
+            lines = table.read_text().splitlines(keepends=True)
+            early = [re.sub(r"20\d\d-\d\d-\d\dT\d\d", "1970-01-01T00", line) for line in lines]
+            half = len(lines) // 2
+            table.write_text("".join(early[:half] + lines[half:]))
+        said = export(capsys, tmp_path, "--csv", "after")
+        assert "note: the robot's clock was set by +" in said.stderr
+        for name in ("steps.csv", "events.csv", "trials.csv"):
+            before, after = (rows_of(tmp_path / place / name) for place in ("before", "after"))
+            assert len(before) == len(after) > 0
+            for row, shifted in zip(before, after, strict=True):
+                for key in row:
+                    if key.endswith("time") or key in ("began", "ended"):
+                        # The last reading of the clock counts, so nothing has moved.
+                        known = float(row[key] or 0)
+                        assert float(shifted[key] or 0) == pytest.approx(known, abs=1.0)
+                    else:
+                        assert shifted[key] == row[key]
+
     def test_a_run_that_was_copied_from_the_robot(
         self, capsys: pytest.CaptureFixture[str], tmp_path: Path
     ) -> None:
@@ -702,11 +775,11 @@ class TestOwnCode:
         (robot / "run").rename(desk / "run")
         (robot / "cart.py").rename(desk / "cart.py")
         shutil.rmtree(robot)
-        said = export(capsys, desk, "--csv", "tables", "--mcap", "run.mcap")
+        said = export(capsys, desk, "--csv", "tables", "--mcap", "run.mcap", *MINE)
         assert "note" not in said.stderr
         assert len(rows_of(desk / "tables" / "steps.csv")) == 14
         (desk / "cart.py").unlink()
-        said = export(capsys, desk, "--csv", "again", code=2)
+        said = export(capsys, desk, "--csv", "again", *MINE, code=2)
         assert "cart" in said.stderr
 
     def test_code_that_fails_now(self, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -714,7 +787,7 @@ class TestOwnCode:
         make_run(capsys, tmp_path, PEG.replace("peg_in_hole_2d", "cart:Cart"))
         spoilt = OWN_PROBLEM.replace("POSE", "").replace("return 0.3", "raise OSError('hm')\n#")
         (tmp_path / "cart.py").write_text(spoilt)
-        said = export(capsys, tmp_path, "--csv", "tables", code=2)
+        said = export(capsys, tmp_path, "--csv", "tables", *MINE, code=2)
         assert "hm" in said.stderr
         assert "cart.py" in said.stderr
         assert not (tmp_path / "tables").exists()
@@ -727,7 +800,7 @@ class TestDecisionsAreCompared:
         (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", ""))
         make_run(capsys, tmp_path, PEG.replace("peg_in_hole_2d", "cart:Cart"))
         (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", "").replace("0.3", "0.45"))
-        said = export(capsys, tmp_path, "--csv", "tables", "--mcap", "run.mcap", code=2)
+        said = export(capsys, tmp_path, "--csv", "tables", "--mcap", "run.mcap", *MINE, code=2)
         assert "trial 0: the decision of step 0 differs when it is computed again" in said.stderr
         assert "the problem's source has changed since (module cart)" in said.stderr
         assert not (tmp_path / "tables").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,20 @@ from holdfast.recording.figure import (
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
+EIGHT = """
+from light_dark_room import LightDarkRoom
+
+
+class Eight(LightDarkRoom):
+    sensing_actions = (
+        "camera in front", "camera at the left", "camera at the right", "lidar, coarse scan",
+        "lidar, fine scan", "force-torque sensor", "ultrasonic range finder", "radio beacon",
+    )
+
+    def observation_mean(self, states, sensing_action):
+        return super().observation_mean(states, sensing_action % 2)
+"""
+
 
 class TestFigure:
     @pytest.mark.parametrize(
@@ -36,6 +51,37 @@ class TestFigure:
         for edge in (picture[0], picture[-1], picture[:, 0], picture[:, -1]):
             assert (edge == 1.0).all()
         assert (picture < 1.0).any()
+
+    def test_eight_sensing_actions_have_room(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.syspath_prepend(EXAMPLES)
+        (tmp_path / "eight_sensors.py").write_text(EIGHT)
+        (tmp_path / "eight.yaml").write_text(
+            "problem: eight_sensors:Eight\nsimulator: {max_steps: 60, sensing_intervals: 2}\n"
+        )
+        drawn: list[Figure] = []
+        saved = Figure.savefig
+
+        def savefig(figure: Figure, *arguments: Any, **options: Any) -> None:
+            drawn.append(figure)
+            saved(figure, *arguments, **options)
+
+        monkeypatch.setattr(Figure, "savefig", savefig)
+        configuration = load(tmp_path / "eight.yaml")
+        recorder = record_trial(configuration, trial=0)
+        trial_figure(configuration, recorder.record, tmp_path / "trial.png")
+        picture = imread(tmp_path / "trial.png")[..., :3]
+        for edge in (picture[0], picture[-1], picture[:, 0], picture[:, -1]):
+            assert (edge == 1.0).all()
+        (figure,) = drawn
+        left, right = figure.subfigs
+        (legend,) = left.legends
+        assert legend.get_window_extent().x1 <= left.bbox.x1
+        labels = [each.get_window_extent() for each in right.axes[-2].get_yticklabels()]
+        assert len(labels) == 8
+        for upper, lower in itertools.pairwise(labels):
+            assert upper.y0 >= lower.y1 - 1.0
 
     def test_it_is_the_same_whatever_the_user_has_set(self, tmp_path: Path) -> None:
         """LaTeX, which need not be installed, and the look of the user's other figures."""

@@ -246,18 +246,58 @@ def test_a_world_of_ones_own_has_a_figure_of_the_belief(workplace: Workplace) ->
     assert "note: no figure, because trial 0 ended in an earlier part of the run" in said.stderr
 
 
-def test_a_figure_that_a_problem_fails_to_describe(workplace: Workplace) -> None:
+@pytest.mark.parametrize("moment", ["import", "sensing"])
+@pytest.mark.parametrize("out", [("--out", "out"), ()])
+def test_a_robot_that_changes_the_directory_writes_where_it_was_started(
+    workplace: Workplace, moment: str, out: tuple[str, ...]
+) -> None:
+    """Simulators do; another run of the same name may lie there."""
+    other = workplace.directory / "simulator"
+    there = other / (out[1] if out else "runs/peg-seed3")
+    there.mkdir(parents=True)
+    for name in ("trials.csv", "summary.json", "events.jsonl", "trial.png", "config.yaml"):
+        (there / name).write_text("another run's")
+    chdir = f"import os; os.chdir({str(other)!r})"
+    workplace.write(
+        "arm.py",
+        f"{chdir if moment == 'import' else ''}\n"
+        "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
+        "from holdfast.robot.environment import SimulatedEnvironment\n"
+        "class Own(PegInHole2D):\n"
+        "    pass\n"
+        "class Arm(SimulatedEnvironment):\n"
+        "    def __init__(self, problem, seed, trial):\n"
+        "        super().__init__(problem, seed, trial)\n"
+        "    def perform_sensing(self, sensing_action):\n"
+        f"        {chdir if moment == 'sensing' else ''}\n"
+        "        return super().perform_sensing(sensing_action)\n",
+    )
+    command = ("run", "peg.yaml", "--problem", "arm:Own", "--environment", "arm:Arm", *out)
+    workplace.runs(*command, "--trials", "1", figures=True)
+    workplace.runs(*command, "--trials", "2", "--resume")
+    assert {path.read_text() for path in there.iterdir()} == {"another run's"}
+    mine = workplace.directory / there.relative_to(other)
+    assert len(workplace.decided(str(mine))) == 2
+    assert (mine / "trial.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("line", "raised"), [("{}['scene']", "KeyError: 'scene'"), ("exit(0)", "SystemExit: 0")]
+)
+def test_a_figure_that_a_problem_fails_to_describe(
+    workplace: Workplace, line: str, raised: str
+) -> None:
     workplace.write(
         "unseen.py",
         "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
         "class Unseen(PegInHole2D):\n"
         "    def scene(self):\n"
-        "        return {}['scene']\n",
+        f"        {line}\n",
     )
     arguments = ("peg.yaml", "--problem", "unseen:Unseen", "--out", "out", "--jobs", "1")
     said = workplace.runs("run", *arguments, figures=True)
     assert "note: no figure, because it cannot be drawn: unseen:Unseen raised" in said.stderr
-    assert "KeyError: 'scene'" in said.stderr
+    assert raised in said.stderr
     assert "Traceback" not in said.stderr
     assert workplace.summary("out")["finished"] == 6
 

@@ -7,7 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from holdfast.recording.step_times import MOMENTS, NS_PER_S, StepClock, read_events, trial_ends
+from holdfast.recording.run_clock import RunClock
+from holdfast.recording.step_times import (
+    MOMENTS,
+    NS_PER_S,
+    StepClock,
+    dated,
+    read_events,
+    trial_ends,
+)
 from holdfast.recording.timings import TimingRow
 
 
@@ -61,5 +69,5 @@ def test_events_in_order_without_the_damaged_ones(tmp_path: Path) -> None:
         )
     )
     events = read_events(path)
-    assert [event.name for event in events] == ["status", "trial"]
+    assert [event.name for event in dated(events, RunClock([]))] == ["status", "trial"]
     assert trial_ends(events) == {0: 1_700_000_001 * NS_PER_S}

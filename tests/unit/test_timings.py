@@ -34,10 +34,10 @@ def test_a_row(tmp_path: Path) -> None:
     with path.open(newline="") as file:
         header, first, second = csv.reader(file)
     assert ",".join(header) == (
-        "trial,step,kind,service,status,waited_ms,round_trip_ms,computed_ms,time"
+        "trial,step,kind,service,status,waited_ms,round_trip_ms,computed_ms,time,boot,uptime_s"
     )
     assert first[:5] == ["2", "9", "task", "tcp/127.0.0.1:7447", "keep_alive"]
-    assert first[5:] == ["1.500", "2.250", "0.750", "2023-11-14T22:13:20.123456Z"]
+    assert first[5:9] == ["1.500", "2.250", "0.750", "2023-11-14T22:13:20.123456Z"]
     assert second[3] == 'a,"b"'
 
 
@@ -102,8 +102,8 @@ class TestCountVerified:
             table.add(VerificationNoted(1, step, cloud, kind, verdict))
         table.close()
         head, first = path.read_text().splitlines()[:2]
-        assert head == "trial,step,service,kind,verdict,time"
-        assert first == f"1,0,{cloud},question,asked,2023-11-14T22:13:20.123456Z"
+        assert head == "trial,step,service,kind,verdict,time,boot,uptime_s"
+        assert first.startswith(f"1,0,{cloud},question,asked,2023-11-14T22:13:20.123456Z,")
         assert count_verified(path) == VerificationCounts(2, {cloud: 1}, 1, 1)
 
     def test_there_is_no_table(self, tmp_path: Path) -> None:

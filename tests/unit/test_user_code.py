@@ -58,11 +58,6 @@ class InTheConstructor(PegInHole2D):
         sys.exit(0)
 
 
-class InTheFigure(PegInHole2D):
-    def scene(self):
-        sys.exit(0)
-
-
 class WithoutException(PegInHole2D):
     def policy(self, states, stage):
         raise GeneratorExit("enough")
@@ -157,7 +152,6 @@ class TestWhateverItRaises:
             ("InThePolicy", "raised SystemExit: 0", "in execute"),
             ("InTheWorld", "raised SystemExit: 0", "in move"),
             ("InTheConstructor", "raised SystemExit: 0", "in __init__"),
-            ("InTheFigure", "raised SystemExit: 0", "in scene"),
             ("WithoutException", "raised GeneratorExit: enough", "in policy"),
             ("WithoutWords", "raised Wordless, which cannot be put into words", "in policy"),
             ("WithManyWords", "raised ValueError: many\n", "in policy"),

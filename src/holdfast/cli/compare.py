@@ -9,6 +9,7 @@ from typing import ClassVar
 
 from holdfast.cli.exit_codes import EXIT_DIFFERENT
 from holdfast.errors import OptionError
+from holdfast.files import shown_path
 from holdfast.printable import printable
 from holdfast.runtime.command_line import Options, argument, flag, location
 
@@ -52,7 +53,7 @@ class CompareOptions(Options):
 def main(arguments: Sequence[str]) -> int:
     """Compare runs and return the exit code."""
     options = CompareOptions.parse("compare", arguments)
-    runs = options.runs
+    runs = [Path(shown_path(run)) for run in options.runs]  # as they were named: no code is run
     if len(runs) < 2 or (len(runs) > 2 and not options.outcomes):
         wanted = "two or more runs" if options.outcomes else "two runs (more with --outcomes)"
         raise OptionError(f"compare takes {wanted}, not {len(runs)}")

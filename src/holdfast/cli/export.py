@@ -13,7 +13,7 @@ from holdfast.cli.exit_codes import ended_by_signals
 from holdfast.cli.terminal import counted, progress_line
 from holdfast.config.user_code import account_of_user_error
 from holdfast.errors import HoldfastError, OptionError, OutputError
-from holdfast.files import directory_beside, move_into_place, require_free
+from holdfast.files import directory_beside, move_into_place, require_free, shown_path
 from holdfast.printable import printable
 from holdfast.runtime.command_line import (
     MAX_TRIALS,
@@ -36,6 +36,7 @@ __all__ = [
     "chosen_trials",
     "main",
     "notes_about",
+    "problem_directory_option",
     "rate_option",
     "replay_trials",
     "size_of",
@@ -79,6 +80,16 @@ def rate_option() -> Any:
     )
 
 
+def problem_directory_option() -> Any:
+    """Declare where the module of a run's own problem lies."""
+    return option(
+        metavar="DIR",
+        read=location,
+        help="Where the module of the run's problem lies, if that is module:Class: its code is "
+        "run. Code that a record names is not run without.",
+    )
+
+
 class ExportOptions(Options):
     """Write a recorded run as other programs read it; the run is not changed.
 
@@ -104,6 +115,7 @@ class ExportOptions(Options):
         help="Write DIR: trials.csv, steps.csv, beliefs.csv and events.csv.",
     )
     trials: range | None = trials_option()
+    problem_directory: Path | None = problem_directory_option()
     rate: float = rate_option()
     quiet: bool = flag("-q", help="Show no progress.")
 
@@ -127,18 +139,18 @@ def _export(options: ExportOptions) -> None:
         require_free(mcap, "--mcap", directory=False)
     if tables is not None:
         require_free(tables, "--csv", directory=True)
-        if mcap is not None and mcap.absolute() == tables.absolute():
-            raise OptionError(f"--mcap and --csv are both {mcap}; give two places")
+        if mcap == tables:
+            raise OptionError(f"--mcap and --csv are both {shown_path(mcap)}; give two places")
     from holdfast.recording.replay import RecordedRun
 
-    with RecordedRun(path) as recorded:
+    with RecordedRun(path, problem_directory=options.problem_directory) as recorded:
         trials = chosen_trials(recorded, wanted)
         notes = _write(recorded, trials, options)
     for note in () if options.quiet else notes:
         sys.stderr.write(f"note: {printable(note)}\n")
     for place in (mcap, tables):
         if place is not None:
-            sys.stdout.write(printable(f"{place}  {size_of(place)}\n"))
+            sys.stdout.write(printable(f"{shown_path(place)}  {size_of(place)}\n"))
     sys.stdout.flush()
 
 
@@ -208,7 +220,7 @@ def replay_trials(
 ) -> None:
     """Write the facts of trials to sinks, and show the progress."""
     line = progress_line(len(trials), quiet=quiet)
-    line.start(f"{counted(len(trials), 'trial')} of {recorded.path}", 0, _NOTE)
+    line.start(f"{counted(len(trials), 'trial')} of {shown_path(recorded.path)}", 0, _NOTE)
     try:
         for finished, _ in enumerate(recorded.replay(trials, sinks, rate_hz), start=1):
             after_each()
@@ -237,6 +249,8 @@ def notes_about(recorded: RecordedRun, trials: Sequence[int], rate_hz: float) ->
             lacking = counted(len(untimed), "trial")
             why = f"{TIMINGS_NAME} lacks {lacking} from {untimed[0]} on; all have one clock"
         notes.append(f"{why}, so every step takes {1.0 / rate_hz:g} s (--rate)")
+    else:
+        notes += recorded.clock_notes
     blind = [trial for trial in trials if not recorded.beliefs_known(trial)]
     if blind:
         notes.append(

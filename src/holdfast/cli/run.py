@@ -22,7 +22,7 @@ from holdfast.cli.overrides import Override, combined, parse_assignment
 from holdfast.cli.run_figure import Remark, draw_figure
 from holdfast.cli.terminal import RunDisplay, counted, print_files, print_summary
 from holdfast.errors import HoldfastError, InvalidValueError, RunError, UnwritableOutputError
-from holdfast.files import require_free
+from holdfast.files import require_free, shown_path
 from holdfast.printable import printable
 from holdfast.recording.view_target import ViewTarget, require_rerun, viewer_url
 from holdfast.runtime.command_line import (
@@ -212,7 +212,7 @@ class RunOptions(Options):
         """Return where to show the run while it goes on, if anywhere."""
         if self.view is None and self.view_file is None:
             return None
-        file = None if self.view_file is None else str(self.view_file.absolute())
+        file = None if self.view_file is None else str(self.view_file)
         return ViewTarget(None if self.view is None else self.view.url, file)
 
     def resume_command(self, directory: Path) -> str:
@@ -229,7 +229,9 @@ class RunOptions(Options):
         for name, each in self.table().items():
             value = getattr(self, name)
             if each.key is not None and value != each.default:
-                plain = list(value) if each.many else str(value) if each.read is location else value
+                plain = list(value) if each.many else value
+                if isinstance(value, Path):
+                    plain = shown_path(value)
                 given.append(Override(" ".join(each.words(value)), each.key, plain))
         return [*map(parse_assignment, self.assignments), *given]
 
@@ -237,7 +239,8 @@ class RunOptions(Options):
         """Read the configuration, with the values that replace those of the file."""
         from holdfast.config.loader import load
 
-        return load(self.configuration, problem=self.problem, overrides=combined(self.overrides()))
+        path = shown_path(self.configuration)  # as messages name it
+        return load(path, problem=self.problem, overrides=combined(self.overrides()))
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -271,6 +274,7 @@ def _run(options: RunOptions) -> int:
     from holdfast.runtime.service_manager import ServiceManager
 
     manager = ServiceManager()
+    runs = _RUNS.absolute()  # before the user's code, which may change the current directory
     configuration = options.load()
     quiet = options.quiet
     as_robot = is_robot_run(options, configuration)
@@ -281,10 +285,10 @@ def _run(options: RunOptions) -> int:
         directory_path = _out_of_one_run(options)
         directory = RunDirectory.resume_if_begun(directory_path, configuration)
     elif options.resume:
-        directory_path = options.out or latest_default_directory(configuration, _RUNS)
+        directory_path = options.out or latest_default_directory(configuration, runs)
         directory = RunDirectory.resume(directory_path, configuration)
     else:
-        directory_path = options.out or claim_default_directory(configuration, _RUNS)
+        directory_path = options.out or claim_default_directory(configuration, runs)
         directory = RunDirectory.create(directory_path, configuration)
     with directory:
         notes = _Notes(options)
@@ -294,7 +298,9 @@ def _run(options: RunOptions) -> int:
         if options.resume_if_begun and (complete := directory.complete_summary()) is not None:
             manager.ready()  # otherwise it takes the end for a failed start
             manager.close()
-            notes.note(f"{directory_path}: complete, with {counted(complete.trials, 'trial')}")
+            notes.note(
+                f"{shown_path(directory_path)}: complete, with {counted(complete.trials, 'trial')}"
+            )
             return _exit_code(complete)
         before, now = directory.services_before, configuration.offload.services
         if before is not None and before != now:
@@ -352,7 +358,7 @@ def _run(options: RunOptions) -> int:
             notes.ended_early(
                 interrupted_by(interruption),
                 f"{len(directory.journal.finished())} of {configuration.simulator.num_trials} "
-                f"trials are finished and kept in {directory_path}",
+                f"trials are finished and kept in {shown_path(directory_path)}",
                 options.resume_command(directory_path),
             )
             raise
@@ -461,17 +467,19 @@ def _require_effect(options: RunOptions, configuration: Configuration, *, as_rob
 
         # Before a directory is claimed: a mistyped one claims none.
         on_command_line = any(given.key == "offload.services" for given in options.overrides())
-        check_services(configuration, None if on_command_line else f"{options.configuration}: ")
+        check_services(
+            configuration, None if on_command_line else f"{shown_path(options.configuration)}: "
+        )
     for given in options.overrides():
         if given.key in _OF_SERVICES and given.value and not configuration.offload.services:
             raise InvalidValueError(
                 f"{given.words} needs --service (or offload.services in "
-                f"{options.configuration}): without a service it would do nothing"
+                f"{shown_path(options.configuration)}): without a service it would do nothing"
             )
         if given.key in _OF_ENVIRONMENTS and given.value and not configuration.environment.object:
             raise InvalidValueError(
                 f"{given.words} needs --environment (or environment.object in "
-                f"{options.configuration}): without an environment it would do nothing"
+                f"{shown_path(options.configuration)}): without an environment it would do nothing"
             )
     target = options.view_target()
     if target is not None:
@@ -481,7 +489,8 @@ def _require_effect(options: RunOptions, configuration: Configuration, *, as_rob
     if options.log == "json" and not as_robot:
         raise InvalidValueError(
             "--log json needs --service, --environment or --rate (or offload.services or "
-            f"environment.object in {options.configuration}): without them there are no events"
+            f"environment.object in {shown_path(options.configuration)}): without them there are "
+            "no events"
         )
 
 

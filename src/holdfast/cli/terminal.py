@@ -12,6 +12,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
 
+from holdfast.files import shown_path
 from holdfast.printable import printable
 
 if TYPE_CHECKING:
@@ -180,7 +181,9 @@ class RunDisplay:
         )
         if self._finished:
             title += f", {self._finished} finished before"
-        self._line.start(f"{title}; results in {directory}", self._finished, self._note())
+        self._line.start(
+            f"{title}; results in {shown_path(directory)}", self._finished, self._note()
+        )
 
     def show(self, result: TrialResult) -> None:
         """Count one more finished trial."""
@@ -303,7 +306,7 @@ def print_files(directory: Path) -> None:
     from holdfast.recording.run_directory import OUTPUT_NAMES
 
     names = [name for name in OUTPUT_NAMES if (directory / name).exists()]
-    sys.stdout.write(printable(f"\n{directory}/\n  {'  '.join(names)}\n"))
+    sys.stdout.write(printable(f"\n{shown_path(directory)}/\n  {'  '.join(names)}\n"))
     sys.stdout.flush()
 
 

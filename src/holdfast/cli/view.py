@@ -11,13 +11,14 @@ from holdfast.cli.exit_codes import ended_by_signals
 from holdfast.cli.export import (
     chosen_trials,
     notes_about,
+    problem_directory_option,
     rate_option,
     replay_trials,
     size_of,
     trials_option,
 )
 from holdfast.errors import InvalidValueError, OptionError, ViewError
-from holdfast.files import directory_beside, move_into_place, require_free
+from holdfast.files import directory_beside, move_into_place, require_free, shown_path
 from holdfast.printable import printable
 from holdfast.recording.view_target import ViewTarget, require_rerun, viewer_url
 from holdfast.runtime.command_line import (
@@ -52,6 +53,7 @@ class ViewOptions(Options):
         metavar="HOST:PORT",
         help="Show it in the viewer that listens there; Rerun's port is 9876.",
     )
+    problem_directory: Path | None = problem_directory_option()
     rate: float = rate_option()
     quiet: bool = flag("-q", help="Show no progress.")
 
@@ -78,7 +80,8 @@ def _view(options: ViewOptions) -> None:
     from holdfast.recording.replay import RecordedRun
     from holdfast.recording.rerun_sink import RerunSink
 
-    with RecordedRun(options.run, "view") as recorded, ExitStack() as stack:
+    own = options.problem_directory
+    with RecordedRun(options.run, "view", problem_directory=own) as recorded, ExitStack() as stack:
         trials = chosen_trials(recorded, options.trials)
         notes = notes_about(recorded, trials, options.rate)
         made = None
@@ -106,5 +109,5 @@ def _view(options: ViewOptions) -> None:
     for note in () if options.quiet else notes:
         sys.stderr.write(f"note: {printable(note)}\n")
     if save is not None:
-        sys.stdout.write(printable(f"{save}  {size_of(save)}\n"))
+        sys.stdout.write(printable(f"{shown_path(save)}  {size_of(save)}\n"))
         sys.stdout.flush()

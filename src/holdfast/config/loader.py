@@ -67,7 +67,7 @@ class Configuration:
     model, state_space_planner : mapping
         The problem's two sections with all defaults filled in, as plain data.
     path : Path
-        The file that this was read from.
+        The file that this was read from; absolute.
     problem_directory : Path or None
         Where the module of ``module:Class`` was found; None for one that is installed.
     unlisted : tuple of str
@@ -111,7 +111,7 @@ class Configuration:
 
     def plain(self) -> dict[str, Any]:
         """Return the configuration as plain data, from which another process can rebuild it."""
-        return {"path": str(self.path.absolute()), "configuration": self._sections()}
+        return {"path": str(self.path), "configuration": self._sections()}
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> Configuration:
@@ -260,7 +260,7 @@ def _build(
         problem_name=name,
         planning=planning,
         simulator=simulator,
-        path=path,
+        path=source.directory / path.name,
         problem_directory=directory,
         offload=offload,
         recovery=recovery,
@@ -300,10 +300,18 @@ def _checked_offload(
             f"is {offload.detection_timeout_ms:g}; it must be at most offload.decision_timeout_ms,"
             f" after which a decision is given up, which is {timeout_ms:g}",
         )
+    services = tuple(_absolute(source, service) for service in offload.services)
+    offload = msgspec.structs.replace(offload, services=services)
     if offload.tls is None:
         return offload
     directory = source.directory_of(("offload", "tls")) / offload.tls
     return msgspec.structs.replace(offload, tls=str(directory.resolve()))
+
+
+def _absolute(source: Source, service: str) -> str:
+    """Return an endpoint with an absolute path, if it has one."""
+    protocol, _, place = service.partition("/")
+    return f"unix/{source.current / place}" if protocol == "unix" and place else service
 
 
 def _located_environment(source: Source, settings: EnvironmentSettings) -> EnvironmentSettings:

@@ -67,9 +67,7 @@ def find_problem(source: Source, name: str | None) -> tuple[str, type, Path | No
         )
     directory = module_directory(source, key, value, module) if colon else None
     try:
-        problem_class = registry.problem_class(
-            name, search_directory=directory or source.path.absolute().parent
-        )
+        problem_class = registry.problem_class(name, search_directory=directory or source.directory)
     except UnknownProblemError as error:
         if given or source.problem is None:
             raise

@@ -6,6 +6,7 @@ instead, because a person who reads it has the file open.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Collection, Mapping
 from importlib.machinery import PathFinder
 from pathlib import Path
@@ -76,12 +77,18 @@ class Source:
         The type of each section that has one; a problem's own are added to it.
     problem, problem_directory : object
         What stands on top.
+    directory, current : Path
+        That of the file, and the current one when this was made.
     sections : dict
         The data of each section, that of ``overrides`` (``section.key``) included.
     """
 
     def __init__(self, document: Document, path: Path, overrides: Mapping[str, Any]) -> None:
         self.path = path
+        # Now: a problem's module, which is imported later, may change the current directory.
+        self.directory = self.current = path.absolute().parent.resolve()
+        with contextlib.suppress(OSError):  # it was removed
+            self.current = Path.cwd()
         self.schemas = dict(SETTINGS)
         self._document = document
         self._overrides: set[KeyPath] = set()
@@ -125,7 +132,7 @@ class Source:
 
     def directory_of(self, path: KeyPath) -> Path:
         """Return the directory to which a relative path that stands at ``path`` is relative."""
-        return Path.cwd() if self.is_overridden(path) else self.path.absolute().parent.resolve()
+        return self.current if self.is_overridden(path) else self.directory
 
     def error(self, path: KeyPath, message: str) -> ConfigurationError:
         """Return an error about the value at ``path``."""
@@ -182,10 +189,8 @@ def module_directory(source: Source, key: KeyPath, value: str | None, module: st
         if not _holds(directory, package):
             raise source.error(key, f"is {shown(value)}, where there is no module {package}")
         return directory.resolve()
-    beside = source.path.absolute().parent.resolve()
-    return next(
-        (directory for directory in (beside, Path.cwd()) if _holds(directory, package)), None
-    )
+    places = (source.directory, source.current)
+    return next((directory for directory in places if _holds(directory, package)), None)
 
 
 def _holds(directory: Path, module: str) -> bool:

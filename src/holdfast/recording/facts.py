@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Protocol
 from holdfast.arrays import FloatArray
 from holdfast.belief import Belief
 from holdfast.outcome import TrialResult
+from holdfast.recording.run_clock import Stamp
 
 __all__ = [
     "SCORES",
@@ -174,6 +175,7 @@ class EventFact(NamedTuple):
     time_ns: int
     name: str
     fields: Mapping[str, Any]
+    stamp: Stamp | None = None
 
 
 class FactSink(Protocol):

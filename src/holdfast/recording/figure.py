@@ -70,7 +70,16 @@ _MAX_MARKS = 120
 """With more sensing steps than this, marks on the paths would hide them; the strip has them all."""
 
 _LABEL_WIDTH = 14
-_SHORT_LABEL = 8
+_WIDE_LABEL = 24
+_FEW_CHOICES = 4
+"""More of them have wider labels, for each line of theirs makes every row higher."""
+
+_ROW = 0.15
+"""Height of a line of a label, where a panel's is 1."""
+
+_MOST_COLUMNS = 4
+_LEGEND_SHARE = 0.98
+"""Of the width of what it stands under."""
 _DOTS_PER_INCH = 150
 _WIDTH = 11.0
 _SMALLEST = 8.0
@@ -107,7 +116,10 @@ def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) 
     problem = configuration.problem
     scene: Scene | None = checked.scene(problem)
     num_panels = problem.state_size + 2
-    height = max(6.2, 1.12 * num_panels + 1.6)
+    labels = _wrapped_choices(problem, record)
+    rows = max(0.75, _ROW * max(label.count("\n") + 1 for label in labels) * len(labels))
+    ratios = [1.0] * problem.state_size + [rows, 1.0]
+    height = max(6.2, 1.12 * max(sum(ratios), num_panels) + 1.6)
     with mpl.rc_context():
         mpl.rcdefaults()  # a figure looks the same whatever the user's matplotlibrc says
         mpl.rcParams.update(STYLE)
@@ -125,9 +137,7 @@ def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) 
             _draw_workspace_legend(left, problem, scene, record)
         else:
             right = figure.add_subfigure(figure.add_gridspec(1, 1)[0, 0])
-        panels = right.subplots(
-            num_panels, 1, sharex=True, height_ratios=[1.0] * problem.state_size + [0.75, 1.0]
-        )
+        panels = right.subplots(num_panels, 1, sharex=True, height_ratios=ratios)
         _draw_coordinates(panels[: problem.state_size], problem, record)
         _draw_choices(panels[-2], problem, record)
         _draw_entropies(panels[-1], configuration, record)
@@ -351,14 +361,19 @@ def _draw_workspace_legend(
     if len(scene.obstacles):
         handles.append(Patch(facecolor=_OBSTACLE, edgecolor=_OBSTACLE_EDGE, label="obstacle"))
     handles += _action_handles(problem, record)
-    # Outside the axes, where the layout makes room for it however many rows it has.
-    figure.legend(
-        handles=handles,
-        loc="outside lower center",
-        ncols=4 if max(map(len, _choices(problem, record))) <= _SHORT_LABEL else 3,
-        columnspacing=1.6,
-        handletextpad=0.6,
-    )
+    # Outside the axes, where the layout makes room for it however many rows it has. As many columns
+    # as are not cut off.
+    for columns in range(_MOST_COLUMNS, 0, -1):
+        legend = figure.legend(
+            handles=handles,
+            loc="outside lower center",
+            ncols=columns,
+            columnspacing=1.6,
+            handletextpad=0.6,
+        )
+        if columns == 1 or legend.get_window_extent().width <= _LEGEND_SHARE * figure.bbox.width:
+            return
+        legend.remove()
 
 
 def _choices(problem: Problem, record: TrialRecord) -> list[str]:
@@ -370,6 +385,13 @@ def _choices(problem: Problem, record: TrialRecord) -> list[str]:
         for sensing in record.sensing
     )
     return labels if is_optional else labels[:-1]
+
+
+def _wrapped_choices(problem: Problem, record: TrialRecord) -> list[str]:
+    """Return the labels of the choices in lines, as they stand at their rows."""
+    choices = _choices(problem, record)
+    width = _LABEL_WIDTH if len(choices) <= _FEW_CHOICES else _WIDE_LABEL
+    return [fill(label, width) for label in choices]
 
 
 def _action_handles(problem: Problem, record: TrialRecord) -> list[Line2D]:
@@ -468,7 +490,7 @@ def _draw_choices(panel: Axes, problem: Problem, record: TrialRecord) -> None:
         x, y = zip(*unexplained, strict=True)
         size = 3.0 * _marker_size(record)
         panel.scatter(x, y, s=size, marker="x", color=_TRUE, linewidth=0.9, zorder=5)
-    labels = [fill(label, _LABEL_WIDTH) for label in choices]
+    labels = _wrapped_choices(problem, record)
     size = 9.0 if max(map(len, labels), default=0) <= _LABEL_WIDTH else _SMALLEST
     panel.set_yticks(range(count), labels, fontsize=size)
     panel.set_ylim(count - 0.4, -0.6)

@@ -95,18 +95,21 @@ class RunArrays:
     Attributes
     ----------
     path : Path
-        Its directory, or its journal.
+        Its directory, or its journal; absolute.
     trials : tuple of int
         Numbers of all its trials, the one that was begun and not finished included.
     results : dict of arrays
         The columns of ``trials.csv``, one entry for each finished trial. A reward that there is
         not is NaN.
+    problem_directory : Path or None
+        As :func:`open_run` was given it; absolute.
     """
 
     path: Path
     configuration: Configuration
     trials: tuple[int, ...]
     results: dict[str, npt.NDArray[Any]]
+    problem_directory: Path | None = None
 
     def trial(self, number: int) -> TrialArrays:
         """Return one trial; :meth:`read` is faster for several."""
@@ -126,25 +129,34 @@ class RunArrays:
         chosen = sorted(set(wanted))
         if lacking := set(chosen).difference(self.trials):
             raise OutputError(f"{self.path}: has no trial {min(lacking)}")
-        with RecordedRun(self.path, "open") as run:
+        with RecordedRun(self.path, "open", problem_directory=self.problem_directory) as run:
             planner = Planner(run.configuration.problem, run.configuration.planning)
             sink = _Collector(planner.num_choices)
             for trial in run.replay(chosen, [sink], rate_hz=1.0):
                 yield sink.collected(trial, run.configuration.problem.action_size)
 
 
-def open_run(path: str | Path) -> RunArrays:
+def open_run(path: str | Path, *, problem_directory: str | Path | None = None) -> RunArrays:
     """Open a recorded run, by its directory or journal, to be read as arrays; it is not changed.
+
+    Parameters
+    ----------
+    problem_directory : str or Path, optional
+        Where the module of a run's own problem (``module:Class``) lies. Its code is run then, and
+        no code that the record names is run without.
 
     Raises
     ------
     OutputError
         If it is no run, damaged, or in use.
+    UntrustedCodeError
+        If its problem is ``module:Class``, and there is no ``problem_directory``.
     HoldfastError
         If its problem cannot be built any more.
     """
-    run = Path(path)
-    with RecordedRun(run, "open") as recorded:
+    run = Path(path).absolute()  # the problem's own code may change the current directory
+    directory = None if problem_directory is None else Path(problem_directory).absolute()
+    with RecordedRun(run, "open", problem_directory=directory) as recorded:
         configuration, trials = recorded.configuration, recorded.trials
     with JournalReader.read_run(run, "open") as journal:
         rows = [
@@ -155,7 +167,7 @@ def open_run(path: str | Path) -> RunArrays:
         name: np.array([np.nan if value is None else value for value in column])
         for name, column in zip(TRIAL_COLUMNS, columns, strict=True)
     }
-    return RunArrays(run, configuration, trials, results)
+    return RunArrays(run, configuration, trials, results, directory)
 
 
 class _Collector:

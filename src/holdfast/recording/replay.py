@@ -13,6 +13,7 @@ decisions and their times, and no beliefs.
 from __future__ import annotations
 
 import math
+import shlex
 from collections import deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -23,7 +24,12 @@ import numpy as np
 
 from holdfast.arrays import FloatArray, floats_or_none
 from holdfast.config.loader import Configuration
-from holdfast.errors import DecidedOtherwiseError, EndOfRecordsError, HoldfastError
+from holdfast.errors import (
+    DecidedOtherwiseError,
+    EndOfRecordsError,
+    HoldfastError,
+    UntrustedCodeError,
+)
 from holdfast.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
 from holdfast.planning import Planner, PlanningState, digest
 from holdfast.protocol.records import decisions_of, reinitialised_after
@@ -40,8 +46,16 @@ from holdfast.recording.facts import (
 from holdfast.recording.fingerprint import difference, fingerprint
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.recording.recorded_environment import RecordedEnvironment
+from holdfast.recording.run_clock import RunClock
 from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME
-from holdfast.recording.step_times import NS_PER_S, StepClock, TrialTimes, read_events, trial_ends
+from holdfast.recording.step_times import (
+    NS_PER_S,
+    StepClock,
+    TrialTimes,
+    dated,
+    read_events,
+    trial_ends,
+)
 from holdfast.recording.timings import rows_by_trial
 from holdfast.robot.environment import Environment, SimulatedEnvironment
 from holdfast.robot.trial import LateStep, SensingStep, TaskStep, TrialObserver, run_trial
@@ -52,7 +66,9 @@ __all__ = ["RecordedRun"]
 class RecordedRun:
     """A recorded run, open to be read; to be used in a ``with`` statement.
 
-    ``run`` is its directory, or its journal. Nobody may be using it; it is not changed.
+    ``run`` is its directory, or its journal. Nobody may be using it; it is not changed. A record
+    names no code that is run: where its problem is a class of a module (``module:Class``), the
+    caller says in which directory that module lies, and so that its code may run.
 
     Attributes
     ----------
@@ -65,23 +81,31 @@ class RecordedRun:
     untimed : tuple of int
         Trials that the table of times lacks although it has others; then no fact has the robot's
         times.
+    clock_notes : tuple of str
+        How the robot's wall clock was set while it ran.
 
     Raises
     ------
     OutputError
         If it is no run, damaged, or in use.
+    UntrustedCodeError
+        If its problem is a class of a module, and nobody says where that lies.
     HoldfastError
         If its problem cannot be built any more.
     """
 
-    def __init__(self, run: Path, purpose: str = "export") -> None:
+    def __init__(
+        self, run: Path, purpose: str = "export", *, problem_directory: Path | None = None
+    ) -> None:
         self.path = run
         with ExitStack() as stack:
             self._journal = stack.enter_context(JournalReader.read_run(run, purpose))
             path = self._journal.path
             directory = path.parent
             self._meta = self._journal.meta()
-            self.configuration, self.world_is_simulated = _configuration(self._meta, path)
+            self.configuration, self.world_is_simulated = _configuration(
+                self._meta, path, purpose, problem_directory
+            )
             self._planner = Planner(self.configuration.problem, self.configuration.planning)
             self._begun = self._journal.unfinished()
             self.unfinished = None if self._begun is None else self._begun.trial
@@ -89,8 +113,21 @@ class RecordedRun:
             if self.unfinished is not None:
                 trials.add(self.unfinished)
             self.trials = tuple(sorted(trials))
-            self._rows = rows_by_trial(directory / TIMINGS_NAME)
-            self._events = read_events(directory / EVENTS_NAME)
+            rows = rows_by_trial(directory / TIMINGS_NAME)
+            events = read_events(directory / EVENTS_NAME)
+            clock = RunClock(
+                [(event.stamp, event.time_ns) for event in events]
+                + [(row.stamp, row.time_ns) for each in rows.values() for row in each.values()]
+            )
+            self.clock_notes = clock.notes
+            self._rows = {
+                trial: {
+                    key: row._replace(time_ns=clock.time_ns(row.stamp, row.time_ns))
+                    for key, row in each.items()
+                }
+                for trial, each in rows.items()
+            }
+            self._events = dated(events, clock)
             self._ends = trial_ends(self._events)
             # All facts have one clock: if one trial has no times, those of the others are of no
             # use. A trial in which nothing was decided needs none.
@@ -428,10 +465,13 @@ class _Output:
         return self._sinks
 
 
-def _configuration(meta: Mapping[str, str], path: Path) -> tuple[Configuration, bool]:
+def _configuration(
+    meta: Mapping[str, str], path: Path, purpose: str, problem_directory: Path | None
+) -> tuple[Configuration, bool]:
     """Return the settings that decided in a run, and whether its world was simulated.
 
-    A run may have been copied from the robot, whose environment, keys and directories are not here.
+    A run may have been copied from the robot, whose environment, keys and directories are not here;
+    or somebody else has made it, and names any module of any directory in it.
     """
     from holdfast.config.yaml_document import read
 
@@ -439,9 +479,24 @@ def _configuration(meta: Mapping[str, str], path: Path) -> tuple[Configuration, 
     plain = dict(read(text.encode(), f"the configuration in {path}").data)
     environment = plain.pop("environment", None) or {}
     plain.pop("offload", None)
-    directory = plain.get("problem_directory")
-    if directory is not None and not Path(directory).is_dir():
-        # Then its module is searched for beside the journal and in the current directory.
-        del plain["problem_directory"]
+    recorded = plain.pop("problem_directory", None)
+    if ":" in str(plain.get("problem")):
+        if problem_directory is None:
+            raise UntrustedCodeError(_what_to_say(str(plain["problem"]), recorded, path, purpose))
+        plain["problem_directory"] = str(problem_directory.absolute())
     configuration = Configuration.from_plain({"path": str(path), "configuration": plain})
     return configuration, environment.get("object") is None
+
+
+def _what_to_say(problem: str, recorded: object, path: Path, purpose: str) -> str:
+    """Return how a caller says that a run's own problem may run."""
+    directory = recorded if isinstance(recorded, str) else "DIR"
+    if purpose == "open":
+        how = f"open_run(..., problem_directory={directory!r:.200})"
+    else:
+        how = f"--problem-directory {shlex.quote(f'{directory:.200}')}"
+    told = "" if directory == "DIR" else ", where it lay when it was run"
+    return (
+        f"{path}: its problem is {problem:.100}, and the code that a record names is not run "
+        f"unasked. If you know that module, say in which directory it lies: {how}{told}"
+    )

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from holdfast.protocol.events import Timing, VerificationNoted
+from holdfast.recording.run_clock import read_clocks
 from holdfast.recording.run_directory import (
     EVENTS_NAME,
     RECOVERY_LOG_NAME,
@@ -55,6 +57,22 @@ class RobotObserver(NamedTuple):
     timing: Callable[[Timing], None]
 
 
+class _StampedLog:
+    """Writes with each event how long the machine has been up: its wall clock may be set."""
+
+    def __init__(self, path: Path) -> None:
+        self._now_ns = 0
+        self._log = EventLog(path, format="json", component="robot", clock=lambda: self._now_ns)
+        self.close = self._log.close
+
+    def event(self, name: str, /, **fields: object) -> None:
+        """Write an event."""
+        self._now_ns, stamp = read_clocks()
+        # First, for the end of a line that is too long is cut off.
+        own = {"boot": stamp.boot, "uptime_s": float(stamp.uptime_s)}
+        self._log.event(name, **{**own, **fields})
+
+
 def perform_trials(
     configuration: Configuration,
     directory: RunDirectory,
@@ -84,7 +102,7 @@ def perform_trials(
     if len(directory.journal.finished()) < configuration.simulator.num_trials:
         directory.allow_robot(after_reboot=after_reboot)
     with contextlib.ExitStack() as stack:
-        log = EventLog(directory.path / EVENTS_NAME, format="json", component="robot")
+        log = _StampedLog(directory.path / EVENTS_NAME)
         journal: StepJournal = directory.journal
         if view is not None:
             from holdfast.recording.live_view import ShownJournal

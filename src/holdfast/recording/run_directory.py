@@ -116,6 +116,7 @@ class RunDirectory:
         OutputError
             If it holds a run already, or cannot be written.
         """
+        path = path.absolute()
         try:
             path.mkdir(parents=True, exist_ok=True)
             taken = [name for name in OUTPUT_NAMES if (path / name).exists()]
@@ -161,6 +162,7 @@ class RunDirectory:
             that the configuration does not ask for, one that is damaged, or one that is in use; or
             if it cannot be written.
         """
+        path = path.absolute()
         if not path.is_dir():
             raise OutputError(f"{path}: there is no such directory, so no run to resume")
         if not (path / JOURNAL_NAME).is_file():
@@ -349,6 +351,7 @@ def latest_default_directory(configuration: Configuration, parent: Path) -> Path
 
 def _default_directories(configuration: Configuration, parent: Path) -> Iterator[Path]:
     name = f"{configuration.path.stem}-seed{configuration.simulator.seed}"
+    parent = parent.absolute()
     yield parent / name
     for number in range(2, _MAX_SUFFIX):
         yield parent / f"{name}-{number}"

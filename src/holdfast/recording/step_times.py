@@ -7,7 +7,7 @@ moments between two recorded times are spread evenly. Else every step takes the 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,9 +16,10 @@ import numpy as np
 from holdfast.arrays import IntArray
 from holdfast.errors import OutputError
 from holdfast.recording.facts import Decider, EventFact
+from holdfast.recording.run_clock import RunClock, Stamp
 from holdfast.recording.timings import TimingRow, nanoseconds
 
-__all__ = ["MOMENTS", "NS_PER_S", "StepClock", "TrialTimes", "read_events", "trial_ends"]
+__all__ = ["MOMENTS", "NS_PER_S", "StepClock", "TrialTimes", "dated", "read_events", "trial_ends"]
 
 NS_PER_S = 1_000_000_000
 
@@ -90,7 +91,7 @@ class StepClock:
 
 
 def read_events(path: Path) -> list[EventFact]:
-    """Return the lines of ``events.jsonl`` in the order of their times."""
+    """Return the lines of ``events.jsonl`` as they are there, with the wall clock's times."""
     events = []
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
@@ -98,14 +99,21 @@ def read_events(path: Path) -> list[EventFact]:
                 try:
                     fields = json.loads(line)
                     moment, name = fields.pop("time"), fields.pop("event")
-                    events.append(EventFact(nanoseconds(moment), str(name), fields))
+                    stamp = Stamp.of(fields.pop("boot", None), fields.pop("uptime_s", None))
+                    events.append(EventFact(nanoseconds(moment), str(name), fields, stamp))
                 except (ValueError, KeyError, TypeError, AttributeError):
                     continue  # a line that a power cut has corrupted
     except FileNotFoundError:
         return []
     except OSError as error:
         raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
-    return sorted(events, key=lambda event: event.time_ns)
+    return events
+
+
+def dated(events: Iterable[EventFact], clock: RunClock) -> list[EventFact]:
+    """Return events in the order of their times by a run's clock."""
+    found = [event._replace(time_ns=clock.time_ns(event.stamp, event.time_ns)) for event in events]
+    return sorted(found, key=lambda event: event.time_ns)
 
 
 def trial_ends(events: Sequence[EventFact]) -> dict[int, int]:

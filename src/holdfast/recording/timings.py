@@ -20,6 +20,7 @@ from typing import NamedTuple
 from holdfast.errors import OutputError
 from holdfast.printable import cell
 from holdfast.protocol.events import Timing, VerificationNoted
+from holdfast.recording.run_clock import Stamp, read_clocks
 
 __all__ = [
     "AnswerCounts",
@@ -37,7 +38,8 @@ __all__ = [
 class EventTable:
     """A table with a row for each event of a kind, open for more.
 
-    Its columns are the event's fields, and the time as ``events.jsonl`` has it.
+    Its columns are the event's fields, and the times as ``events.jsonl`` has them: the wall
+    clock's, which boot of the machine this is, and how long it lasts.
 
     Parameters
     ----------
@@ -67,17 +69,20 @@ class EventTable:
             self._file = path.open("a", buffering=1, encoding="utf-8", newline="")
             self._writer = csv.writer(self._file, lineterminator="\n")
             if self._file.tell() == 0:
-                self._writer.writerow([*kind._fields, "time"])
+                self._writer.writerow([*kind._fields, "time", "boot", "uptime_s"])
         except OSError as error:
             raise self._unwritable(error) from error
 
     def add(self, event: Timing | VerificationNoted) -> None:
         """Add a row."""
-        seconds, rest_ns = divmod(self._clock(), 1_000_000_000)
+        now_ns, stamp = read_clocks(self._clock)
+        seconds, rest_ns = divmod(now_ns, 1_000_000_000)
         moment = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(seconds))
         cells = [f"{each:.3f}" if isinstance(each, float) else cell(each) for each in event]
         try:
-            self._writer.writerow([*cells, f"{moment}.{rest_ns // 1000:06d}Z"])
+            self._writer.writerow(
+                [*cells, f"{moment}.{rest_ns // 1000:06d}Z", stamp.boot, stamp.uptime_s]
+            )
         except OSError as error:
             raise self._unwritable(error) from error
 
@@ -203,6 +208,7 @@ class TimingRow(NamedTuple):
     round_trip_ms: float = math.nan
     computed_ms: float = math.nan
     time_ns: int = 0
+    stamp: Stamp | None = None
 
 
 def rows_by_trial(path: Path) -> dict[int, dict[tuple[int, str], TimingRow]]:
@@ -235,11 +241,12 @@ def read_timings(path: Path) -> Iterator[TimingRow]:
         except ValueError:
             continue
         with contextlib.suppress(ValueError):
-            round_trip_ms, computed_ms, moment = rest
+            round_trip_ms, computed_ms, moment, *uptime = rest
             row = row._replace(
                 round_trip_ms=float(round_trip_ms),
                 computed_ms=float(computed_ms),
                 time_ns=nanoseconds(moment),
+                stamp=Stamp.of(*uptime) if len(uptime) == 2 else None,
             )
         yield row
 

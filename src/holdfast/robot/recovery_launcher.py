@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO
 
+from holdfast.files import started_in
 from holdfast.protocol.events import RecoveryExited
 from holdfast.runtime.pool import ThreadPool
 from holdfast.runtime.signal_names import signal_name
@@ -49,6 +50,8 @@ class RecoveryLauncher:
                     stdin=subprocess.PIPE,
                     stdout=output,
                     stderr=output,
+                    # Not where the robot's own code may have gone: a problem may read files.
+                    cwd=started_in(),
                     # Ctrl-C is the robot's to answer; it may still need this service to end well.
                     start_new_session=True,
                 )

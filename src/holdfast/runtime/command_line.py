@@ -107,7 +107,12 @@ class Option(NamedTuple):
         """Return the words of a command line that give this value."""
         if self.is_flag:
             return [self.names[0] if value else f"--no-{self.names[0].removeprefix('--')}"]
-        values = [str(each) for each in (value if self.many else (value,))]
+        from holdfast.files import shown_path
+
+        values = [
+            shown_path(each) if isinstance(each, Path) else str(each)
+            for each in (value if self.many else (value,))
+        ]
         if not self.names:
             return [f"./{each}" if each.startswith("-") else each for each in values]
         # In two words a value with a dash in front would be taken for an option.
@@ -202,6 +207,9 @@ class Options:
         SystemExit
             After the help was shown.
         """
+        from holdfast.files import remember_directory
+
+        remember_directory()
         parser = _parser(cls, f"holdfast {command}")
         if cls.needs_arguments and not arguments:
             import sys
@@ -387,10 +395,14 @@ def one_of(*choices: str) -> Callable[[str], str]:
 
 
 def location(text: str) -> Path:
-    """Read a path. The empty text, such as an unset variable of a script, is not one."""
+    """Read a path. The empty text, such as an unset variable of a script, is not one.
+
+    It is absolute from here on: the code of a problem or robot, which runs later, may change the
+    current directory, as simulators do.
+    """
     if not text:
         raise argparse.ArgumentTypeError("is ''; expected a path (. is the current directory)")
-    return Path(text)
+    return Path(text).absolute()
 
 
 def wants_json(arguments: Sequence[str]) -> bool:

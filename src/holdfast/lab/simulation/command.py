@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.cli.exit_codes import EXIT_DIFFERENT, ended_by_signals
 from holdfast.errors import HoldfastError, OptionError
-from holdfast.files import read_bounded
+from holdfast.files import read_bounded, shown_path
 from holdfast.runtime.command_line import (
     MAX_JOBS,
     Options,
@@ -92,10 +92,11 @@ def main(arguments: Sequence[str]) -> int:
     if options.schedule is not None:
         if options.seeds is not None or options.story:
             raise OptionError(
-                f"--schedule {options.schedule} is a run by itself; leave --seeds and --story out"
+                f"--schedule {shown_path(options.schedule)} is a run by itself; leave --seeds and "
+                "--story out"
             )
         with ended_by_signals():
-            good = _run_file(options.schedule, shrink=options.shrink)
+            good = _run_file(Path(shown_path(options.schedule)), shrink=options.shrink)
     elif options.story:
         good = all(_tell_seed(seed) for seed in options.seeds or range(1))
     else:
