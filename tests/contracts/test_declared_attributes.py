@@ -79,6 +79,10 @@ def listed(value: Any) -> Any:
     return list(map(listed, value)) if isinstance(value, tuple) else value
 
 
+def tuple_or_same(value: Any) -> Any:
+    return value
+
+
 FORMS: dict[str, Callable[[Any], Any]] = {"list": listed, "array": array, "scalars": scalars}
 
 
@@ -90,7 +94,7 @@ def what_it_means(problem: Any) -> list[Any]:
     """Return what is decided, computed and drawn with a problem."""
     found: list[Any] = []
     for method in ("path_entropy", "state_entropy", "action_covariance", "expected_return"):
-        selector = hf.SelectorSettings(method=method, nats_per_cost=0.1)  # type: ignore[arg-type]
+        selector = hf.SelectorSettings(method=method, nats_per_cost=0.1)
         planner = hf.Planner(problem, msgspec.structs.replace(SETTINGS, selector=selector))
         recorder = Recorder(0, planner)
         ended = hf.run_trial(planner, 4, max_steps=6, observer=recorder)
@@ -126,9 +130,10 @@ def test_the_attribute_has_a_meaning(attribute: str) -> None:
 
 
 def test_no_labels_as_an_empty_array() -> None:
-    for none in ((), [], np.array([]), None):
+    nones: list[Any] = [(), [], np.array([])]
+    for none in [*nones, None]:
         check_problem(problem_of(state_labels=none))
-    for none in ((), [], np.array([])):
+    for none in nones:
         check_problem(problem_of(circular=none, circular_observations=none, circular_actions=none))
 
 
@@ -143,7 +148,8 @@ def test_a_figure(tmp_path: Path) -> None:
     example = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
     configuration = hf.load_configuration(example)
     pictures = []
-    for form in (lambda value: value, array):
+    forms: list[Callable[[Any], Any]] = [tuple_or_same, array]
+    for form in forms:
         problem = problem_of(**{name: form(value) for name, value in PLAIN.items()})
         planner = hf.Planner(problem, SETTINGS)
         recorder = Recorder(0, planner)
