@@ -12,8 +12,10 @@ functions here return tuples of Python's own numbers and texts, and arrays of fl
 
 from __future__ import annotations
 
+import difflib
 import functools
 import inspect
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -74,8 +76,20 @@ GAUSSIAN_OBSERVATIONS = ("observation_mean", "observation_variance")
 """Functions that a problem with a likelihood of its own need not have."""
 
 
+NEEDED = ("initial_states", "move", "policy", "is_goal")
+"""Functions without which no problem can be used; its observations are needed, too."""
+
+KNOWN_ATTRIBUTES = (
+    *("name", "state_size", "action_size", "num_stages", "sensing_actions", "state_labels"),
+    *("resolution", "state_resolution", "motion_variance", "sensing_costs", "rank_test"),
+    *("circular", "circular_actions", "circular_observations", "pose", "up"),
+)
+
+
 def check_problem(problem: Any) -> None:
     """Check all that can be checked without calling a function of the problem.
+
+    A name that is nearly one that holdfast asks for, which the problem lacks, is warned of.
 
     Raises
     ------
@@ -85,6 +99,10 @@ def check_problem(problem: Any) -> None:
     """
     check_sizes(problem)
     name = problem.name
+    observations = () if has_general_observations(problem) else GAUSSIAN_OBSERVATIONS
+    missing = [each for each in (*NEEDED, *observations) if not hasattr(problem, each)]
+    if missing:
+        raise ProblemError(f"{name} has no {' and no '.join(missing)}{misspelt_in(problem)}")
     if not sensing_labels(problem):
         raise ProblemError(
             f"sensing_actions of {name} is {getattr(problem, 'sensing_actions', ())!r:.80}: must "
@@ -117,10 +135,35 @@ def check_problem(problem: Any) -> None:
     if len(given) == 1:
         raise ProblemError(
             f"{name} has {given[0]} alone: log_likelihood and sample_observation go together"
+            f"{misspelt_in(problem)}"
         )
+    if hint := misspelt_in(problem):
+        warnings.warn(f"{name}{hint}", stacklevel=2)
     for function, parameters in PARAMETERS.items():
         if hasattr(problem, function):
             _check_parameters(name, function, getattr(problem, function), parameters)
+
+
+def misspelt_in(problem: Any) -> str:
+    """Return what to ask after names of a problem that are nearly known ones; empty for none."""
+    own = frozenset(name for name in getattr(problem, "__dict__", {}) if name[0] != "_")
+    kind: type = type(problem)
+    return _misspelt(kind, own)
+
+
+@functools.lru_cache(maxsize=1000)
+def _misspelt(kind: type, of_instance: frozenset[str]) -> str:
+    theirs = [base for base in kind.__mro__ if not base.__module__.startswith("holdfast.")]
+    names = {name for base in theirs for name in vars(base) if name[0] != "_"} | of_instance
+    known = {*PARAMETERS, *KNOWN_ATTRIBUTES}
+    # One that the problem has was hardly meant by another.
+    lacking = sorted(known - names)
+    found = [
+        f"{name}: did you mean {meant[0]}?"
+        for name in sorted(names - known)
+        if (meant := difflib.get_close_matches(name, lacking, n=1, cutoff=0.9))
+    ]
+    return f"; it has {', and '.join(found)}" if found else ""
 
 
 def check_sizes(problem: Any) -> None:
