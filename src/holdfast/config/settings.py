@@ -11,7 +11,7 @@ every trial.
 from __future__ import annotations
 
 import itertools
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
@@ -74,6 +74,8 @@ class _Keys(msgspec.StructMeta):
 class _Section(msgspec.Struct, metaclass=_Keys, frozen=True):
     """A section of the settings."""
 
+
+SettingsT = TypeVar("SettingsT", bound=_Section)
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 NonNegativeCount = Annotated[int, msgspec.Meta(ge=0)]
@@ -456,7 +458,7 @@ def unfit_for_the_method(settings: PlanningSettings) -> tuple[tuple[str, str], s
     return None
 
 
-def plain_settings(settings: PlanningSettings) -> PlanningSettings:
+def plain_settings(settings: SettingsT) -> SettingsT:
     """Return settings with Python's own numbers in the place of NumPy's.
 
     What is out of bounds stays as it is, for :func:`check_settings` to name.
@@ -469,7 +471,7 @@ def plain_settings(settings: PlanningSettings) -> PlanningSettings:
         return settings
     try:
         plain = msgspec.to_builtins(settings, enc_hook=_plain)
-        return msgspec.convert(plain, PlanningSettings)
+        return msgspec.convert(plain, type(settings))
     except (TypeError, msgspec.ValidationError):
         return settings
 

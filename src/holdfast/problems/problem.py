@@ -152,6 +152,8 @@ class Problem(Protocol):
 
     Notes
     -----
+    Sequences may be lists, tuples or arrays, and numbers Python's or NumPy's.
+
     A problem may also have ``state_resolution``, a float or an array of shape ``(state_size,)``:
     the resolution of states, for ``state_entropy`` and for nothing else. Without it (or with None)
     states have the actions' resolution, which must then be one number, or an action must have as
