@@ -26,6 +26,7 @@ __all__ = [
     "floats_or_none",
     "in_brief",
     "integer",
+    "is_masked",
     "plain",
     "real_number",
     "real_numbers",
@@ -87,9 +88,12 @@ def _hides_something(value: object) -> bool:
     """Tell whether NumPy would silently make a number of something else, in a list say."""
     if isinstance(value, list | tuple):
         return any(map(_hides_something, value)) if value else False
-    if isinstance(value, np.ma.MaskedArray):
-        return bool(np.ma.is_masked(value))
-    return isinstance(value, bool | np.bool_)
+    return is_masked(value) or isinstance(value, bool | np.bool_)
+
+
+def is_masked(value: object) -> bool:
+    """Tell whether a mask hides an entry of an array: NumPy's functions drop it in silence."""
+    return isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(value))
 
 
 def real_number(value: object) -> float | None:

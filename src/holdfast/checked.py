@@ -17,7 +17,15 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel
-from holdfast.arrays import BoolArray, FloatArray, IntArray, floats, in_brief
+from holdfast.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    floats,
+    in_brief,
+    is_masked,
+    real_numbers,
+)
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.floating_mode import as_caller
 from holdfast.problem_attributes import has_own, name_of
@@ -75,7 +83,8 @@ def prediction(
     mean = mean.copy()
     variance: FloatArray = _ask(problem, "observation_variance", states, sensing_action)
     one = mean.shape[-1:]
-    if not isinstance(variance, np.ndarray) or variance.shape not in (one, mean.shape):
+    fits = isinstance(variance, np.ndarray) and variance.shape in (one, mean.shape)
+    if not fits or is_masked(variance):
         need = one if mean.ndim == 1 else f"{one} or {mean.shape}"
         what = f"observation_variance of sensing action {sensing_action}"
         raise _misfit(problem, what, variance, need)
@@ -187,7 +196,7 @@ def move_observation(
 
 def _shown(problem: Any, function: str, value: object) -> FloatArray:
     """Return what a function of the problem says that the world shows, shape ``(n,)``."""
-    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu" or value.ndim != 1:
+    if not isinstance(value, np.ndarray) or real_numbers(value) is None or value.ndim != 1:
         raise _misfit(problem, function, value, "(n,)")
     if not 1 <= value.size <= MAX_OBSERVATION_SIZE or not np.isfinite(value).all():
         raise ProblemError(
@@ -410,13 +419,13 @@ def _single(problem: Any, function: str, value: object) -> Any:
     if type(value) in (int, float, bool):
         return value
     number = None if isinstance(value, (list, tuple)) else np.asarray(value)
-    if number is None or number.ndim != 0 or number.dtype.kind not in "fiub":
+    if number is None or number.ndim or number.dtype.kind not in "fiub" or is_masked(value):
         raise _misfit(problem, function, value, ())
     return value
 
 
 def _is_float_array(value: object) -> bool:
-    return isinstance(value, np.ndarray) and value.dtype == np.float64
+    return isinstance(value, np.ndarray) and value.dtype == np.float64 and not is_masked(value)
 
 
 def _misfit(
@@ -428,7 +437,8 @@ def _misfit(
 
 def _returned(problem: Any, function: str, value: object, need: str) -> ProblemError:
     if isinstance(value, np.ndarray):
-        came = f"{value.dtype} of shape {value.shape}"
+        masked = ", masked in part," if is_masked(value) else ""
+        came = f"{value.dtype}{masked} of shape {value.shape}"
     else:
         came = f"{type(value).__name__} ({' '.join(repr(value).split())[:40]})"
     return ProblemError(f"{function} of {name_of(problem)} returned {came}: need {need}")

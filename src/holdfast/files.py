@@ -36,7 +36,6 @@ __all__ = [
     "remove_unfinished_of",
     "replace_file",
     "require_free",
-    "restore_directory",
     "shown_path",
     "started_in",
     "write_atomically",

@@ -50,7 +50,7 @@ from holdfast.config.settings import (
     plain_settings,
 )
 from holdfast.errors import CheckpointError, InvalidValueError, ProblemError
-from holdfast.problem_attributes import check_problem, circular_states, moves_show
+from holdfast.problem_attributes import check_problem, check_sizes, circular_states, moves_show
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
 from holdfast.sensing import SensingInfo
@@ -140,6 +140,7 @@ class Planner:
     ) -> None:
         if isinstance(problem, str):
             raise InvalidValueError(f"problem is the name {problem!r}: holdfast.make builds it")
+        check_sizes(problem)
         self.problem = problem
         self.settings = PlanningSettings() if settings is None else plain_settings(settings)
         if particles is not None:

@@ -4,18 +4,24 @@ A problem is a user's own code, and NumPy forgives much: an array that does not 
 the decisions are quietly wrong. So its attributes are checked before the first step, and
 :mod:`holdfast.checked` checks what its functions return. Here a problem is any object, which may
 or may not have the members of :class:`holdfast.problems.problem.Problem`.
+
+An attribute may be a list, a tuple or an array, of Python's numbers or NumPy's, which differ where
+they are compared, repeated or asked whether they are empty. So it is read here alone, and the
+functions here return tuples of Python's own numbers and texts, and arrays of float64.
 """
 
 from __future__ import annotations
 
+import difflib
 import functools
 import inspect
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from holdfast.arrays import FloatArray, in_brief, real_numbers
+from holdfast.arrays import FloatArray, in_brief, integer, real_numbers
 from holdfast.errors import InvalidValueError, ProblemError
 
 __all__ = [
@@ -32,6 +38,9 @@ __all__ = [
     "name_of",
     "resolution_of",
     "sensing_costs",
+    "sensing_labels",
+    "sequence_of",
+    "state_labels",
 ]
 
 
@@ -67,8 +76,20 @@ GAUSSIAN_OBSERVATIONS = ("observation_mean", "observation_variance")
 """Functions that a problem with a likelihood of its own need not have."""
 
 
+NEEDED = ("initial_states", "move", "policy", "is_goal")
+"""Functions without which no problem can be used; its observations are needed, too."""
+
+KNOWN_ATTRIBUTES = (
+    *("name", "state_size", "action_size", "num_stages", "sensing_actions", "state_labels"),
+    *("resolution", "state_resolution", "motion_variance", "sensing_costs", "rank_test"),
+    *("circular", "circular_actions", "circular_observations", "pose", "up"),
+)
+
+
 def check_problem(problem: Any) -> None:
     """Check all that can be checked without calling a function of the problem.
+
+    A name that is nearly one that holdfast asks for, which the problem lacks, is warned of.
 
     Raises
     ------
@@ -78,17 +99,18 @@ def check_problem(problem: Any) -> None:
     """
     check_sizes(problem)
     name = problem.name
-    actions = getattr(problem, "sensing_actions", ())
-    if isinstance(actions, str) or not isinstance(actions, Sequence) or not actions:
+    observations = () if has_general_observations(problem) else GAUSSIAN_OBSERVATIONS
+    missing = [each for each in (*NEEDED, *observations) if not hasattr(problem, each)]
+    if missing:
+        raise ProblemError(f"{name} has no {' and no '.join(missing)}{misspelt_in(problem)}")
+    if not sensing_labels(problem):
         raise ProblemError(
-            f"sensing_actions of {name} is {actions!r:.80}: must be a sequence of labels, not empty"
+            f"sensing_actions of {name} is {getattr(problem, 'sensing_actions', ())!r:.80}: must "
+            "be a sequence of labels, not empty"
         )
-    for label in actions:
-        if not isinstance(label, str):
-            raise ProblemError(f"sensing_actions of {name} has {label!r:.80}: labels must be text")
     sensing_costs(problem)
     _check_circular(problem)
-    labels = getattr(problem, "state_labels", ())
+    labels = state_labels(problem)
     if labels and len(labels) != problem.state_size:
         raise ProblemError(
             f"state_labels of {name} has {len(labels)} labels: must have {problem.state_size} or "
@@ -113,22 +135,60 @@ def check_problem(problem: Any) -> None:
     if len(given) == 1:
         raise ProblemError(
             f"{name} has {given[0]} alone: log_likelihood and sample_observation go together"
+            f"{misspelt_in(problem)}"
         )
+    if hint := misspelt_in(problem):
+        warnings.warn(f"{name}{hint}", stacklevel=2)
     for function, parameters in PARAMETERS.items():
         if hasattr(problem, function):
             _check_parameters(name, function, getattr(problem, function), parameters)
 
 
+def misspelt_in(problem: Any) -> str:
+    """Return what to ask after names of a problem that are nearly known ones; empty for none."""
+    own = frozenset(name for name in getattr(problem, "__dict__", {}) if name[0] != "_")
+    kind: type = type(problem)
+    return _misspelt(kind, own)
+
+
+@functools.lru_cache(maxsize=1000)
+def _misspelt(kind: type, of_instance: frozenset[str]) -> str:
+    theirs = [base for base in kind.__mro__ if not base.__module__.startswith("holdfast.")]
+    names = {name for base in theirs for name in vars(base) if name[0] != "_"} | of_instance
+    known = {*PARAMETERS, *KNOWN_ATTRIBUTES}
+    # One that the problem has was hardly meant by another.
+    lacking = sorted(known - names)
+    found = [
+        f"{name}: did you mean {meant[0]}?"
+        for name in sorted(names - known)
+        if (meant := difflib.get_close_matches(name, lacking, n=1, cutoff=0.9))
+    ]
+    return f"; it has {', and '.join(found)}" if found else ""
+
+
 def check_sizes(problem: Any) -> None:
-    """Check the name and the sizes, which every use of a problem needs; raise ProblemError."""
+    """Check the name and the sizes, which every use of a problem needs; raise ProblemError.
+
+    A size of NumPy's is replaced by Python's own: it is read everywhere, and ``[0.0] * size`` is
+    something else with NumPy's.
+    """
     kind = type(problem).__name__
     name = getattr(problem, "name", "")
     if not isinstance(name, str) or not name:
         raise ProblemError(f"name of {kind} is {name!r}: must be a text, not empty")
     for attribute in ("state_size", "action_size", "num_stages"):
-        size = getattr(problem, attribute, None)
-        if not isinstance(size, int) or size < 1:
-            raise ProblemError(f"{attribute} of {name} is {size!r}: must be a whole number >= 1")
+        given = getattr(problem, attribute, None)
+        size = integer(given)
+        if size is None or size < 1:
+            raise ProblemError(f"{attribute} of {name} is {given!r}: must be a whole number >= 1")
+        if type(given) is not int:
+            try:
+                setattr(problem, attribute, size)
+            except AttributeError:
+                raise ProblemError(
+                    f"{attribute} of {name} is {given!r} and cannot be set: declare it as "
+                    f"int, {size}"
+                ) from None
 
 
 def _check_resolution(problem: Any, attribute: str, of_what: str, size: int) -> None:
@@ -152,7 +212,8 @@ def _check_circular(problem: Any) -> None:
     for attribute, size in (("circular", "state_size"), ("circular_actions", "action_size")):
         _require_indices(name, attribute, getattr(problem, attribute, ()), getattr(problem, size))
     given = getattr(problem, "circular_observations", ())
-    if isinstance(given, Sequence) and not given:
+    own = sequence_of(given)
+    if own == ():
         return
     count = len(problem.sensing_actions)
     if has_general_observations(problem):
@@ -160,13 +221,13 @@ def _check_circular(problem: Any) -> None:
             f"circular_observations of {name} is {given!r:.80}: it has no effect beside "
             "log_likelihood, which has to know itself what is an angle; leave it out"
         )
-    if isinstance(given, str) or not isinstance(given, Sequence) or len(given) != count:
+    if own is None or len(own) != count:
         raise ProblemError(
             f"circular_observations of {name} is {given!r:.80}: must be {count} sequences, one for "
             "each sensing action, of the coordinates of its observation that are angles"
         )
-    for action, own in enumerate(given):
-        _require_indices(name, f"circular_observations[{action}]", own, None)
+    for action, each in enumerate(own):
+        _require_indices(name, f"circular_observations[{action}]", each, None)
 
 
 def _require_indices(name: str, attribute: str, given: Any, size: int | None) -> None:
@@ -187,19 +248,48 @@ def _require_indices(name: str, attribute: str, given: Any, size: int | None) ->
         )
 
 
+def sequence_of(given: object) -> tuple[Any, ...] | None:
+    """Return a declared list, tuple or array as a tuple; None for anything else, a text too."""
+    if isinstance(given, np.ndarray):
+        given = given.tolist()
+    return tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else None
+
+
+def _indices(given: Any) -> tuple[int, ...]:
+    """Return indices that :func:`check_problem` has let pass."""
+    return tuple(map(int, given))
+
+
+def sensing_labels(problem: Any) -> tuple[str, ...]:
+    """Return a label for each sensing action; ProblemError if one is no text."""
+    labels = sequence_of(getattr(problem, "sensing_actions", ())) or ()
+    for label in labels:
+        if not isinstance(label, str):
+            raise ProblemError(
+                f"sensing_actions of {name_of(problem)} has {label!r:.80}: labels must be text"
+            )
+    return tuple(map(str, labels))
+
+
+def state_labels(problem: Any) -> tuple[str, ...]:
+    """Return a label for each coordinate of a state; empty if the problem has none."""
+    labels = getattr(problem, "state_labels", None)
+    return () if labels is None else tuple(map(str, labels))
+
+
 def circular_states(problem: Any) -> Sequence[int]:
     """Return which coordinates of a state are angles."""
-    return getattr(problem, "circular", ())
+    return _indices(getattr(problem, "circular", ()))
 
 
 def circular_actions(problem: Any) -> Sequence[int]:
     """Return which coordinates of a task action are angles."""
-    return getattr(problem, "circular_actions", ())
+    return _indices(getattr(problem, "circular_actions", ()))
 
 
 def has_circular_observations(problem: Any) -> bool:
     """Tell whether a problem says which coordinates of an observation are angles."""
-    return bool(getattr(problem, "circular_observations", ()))
+    return len(getattr(problem, "circular_observations", ())) > 0
 
 
 def circular_observation(problem: Any, sensing_action: int, size: int) -> Sequence[int]:
@@ -209,7 +299,7 @@ def circular_observation(problem: Any, sensing_action: int, size: int) -> Sequen
     """
     if not has_circular_observations(problem):
         return ()
-    own: Sequence[int] = problem.circular_observations[sensing_action]
+    own = _indices(problem.circular_observations[sensing_action])
     if any(coordinate >= size for coordinate in own):
         raise ProblemError(
             f"circular_observations[{sensing_action}] of {name_of(problem)} is {own!r:.80}: "
@@ -320,7 +410,7 @@ def has_general_observations(problem: object) -> bool:
 
 def choice_labels(problem: Any) -> list[str]:
     """Return a label for each choice: the sensing actions, and not to sense."""
-    return [*map(str, problem.sensing_actions), "no sensing"]
+    return [*sensing_labels(problem), "no sensing"]
 
 
 def moves_show(problem: object) -> bool:

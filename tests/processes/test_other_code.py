@@ -115,7 +115,6 @@ def make(gain):
     return Made
 """
 WRITTEN_BY_A_USER = {
-    "a name of the standard library": ("turtle:P", {"turtle.py": IMPLEMENTED}, "GAIN = 1.0"),
     "made by a function": (
         "mine:P",
         {"impl.py": IMPLEMENTED, "mine.py": "from impl import make\nP = make(1.0)\n"},

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
+import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
 
 import pytest
 
@@ -69,3 +71,26 @@ def test_errors_come_home(pool: ProcessPoolExecutor) -> None:
     with pytest.raises(MessageError, match="no message") as caught:
         pool.submit(refuse, "malformed").result()
     assert caught.value.code == "malformed"
+
+
+def test_a_problem_of_the_users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its class is found by its name, in the directory of the configuration."""
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.delitem(sys.modules, "pool_peg", raising=False)
+    for name, text in {
+        "pool_peg.py": (
+            "import pool_helper\nfrom holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
+            "class Peg(PegInHole2D):\n    resolution = 2.0 * pool_helper.HALF\n"
+            "    def __init__(self): super().__init__(); self.resolution = Peg.resolution\n"
+            "    @classmethod\n    def from_settings(cls, model, planner): return cls()\n"
+        ),
+        "pool_helper.py": "HALF = 0.05\n",
+        "queue.py": "raise SystemExit\n",
+        "peg.yaml": "problem: pool_peg:Peg\nparticle_filter: {num_particles: 30}\n",
+    }.items():
+        (tmp_path / name).write_text(text)
+    configuration = hf.load_configuration(tmp_path / "peg.yaml")
+    planner = hf.Planner(configuration.problem, configuration.planning)
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        there = pool.submit(hf.run_trial, planner, 3, max_steps=40).result()
+    assert there.digest == hf.run_trial(planner, 3, max_steps=40).digest

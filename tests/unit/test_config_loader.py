@@ -592,7 +592,18 @@ class TestKeysAndValues:
                 "particle_filters is not a known section; did you mean particle_filter?\n"
                 "allowed: problem, problem_directory, model, particle_filter, state_space_planner,",
             ),
-            ("num_particles: 10", "line 2: num_particles is not a known section"),
+            (
+                "num_particles: 10",
+                "line 2: num_particles is a key of particle_filter\nallowed: prob",
+            ),
+            (
+                "active_sensing: {sensing_interval: 2}",
+                "sensing_interval is not a known key; did you mean simulator.sensing_intervals?",
+            ),
+            (
+                "simulator: {sensing_interval: 2}",
+                "sensing_interval is not a known key; did you mean sensing_intervals?",
+            ),
             ("simulator: {'\\e[2J': 1}", "is not a known key"),
         ],
     )

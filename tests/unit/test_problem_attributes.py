@@ -18,6 +18,7 @@ from holdfast.problems.problem import (
     GeneralObservationProblem,
     KnownStateReturnProblem,
     Problem,
+    ProblemBase,
     ReinitialisedProblem,
     ShownMovesProblem,
 )
@@ -187,3 +188,57 @@ def test_the_parameters_are_those_of_the_contract() -> None:
         if inspect.isfunction(member) and not name.startswith("_")
     }
     assert functions == PARAMETERS
+
+
+class TestMisspelt:
+    """A name that is nearly one that is asked for."""
+
+    @staticmethod
+    def of(**attributes: object) -> Any:
+        return type("Misspelt", (Line,), attributes)()
+
+    @pytest.mark.parametrize(
+        ("name", "meant"),
+        [
+            ("log_likelyhood", "log_likelihood"),
+            ("log_likelihoods", "log_likelihood"),
+            ("reinitial_state", "reinitial_states"),
+            ("sensing_cost", "sensing_costs"),
+            ("circular_observation", "circular_observations"),
+            ("rewards", "reward"),
+        ],
+    )
+    def test_one_that_would_be_ignored(self, name: str, meant: str) -> None:
+        with pytest.warns(UserWarning, match=f"line; it has {name}: did you mean {meant}.$"):
+            check_problem(self.of(**{name: lambda *_: 0.0}))
+        of_instance = Line()
+        setattr(of_instance, name, (1.0, 2.0))
+        with pytest.warns(UserWarning, match=f"{name}: did you mean {meant}"):
+            check_problem(of_instance)
+
+    def test_names_that_mean_nothing_else(self) -> None:
+        """A helper beside the function itself, and one of no known name."""
+        check_problem(
+            self.of(rewards=1, reward=Line.policy, my_helper=1, speed=2, _log_likelyhood=3)
+        )
+
+    def test_one_of_a_pair(self) -> None:
+        broken = self.of(
+            log_likelyhood=lambda *_: 0.0,
+            sample_observation=lambda *arguments: arguments[1],
+        )
+        with pytest.raises(ProblemError, match="go together; it has log_likelyhood: did you mean"):
+            check_problem(broken)
+
+    def test_one_that_is_needed(self) -> None:
+        class Bare(ProblemBase):
+            name, state_size, action_size, sensing_actions = "bare", 1, 1, ("x",)
+            polcy = Line.policy
+            initial_states, move, is_goal = Line.initial_states, Line.move, Line.is_goal
+            observation_mean = Line.observation_mean
+            observation_variance = Line.observation_variance
+
+        with pytest.raises(
+            ProblemError, match=r"bare has no policy; it has polcy: did you mean pol"
+        ):
+            check_problem(Bare())

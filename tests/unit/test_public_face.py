@@ -155,6 +155,14 @@ def test_load_configuration(tmp_path: Path) -> None:
         ),
         (lambda: hf.run_trial(planner_of(), max_steps=0), r"max_steps 0: allowed are"),
         (
+            lambda: hf.PlanningSettings(sensing_intervals=8),  # type: ignore[call-arg]
+            r"PlanningSettings has no sensing_intervals; did you mean sensing_interval\?; allowed",
+        ),
+        (
+            lambda: hf.SelectorSettings(metod="random"),  # type: ignore[call-arg]
+            r"SelectorSettings has no metod; did you mean method\?; allowed: method, sensing_act",
+        ),
+        (
             lambda: hf.run_trial(cast("Any", hf.make("peg_in_hole_2d"))),
             r"planner is a PegInHole2D: run_trial takes a planner, as in run_trial\(Planner\(probl",
         ),

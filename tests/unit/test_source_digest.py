@@ -16,9 +16,10 @@ import pytest
 
 import holdfast
 from holdfast import _kernel
+from holdfast.config.imports import follow_imports
 from holdfast.problems import registry
 from holdfast.recording.fingerprint import difference
-from holdfast.source_digest import core_version, follow_imports, problem_digest, problem_sources
+from holdfast.source_digest import core_version, problem_digest, problem_sources
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = Path(holdfast.__file__).parent
@@ -144,7 +145,9 @@ class TestProblem:
         (folder / "cmd.py").write_text("X = 1\n")
         assert "turtle" in sys.stdlib_module_names
         try:
-            sources = problem_sources(registry.problem_class("turtle:P", folder), "turtle")
+            # As a script's: a configuration's would be refused.
+            monkeypatch.syspath_prepend(folder)
+            sources = problem_sources(importlib.import_module("turtle").P, "turtle")
         finally:
             sys.modules.pop("turtle", None)
             sys.modules.pop("cmd", None)

@@ -45,7 +45,7 @@ from holdfast.config.validation import described, shown
 from holdfast.config.yaml_document import MAX_BYTES, Document, read, write
 from holdfast.errors import ConfigurationError, InvalidValueError
 from holdfast.files import read_bounded
-from holdfast.problem_attributes import resolution_of
+from holdfast.problem_attributes import resolution_of, sensing_labels
 from holdfast.problems.problem import Problem
 from holdfast.problems.registry import names
 
@@ -248,7 +248,7 @@ def _build(
     )
     if (unfit := unfit_for_the_method(planning)) is not None:
         raise source.error(*unfit)
-    actions = built.problem.sensing_actions
+    actions = sensing_labels(built.problem)
     if selector.method == "fixed" and selector.sensing_action >= len(actions):
         raise source.error(
             ("selector", "sensing_action"),

@@ -22,7 +22,11 @@ from holdfast.config.user_code import account_of_user_error, in_words
 from holdfast.config.validation import shown
 from holdfast.config.yaml_document import Document
 from holdfast.errors import ConfigurationError, HoldfastError, UnknownProblemError
-from holdfast.problem_attributes import GAUSSIAN_OBSERVATIONS, has_general_observations
+from holdfast.problem_attributes import (
+    GAUSSIAN_OBSERVATIONS,
+    has_general_observations,
+    misspelt_in,
+)
 from holdfast.problems import registry
 from holdfast.problems.problem import Problem, ProblemBase
 
@@ -169,6 +173,7 @@ def build_from(source: Source, name: str, problem_class: type) -> BuiltProblem:
     if missing:
         raise ConfigurationError(
             f"{source.path}: {name} is no problem: it lacks {', '.join(missing)}"
+            f"{misspelt_in(problem)}"
         )
     return BuiltProblem(problem, resolved["model"], resolved["state_space_planner"], unlisted)
 

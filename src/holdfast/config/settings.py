@@ -11,7 +11,7 @@ every trial.
 from __future__ import annotations
 
 import itertools
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
@@ -53,6 +53,29 @@ MAX_PATH_STEPS = 10_000
 
 MAX_PATH_OFFSETS = 64
 """Bound on the number of entries of ``selector.path_offsets``."""
+
+
+class _Keys(msgspec.StructMeta):
+    """Names the key that was meant where one is given, in Python, that a section does not have."""
+
+    def __call__(self, *values: Any, **keys: Any) -> Any:
+        for key in keys:
+            if key not in self.__struct_fields__:
+                from holdfast.config.validation import close_match
+
+                allowed = self.__struct_fields__
+                raise InvalidValueError(
+                    f"{self.__name__} has no {key}{close_match(key, allowed)}; allowed: "
+                    f"{', '.join(allowed)}"
+                )
+        return super().__call__(*values, **keys)
+
+
+class _Section(msgspec.Struct, metaclass=_Keys, frozen=True):
+    """A section of the settings."""
+
+
+SettingsT = TypeVar("SettingsT", bound=_Section)
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 NonNegativeCount = Annotated[int, msgspec.Meta(ge=0)]
@@ -96,7 +119,7 @@ OnLost = Literal["continue", "hold", "reinitialise"]
 """What a robot that is lost does."""
 
 
-class ParticleFilterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class ParticleFilterSettings(_Section, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The section ``particle_filter``.
 
     Attributes
@@ -118,7 +141,7 @@ class ParticleFilterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=
     estimate: Estimate = "mean"
 
 
-class ActiveSensingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class ActiveSensingSettings(_Section, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The section ``active_sensing``: Algorithm 2 and its entropy estimate.
 
     Attributes
@@ -143,7 +166,7 @@ class ActiveSensingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=T
     num_cores: NonNegativeCount = 0
 
 
-class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class SelectorSettings(_Section, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The section ``selector``: how the sensing action is chosen.
 
     Attributes
@@ -212,7 +235,7 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     max_observation_samples: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 40
 
 
-class SimulatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class SimulatorSettings(_Section, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The section ``simulator``: trials, their length and how often the robot senses.
 
     Attributes
@@ -233,7 +256,7 @@ class SimulatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     seed: Seed = 0
 
 
-class OffloadSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class OffloadSettings(_Section, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The section ``offload``: which services decide, and how soon one is considered lost.
 
     Nothing here changes a decision, only when and where it is made.
@@ -282,7 +305,7 @@ class OffloadSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     name: Text | None = None
 
 
-class RecoverySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class RecoverySettings(_Section, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The section ``recovery``: the local service that decides while no other can.
 
     Attributes
@@ -306,7 +329,7 @@ class RecoverySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     journal_survives: Literal["process_crash", "power_cut"] = "process_crash"
 
 
-class LostSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class LostSettings(_Section, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The section ``lost``: when the robot counts as lost, and what it does then.
 
     The robot's own: services see only a recorded reinitialisation.
@@ -325,7 +348,7 @@ class LostSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     on_lost: OnLost = "continue"
 
 
-class EnvironmentSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EnvironmentSettings(_Section, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The section ``environment``: the world that the robot acts on.
 
     Nothing here changes a decision, given what was sensed.
@@ -357,7 +380,7 @@ class EnvironmentSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
     max_missing_in_a_row: Annotated[int, msgspec.Meta(ge=0, le=1_000_000)] = 20
 
 
-class PlanningSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class PlanningSettings(_Section, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """All that a decision depends on besides the problem and the state.
 
     Attributes
@@ -438,7 +461,7 @@ def unfit_for_the_method(settings: PlanningSettings) -> tuple[tuple[str, str], s
     return None
 
 
-def plain_settings(settings: PlanningSettings) -> PlanningSettings:
+def plain_settings(settings: SettingsT) -> SettingsT:
     """Return settings with Python's own numbers in the place of NumPy's.
 
     What is out of bounds stays as it is, for :func:`check_settings` to name.
@@ -451,7 +474,7 @@ def plain_settings(settings: PlanningSettings) -> PlanningSettings:
         return settings
     try:
         plain = msgspec.to_builtins(settings, enc_hook=_plain)
-        return msgspec.convert(plain, PlanningSettings)
+        return msgspec.convert(plain, type(settings))
     except (TypeError, msgspec.ValidationError):
         return settings
 

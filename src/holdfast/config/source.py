@@ -161,13 +161,21 @@ class Source:
         homes = [
             section
             for section, schema in self.schemas.items()
-            if len(path) == 2 and section != path[0] and path[1] in field_names(schema)
+            if len(path) <= 2 and section != path[0] and path[-1] in field_names(schema)
         ]
-        hint = (
-            f"is a key of {' and '.join(homes)}, not of {dotted(path[:-1])}"
-            if homes
-            else f"is not a known {what}{close_match(str(path[-1]), allowed)}"
-        )
+        if homes:
+            here = f", not of {dotted(path[:-1])}" if len(path) == 2 else ""
+            hint = f"is a key of {' and '.join(homes)}{here}"
+        else:
+            elsewhere = [
+                f"{section}.{key}"
+                for section, schema in self.schemas.items()
+                for key in field_names(schema)
+            ]
+            key = str(path[-1])
+            hint = (
+                f"is not a known {what}{close_match(key, allowed) or close_match(key, elsewhere)}"
+            )
         text = f"{hint}\nallowed: {', '.join(allowed) or 'no keys'}"
         if len(path) == 2 and self.is_overridden(path):
             # The key itself was given instead of the file's, which has nothing to do with it.

@@ -15,13 +15,13 @@ import difflib
 import functools
 import importlib
 import re
-import sys
 import sysconfig
 import traceback
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from holdfast.config.user_modules import find_in
 from holdfast.errors import ConfigurationError
 
 __all__ = [
@@ -156,8 +156,7 @@ def find_class(
     what : str
         What it is for, usually the key of the configuration; messages begin with it.
     search_directory : Path or None
-        Directory in which ``module`` is looked for first. It goes on the import path and stays
-        there, as a script's directory does, for the module may import its neighbours later.
+        Directory in which ``module`` is looked for first (:mod:`holdfast.config.user_modules`).
     built_in : iterable of str
         Further names that messages suggest.
 
@@ -259,10 +258,10 @@ def _imported(name: str, search_directory: Path | None) -> object:
                 f"{name} is looked for in {search_directory}, which is no directory"
             )
         where = f" (looked in {search_directory} first)"
-        directory = str(search_directory.resolve())
-        if directory not in sys.path:
-            sys.path.insert(0, directory)
-            importlib.invalidate_caches()
+        try:
+            find_in(search_directory, module_name)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{name}: {error}") from None
     module = _loaded(
         functools.partial(importlib.import_module, module_name),
         name,

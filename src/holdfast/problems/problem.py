@@ -31,6 +31,7 @@ too, but then another machine needs the checkpoint of a state and cannot compute
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -38,6 +39,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast.arrays import BoolArray, FloatArray, IntArray, real_numbers
+from holdfast.config.validation import close_match
 from holdfast.errors import ProblemError
 from holdfast.randomness import Stream
 
@@ -150,6 +152,8 @@ class Problem(Protocol):
 
     Notes
     -----
+    Sequences may be lists, tuples or arrays, and numbers Python's or NumPy's.
+
     A problem may also have ``state_resolution``, a float or an array of shape ``(state_size,)``:
     the resolution of states, for ``state_entropy`` and for nothing else. Without it (or with None)
     states have the actions' resolution, which must then be one number, or an action must have as
@@ -370,6 +374,15 @@ class KnownStateReturnProblem(Protocol):
         ...
 
 
+def _meant(kind: type, given: list[str]) -> str:
+    """Return what to ask after a setting that a constructor does not take; empty for nothing."""
+    try:
+        takes = list(inspect.signature(kind).parameters)
+    except (TypeError, ValueError):
+        return ""
+    return "".join(close_match(key, takes) for key in given if key not in takes)
+
+
 class ProblemBase:
     """Defaults for the optional members of :class:`Problem`.
 
@@ -419,6 +432,7 @@ class ProblemBase:
         except TypeError as error:
             raise ProblemError(
                 f"{cls.__name__} cannot be built from its settings: {error}"
+                f"{_meant(cls, [*model, *state_space_planner])}"
             ) from error
 
     def next_stage(self, estimates: FloatArray, stage: int | IntArray) -> int | IntArray:

@@ -107,8 +107,8 @@ def make(name: str, **settings: Any) -> Problem:
 def problem_class(name: str, search_directory: Path | None = None) -> type[Any]:
     """Find the class of a problem by its registered name, or ``module:Class``.
 
-    The search directory, in which ``module`` is looked for first, goes on the import path and stays
-    there, as a script's directory does, for the module may import its neighbours later.
+    The search directory is that in which ``module`` is looked for first
+    (:mod:`holdfast.config.user_modules`).
 
     Raises
     ------

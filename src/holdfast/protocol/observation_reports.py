@@ -12,6 +12,7 @@ from holdfast.config.settings import LostSettings, OnLost
 from holdfast.errors import HeldError
 from holdfast.lost import MOVE, Verdict
 from holdfast.planning import ObservationInfo
+from holdfast.problem_attributes import sensing_labels
 from holdfast.protocol.events import Effects, RobotEffect
 from holdfast.tracking import Trial
 
@@ -115,7 +116,7 @@ class ObservationReports:
         action = alarm.sensing_action
         fields: dict[str, object] = {}
         if action is not None:
-            labels = trial.planner.problem.sensing_actions
+            labels = sensing_labels(trial.planner.problem)
             fields["sensing_action"] = "move" if action == MOVE else f"{action} ({labels[action]})"
         self._effects.report(
             alarm.kind,

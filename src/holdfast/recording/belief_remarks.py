@@ -15,7 +15,7 @@ from holdfast.arrays import FloatArray
 from holdfast.circular import unwrapped
 from holdfast.config.settings import PlanningSettings
 from holdfast.modes import heaviest_mode
-from holdfast.problem_attributes import circular_states, name_of
+from holdfast.problem_attributes import circular_states, name_of, state_labels
 from holdfast.recording.recorder import TrialRecord
 
 __all__ = ["belief_remarks"]
@@ -34,9 +34,9 @@ def belief_remarks(problem: Any, settings: PlanningSettings, record: TrialRecord
     """
     count = len(record.sensing)
     remarks: list[str] = []
-    circular = tuple(circular_states(problem))
-    for coordinate, label in enumerate(problem.state_labels):
-        if coordinate in circular or "rad" not in str(label):
+    circular = circular_states(problem)
+    for coordinate, label in enumerate(state_labels(problem)):
+        if coordinate in circular or "rad" not in label:
             continue
         wraps = sum(_wraps(step.after, coordinate) for step in record.sensing)
         if wraps > _SHARE * count:

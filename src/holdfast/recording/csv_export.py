@@ -18,6 +18,7 @@ from holdfast.arrays import FloatArray
 from holdfast.belief import Belief
 from holdfast.printable import cell
 from holdfast.problem_attributes import choice_labels
+from holdfast.problem_attributes import state_labels as declared_labels
 from holdfast.problems.problem import Problem
 from holdfast.recording.facts import (
     Decider,
@@ -201,7 +202,7 @@ class CsvSink:
 
 def state_labels(problem: Problem) -> list[str]:
     """Return a name for each coordinate of a state: the problem's label, if all have one."""
-    labels = list(map(str, problem.state_labels))
+    labels = list(declared_labels(problem))
     if len(set(labels)) == problem.state_size:
         return labels
     return [f"state_{index}" for index in range(problem.state_size)]

@@ -33,7 +33,7 @@ from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration
 from holdfast.files import write_atomically
 from holdfast.outcome import Outcome
-from holdfast.problem_attributes import choice_labels, circular_states
+from holdfast.problem_attributes import choice_labels, circular_states, state_labels
 from holdfast.problems.problem import Problem, Scene
 from holdfast.recording.facts import SCORES
 from holdfast.recording.recorder import SensingRecord, TrialRecord
@@ -170,7 +170,7 @@ def _title(configuration: Configuration, record: TrialRecord) -> str:
 
 
 def _labels(problem: Problem) -> Sequence[str]:
-    labels = problem.state_labels
+    labels = state_labels(problem)
     if len(labels) == problem.state_size:
         return labels
     return [f"state[{index}]" for index in range(problem.state_size)]

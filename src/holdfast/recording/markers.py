@@ -16,6 +16,7 @@ from holdfast import checked
 from holdfast.arrays import FloatArray
 from holdfast.belief import Belief, estimate
 from holdfast.geometry import BoxWorld
+from holdfast.problem_attributes import sensing_labels, state_labels
 from holdfast.problems.problem import Problem, Scene
 from holdfast.recording.poses import POSE_COORDINATES, PoseLayout
 
@@ -124,7 +125,7 @@ def sensing_markers(
     spread = np.sqrt(np.trace(layout.covariance(belief)[:3, :3]))
     size = _size(scene) if scene is not None else 10.0 * max(float(spread), 0.1)
     middle = layout.poses(estimate(belief))[:3]
-    label = str(problem.sensing_actions[sensing_action])
+    label = sensing_labels(problem)[sensing_action]
     word = _sensed_coordinate(problem, layout, label)
     reach = _ARROW * size
     # Of an arrow: the shaft's and the head's diameter, and the head's length.
@@ -166,7 +167,7 @@ def _up(layout: PoseLayout) -> FloatArray:
 
 def _sensed_coordinate(problem: Problem, layout: PoseLayout, label: str) -> str | None:
     """Return which coordinate of the pose a sensing action is named after."""
-    names = [str(each).split(" (")[0] for each in problem.state_labels]
+    names = [each.split(" (")[0] for each in state_labels(problem)]
     if len(names) != problem.state_size or label not in names:
         return None
     index = names.index(label)

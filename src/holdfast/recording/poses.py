@@ -26,7 +26,7 @@ from holdfast.arrays import FloatArray
 from holdfast.belief import Belief, estimate
 from holdfast.circular import differences
 from holdfast.errors import ProblemError
-from holdfast.problem_attributes import circular_states
+from holdfast.problem_attributes import circular_states, sequence_of
 
 __all__ = ["POSE_COORDINATES", "PoseLayout", "pose_layout"]
 
@@ -96,13 +96,14 @@ def pose_layout(problem: Any) -> PoseLayout | None:
 
     It is None if the problem does not say. Raises ProblemError if these attributes are invalid.
     """
-    words = getattr(problem, "pose", None)
-    if words is None or (isinstance(words, tuple | list) and not words):
+    given = getattr(problem, "pose", None)
+    words = sequence_of(given)
+    if given is None or words == ():
         return None
     name = getattr(problem, "name", "") or type(problem).__name__
-    if isinstance(words, str) or not isinstance(words, tuple | list):
+    if words is None:
         raise ProblemError(
-            f"pose of {name} is {words!r:.80}: must be a sequence with one word for each coordinate"
+            f"pose of {name} is {given!r:.80}: must be a sequence with one word for each coordinate"
             ' of the state, such as ("x", "y", "yaw")'
         )
     if len(words) > problem.state_size:

@@ -23,6 +23,7 @@ from holdfast import checked
 from holdfast.arrays import FloatArray, KeepsReadOnly, floats, integer, real_numbers, whole
 from holdfast.config.settings import EnvironmentSettings
 from holdfast.config.user_code import find_class
+from holdfast.config.user_modules import find_in
 from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import Done, MoveResult
 from holdfast.problem_attributes import check_sizes, has_general_observations
@@ -434,6 +435,11 @@ def load_environment(configuration: Configuration) -> EnvironmentMaker:
             search_directory=directory if ":" in settings.object else configuration.path.parent,
             error_type=ConfigurationError,
         )
+        if settings.object in BUILT_IN:
+            # The modules of functions, too.
+            for value in settings.arguments.values():
+                if isinstance(value, str) and ":" in value:
+                    find_in(configuration.path.parent, value.partition(":")[0])
         return EnvironmentMaker(
             name,
             problem,

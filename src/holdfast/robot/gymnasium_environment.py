@@ -27,7 +27,16 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import FloatArray, floats, in_brief, integer, plain, real_numbers, whole
+from holdfast.arrays import (
+    FloatArray,
+    floats,
+    in_brief,
+    integer,
+    plain,
+    real_number,
+    real_numbers,
+    whole,
+)
 from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import Done, Ending, MoveResult
 from holdfast.problems.problem import Problem
@@ -184,6 +193,10 @@ class GymnasiumEnvironment:
         step, before = self._steps, self._seen
         action = self._translated(floats("task action", task_action))
         seen, reward, terminated, truncated, self.info = self.environment.step(action)
+        if (earned := real_number(reward)) is None:
+            raise EnvironmentFailedError(
+                f"the reward of {self._name} is {reward!r:.80}; it must be a number"
+            )
         self._seen = copy.deepcopy(seen)
         self._steps += 1
         self._ending = self._ended(terminated=bool(terminated), truncated=bool(truncated))
@@ -203,7 +216,7 @@ class GymnasiumEnvironment:
             purpose = Purpose.WORLD_MOVE_OBSERVATION
             noise = self._observation_noise
             observation = self._noisy(observation, noise, "observation", purpose, step)
-        self._last_move = MoveResult(float(reward), motion, observation)
+        self._last_move = MoveResult(earned, motion, observation)
         return self._last_move
 
     def is_done(self) -> Done:

@@ -36,6 +36,7 @@ from holdfast.problem_attributes import (
     circular_actions,
     circular_states,
     sensing_costs,
+    state_labels,
 )
 from holdfast.problems.problem import Problem
 from holdfast.problems.registry import make
@@ -275,7 +276,7 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
 
     def _labels(self) -> list[str]:
         problem = self.problem
-        states = getattr(problem, "state_labels", ()) or range(problem.state_size)
+        states = state_labels(problem) or range(problem.state_size)
         labels = []
         for index, name in enumerate(states):
             kinds = ("sine", "cosine") if index in self._circular else ("estimate",)

@@ -18,7 +18,13 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast.arrays import FloatArray, real_number, real_numbers, whole
-from holdfast.config.settings import EnvironmentSettings, LostSettings, OnLost, SimulatorSettings
+from holdfast.config.settings import (
+    EnvironmentSettings,
+    LostSettings,
+    OnLost,
+    SimulatorSettings,
+    plain_settings,
+)
 from holdfast.errors import EnvironmentFailedError, HeldError, InvalidValueError, ProblemError
 from holdfast.outcome import Ending, MoveResult, TrialResult, ending_of
 from holdfast.planning import (
@@ -165,7 +171,7 @@ def run_trial(
     if environment is None:
         environment = SimulatedEnvironment(planner.problem, seed, trial)
     require_methods(environment, type(environment).__name__)
-    track = Trial(planner, seed, trial, lost.false_alarm_rate)
+    track = Trial(planner, seed, trial, plain_settings(lost).false_alarm_rate)
     missing = MissingReadings(max_missing_in_a_row)
     name = type(environment).__name__
     observer.trial_began(environment, track.state)

@@ -27,6 +27,7 @@ import numpy as np
 from holdfast.arrays import FloatArray, in_brief
 from holdfast.errors import EnvironmentFailedError
 from holdfast.outcome import Done, Ending, MoveResult
+from holdfast.problem_attributes import sensing_labels
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import ObservationSizes
 from holdfast.ros.deadlines import Absence, Deadline
@@ -75,7 +76,7 @@ def make_ros_environment(
     is missing for ``environment.discovery_timeout_ms``, or the reset fails.
     """
     del seed
-    interface = RobotInterface(parameters, problem.sensing_actions, problem.action_size)
+    interface = RobotInterface(parameters, sensing_labels(problem), problem.action_size)
     made = CountingRos2Environment if "steps" in interface.calls else Ros2Environment
     return made(connections, interface, problem, trial, resumed=resumed)
 
@@ -146,7 +147,7 @@ class Ros2Environment:
             if call is None
             else Deadline(call.timeout_s, call.key("timeout_ms"))
         )
-        label = self._problem.sensing_actions[sensing_action]
+        label = sensing_labels(self._problem)[sensing_action]
         answer: Any = None
         if call is not None:
             request = self._request(call)

@@ -19,9 +19,9 @@ import msgspec
 
 import holdfast
 from holdfast import _kernel
+from holdfast.config.imports import follow_imports
 from holdfast.lab.errors import TaskError
 from holdfast.recording.machine import describe
-from holdfast.source_digest import follow_imports
 
 if TYPE_CHECKING:
     import pandas as pd

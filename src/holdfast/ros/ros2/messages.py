@@ -21,6 +21,7 @@ from std_msgs.msg import Header
 from holdfast import planning
 from holdfast.arrays import FloatArray
 from holdfast.outcome import TrialResult
+from holdfast.problem_attributes import sensing_labels
 from holdfast.problems.problem import Problem
 from holdfast.ros.ros2.telemetry import PublishedDecision
 
@@ -63,7 +64,7 @@ def decision_message(shown: PublishedDecision, problem: Problem, frame_id: str, 
         kind=Decision.ACT if sensing_action is None else Decision.SENSE,
         sensing_action=sensing_action or 0,
         sensing_action_name=(
-            "" if sensing_action is None else str(problem.sensing_actions[sensing_action])
+            "" if sensing_action is None else sensing_labels(problem)[sensing_action]
         ),
         entropies=floats(shown.entropies),
         task_action=floats(shown.task_action),

@@ -34,6 +34,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from holdfast.errors import HoldfastError
 from holdfast.planning import PlanningState
+from holdfast.problem_attributes import sensing_labels
 from holdfast.protocol.events import Act, Sense
 from holdfast.recording.poses import PoseLayout, pose_layout
 from holdfast.recording.run_directory import RunDirectory
@@ -502,7 +503,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             else:
                 response.kind = _Decide.Response.SENSE
                 response.sensing_action = due.sensing_action
-                names = read.configuration.problem.sensing_actions
+                names = sensing_labels(read.configuration.problem)
                 response.sensing_action_name = str(names[due.sensing_action])
         return response
 

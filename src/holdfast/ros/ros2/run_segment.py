@@ -27,6 +27,7 @@ from holdfast.errors import (
 )
 from holdfast.outcome import TrialResult
 from holdfast.planning import PlanningState
+from holdfast.problem_attributes import sensing_labels
 from holdfast.protocol.events import Act, Sense, Timing
 from holdfast.recording.robot_run import RobotObserver, perform_trials
 from holdfast.recording.run_directory import RunDirectory
@@ -113,7 +114,7 @@ def make_world(connections: Any, parameters: NodeParameters) -> World:
     from holdfast.ros.ros2_environment import make_ros_environment
 
     # Invalid parameters are reported now, not when a trial begins.
-    RobotInterface(parameters.mapping, problem.sensing_actions, problem.action_size)
+    RobotInterface(parameters.mapping, sensing_labels(problem), problem.action_size)
     make: Any = functools.partial(make_ros_environment, connections, parameters.mapping)
     maker = EnvironmentMaker(
         "the robot",
