@@ -23,6 +23,7 @@ from holdfast.arrays import FloatArray, in_brief
 from holdfast.circular import differences, mean_angles
 from holdfast.config.settings import Estimate
 from holdfast.errors import InvalidValueError
+from holdfast.floating_mode import in_own_mode
 from holdfast.modes import heaviest_mode
 from holdfast.problem_attributes import circular_observation, has_general_observations
 from holdfast.randomness import Stream
@@ -78,6 +79,7 @@ class Belief(NamedTuple):
         return cls(array, uniform_weights(array.shape[0]))
 
     @classmethod
+    @in_own_mode
     def weighted(cls, states: npt.ArrayLike, weights: npt.ArrayLike) -> Belief:
         """Return a belief of weighted particles; the weights are normalised.
 
@@ -163,6 +165,7 @@ def estimate(
     return mean
 
 
+@in_own_mode
 def standard_deviation(belief: Belief, circular: Sequence[int] = ()) -> FloatArray:
     """Return the standard deviation of each coordinate, shape ``(state_size,)``.
 

@@ -44,6 +44,7 @@ from holdfast.belief import (
 )
 from holdfast.config.settings import MAX_PARTICLES, Method, PlanningSettings, check_settings
 from holdfast.errors import CheckpointError, InvalidValueError, ProblemError
+from holdfast.floating_mode import in_own_mode
 from holdfast.problem_attributes import check_problem, circular_states, moves_show
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
@@ -147,6 +148,7 @@ class Planner:
         changed = msgspec.structs.replace(getattr(self.settings, section), **{key: value})
         self.settings = msgspec.structs.replace(self.settings, **{section: changed})
 
+    @in_own_mode
     def init(self, seed: int, trial: int = 0) -> PlanningState:
         """Return the state before the first step of a trial.
 
@@ -172,6 +174,7 @@ class Planner:
         states = checked.initial_states(problem, random, count)
         return PlanningState(seed, trial, 0, 0, False, Belief(states, uniform_weights(count)))
 
+    @in_own_mode
     def check(self, state: PlanningState) -> None:
         """Check that a state from elsewhere belongs to this problem and these settings.
 
@@ -218,6 +221,7 @@ class Planner:
         """Tell whether the next decision is a sensing action (else it is a task action)."""
         return needs_sensing(self.settings, state)
 
+    @in_own_mode
     def choose_sensing_action(self, state: PlanningState) -> tuple[int, SensingInfo]:
         """Choose the next sensing action, an index into ``problem.sensing_actions``.
 
@@ -238,6 +242,7 @@ class Planner:
             stream(state.seed, state.trial, state.step, Purpose.SELECTION),
         )
 
+    @in_own_mode
     def observe(
         self, state: PlanningState, sensing_action: int, observation: npt.ArrayLike | None
     ) -> tuple[PlanningState, ObservationInfo]:
@@ -269,6 +274,7 @@ class Planner:
         belief, info = self._resampled(state, *updated, Purpose.RESAMPLING)
         return state._replace(sensed=True, belief=belief), info
 
+    @in_own_mode
     def observe_move(
         self, state: PlanningState, task_action: FloatArray, observation: npt.ArrayLike
     ) -> tuple[PlanningState, ObservationInfo]:
@@ -302,6 +308,7 @@ class Planner:
         size, explained, _, distance, within_gate = found
         return belief, ObservationInfo(size, explained, resampled, distance, within_gate)
 
+    @in_own_mode
     def reinitialise(self, state: PlanningState) -> PlanningState:
         """Return the state with a new belief, for a robot that is lost.
 
@@ -318,6 +325,7 @@ class Planner:
         states = checked.reinitial_states(self.problem, state.belief.states, random)
         return state._replace(belief=Belief(states, uniform_weights(states.shape[0])))
 
+    @in_own_mode
     def choose_task_action(self, state: PlanningState) -> tuple[FloatArray, TaskInfo]:
         """Choose the next task action: the policy's for the estimate, within the limits of a step.
 
@@ -340,6 +348,7 @@ class Planner:
             )
         return action, TaskInfo(estimated, commanded, stage)
 
+    @in_own_mode
     def advance(
         self,
         state: PlanningState,
@@ -427,6 +436,7 @@ class Planner:
         self.check(state)
         return state
 
+    @in_own_mode
     def estimate(self, state: PlanningState) -> FloatArray:
         """Return the state that stands for the belief, shape ``(state_size,)``."""
         return self._estimate(state)[0]
@@ -502,6 +512,7 @@ def encode_checkpoint(state: PlanningState) -> bytes:
     )
 
 
+@in_own_mode
 def decode_checkpoint(data: bytes | memoryview) -> PlanningState:
     """Decode a state and check it by itself; :meth:`Planner.check` checks it against a problem.
 

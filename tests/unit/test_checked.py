@@ -196,7 +196,7 @@ class Rough(Line):
         self, states: FloatArray, sensing_action: int, observation: FloatArray
     ) -> FloatArray:
         away = states[:, sensing_action] - observation[0]
-        return -50.0 * away * away
+        return np.asarray(-50.0 * away * away)
 
     def sample_observation(
         self, state: FloatArray, sensing_action: int, stream: Stream

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from holdfast.errors import InvalidValueError, UnknownProblemError
+from holdfast.floating_mode import in_own_mode
 from holdfast.problems.problem import Problem
 
 __all__ = ["BUILT_IN", "BuiltIn", "make", "names", "problem_class", "problem_module"]
@@ -57,6 +58,7 @@ def names() -> list[str]:
     return sorted({*BUILT_IN, *registered_names(GROUP)})
 
 
+@in_own_mode
 def make(name: str, **settings: Any) -> Problem:
     """Build a problem by its registered name, or ``module:Class``.
 

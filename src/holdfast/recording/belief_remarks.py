@@ -14,6 +14,7 @@ import numpy as np
 from holdfast.arrays import FloatArray
 from holdfast.circular import unwrapped
 from holdfast.config.settings import PlanningSettings
+from holdfast.floating_mode import in_own_mode
 from holdfast.modes import heaviest_mode
 from holdfast.problem_attributes import circular_states, name_of
 from holdfast.recording.recorder import TrialRecord
@@ -24,6 +25,7 @@ _SHARE = 0.2
 """Of the beliefs after an observation, from which on it is worth a remark."""
 
 
+@in_own_mode
 def belief_remarks(problem: Any, settings: PlanningSettings, record: TrialRecord) -> list[str]:
     """Return what a user should know of the beliefs after a trial's observations; mostly nothing.
 

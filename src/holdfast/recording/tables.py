@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator
 import msgspec
 import numpy as np
 
+from holdfast.floating_mode import in_own_mode
 from holdfast.outcome import TRIAL_COLUMNS, TrialResult
 from holdfast.recording.timings import AnswerCounts, VerificationCounts
 
@@ -177,6 +178,7 @@ class SummaryBuilder:
         self._sensing_ms.extend(result.sensing_ms)
         self._digest.update(bytes.fromhex(result.digest))
 
+    @in_own_mode
     def build(
         self,
         *,

@@ -23,6 +23,7 @@ from holdfast import checked
 from holdfast.arrays import FloatArray
 from holdfast.config.user_code import find_class
 from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
+from holdfast.floating_mode import in_own_mode
 from holdfast.outcome import Done, MoveResult
 from holdfast.problem_attributes import check_sizes, has_general_observations
 from holdfast.problems.problem import Problem, ProblemBase
@@ -154,6 +155,7 @@ class SimulatedEnvironment:
         Task actions performed so far.
     """
 
+    @in_own_mode
     def __init__(self, problem: Problem, seed: int, trial: int = 0) -> None:
         self._problem = problem
         self._seed = seed
@@ -174,6 +176,7 @@ class SimulatedEnvironment:
             environment.perform(action)
         return environment
 
+    @in_own_mode
     def perform_sensing(self, sensing_action: int) -> FloatArray:
         """Draw an observation of the true state.
 
@@ -198,6 +201,7 @@ class SimulatedEnvironment:
             checked.require_usable(problem, sensing_action, mean, variance)
         return shown
 
+    @in_own_mode
     def perform(self, task_action: FloatArray) -> float | MoveResult | None:
         """Move the true state by an executed task action and return the reward.
 
@@ -223,6 +227,7 @@ class SimulatedEnvironment:
             observation = checked.move_observation(problem, self.state, task_action, noise)
         return MoveResult(reward, motion, observation)
 
+    @in_own_mode
     def is_done(self) -> bool:
         """Return whether the true state is a goal."""
         return checked.is_goal(self._problem, self.state)
