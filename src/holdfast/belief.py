@@ -32,6 +32,7 @@ from holdfast.validation_gate import gate, is_typical, is_within
 __all__ = [
     "Belief",
     "ObservationInfo",
+    "distinct_particles",
     "effective_sample_size",
     "estimate",
     "resample",
@@ -131,6 +132,9 @@ class ObservationInfo(NamedTuple):
     within_gate : bool
         Whether the observation is one that the belief makes likely: within the gate of
         :mod:`holdfast.validation_gate` (for a general likelihood: possible for some particle).
+    distinct_particles : int
+        How many different particles the observation weighed; copies of one count once. Far below
+        their number the belief is depleted: a state that does not move gets no new particles.
     """
 
     effective_sample_size: float
@@ -138,6 +142,7 @@ class ObservationInfo(NamedTuple):
     resampled: bool
     mahalanobis_distance: float | None = None
     within_gate: bool = True
+    distinct_particles: int = 0
 
 
 def estimate(
@@ -179,6 +184,16 @@ def standard_deviation(belief: Belief, circular: Sequence[int] = ()) -> FloatArr
 def effective_sample_size(belief: Belief) -> float:
     """Return ``1 / sum(weights**2)`` (Kong, Liu and Wong 1994)."""
     return 1.0 / _kernel.sum(belief.weights * belief.weights)
+
+
+def distinct_particles(states: FloatArray) -> int:
+    """Return the number of different particles, of which copies stand side by side.
+
+    Resampling puts them there, and nothing moves them apart. Equal states that are no copies of one
+    (where a state has few values) count as often as they do not meet.
+    """
+    differs = states[1:] != states[:-1]
+    return 1 + int(np.count_nonzero(differs.any(axis=1)))
 
 
 def update(
@@ -296,7 +311,8 @@ def _reweighted(
         weights.setflags(write=False)
         after = Belief(belief.states, weights)
     found = effective_sample_size(after), explained and survivors > 0, False
-    return after, ObservationInfo(*found, distance, within_gate)
+    distinct = distinct_particles(belief.states)
+    return after, ObservationInfo(*found, distance, within_gate, distinct)
 
 
 def _gaussian_log_likelihood(

@@ -19,7 +19,7 @@ import numpy as np
 
 from holdfast import _kernel
 
-__all__ = ["as_caller", "in_own_mode"]
+__all__ = ["as_caller", "in_own_mode", "modes_agree"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -36,7 +36,7 @@ def in_own_mode(function: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(function)
     def in_mode(*arguments: P.args, **keywords: P.kwargs) -> R:
         processor = _kernel.enter_standard_mode()
-        mode: dict[str, Any] = dict(np.geterr())
+        mode: Any = np.geterr()
         if not processor and mode == _OWN:
             return function(*arguments, **keywords)
         token = _callers.set(None if mode == _OWN else mode)
@@ -49,6 +49,11 @@ def in_own_mode(function: Callable[P, R]) -> Callable[P, R]:
                 _kernel.restore_mode(processor)
 
     return in_mode
+
+
+def modes_agree() -> bool:
+    """Tell whether who called us has our mode of NumPy, so that :func:`as_caller` does nothing."""
+    return _callers.get() is None
 
 
 def as_caller(function: Callable[P, R], *arguments: P.args, **keywords: P.kwargs) -> R:

@@ -35,6 +35,7 @@ from holdfast.arrays import FloatArray, in_brief
 from holdfast.belief import (
     Belief,
     ObservationInfo,
+    distinct_particles,
     effective_sample_size,
     estimate,
     resample,
@@ -266,7 +267,9 @@ class Planner:
             )
         if observation is None:
             size = effective_sample_size(state.belief)
-            return state._replace(sensed=True), ObservationInfo(size, True, False)
+            distinct = distinct_particles(state.belief.states)
+            info = ObservationInfo(size, True, False, distinct_particles=distinct)
+            return state._replace(sensed=True), info
         ranks = None
         if getattr(problem, "rank_test", False):
             ranks = stream(state.seed, state.trial, state.step, Purpose.RANK_TEST)
@@ -305,8 +308,7 @@ class Planner:
         resampled = threshold == count or found.effective_sample_size <= threshold
         if resampled:
             belief = resample(belief, stream(state.seed, state.trial, state.step, purpose))
-        size, explained, _, distance, within_gate = found
-        return belief, ObservationInfo(size, explained, resampled, distance, within_gate)
+        return belief, found._replace(resampled=resampled)
 
     @in_own_mode
     def reinitialise(self, state: PlanningState) -> PlanningState:

@@ -50,6 +50,7 @@ class TestTables:
             "digest",
             "lost",
             "suspect_sensors",
+            "fewest_distinct_particles",
             "outcome",
             "reason",
         )
