@@ -90,6 +90,14 @@ class TestTables:
         assert (summary.lost, summary.suspect_sensors) == (3, 1)
         assert dict(_summary_rows(summary))["lost"].startswith("3 times, 1 suspect sensor (")
 
+    def test_the_fewest_particles_are_those_of_the_worst_trial(self) -> None:
+        builder = SummaryBuilder()
+        for trial, fewest in enumerate((None, 300, 4, 20)):
+            result = result_of(trial)
+            builder.add(msgspec.structs.replace(result, fewest_distinct_particles=fewest))
+        summary = builder.build(problem="p", seed=5, version="1", trials=4, wall_time_s=2.0)
+        assert json.loads(summary.to_json())["fewest_distinct_particles"] == 4
+
     def test_failures_are_no_successes_and_told_if_there_are_any(self) -> None:
         builder = SummaryBuilder()
         builder.add(result_of(0, reward=-1.0))
