@@ -85,6 +85,9 @@ void holdfast::bind_numerics(nb::module_& module) {
         uniforms(to_stream(words), 0, count, out);
         return result;
     });
+    // Not by define, which would undo what they do.
+    module.def("enter_standard_mode", &enter_standard_mode);
+    module.def("restore_mode", &restore_mode);
     define(module, "systematic_resample", [](const Input<1>& weights, double offset) {
         std::int64_t* out;
         auto result = make_array<std::int64_t>({weights.shape(0)}, out);

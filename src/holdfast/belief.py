@@ -23,6 +23,7 @@ from holdfast.arrays import FloatArray, floats, in_brief
 from holdfast.circular import differences, mean_angles
 from holdfast.config.settings import Estimate
 from holdfast.errors import InvalidValueError
+from holdfast.floating_mode import in_own_mode
 from holdfast.modes import heaviest_mode
 from holdfast.problem_attributes import circular_observation, has_general_observations
 from holdfast.randomness import Stream
@@ -31,6 +32,7 @@ from holdfast.validation_gate import gate, is_typical, is_within
 __all__ = [
     "Belief",
     "ObservationInfo",
+    "distinct_particles",
     "effective_sample_size",
     "estimate",
     "resample",
@@ -82,6 +84,7 @@ class Belief(NamedTuple):
         return cls(array, uniform_weights(array.shape[0]))
 
     @classmethod
+    @in_own_mode
     def weighted(cls, states: npt.ArrayLike, weights: npt.ArrayLike) -> Belief:
         """Return a belief of weighted particles; the weights are normalised.
 
@@ -139,6 +142,9 @@ class ObservationInfo(NamedTuple):
     within_gate : bool
         Whether the observation is one that the belief makes likely: within the gate of
         :mod:`holdfast.validation_gate` (for a general likelihood: possible for some particle).
+    distinct_particles : int
+        How many different particles the observation weighed; copies of one count once. Far below
+        their number the belief is depleted: a state that does not move gets no new particles.
     """
 
     effective_sample_size: float
@@ -146,6 +152,7 @@ class ObservationInfo(NamedTuple):
     resampled: bool
     mahalanobis_distance: float | None = None
     within_gate: bool = True
+    distinct_particles: int = 0
 
 
 def estimate(
@@ -173,6 +180,7 @@ def estimate(
     return mean
 
 
+@in_own_mode
 def standard_deviation(belief: Belief, circular: Sequence[int] = ()) -> FloatArray:
     """Return the standard deviation of each coordinate, shape ``(state_size,)``.
 
@@ -186,6 +194,16 @@ def standard_deviation(belief: Belief, circular: Sequence[int] = ()) -> FloatArr
 def effective_sample_size(belief: Belief) -> float:
     """Return ``1 / sum(weights**2)`` (Kong, Liu and Wong 1994)."""
     return 1.0 / _kernel.sum(belief.weights * belief.weights)
+
+
+def distinct_particles(states: FloatArray) -> int:
+    """Return the number of different particles, of which copies stand side by side.
+
+    Resampling puts them there, and nothing moves them apart. Equal states that are no copies of one
+    (where a state has few values) count as often as they do not meet.
+    """
+    differs = states[1:] != states[:-1]
+    return 1 + int(np.count_nonzero(differs.any(axis=1)))
 
 
 def update(
@@ -303,7 +321,8 @@ def _reweighted(
         weights.setflags(write=False)
         after = Belief(belief.states, weights)
     found = effective_sample_size(after), explained and survivors > 0, False
-    return after, ObservationInfo(*found, distance, within_gate)
+    distinct = distinct_particles(belief.states)
+    return after, ObservationInfo(*found, distance, within_gate, distinct)
 
 
 def _gaussian_log_likelihood(

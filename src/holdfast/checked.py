@@ -27,7 +27,7 @@ from holdfast.arrays import (
     real_numbers,
 )
 from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.floating_mode import as_caller
+from holdfast.floating_mode import as_caller, modes_agree
 from holdfast.problem_attributes import has_own, name_of
 from holdfast.randomness import Stream
 
@@ -50,6 +50,7 @@ __all__ = [
     "next_stages",
     "policy",
     "prediction",
+    "predictions",
     "reinitial_states",
     "require_usable",
     "reward",
@@ -69,6 +70,53 @@ def prediction(
     The mean has the shape ``(..., observation_size)``, and the variance that or
     ``(observation_size,)``. Whether they are finite is left to :func:`require_usable`.
     """
+    mean = _mean(problem, states, sensing_action).copy()
+    return mean, _variance(problem, states, sensing_action, mean.shape).copy()
+
+
+def predictions(
+    problem: Any, states: FloatArray, sensing_actions: Sequence[int]
+) -> tuple[list[int], FloatArray, FloatArray]:
+    """Return the predictions for n states under several sensing actions, one below the other.
+
+    They are the sizes of the observations, D in all; their means, shape ``(D, n)``; and their
+    variances, shape ``(D, n)``, or ``(D, 1)`` if none depends on the state.
+    """
+    sizes: list[int] = []
+    means, variances = np.empty((0, states.shape[0])), np.empty((0, 1))
+    row = 0
+    for number, action in enumerate(sensing_actions):
+        # What comes is kept before the next call, which may return the same buffer.
+        mean = _mean(problem, states, action)
+        shape, size = mean.shape, mean.shape[-1]
+        if row + size > means.shape[0]:
+            # Mostly all sensing actions show as many numbers as the first.
+            rows = row + size * (len(sensing_actions) - number)
+            means, variances = _with_rows(means, rows), _with_rows(variances, rows)
+        means[row : row + size] = mean.T
+        variance = _variance(problem, states, action, shape)
+        if variance.ndim > 1 and variances.shape[1] == 1:
+            variances = np.repeat(variances, states.shape[0], axis=1)
+        variances[row : row + size] = variance.T if variance.ndim > 1 else variance.reshape(-1, 1)
+        sizes.append(size)
+        row += size
+    if row < means.shape[0]:
+        means, variances = means[:row], variances[:row]
+    # A comparison with NaN is false.
+    usable = ((variances > 0.0) & (variances < np.inf)).all()
+    if not usable or not _kernel.all_finite(means):
+        for action in sensing_actions:
+            require_usable(problem, action, *prediction(problem, states, action))
+    return sizes, means, variances
+
+
+def _with_rows(array: FloatArray, rows: int) -> FloatArray:
+    larger = np.empty((rows, array.shape[1]))
+    larger[: array.shape[0]] = array
+    return larger
+
+
+def _mean(problem: Any, states: FloatArray, sensing_action: int) -> FloatArray:
     mean: FloatArray = _ask(problem, "observation_mean", states, sensing_action)
     leading = states.shape[:-1]
     if not _is_float_array(mean) or mean.ndim != states.ndim or mean.shape[:-1] != leading:
@@ -79,16 +127,20 @@ def prediction(
             f"observation_mean of {name_of(problem)} has {mean.shape[-1]} coordinates: allowed are "
             f"1 to {MAX_OBSERVATION_SIZE}"
         )
-    # Before the next call, which may return the same buffer.
-    mean = mean.copy()
+    return mean
+
+
+def _variance(
+    problem: Any, states: FloatArray, sensing_action: int, shape: tuple[int, ...]
+) -> FloatArray:
     variance: FloatArray = _ask(problem, "observation_variance", states, sensing_action)
-    one = mean.shape[-1:]
-    fits = isinstance(variance, np.ndarray) and variance.shape in (one, mean.shape)
+    one = shape[-1:]
+    fits = isinstance(variance, np.ndarray) and variance.shape in (one, shape)
     if not fits or is_masked(variance):
-        need = one if mean.ndim == 1 else f"{one} or {mean.shape}"
+        need = one if len(shape) == 1 else f"{one} or {shape}"
         what = f"observation_variance of sensing action {sensing_action}"
         raise _misfit(problem, what, variance, need)
-    return mean, variance.copy()
+    return variance
 
 
 def require_usable(
@@ -114,7 +166,7 @@ def sample_observation(
     problem: Any, state: FloatArray, sensing_action: int, stream: Stream
 ) -> FloatArray:
     """Return an observation that was drawn in one state, shape ``(observation_size,)``."""
-    drawn = _ask(problem, "sample_observation", state, sensing_action, stream, streams=(stream,))
+    drawn = _draw(problem, "sample_observation", state, sensing_action, stream, streams=(stream,))
     return _shown(problem, f"sample_observation of sensing action {sensing_action}", drawn)
 
 
@@ -172,7 +224,7 @@ def moved_by_measurement(
             f"{function}(states, motion, stream) that could move the belief by it"
         )
     measured.setflags(write=False)
-    moved = _ask(problem, function, states, measured, stream, streams=(stream,))
+    moved = _draw(problem, function, states, measured, stream, streams=(stream,))
     return _states(problem, function, moved, states.shape)
 
 
@@ -181,7 +233,7 @@ def measured_motion(
 ) -> FloatArray:
     """Return the measurement of a true move, shape ``(n,)``."""
     function = "measure_motion"
-    drawn = _ask(problem, function, before, after, stream, streams=(stream,))
+    drawn = _draw(problem, function, before, after, stream, streams=(stream,))
     return _shown(problem, function, drawn)
 
 
@@ -190,7 +242,7 @@ def move_observation(
 ) -> FloatArray:
     """Return what comes with a move into one state, shape ``(n,)``."""
     function = "sample_move_observation"
-    drawn = _ask(problem, function, state, action, stream, streams=(stream,))
+    drawn = _draw(problem, function, state, action, stream, streams=(stream,))
     return _shown(problem, function, drawn)
 
 
@@ -299,7 +351,7 @@ def known_state_return(problem: Any, states: FloatArray, stages: IntArray) -> Fl
 
 def initial_states(problem: Any, stream: Stream, count: int) -> FloatArray:
     """Return states drawn from the initial belief, shape ``(count, state_size)``, read-only."""
-    drawn = _ask(problem, "initial_states", stream, count, streams=(stream,))
+    drawn = _draw(problem, "initial_states", stream, count, streams=(stream,))
     return _states(problem, "initial_states", drawn, (count, problem.state_size))
 
 
@@ -308,13 +360,13 @@ def reinitial_states(problem: Any, states: FloatArray, stream: Stream) -> FloatA
     function = "reinitial_states"
     if getattr(problem, function, None) is None:
         return initial_states(problem, stream, states.shape[0])
-    drawn = _ask(problem, function, states, stream, streams=(stream,))
+    drawn = _draw(problem, function, states, stream, streams=(stream,))
     return _states(problem, function, drawn, states.shape)
 
 
 def move(problem: Any, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
     """Return the states after executed actions, of the shape of ``states``, read-only."""
-    moved = _ask(problem, "move", states, actions, stream, streams=(stream,))
+    moved = _draw(problem, "move", states, actions, stream, streams=(stream,))
     return _states(problem, "move", moved, states.shape)
 
 
@@ -342,7 +394,7 @@ def move_each(
     counts if the problem has a ``move_each``.
     """
     if has_own(problem, "move_each", ("move",)):
-        moved = _ask(problem, "move_each", states, actions, streams, threads, streams=streams)
+        moved = _draw(problem, "move_each", states, actions, streams, threads, streams=streams)
         return _states(problem, "move_each", moved, states.shape)
     together = np.empty(states.shape)
     for row, (own, action, stream) in enumerate(zip(states, actions, streams, strict=True)):
@@ -378,9 +430,15 @@ def is_goal(problem: Any, state: FloatArray) -> bool:
     return bool(single)
 
 
-def _ask(problem: Any, function: str, *arguments: object, streams: Sequence[Stream] = ()) -> Any:
-    """Call a function of the problem; ``streams`` are those among its arguments."""
-    found = as_caller(getattr(problem, function), *arguments)
+def _ask(problem: Any, function: str, *arguments: object) -> Any:
+    """Call a function of the problem."""
+    called = getattr(problem, function)
+    return called(*arguments) if modes_agree() else as_caller(called, *arguments)
+
+
+def _draw(problem: Any, function: str, *arguments: object, streams: Sequence[Stream]) -> Any:
+    """Call a function of the problem that draws; ``streams`` are those among its arguments."""
+    found = _ask(problem, function, *arguments)
     for stream in streams:
         stream.end()
     return found

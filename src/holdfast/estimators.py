@@ -24,6 +24,7 @@ from holdfast.arrays import FloatArray, floats, in_brief, real_number, whole
 from holdfast.circular import unwrapped
 from holdfast.config.settings import MAX_PRIOR_NEIGHBORS_POINTS
 from holdfast.errors import InvalidValueError
+from holdfast.floating_mode import in_own_mode
 
 __all__ = ["GaussianMixture", "NearestNeighbor", "PriorNeighbors", "entropy"]
 
@@ -56,13 +57,15 @@ class NearestNeighbor(NamedTuple):
     ----------
     neighbors : int
         The k, at least 1.
-    resolution : float or array of shape (d,)
+    resolution : float or array of shape (d,), optional
         Positive, in the unit of the points. With an array distances are measured in resolutions,
-        coordinate by coordinate, so they do not depend on units.
+        coordinate by coordinate, so they do not depend on units. None: :func:`entropy` takes a
+        thousandth of the points' own scale, the median of their distances from their median (or,
+        where half of them are there, the root of the mean square of those distances).
     """
 
     neighbors: int = 5
-    resolution: float | FloatArray = 1e-3
+    resolution: float | FloatArray | None = None
 
 
 class PriorNeighbors(NamedTuple):
@@ -88,7 +91,7 @@ class PriorNeighbors(NamedTuple):
         Weights of the points before the observation: non-negative, of sum 1.
     neighbors : int
         The k, at least 1.
-    resolution : float or array of shape (d,)
+    resolution : float or array of shape (d,), optional
         As that of :class:`NearestNeighbor`.
 
     Notes
@@ -104,7 +107,7 @@ class PriorNeighbors(NamedTuple):
 
     prior: FloatArray
     neighbors: int = 5
-    resolution: float | FloatArray = 1e-3
+    resolution: float | FloatArray | None = None
 
 
 class GaussianMixture(NamedTuple):
@@ -228,16 +231,15 @@ def kernel_estimator(
     ``split_volume`` keeps the part of a mixture's entropy that depends on units apart, in
     ``log_volume``. That of a nearest-neighbour estimate with an array is always there.
     """
-    if not 1 <= dimension <= MAX_DIMENSION:
-        raise InvalidValueError(
-            f"points of {dimension} coordinates: allowed are 1 to {MAX_DIMENSION}"
-        )
+    _check_dimension(dimension)
     if isinstance(estimator, NearestNeighbor | PriorNeighbors):
         neighbors = whole("neighbors", estimator.neighbors, 1)
         if isinstance(estimator, NearestNeighbor):
             kind, prior = EstimatorKind.NEAREST_NEIGHBOR, _NO_PRIOR
         else:
             kind, prior = EstimatorKind.PRIOR_NEIGHBORS, _checked_prior(estimator.prior)
+        if estimator.resolution is None:
+            raise InvalidValueError("resolution is None: only entropy, which has points, takes it")
         resolution = real_number(estimator.resolution)
         if resolution is None:  # one for each coordinate
             scale, log_volume = scale_of(estimator.resolution, dimension)
@@ -266,6 +268,37 @@ def kernel_estimator(
     )
 
 
+def _own_resolution(points: FloatArray, shares: FloatArray) -> float:
+    """Return a thousandth of the scale of weighted points."""
+    middle = np.array([_median(column, shares) for column in points.T])
+    distances = np.abs(points - middle) * (shares > 0.0)[:, np.newaxis]
+    greatest = float(distances.max())
+    if greatest == 0.0:
+        raise InvalidValueError(
+            f"points that are all {in_brief(middle)} have no scale from which a resolution could "
+            "follow: give an estimator with one, NearestNeighbor(resolution=...)"
+        )
+    # In parts of the greatest coordinate, whose squares are not too large, and not all 0.
+    parts = distances / greatest
+    squares = np.square(parts).sum(axis=1)
+    square = _median(squares, shares) or float((shares * squares).sum() / shares.sum())
+    return 1e-3 * greatest * float(np.sqrt(square))
+
+
+def _median(values: FloatArray, shares: FloatArray) -> float:
+    """Return the least value below or at which half of the weight lies."""
+    order = np.argsort(values, kind="stable")
+    below = np.cumsum(shares[order])
+    return float(values[order[np.searchsorted(below, 0.5 * below[-1])]])
+
+
+def _check_dimension(dimension: int) -> None:
+    if not 1 <= dimension <= MAX_DIMENSION:
+        raise InvalidValueError(
+            f"points of {dimension} coordinates: allowed are 1 to {MAX_DIMENSION}"
+        )
+
+
 def _checked_prior(prior: npt.ArrayLike) -> FloatArray:
     weights = floats("prior", prior)
     if weights.ndim != 1 or not 1 <= weights.shape[0] <= MAX_PRIOR_NEIGHBORS_POINTS:
@@ -281,6 +314,7 @@ def _checked_prior(prior: npt.ArrayLike) -> FloatArray:
     return weights
 
 
+@in_own_mode
 def entropy(
     points: npt.ArrayLike,
     weights: npt.ArrayLike | None = None,
@@ -299,7 +333,8 @@ def entropy(
         Non-negative, not all zero; need not sum to 1. With ``b`` rows, ``b`` entropies of the same
         points under different weights, much faster than one by one. Default: equal weights.
     estimator : NearestNeighbor, PriorNeighbors or GaussianMixture, optional
-        Default: ``NearestNeighbor()``.
+        Default: ``NearestNeighbor()``, whose resolution follows from the points: in another unit
+        (points times s) the entropy is ``d log(s)`` more. Points that are all equal need one.
     circular : sequence of int
         Which coordinates are angles in radians, of which pi is -pi. Distances across the widest gap
         between neighbouring angles are not seen.
@@ -330,13 +365,17 @@ def entropy(
         raise InvalidValueError(
             f"point {bad} is {array[bad]}: every coordinate must be finite and at most {LARGEST:g}"
         )
-    kernel = kernel_estimator(estimator, array.shape[1])
-    if not isinstance(estimator, GaussianMixture) and estimator.neighbors >= count > 1:
-        raise InvalidValueError(
-            f"neighbors {estimator.neighbors}: must be below the number of points, {count}"
-        )
-    if isinstance(estimator, PriorNeighbors) and kernel.prior.shape != (count,):
-        raise InvalidValueError(f"prior of shape {kernel.prior.shape}: need ({count},)")
+    _check_dimension(array.shape[1])
+    if not isinstance(estimator, GaussianMixture):
+        neighbors = whole("neighbors", estimator.neighbors, 1)
+        if neighbors >= count > 1:
+            raise InvalidValueError(
+                f"neighbors {neighbors}: must be below the number of points, {count}"
+            )
+    if isinstance(estimator, PriorNeighbors):
+        estimator = estimator._replace(prior=_checked_prior(estimator.prior))
+        if estimator.prior.shape != (count,):
+            raise InvalidValueError(f"prior of shape {estimator.prior.shape}: need ({count},)")
     rows = np.ones((1, count)) if weights is None else floats("weights", weights)
     single = rows.ndim == 1 or weights is None
     rows = rows.reshape(1, -1) if rows.ndim == 1 else rows
@@ -352,7 +391,14 @@ def entropy(
         raise InvalidValueError(f"weights[{bad}] are all zero: one must be positive")
     angles = [whole("circular", each, 0, array.shape[1] - 1) for each in circular]
     threads = whole("threads", threads, 0)
-    array = scaled(unwrapped(array, angles) if angles else array, kernel)
+    array = unwrapped(array, angles) if angles else array
+    if not isinstance(estimator, GaussianMixture) and estimator.resolution is None:
+        shares = (rows / rows.sum(axis=1, keepdims=True)).sum(axis=0)
+        if isinstance(estimator, PriorNeighbors):
+            shares = estimator.prior
+        estimator = estimator._replace(resolution=_own_resolution(array, shares))
+    kernel = kernel_estimator(estimator, array.shape[1])
+    array = scaled(array, kernel)
     result, _, _, _ = _kernel.entropies(
         array,
         rows,

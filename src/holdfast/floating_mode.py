@@ -1,9 +1,11 @@
-"""NumPy's floating-point mode: one of our own inside, the caller's in the caller's code.
+"""The floating-point mode: our own inside, the caller's in the caller's code.
 
-``np.seterr(all="raise")``, also by some library, makes NumPy raise where a tiny number becomes 0,
-which is harmless in a belief. So what a user calls runs in NumPy's default mode, and the functions
-of a user's problem get the caller's mode back while they run. Where the caller has the default
-mode, which is nearly always, both cost a comparison. The kernel sees to the processor's own mode.
+``np.seterr(all="raise")``, perhaps by some library, makes NumPy raise where a tiny number becomes
+0, which is harmless in a belief. Other libraries make the processor round otherwise, or take tiny
+numbers for 0. So what a user calls runs in the standard mode of both. The functions of a user's
+problem get the caller's mode of NumPy back while they run; the processor's stays standard, for what
+they compute must have the same bits everywhere. Where the caller has both standard modes, which is
+nearly always, all this costs a comparison.
 """
 
 from __future__ import annotations
@@ -15,7 +17,9 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-__all__ = ["as_caller", "in_own_mode"]
+from holdfast import _kernel
+
+__all__ = ["as_caller", "in_own_mode", "modes_agree"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -23,29 +27,37 @@ R = TypeVar("R")
 _OWN: dict[str, Any] = {"divide": "warn", "over": "warn", "under": "ignore", "invalid": "warn"}
 
 _callers: ContextVar[dict[str, Any] | None] = ContextVar("callers_mode", default=None)
-"""The mode of who called, while it is not ours."""
+"""NumPy's mode of who called, while it is not ours."""
 
 
 def in_own_mode(function: Callable[P, R]) -> Callable[P, R]:
-    """Make a function of the public face run in NumPy's default mode."""
+    """Make a function of the public face run in the standard floating-point mode."""
 
     @functools.wraps(function)
     def in_mode(*arguments: P.args, **keywords: P.kwargs) -> R:
-        mode: dict[str, Any] = dict(np.geterr())
-        if mode == _OWN:
+        processor = _kernel.enter_standard_mode()
+        mode: Any = np.geterr()
+        if not processor and mode == _OWN:
             return function(*arguments, **keywords)
-        token = _callers.set(mode)
+        token = _callers.set(None if mode == _OWN else mode)
         try:
             with np.errstate(**_OWN):
                 return function(*arguments, **keywords)
         finally:
             _callers.reset(token)
+            if processor:
+                _kernel.restore_mode(processor)
 
     return in_mode
 
 
+def modes_agree() -> bool:
+    """Tell whether who called us has our mode of NumPy, so that :func:`as_caller` does nothing."""
+    return _callers.get() is None
+
+
 def as_caller(function: Callable[P, R], *arguments: P.args, **keywords: P.kwargs) -> R:
-    """Call a user's function in the mode of who called us; one of ours in our own."""
+    """Call a user's function in NumPy's mode of who called us; one of ours in our own."""
     mode = _callers.get()
     if mode is None or (getattr(function, "__module__", None) or "").startswith("holdfast."):
         return function(*arguments, **keywords)

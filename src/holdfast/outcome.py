@@ -296,6 +296,8 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
         Observations that no particle of the belief explained.
     lost, suspect_sensors : int
         Times that the robot was found lost, and a sensing action suspect (:mod:`holdfast.lost`).
+    fewest_distinct_particles : int or None
+        The least number of different particles that an observation weighed; None without one.
     digest : str
         BLAKE2b-256 of the decisions, in hexadecimal.
     sensing_ms : tuple of float
@@ -320,6 +322,7 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     lost: int = 0
     suspect_sensors: int = 0
     missing_observations: int = 0
+    fewest_distinct_particles: int | None = None
     sensing_ms: tuple[float, ...]
     decisions: Decisions | None = None
 

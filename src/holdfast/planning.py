@@ -35,6 +35,7 @@ from holdfast.arrays import FloatArray, floats, in_brief, integer, plain, whole
 from holdfast.belief import (
     Belief,
     ObservationInfo,
+    distinct_particles,
     effective_sample_size,
     estimate,
     resample,
@@ -50,6 +51,7 @@ from holdfast.config.settings import (
     plain_settings,
 )
 from holdfast.errors import CheckpointError, InvalidValueError, ProblemError
+from holdfast.floating_mode import in_own_mode
 from holdfast.problem_attributes import check_problem, check_sizes, circular_states, moves_show
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
@@ -154,6 +156,7 @@ class Planner:
         changed = msgspec.structs.replace(getattr(self.settings, section), **{key: value})
         self.settings = msgspec.structs.replace(self.settings, **{section: changed})
 
+    @in_own_mode
     def init(self, seed: int, trial: int = 0) -> PlanningState:
         """Return the state before the first step of a trial.
 
@@ -175,6 +178,7 @@ class Planner:
         states = checked.initial_states(problem, random, count)
         return PlanningState(seed, trial, 0, 0, False, Belief(states, uniform_weights(count)))
 
+    @in_own_mode
     def check(self, state: PlanningState) -> None:
         """Check that a state from elsewhere belongs to this problem and these settings.
 
@@ -221,6 +225,7 @@ class Planner:
         """Tell whether the next decision is a sensing action (else it is a task action)."""
         return needs_sensing(self.settings, state)
 
+    @in_own_mode
     def choose_sensing_action(self, state: PlanningState) -> tuple[int, SensingInfo]:
         """Choose the next sensing action, an index into ``problem.sensing_actions``.
 
@@ -241,6 +246,7 @@ class Planner:
             stream(state.seed, state.trial, state.step, Purpose.SELECTION),
         )
 
+    @in_own_mode
     def observe(
         self, state: PlanningState, sensing_action: int, observation: npt.ArrayLike | None
     ) -> tuple[PlanningState, ObservationInfo]:
@@ -265,7 +271,9 @@ class Planner:
             )
         if observation is None:
             size = effective_sample_size(state.belief)
-            return state._replace(sensed=True), ObservationInfo(size, True, False)
+            distinct = distinct_particles(state.belief.states)
+            info = ObservationInfo(size, True, False, distinct_particles=distinct)
+            return state._replace(sensed=True), info
         ranks = None
         if getattr(problem, "rank_test", False):
             ranks = stream(state.seed, state.trial, state.step, Purpose.RANK_TEST)
@@ -273,6 +281,7 @@ class Planner:
         belief, info = self._resampled(state, *updated, Purpose.RESAMPLING)
         return state._replace(sensed=True, belief=belief), info
 
+    @in_own_mode
     def observe_move(
         self, state: PlanningState, task_action: FloatArray, observation: npt.ArrayLike
     ) -> tuple[PlanningState, ObservationInfo]:
@@ -304,9 +313,9 @@ class Planner:
         resampled = threshold == count or found.effective_sample_size <= threshold
         if resampled:
             belief = resample(belief, stream(state.seed, state.trial, state.step, purpose))
-        size, explained, _, distance, within_gate = found
-        return belief, ObservationInfo(size, explained, resampled, distance, within_gate)
+        return belief, found._replace(resampled=resampled)
 
+    @in_own_mode
     def reinitialise(self, state: PlanningState) -> PlanningState:
         """Return the state with a new belief, for a robot that is lost.
 
@@ -323,6 +332,7 @@ class Planner:
         states = checked.reinitial_states(self.problem, state.belief.states, random)
         return state._replace(belief=Belief(states, uniform_weights(states.shape[0])))
 
+    @in_own_mode
     def choose_task_action(self, state: PlanningState) -> tuple[FloatArray, TaskInfo]:
         """Choose the next task action: the policy's for the estimate, within the limits of a step.
 
@@ -345,6 +355,7 @@ class Planner:
             )
         return action, TaskInfo(estimated, commanded, stage)
 
+    @in_own_mode
     def advance(
         self,
         state: PlanningState,
@@ -433,6 +444,7 @@ class Planner:
         self.check(state)
         return state
 
+    @in_own_mode
     def estimate(self, state: PlanningState) -> FloatArray:
         """Return the state that stands for the belief, shape ``(state_size,)``."""
         return self._estimate(state)[0]
@@ -508,6 +520,7 @@ def encode_checkpoint(state: PlanningState) -> bytes:
     )
 
 
+@in_own_mode
 def decode_checkpoint(data: bytes | memoryview) -> PlanningState:
     """Decode a state and check it by itself; :meth:`Planner.check` checks it against a problem.
 

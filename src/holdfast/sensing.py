@@ -405,21 +405,7 @@ def _hypotheses(
     """Return the hypothetical observations of some sensing actions, ``samples`` each."""
     if has_general_observations(problem):
         return _general_hypotheses(problem, belief, actions, samples, stream)
-    found = [checked.prediction(problem, belief.states, action) for action in actions]
-    sizes = [mean.shape[-1] for mean, _ in found]
-    predicted = np.empty((sum(sizes), belief.states.shape[0]))
-    varying = any(variance.ndim > 1 for _, variance in found)
-    variances = np.empty((predicted.shape[0], predicted.shape[1] if varying else 1))
-    row = 0
-    for size, (mean, variance) in zip(sizes, found, strict=True):
-        predicted[row : row + size] = mean.T
-        variances[row : row + size] = variance.T if variance.ndim > 1 else variance.reshape(-1, 1)
-        row += size
-    # A comparison with NaN is false.
-    usable = ((variances > 0.0) & (variances < np.inf)).all()
-    if not usable or not numerics.all_finite(predicted):
-        for action, (mean, variance) in zip(actions, found, strict=True):
-            checked.require_usable(problem, action, mean, variance)
+    sizes, predicted, variances = checked.predictions(problem, belief.states, actions)
     angles: list[int] = []
     if has_circular_observations(problem):
         for action, size in zip(actions, sizes, strict=True):

@@ -77,6 +77,8 @@ class Trial:
         Sensing actions that were performed and have no observation (so far, if it comes late).
     num_unexplained : int
         Observations that no particle explains.
+    fewest_distinct : int or None
+        The least number of different particles that an observation weighed.
     lost_test : LostTest
     alarm : Verdict or None
         That of the last input or move.
@@ -101,6 +103,7 @@ class Trial:
         self.num_inputs = 0
         self.num_missing = 0
         self.num_unexplained = 0
+        self.fewest_distinct: int | None = None
         self.lost_test = LostTest(false_alarm_rate)
         self.alarm: Verdict | None = None
         self.sensing_ms: list[float] = []
@@ -231,6 +234,7 @@ class Trial:
             unexplained_observations=self.num_unexplained,
             lost=self.lost_test.num_lost,
             suspect_sensors=self.lost_test.num_suspect,
+            fewest_distinct_particles=self.fewest_distinct,
             digest=decisions.digest(),
             sensing_ms=sensing_ms,
             decisions=decisions,
@@ -244,6 +248,8 @@ class Trial:
         if info is None:
             return
         self.num_unexplained += not info.explained
+        distinct = info.distinct_particles
+        self.fewest_distinct = min(distinct, self.fewest_distinct or distinct)
         if not of_old_belief:
             self.alarm = self.lost_test.observed(sensing_action, info.within_gate)
 

@@ -96,27 +96,35 @@ def _squared_distance(
     weights: FloatArray,
     circular: Sequence[int] = (),
 ) -> float:
-    """Return ``r' S^-1 r``, r the innovation and S its covariance, by a Cholesky factorisation."""
-    size = observed.shape[0]
+    """Return ``r' S^-1 r``, r the innovation and S its covariance.
+
+    S is never formed: where two channels show nearly the same, its digits do not suffice. With A
+    the rows that make ``S = A' A`` (a row for each particle, and one for each channel's noise), it
+    is the triangle of a QR factorisation of A, by Gram and Schmidt's modified method.
+    """
+    size, count = observed.shape[0], mean.shape[0]
     predicted = _kernel.weighted_sums(weights, mean)
     if circular:
         angles = list(circular)
         predicted[angles] = mean_angles(mean[:, angles], weights)
     spread = differences(mean, predicted, circular)
     noise = variance if variance.ndim == 1 else _kernel.weighted_sums(weights, variance)
-    columns = [
-        _kernel.weighted_sums(weights, spread * spread[:, column : column + 1])
-        for column in range(size)
-    ]
-    innovation = differences(observed, predicted, circular)
+    # In units of its whole deviation each column has the length 1.
+    unit = np.sqrt(_kernel.weighted_sums(weights, spread * spread) + noise)
+    rows = np.zeros((count + size, size))
+    rows[:count] = np.sqrt(weights)[:, np.newaxis] * (spread / unit)
+    rows[np.arange(count, count + size), np.arange(size)] = np.sqrt(noise) / unit
+    innovation = differences(observed, predicted, circular) / unit
     squared = 0.0
     for column in range(size):
-        columns[column][column] += noise[column]
-        root = np.sqrt(columns[column][column])
-        below = columns[column][column + 1 :] / root
-        for later in range(column + 1, size):
-            columns[later][column + 1 :] -= below * below[later - column - 1]
-        scaled = innovation[column] / root
-        innovation[column + 1 :] -= below * scaled
+        own = np.ascontiguousarray(rows[:, column])
+        later = np.ascontiguousarray(rows[:, column + 1 :])
+        length = np.sqrt(_kernel.sum(own * own))
+        direction = own / length
+        scaled = innovation[column] / length
         squared += float(scaled * scaled)
+        if later.shape[1]:
+            along = _kernel.weighted_sums(direction, later)
+            rows[:, column + 1 :] = later - direction[:, np.newaxis] * along
+            innovation[column + 1 :] -= along * scaled
     return squared

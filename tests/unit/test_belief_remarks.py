@@ -1,4 +1,4 @@
-"""What a trial's beliefs tell: of the two examples that need a setting, and of nothing else."""
+"""What a trial's beliefs tell: of what needs a setting or some noise, and of nothing else."""
 
 from __future__ import annotations
 
@@ -6,11 +6,20 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import msgspec
+import numpy as np
 import pytest
+from tests.line_problem import SETTINGS, Line
 from tests.recordings import record_trial
 
+from holdfast.arrays import FloatArray, IntArray
 from holdfast.config.loader import Configuration, load
+from holdfast.outcome import TrialResult
+from holdfast.planning import Planner
+from holdfast.randomness import Stream
 from holdfast.recording.belief_remarks import belief_remarks
+from holdfast.recording.recorder import Recorder
+from holdfast.robot.trial import SensingStep, run_trial
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -57,6 +66,72 @@ class TestAngles:
         assert remark.startswith("heading (rad) lay on both sides of a whole turn in ")
         assert "give wrapping_heading circular = (2,)" in remark
         assert not remarks_on(configuration, configuration.problem, 0)
+
+
+class Beacon(Line):
+    """A robot on a line that looks for a beacon, which does not move."""
+
+    state_labels = ("robot (m)", "beacon (m)")
+    noise = np.array([0.1, 0.0])
+
+    def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
+        moved = states + self.noise * stream.normal(states.shape)
+        moved[..., :1] += actions
+        return moved
+
+    def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
+        return np.clip(states[..., 1:] - states[..., :1], -0.1, 0.1)
+
+    def is_goal(self, states: FloatArray) -> Any:
+        return np.zeros(states.shape[:-1], dtype=bool)
+
+
+class TestDepletion:
+    def recorded(self, problem: Any) -> tuple[list[str], TrialResult, list[int]]:
+        settings = msgspec.structs.replace(SETTINGS, sensing_interval=1)
+        planner = Planner(problem, settings)
+        distinct: list[int] = []
+
+        class Both(Recorder):
+            def sensed(self, step: SensingStep) -> None:
+                super().sensed(step)
+                distinct.append(step.observation_info.distinct_particles)
+
+        recorder = Both(0, planner)
+        result = run_trial(planner, seed=5, max_steps=60, observer=recorder)
+        return belief_remarks(problem, settings, recorder.record), result, distinct
+
+    def test_what_does_not_move_is_told(self) -> None:
+        (remark,), result, _ = self.recorded(Beacon())
+        assert remark.startswith("beacon (m) does not move, and by step 58 its particles had 1 ")
+        assert "docs/problems.md, What does not move" in remark
+        # The robot's own coordinate is another one in each particle.
+        assert result.fewest_distinct_particles == 30
+
+    def test_nothing_is_told_of_what_moves_a_little(self) -> None:
+        class Drifting(Beacon):
+            noise = np.array([0.1, 0.03])
+
+        remarks, _, _ = self.recorded(Drifting())
+        assert not remarks
+
+    def test_nor_of_a_switch(self) -> None:
+        class Switch(Beacon):
+            def initial_states(self, stream: Stream, count: int) -> FloatArray:
+                return np.sign(stream.normal((count, 2)))
+
+        remarks, _, _ = self.recorded(Switch())
+        assert not remarks
+
+    def test_info_and_result_count_what_is_left(self) -> None:
+        class Still(Beacon):
+            noise = np.zeros(2)
+
+        remarks, result, distinct = self.recorded(Still())
+        assert distinct[0] == 30
+        assert distinct == sorted(distinct, reverse=True)
+        assert result.fewest_distinct_particles == distinct[-1] == 1
+        assert len(remarks) == 1  # the robot moves
 
 
 @pytest.mark.parametrize("name", ["peg_in_hole_2d", "light_dark_room", "corridor_doors"])

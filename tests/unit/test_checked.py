@@ -196,7 +196,7 @@ class Rough(Line):
         self, states: FloatArray, sensing_action: int, observation: FloatArray
     ) -> FloatArray:
         away = states[:, sensing_action] - observation[0]
-        return -50.0 * away * away
+        return np.asarray(-50.0 * away * away)
 
     def sample_observation(
         self, state: FloatArray, sensing_action: int, stream: Stream
@@ -252,3 +252,30 @@ class TestStreams:
         environment.perform(np.zeros(1))
         with pytest.raises(ProblemError, match="kept from an earlier call cannot be drawn from"):
             environment.perform(np.zeros(1))
+
+
+class TestPredictions:
+    @pytest.mark.parametrize("sizes", [(1, 1, 1), (1, 3, 2), (3, 1, 1), (2, 1, 4)])
+    @pytest.mark.parametrize("varying", [(), (0,), (1,), (2,), (0, 1, 2)])
+    def test_they_stand_one_below_the_other(
+        self, sizes: tuple[int, ...], varying: tuple[int, ...]
+    ) -> None:
+        class Mixed(Line):
+            sensing_actions = ("a", "b", "c")
+
+            def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray:
+                columns = np.arange(sizes[sensing_action])
+                return np.asarray(states[..., :1] + 10.0 * sensing_action + columns)
+
+            def observation_variance(self, states: FloatArray, sensing_action: int) -> FloatArray:
+                own = 0.1 * (1.0 + sensing_action) + np.arange(sizes[sensing_action])
+                return np.asarray(own + states[..., :1] ** 2 if sensing_action in varying else own)
+
+        states = np.random.default_rng(2).normal(size=(7, 2))
+        found, means, variances = checked.predictions(Mixed(), states, range(3))
+        assert found == list(sizes)
+        assert variances.shape == (sum(sizes), 7 if varying else 1)
+        each = [checked.prediction(Mixed(), states, action) for action in range(3)]
+        assert means.tobytes() == np.vstack([mean.T for mean, _ in each]).tobytes()
+        wide = [np.broadcast_to(variance, mean.shape).T for mean, variance in each]
+        assert np.broadcast_to(variances, means.shape).tobytes() == np.vstack(wide).tobytes()

@@ -8,7 +8,7 @@ import pytest
 from holdfast import estimators as estimation
 from holdfast.arrays import FloatArray
 from holdfast.errors import InvalidValueError
-from holdfast.estimators import GaussianMixture, NearestNeighbor
+from holdfast.estimators import GaussianMixture, NearestNeighbor, PriorNeighbors
 
 # Sums of up to some thousand terms, the same but for rounding.
 TOLERANCE = 1e-9
@@ -27,7 +27,7 @@ COUNTS = [6, 50, 100, 1500]
 def entropy(
     points: FloatArray,
     weights: FloatArray | None = None,
-    estimator: NearestNeighbor | GaussianMixture | None = None,
+    estimator: NearestNeighbor | PriorNeighbors | GaussianMixture | None = None,
 ) -> float:
     estimate = estimation.entropy(points, weights, estimator)
     assert isinstance(estimate, float)
@@ -267,8 +267,42 @@ class TestDefaults:
     def test_weights_and_estimator(self) -> None:
         points, _ = draw(100)
         expected = entropy(points, np.ones(100), NearestNeighbor(5, 1e-3))
-        assert entropy(points) == expected
-        assert estimation.entropy(points.tolist()) == expected
+        assert entropy(points) == pytest.approx(expected, abs=1e-12)
+        assert estimation.entropy(points.tolist()) == entropy(points)
+
+    @pytest.mark.parametrize("scale", [1e-140, 1e-9, 1e-6, 1.0, 1e6, 1e140])
+    def test_the_unit_does_not_matter(self, scale: float) -> None:
+        points, weights = draw(100)
+        for estimator in (None, NearestNeighbor(3), PriorNeighbors(np.full(100, 0.01))):
+            usual, found = (
+                entropy(points, weights, estimator),
+                entropy(scale * points, weights, estimator),
+            )
+            assert found == pytest.approx(usual + 3.0 * np.log(scale), abs=1e-9)
+        # Of a Gaussian it is right at every scale: 3 nats off would be a scale that is taken for 1.
+        normal = np.random.default_rng(4).normal(size=(2000, 1))
+        exact = 0.5 * np.log(2.0 * np.pi * np.e) + np.log(scale)
+        assert entropy(scale * normal) == pytest.approx(exact, abs=0.1)
+
+    def test_what_is_far_away_or_weighs_nothing_does_not_set_the_scale(self) -> None:
+        points = np.random.default_rng(4).normal(size=(500, 1))
+        sharp = entropy(points, None, NearestNeighbor(5, 1e-9))
+        far = np.vstack([points, [[1e6]]])
+        assert entropy(far) == pytest.approx(entropy(far, None, NearestNeighbor(5, 1e-9)), abs=1e-9)
+        weights = np.append(np.ones(500), 1e-30)
+        assert entropy(far, weights) == pytest.approx(sharp, abs=1e-6)
+        assert entropy(far, np.append(np.ones(500), 0.0)) == entropy(points)
+
+    def test_where_most_points_are_equal_the_others_have_a_scale(self) -> None:
+        tied = np.vstack([np.zeros((60, 2)), np.random.default_rng(4).normal(size=(40, 2))])
+        assert np.isfinite(entropy(tied))
+        assert entropy(1e-6 * tied) == pytest.approx(entropy(tied) + 2.0 * np.log(1e-6))
+
+    @pytest.mark.parametrize("points", [np.full((9, 2), 0.3), np.zeros((1, 1))])
+    def test_equal_points_have_no_scale(self, points: np.ndarray) -> None:
+        with pytest.raises(InvalidValueError, match=r"have no scale .*NearestNeighbor\(res"):
+            estimation.entropy(points)
+        assert np.isfinite(entropy(points, None, NearestNeighbor(1, 0.1)))
 
     def test_form_of_the_result(self) -> None:
         points, weights = draw(30)

@@ -142,6 +142,26 @@ def test_what_an_environment_keeps_may_change() -> None:
     assert len(digests) == 1
 
 
+@pytest.mark.parametrize("kind", ["later", "in the background"])
+def test_what_waits_is_kept_as_it_came(kind: str) -> None:
+    """The environment shows the next observation in the same array."""
+    buffer = np.zeros(1)
+
+    class Reusing(SimulatedEnvironment):
+        def perform_sensing(self, sensing_action: int) -> Any:
+            buffer[:] = sensing_action
+            return buffer
+
+    reusing = Reusing(PegInHole2D(), 5, 0)
+    robot: Any = SenseLater(reusing, 1) if kind == "later" else SenseInBackground(reusing)
+    for sensing_action in (1, 2, 0):
+        robot.perform_sensing(sensing_action)
+    robot.perform(ACTION)
+    if kind != "later":
+        robot.close()
+    assert [float(shown[0]) for _, shown in robot.late_observations()] == [1.0, 2.0, 0.0]
+
+
 @pytest.mark.parametrize("what", ["motion", "observation"])
 @pytest.mark.parametrize(
     "shown", ["abc", [[1], [1, 2]], np.zeros((2, 2)), [], [1j], np.zeros(5000)]

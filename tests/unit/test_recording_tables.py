@@ -60,6 +60,7 @@ class TestTables:
             "lost",
             "suspect_sensors",
             "missing_observations",
+            "fewest_distinct_particles",
             "outcome",
             "reason",
         )
@@ -122,6 +123,13 @@ class TestTables:
         summary = builder.build(problem="p", seed=5, version="1", trials=3, wall_time_s=2.0)
         assert summary.missing_observations == 3
         assert dict(_summary_rows(summary))["no reading"] == "3 of 15 looks had no observation"
+    def test_the_fewest_particles_are_those_of_the_worst_trial(self) -> None:
+        builder = SummaryBuilder()
+        for trial, fewest in enumerate((None, 300, 4, 20)):
+            result = result_of(trial)
+            builder.add(msgspec.structs.replace(result, fewest_distinct_particles=fewest))
+        summary = builder.build(problem="p", seed=5, version="1", trials=4, wall_time_s=2.0)
+        assert json.loads(summary.to_json())["fewest_distinct_particles"] == 4
 
     def test_failures_are_no_successes_and_told_if_there_are_any(self) -> None:
         builder = SummaryBuilder()

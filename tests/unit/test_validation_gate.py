@@ -37,6 +37,42 @@ def test_the_distance_is_that_of_the_whole_covariance(size: int, varying: bool) 
     assert _squared_distance(observed, mean, variance, weights) == pytest.approx(expected)
 
 
+@pytest.mark.parametrize("variance", [1e-2, 1e-8, 1e-16, 1e-20])
+@pytest.mark.parametrize("varying", [False, True])
+def test_two_channels_that_show_the_same(variance: float, varying: bool) -> None:
+    """Their mean and their difference are independent, which gives the distance exactly."""
+    draws = np.random.default_rng(7)
+    deviation, count = np.sqrt(variance), 100
+    outside = 0
+    for _ in range(300):
+        place = draws.normal(size=(count, 1))
+        shown = draws.normal() + deviation * draws.normal(size=2)
+        weights = draws.dirichlet(np.ones(count))
+        noise = np.full((count, 2) if varying else 2, variance)
+        found = _squared_distance(shown, np.repeat(place, 2, axis=1), noise, weights)
+        spread = float(weights @ (place[:, 0] - weights @ place[:, 0]) ** 2)
+        middle = shown.mean() - float(weights @ place[:, 0])
+        expected = middle**2 / (spread + variance / 2) + (shown[0] - shown[1]) ** 2 / (2 * variance)
+        # A number near 1 is rounded by 1e-16, which is much beside a deviation of 1e-10.
+        assert found == pytest.approx(expected, rel=1e-6, abs=20.0 * (1e-16 / deviation) ** 1.0)
+        outside += found > gate(2)
+    # The belief is the truth's, up to the sample of it: 3 are expected, more than 15 not in 1e-6.
+    assert outside <= 15
+
+
+@pytest.mark.parametrize("size", [2, 5])
+@pytest.mark.parametrize("scale", [1e-150, 1e-5, 1e5, 1e140])
+def test_units_do_not_matter(size: int, scale: float) -> None:
+    draws = np.random.default_rng(3)
+    mean, observed = draws.normal(size=(40, size)), draws.normal(size=size)
+    weights, variance = np.full(40, 1 / 40), np.full(size, 0.1)
+    usual = _squared_distance(observed, mean, variance, weights)
+    units = np.ones(size)
+    units[0] = scale
+    found = _squared_distance(observed * units, mean * units, variance * units * units, weights)
+    assert found == pytest.approx(usual, rel=1e-9)
+
+
 class TwoDoors:
     """Observes the coordinates of the state."""
 

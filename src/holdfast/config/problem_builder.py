@@ -22,6 +22,7 @@ from holdfast.config.user_code import account_of_user_error, in_words
 from holdfast.config.validation import shown
 from holdfast.config.yaml_document import Document
 from holdfast.errors import ConfigurationError, HoldfastError, UnknownProblemError
+from holdfast.floating_mode import in_own_mode
 from holdfast.problem_attributes import (
     GAUSSIAN_OBSERVATIONS,
     has_general_observations,
@@ -132,6 +133,7 @@ class BuiltProblem(NamedTuple):
     unlisted: tuple[str, ...]
 
 
+@in_own_mode
 def build_from(source: Source, name: str, problem_class: type) -> BuiltProblem:
     """Build the problem of a configuration from its two sections."""
     resolved: dict[str, dict[str, Any]] = {}

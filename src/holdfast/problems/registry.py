@@ -17,6 +17,7 @@ import msgspec
 from holdfast.arrays import plain
 from holdfast.config.validation import close_match
 from holdfast.errors import InvalidValueError, UnknownProblemError
+from holdfast.floating_mode import in_own_mode
 from holdfast.problems.problem import Problem
 
 __all__ = ["BUILT_IN", "BuiltIn", "make", "names", "problem_class", "problem_module"]
@@ -59,6 +60,7 @@ def names() -> list[str]:
     return sorted({*BUILT_IN, *registered_names(GROUP)})
 
 
+@in_own_mode
 def make(name: str, **settings: Any) -> Problem:
     """Build a problem by its registered name, or ``module:Class``.
 

@@ -1,12 +1,14 @@
-"""What a trial's beliefs tell about its settings: angles taken for numbers, and several modes.
+"""What a trial's beliefs tell: angles taken for numbers, several modes, and few particles left.
 
-Both make a robot slow or stop it, and neither looks like an error. A heading of which half of the
-particles say 3.1 and half -3.1 has a mean of 0; and the mean of a belief with several modes is
-where the robot is not.
+All make a robot slow or stop it, and none looks like an error. A heading of which half of the
+particles say 3.1 and half -3.1 has a mean of 0; the mean of a belief with several modes is where
+the robot is not; and of what does not move, resampling leaves copies of one particle, which are
+certain and wrong.
 """
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ import numpy as np
 from holdfast.arrays import FloatArray
 from holdfast.circular import unwrapped
 from holdfast.config.settings import PlanningSettings
+from holdfast.floating_mode import in_own_mode
 from holdfast.modes import heaviest_mode
 from holdfast.problem_attributes import circular_states, name_of, state_labels
 from holdfast.recording.recorder import TrialRecord
@@ -23,14 +26,19 @@ __all__ = ["belief_remarks"]
 _SHARE = 0.2
 """Of the beliefs after an observation, from which on it is worth a remark."""
 
+_FEW = 0.03
+"""Of the values that a coordinate had at first: what is left of a depleted one."""
 
+
+@in_own_mode
 def belief_remarks(problem: Any, settings: PlanningSettings, record: TrialRecord) -> list[str]:
     """Return what a user should know of the beliefs after a trial's observations; mostly nothing.
 
     A coordinate counts as an angle that wraps if its label has the unit rad, and its particles
     span more than half a circle as numbers, but less than that on the circle. Several modes are
     told of where the trial failed: a sharp observation may leave particles in a few heaps, too,
-    which does no harm.
+    which does no harm. A coordinate that does not move is told of if hardly any of the values are
+    left that its particles had at first, unless these were few, as those of a switch.
     """
     count = len(record.sensing)
     remarks: list[str] = []
@@ -45,6 +53,13 @@ def belief_remarks(problem: Any, settings: PlanningSettings, record: TrialRecord
                 f"averaged as a number: give {name_of(problem)} circular = ({coordinate},), so "
                 "that pi is -pi"
             )
+    for at, least, step in _depleted(record):
+        label = problem.state_labels[at] if problem.state_labels else f"coordinate {at} of a state"
+        remarks.append(
+            f"{label} does not move, and by step {step} its particles had {least} different values "
+            "left, of which the belief may be certain and wrong: give it some noise in move, or "
+            "take more particles (docs/problems.md, What does not move)"
+        )
     failed = record.result is not None and not record.result.success
     if failed and not remarks and settings.particle_filter.estimate == "mean":
         several = sum(
@@ -57,6 +72,23 @@ def belief_remarks(problem: Any, settings: PlanningSettings, record: TrialRecord
                 "where the robot is not: particle_filter.estimate: heaviest_mode takes one of them"
             )
     return remarks
+
+
+def _depleted(record: TrialRecord) -> list[tuple[int, int, int]]:
+    """Return the depleted coordinates, with the values left at the last observation, and its step.
+
+    Of what does not move the particles have after a move the values that they had before it.
+    """
+    steps = record.sensing
+    found = []
+    for at in range(steps[0].before.shape[1] if len(steps) > 1 else 0):
+        first, last = (len(np.unique(step.before[:, at])) for step in (steps[0], steps[-1]))
+        varied = 2 * first > len(steps[0].before)
+        if varied and last <= max(1.0, _FEW * first):
+            pairs = itertools.pairwise(steps)
+            if all(np.array_equal(one.after[:, at], two.before[:, at]) for one, two in pairs):
+                found.append((at, last, steps[-1].step))
+    return found
 
 
 def _wraps(states: FloatArray, coordinate: int) -> bool:

@@ -32,6 +32,7 @@ from holdfast import checked, numerics
 from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration
 from holdfast.files import write_atomically
+from holdfast.floating_mode import in_own_mode
 from holdfast.outcome import Outcome
 from holdfast.problem_attributes import choice_labels, circular_states, state_labels
 from holdfast.problems.problem import Problem, Scene
@@ -105,6 +106,7 @@ STYLE: Any = {
 }
 
 
+@in_own_mode
 def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) -> None:
     """Draw a trial and write the picture as PNG.
 

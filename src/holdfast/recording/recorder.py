@@ -8,6 +8,7 @@ import numpy as np
 
 from holdfast.arrays import FloatArray
 from holdfast.belief import Belief, estimate, standard_deviation
+from holdfast.floating_mode import in_own_mode
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner, PlanningState
 from holdfast.problem_attributes import circular_states
@@ -98,6 +99,7 @@ class Recorder(TrialObserver):
             self.record = TrialRecord()
             self._keep_true_state(environment)
 
+    @in_own_mode
     def sensed(self, step: SensingStep) -> None:
         """Keep a sensing step."""
         if not self._keeps(step.before):
@@ -115,6 +117,7 @@ class Recorder(TrialObserver):
             )
         )
 
+    @in_own_mode
     def acted(self, step: TaskStep) -> None:
         """Keep a step."""
         if not self._keeps(step.state):
@@ -126,6 +129,7 @@ class Recorder(TrialObserver):
         self.record.actions.append(np.array(step.executed, dtype=np.float64))
         self.record.rewards.append(float("nan") if step.reward is None else float(step.reward))
 
+    @in_own_mode
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
         """Keep the last belief and the outcome."""
         if state.trial != self.trial:

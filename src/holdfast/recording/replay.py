@@ -30,6 +30,7 @@ from holdfast.errors import (
     HoldfastError,
     UntrustedCodeError,
 )
+from holdfast.floating_mode import in_own_mode
 from holdfast.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
 from holdfast.planning import Planner, PlanningState, digest
 from holdfast.protocol.records import decisions_of, reinitialised_after
@@ -290,6 +291,7 @@ class _Replay(TrialObserver):
         for sink in self._output.at(begin.time_ns, between_trials=True):
             sink.trial_begins(begin)
 
+    @in_own_mode
     def sensed(self, step: SensingStep) -> None:
         number, after = step.before.step, step.after
         state_digest = digest(after)
@@ -319,6 +321,7 @@ class _Replay(TrialObserver):
         self._state = after
         self._sensed_step = number
 
+    @in_own_mode
     def acted(self, step: TaskStep) -> None:
         number = step.state.step
         action = np.array(step.executed, dtype=np.float64)
@@ -343,6 +346,7 @@ class _Replay(TrialObserver):
         self._steps = number + 1
         self._state = None  # the next one is not known before something is done in it
 
+    @in_own_mode
     def observed_late(self, step: LateStep) -> None:
         number = step.after.step
         # With the move before, or, if the robot was killed meanwhile, after it has sensed again.
@@ -365,6 +369,7 @@ class _Replay(TrialObserver):
         if self._state is not None:
             self._state = state
 
+    @in_own_mode
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
         if self._result is None or result.decisions != self._result.decisions:
             raise DecidedOtherwiseError(self._trial, result.steps, None)

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator
 import msgspec
 import numpy as np
 
+from holdfast.floating_mode import in_own_mode
 from holdfast.outcome import TRIAL_COLUMNS, TrialResult
 from holdfast.printable import cell
 from holdfast.recording.timings import AnswerCounts, VerificationCounts
@@ -50,6 +51,8 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         Observations that no particle explains.
     lost, suspect_sensors : int
         Times that the robot was found lost, and a sensing action suspect.
+    fewest_distinct_particles : int or None
+        The least number of different particles that an observation weighed, in any trial.
     recoveries : int
         Times that the local service took over, in all processes of the run.
     sensing_decisions_by_service, task_answers_by_service, longest_wait_ms
@@ -83,6 +86,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     unexplained_observations: int
     lost: int = 0
     suspect_sensors: int = 0
+    fewest_distinct_particles: int | None = None
     recoveries: int
     sensing_decisions_by_service: dict[str, int] | None = None
     task_answers_by_service: dict[str, int] | None = None
@@ -163,6 +167,7 @@ class SummaryBuilder:
         self._unexplained = 0
         self._lost = 0
         self._suspect_sensors = 0
+        self._distinct: int | None = None
         self._recoveries = 0
         self._sensing_ms = array("f")
         self._digest = hashlib.blake2b(digest_size=32)
@@ -181,10 +186,13 @@ class SummaryBuilder:
         self._unexplained += result.unexplained_observations
         self._lost += result.lost
         self._suspect_sensors += result.suspect_sensors
+        if (distinct := result.fewest_distinct_particles) is not None:
+            self._distinct = min(distinct, self._distinct or distinct)
         self._recoveries += result.recoveries
         self._sensing_ms.extend(result.sensing_ms)
         self._digest.update(bytes.fromhex(result.digest))
 
+    @in_own_mode
     def build(
         self,
         *,
@@ -220,6 +228,7 @@ class SummaryBuilder:
             unexplained_observations=self._unexplained,
             lost=self._lost,
             suspect_sensors=self._suspect_sensors,
+            fewest_distinct_particles=self._distinct,
             recoveries=self._recoveries,
             **{} if answers is None else answers._asdict(),
             **{} if verified is None else verified._asdict(),

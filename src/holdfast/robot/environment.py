@@ -25,6 +25,7 @@ from holdfast.config.settings import EnvironmentSettings
 from holdfast.config.user_code import find_class
 from holdfast.config.user_modules import find_in
 from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
+from holdfast.floating_mode import in_own_mode
 from holdfast.outcome import Done, MoveResult
 from holdfast.problem_attributes import check_sizes, has_general_observations
 from holdfast.problems.problem import Problem, ProblemBase
@@ -158,6 +159,7 @@ class SimulatedEnvironment(KeepsReadOnly):
         Task actions performed so far.
     """
 
+    @in_own_mode
     def __init__(self, problem: Problem, seed: int, trial: int = 0) -> None:
         self._problem = problem
         self._seed = seed = whole("seed", seed, 0, 2**63 - 1)
@@ -178,6 +180,7 @@ class SimulatedEnvironment(KeepsReadOnly):
             environment.perform(action)
         return environment
 
+    @in_own_mode
     def perform_sensing(self, sensing_action: int) -> FloatArray:
         """Draw an observation of the true state.
 
@@ -204,6 +207,7 @@ class SimulatedEnvironment(KeepsReadOnly):
             checked.require_usable(problem, sensing_action, mean, variance)
         return shown
 
+    @in_own_mode
     def perform(self, task_action: FloatArray) -> float | MoveResult | None:
         """Move the true state by an executed task action and return the reward.
 
@@ -227,6 +231,7 @@ class SimulatedEnvironment(KeepsReadOnly):
         self.state, self.step = state, step + 1
         return MoveResult(reward, motion, observation) if self._moves_show else reward
 
+    @in_own_mode
     def is_done(self) -> bool:
         """Return whether the true state is a goal."""
         return checked.is_goal(self._problem, self.state)

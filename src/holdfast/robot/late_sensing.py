@@ -7,6 +7,7 @@ was taken (:mod:`holdfast.tracking`).
 
 from __future__ import annotations
 
+import copy
 import threading
 from collections import deque
 from typing import Any
@@ -96,7 +97,7 @@ class SenseInBackground(_Around):
     def _sense(self, step: int, sensing_action: int) -> None:
         try:
             shown = self._environment.perform_sensing(sensing_action)
-            self._came.append((step, shown))  # type: ignore[arg-type]
+            self._came.append((step, copy.deepcopy(shown)))  # type: ignore[arg-type]
         except BaseException as error:  # noqa: BLE001 - raised again where it can be heard
             self._failed = step, error
 
@@ -128,7 +129,8 @@ class SenseLater(_Around):
     def perform_sensing(self, sensing_action: int) -> Later:
         """Sense, and keep the observation."""
         shown = self._environment.perform_sensing(sensing_action)
-        self._due.append((self._step, shown))  # type: ignore[arg-type]
+        # A copy: the environment may show the next one in the same array.
+        self._due.append((self._step, copy.deepcopy(shown)))  # type: ignore[arg-type]
         return LATER
 
     def late_observations(self) -> list[tuple[int, npt.ArrayLike]]:

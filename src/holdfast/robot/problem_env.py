@@ -28,6 +28,7 @@ from holdfast.arrays import FloatArray, floats_or_none, integer, whole
 from holdfast.belief import Belief, standard_deviation
 from holdfast.config.settings import Method, PlanningSettings, SimulatorSettings, check_settings
 from holdfast.errors import InvalidValueError
+from holdfast.floating_mode import in_own_mode
 from holdfast.outcome import Ending, MoveResult, ending_of
 from holdfast.planning import Planner, PlanningState
 from holdfast.problem_attributes import (
@@ -126,6 +127,7 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - as gymnasium declares it
 
+    @in_own_mode
     def __init__(
         self,
         problem: str | Problem,
@@ -184,6 +186,7 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
         """What the planner knows; after ``reset``."""
         return self._running()[0].state
 
+    @in_own_mode
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
@@ -205,6 +208,7 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
         self._sensing_steps = 0
         return self._observation(), self._info()
 
+    @in_own_mode
     def step(self, action: SupportsIndex) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Sense what the agent has chosen, then move until the robot senses again."""
         track, world = self._running()
@@ -231,6 +235,7 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
             info["digest"] = track.result(self._ending).digest
         return self._observation(), total, terminated, truncated, info
 
+    @in_own_mode
     def choose(self, method: Method | None = None) -> int:
         """Return what one of holdfast's own methods would choose now; None: the settings'.
 

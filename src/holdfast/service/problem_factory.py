@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 
 from holdfast.errors import HoldfastError, OtherCodeError, UnknownProblemError
+from holdfast.floating_mode import in_own_mode
 from holdfast.problems import registry
 from holdfast.problems.problem import Problem
 from holdfast.protocol.messages import SessionConfiguration
@@ -68,6 +69,7 @@ class ProblemFactory:
         with self._lock:
             return self._build(session_configuration)
 
+    @in_own_mode
     def _build(self, session_configuration: SessionConfiguration) -> Problem:
         name = session_configuration.problem
         found = self._classes.get(name) or self._registered(name)
