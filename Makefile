@@ -147,15 +147,15 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(INSTALLED_FIGURES): pyproject.toml $(NATIVE_SOURCES) | $(BIN)/python
-	$(BIN)/python -m pip install --disable-pip-version-check -q -e ".[figures,service]"
+	@cmake/pip_install $(BIN)/python $(VENV)/pip.log -e ".[figures,service]"
 	@touch $@
 
 $(INSTALLED_DEV): pyproject.toml $(NATIVE_SOURCES) | $(BIN)/python
-	$(BIN)/python -m pip install --disable-pip-version-check -q -e ".[dev]"
+	@cmake/pip_install $(BIN)/python $(VENV)/pip.log -e ".[dev]"
 	@touch $(INSTALLED_FIGURES) $@
 
 # The sources are copied into it, so whatever of them changes is installed again.
 $(INSTALLED_COMPILED): pyproject.toml $(NATIVE_SOURCES) $(PACKAGE_SOURCES) | $(BIN)/python
 	$(BIN)/python -m venv $(COMPILED)
-	HOLDFAST_COMPILED=1 $(COMPILED)/bin/python -m pip install --disable-pip-version-check -q ".[test]"
+	@HOLDFAST_COMPILED=1 cmake/pip_install $(COMPILED)/bin/python $(COMPILED)/pip.log ".[test]"
 	@touch $@

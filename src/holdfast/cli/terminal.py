@@ -275,7 +275,8 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
         rows.append(("no reading", f"{shown} had no observation"))
     if summary.unexplained_observations:
         deviations = f"{VALIDATION_GATE_SQUARED**0.5:g}"
-        number, looks = summary.unexplained_observations, summary.sensing_decisions
+        number = summary.unexplained_observations
+        looks = summary.sensing_decisions - summary.missing_observations
         # Of the moves that have shown something there is no number here.
         shown = counted(looks, "observation") if number <= looks else "the looks and moves"
         far = f"{number:,} of {shown} over {deviations} sigma from every particle"

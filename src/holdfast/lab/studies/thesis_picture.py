@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 
 from holdfast.arrays import FloatArray
@@ -158,11 +159,24 @@ def _draw_answers(panel: Axes, table: pd.DataFrame) -> None:
     milliseconds(panel, "from question to answer (ms)")
     low, high = panel.get_ylim()
     panel.set_ylim(low / 1.6, high * 1.6)
-    handles = [
-        Line2D([], [], marker="D", linestyle="", color="#4A4F57", markerfacecolor=face, label=label)
-        for face, label in (("#4A4F57", "what to sense"), ("white", "what to do until then"))
-    ]
-    panel.legend(handles=handles, loc="lower right", markerscale=0.7, fontsize=8.5)
+    handles = {
+        label: tuple(
+            Line2D([], [], marker=MARKERS[at], linestyle="", color=COLORS[at], markerfacecolor=face)
+            for at, face in enumerate(faces)
+        )
+        for label, faces in (
+            ("what to sense", COLORS[:2]),
+            ("what to do until then", ("white", "white")),
+        )
+    }
+    panel.legend(
+        list(handles.values()),
+        list(handles),
+        loc="lower right",
+        handler_map={tuple: HandlerTuple(None)},
+        markerscale=0.8,
+        fontsize=8.5,
+    )
 
 
 def _draw_moments(panels: Sequence[Axes], kill: _Kill) -> None:
