@@ -156,6 +156,21 @@ class TestReplayWindow:
                 came.add(counter)
                 assert window.newest == max(came)
 
+    @pytest.mark.parametrize("behind", [0, 1, WINDOW - 1, WINDOW, WINDOW + 1, 2 * WINDOW])
+    def test_no_replay_is_fresh_wherever_the_window_is(self, behind: int) -> None:
+        """Also at its edges, whether the newest is reached step by step or in one."""
+        for counters in (range(behind + 1), (0, behind)):
+            window = ReplayWindow()
+            for counter in counters:
+                window.note(counter)
+            assert window.newest == behind
+            assert not window.is_fresh(0)
+        # What has not come is fresh as long as the window can tell.
+        window = ReplayWindow()
+        window.note(behind)
+        assert window.is_fresh(0) == (0 < behind < WINDOW)
+        assert window.is_fresh(behind + 1)
+
     def test_none_is_lost_when_all_come(self) -> None:
         window = ReplayWindow()
         for counter in range(1000):

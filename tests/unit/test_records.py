@@ -32,6 +32,7 @@ PROBLEM = PegInHole2D()
 PLANNING = PlanningSettings(
     particle_filter=ParticleFilterSettings(num_particles=12), sensing_interval=3
 )
+PLANNING_EACH_STEP = msgspec.structs.replace(PLANNING, sensing_interval=0)
 RECORDS: list[Record] = [
     ObservedRecord(8, 1, encode_floats([0.5]), bytes(32), 1.5),
     ActingRecord(8, encode_floats([0.25, -0.5, 0.0])),
@@ -112,3 +113,20 @@ def test_when_a_belief_was_begun_anew_is_in_the_records() -> None:
         ReinitialisedRecord(2, bytes(32)),
     ]
     assert reinitialised_after(records) == {2, 4}
+
+
+def test_a_lost_robot_stays_lost_when_an_explained_observation_comes_late() -> None:
+    """It held still, or was killed, before the new belief was written down."""
+    history = TrialHistory(Planner(PROBLEM, PLANNING_EACH_STEP), 5, 0, 1.0)
+    explained = history.planner.problem.observation_mean(history.state.belief.states[:1], 0)[0]
+    history.observed(0, None, 0.0)
+    history.pending = np.zeros(3)
+    history.performed(PerformedRecord(0, None))
+    history.observed(0, np.full(1, 1e6), 0.0)
+    assert history.is_lost
+    found = history.came_late(LateObservation(0, explained))
+    assert found is not None
+    assert found[0].within_gate
+    assert history.is_lost
+    history.reinitialised()
+    assert not history.is_lost

@@ -119,3 +119,80 @@ class TestRequestQueue:
         self.finish(first)
         self.finish(second)
         assert (self.queue.num_running, self.queue.num_waiting) == (0, 0)
+
+
+class TestTheWait:
+    """Four workers; each task is expected to take 50 ms."""
+
+    def setup_method(self) -> None:
+        self.limits = ServiceLimits(max_wait_ms=100.0)
+        self.queue = RequestQueue(4, self.limits)
+
+    def add(
+        self, number: int, owner: str | None = None, *, size: int = 10, newcomer: bool = False
+    ) -> None:
+        robot = Robot(key=number)
+        request = robot.request()
+        session = Session(
+            (owner, request.session),
+            request,
+            robot.session_configuration,
+            ExpectedTime(0.05),
+            ExpectedTime(0.05),
+        )
+        session.newcomer = newcomer
+        task = PendingTask(
+            session, b"%d" % number, sensing=True, request=request, state=None, size=size, since=0.0
+        )
+        self.queue.enqueue(task)
+
+    def overloaded(self, owner: str | None = None, *, newcomer: bool = False) -> bool:
+        return self.queue.is_overloaded(0.0, owner, newcomer=newcomer)
+
+    def test_the_longest_wait_is_that_of_all_workers_together(self) -> None:
+        for number in range(8):
+            self.add(number)
+        assert self.queue.wait_s(0.0, None, newcomer=False) == pytest.approx(0.1)
+        assert not self.overloaded()
+        self.add(8)
+        assert self.overloaded()
+
+    def test_nobody_is_turned_away_while_a_worker_is_free(self) -> None:
+        self.limits = ServiceLimits(max_waiting=1, max_wait_ms=1.0)
+        self.queue = RequestQueue(4, self.limits)
+        for number in range(3):
+            self.add(number)
+            assert not self.overloaded()
+        self.add(3)
+        assert self.overloaded()
+
+    @pytest.mark.parametrize("bound", ["max_waiting", "max_waiting_bytes"])
+    def test_half_of_the_room_is_kept_for_those_that_were_served(self, bound: str) -> None:
+        limits = {"max_waiting": 16, "max_waiting_bytes": 16_000, "max_wait_ms": 1e6}
+        limits["max_waiting_bytes" if bound == "max_waiting" else "max_waiting"] = 10**6
+        self.queue = RequestQueue(4, ServiceLimits(**limits))  # type: ignore[arg-type]
+        for number in range(16):
+            assert not self.overloaded()
+            assert self.overloaded(newcomer=True) == (number >= 8)
+            self.add(number, size=1000, newcomer=True)
+        assert not self.overloaded()  # of those that go before it, none waits
+        self.queue = RequestQueue(4, ServiceLimits(**limits))  # type: ignore[arg-type]
+        for number in range(16):
+            assert not self.overloaded()
+            self.add(number, size=1000)
+        assert self.overloaded()
+
+    def test_one_robot_has_no_more_than_its_share(self) -> None:
+        limits = ServiceLimits(max_waiting_per_robot=6, max_wait_ms=1e6, max_waiting_bytes=1000)
+        self.queue = RequestQueue(4, limits)
+        for number in range(6):
+            assert not self.overloaded("anna")
+            self.add(number, "anna")
+        assert self.overloaded("anna")
+        assert not self.overloaded("berta")
+        assert not self.overloaded()  # those without a certificate are many
+        self.queue = RequestQueue(4, limits)
+        for number in range(5):
+            self.add(number, "anna", size=100)
+            assert self.overloaded("anna") == (number == 4)
+        assert not self.overloaded("berta")

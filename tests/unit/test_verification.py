@@ -407,3 +407,33 @@ def test_without_a_local_service_the_robot_stops_when_all_have_lied() -> None:
     assert isinstance(world.stopped, Halt)
     assert isinstance(world.stopped.error, ServiceRefusedError)
     assert "the robot's own planner" in str(world.stopped.error)
+
+
+def test_two_services_that_give_the_same_wrong_answer_are_both_found_out() -> None:
+    """They agree, so nothing is disputed; the robot's own planner says otherwise."""
+    effects: Effects[RobotEffect] = Effects()
+    verification = Verification(1.0, b"secret", None, PROBLEM, effects)
+    question = question_of(3)
+    for service in ("first", "second", "first"):
+        reply = SensingAnswer(1, question.state.step, 0, question.digest, 0)
+        part = AnswerPart(service, None, reply)
+        verification.take(question, part, Provenance(service, 0.0, 0.0))
+    assert [part.service for part in question.parts] == ["first", "second"]
+    assert not question.disputed
+    while asked := [each for each in effects.take() if isinstance(each, ComputeOwnAnswer)]:
+        for each in asked:
+            verification.decided(OwnAnswer(each.number, (), 1, question.digest), None)
+    wrong = [(each.service, each.step, each.kind) for each in verification.take_wrong()]
+    assert wrong == [("first", 0, "sensing"), ("second", 0, "sensing")]
+    assert verification.take_wrong() == []
+
+
+def test_a_second_liar_that_agrees_with_the_first_is_found_out_in_a_run() -> None:
+    world = World(services=("first", "second"), verify_share=1.0)
+    for name in ("first", "second"):
+        lie(world, name, other_sensing)
+    world.start()
+    world.run()
+    assert world.stopped is None
+    assert {service for service, _ in wrong(world)} == {"first", "second"}
+    assert world.statuses()[-1] == "local_recovery"
