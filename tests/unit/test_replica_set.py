@@ -127,7 +127,10 @@ class TestLateReplies:
 
     def test_one_in_time_begins_anew(self) -> None:
         late, in_time = [(0.0, 0.4), (1.0, 1.4)], [(2.0, 2.25)]
-        assert self.heard(*late, *in_time, *late) == [None] * 5
+        again = [(3.0, 3.4), (4.0, 4.3)]
+        assert self.heard(*late, *in_time, *again) == [None] * 5
+        told = self.heard(*late, *in_time, *again, (5.0, 5.5))
+        assert told[-1] == pytest.approx(0.3)
 
     def test_what_waited_for_the_same_thing_counts_once(self) -> None:
         """A service stood still for a second, and then replies to all that it was asked."""
@@ -227,8 +230,8 @@ def test_pauses_grow_to_a_second_and_end_with_both_parts() -> None:
     for sensing in (False, True):
         service.note_refusal("busy", "no", 20.0, sensing=sensing)
     assert told(service) == "busy: no"
-    service.note_answer(question_at(0), 21.0, sensing=True, restored=False)
-    assert service.usable(21.0)
+    service.note_answer(question_at(0), 20.5, sensing=True, restored=False)
+    assert service.usable(20.5)
     assert (service.backoff_s, service.num_refusals) == (1.0, [1, 0])
     assert told(service) is not None
     service.note_answer(question_at(0), 21.0, sensing=False, restored=False)
@@ -393,3 +396,39 @@ class TestAllOfThem:
                 assert services.hopeless() == at_once
                 replica.distrust("lied")
             assert services.hopeless()
+
+    def test_a_local_service_is_usable_when_it_is_there(self) -> None:
+        assert not ReplicaSet(["cloud"], None, 0.25).local_usable(0.0)
+        services = self.services()
+        assert services.local is not None
+        assert not services.local_usable(0.0)
+        services.local.detector.appeared("b1", 0.0)
+        assert services.local_usable(0.0)
+
+    def test_what_is_said_of_each(self) -> None:
+        services = ReplicaSet(["absent", "gone", "busy", "slow", "failing", "wrong"], "local", 0.25)
+        absent, gone, busy, slow, failing, wrong = services.cloud
+        for replica in (gone, busy, slow, failing, wrong):
+            replica.detector.appeared("b1", 0.0)
+        gone.detector.vanished("b1")
+        slow.detector.suspect("no sign of progress")
+        failing.note_refusal("failed", "no such state", 0.0, sensing=True)
+        wrong.distrust("lied")
+        assert absent.refusal is None
+        assert services.why_lost().split("; ") == [
+            "absent has not appeared",
+            "gone is gone",
+            "busy is busy",
+            "slow no sign of progress",
+            "failing failed: no such state",
+            "wrong lied",
+        ]
+        assert services.why_nobody().split("; ") == [
+            "absent: has not appeared",
+            "gone: is not there",
+            "busy: is busy",
+            "slow: no sign of progress",
+            "failing: failed: no such state",
+            "wrong: wrong_answer: lied",
+            "local: is being launched",
+        ]
