@@ -23,6 +23,7 @@ from holdfast.protocol.records import (
     TrialHistory,
     decode_record,
     encode_record,
+    has_shown,
     reinitialised_after,
     replay,
 )
@@ -130,3 +131,57 @@ def test_a_lost_robot_stays_lost_when_an_explained_observation_comes_late() -> N
     assert history.is_lost
     history.reinitialised()
     assert not history.is_lost
+
+
+def test_an_unexplained_observation_that_comes_late_can_find_it_lost() -> None:
+    history = TrialHistory(Planner(PROBLEM, PLANNING_EACH_STEP), 5, 0, 1.0)
+    history.observed(0, None, 0.0)
+    assert not history.is_lost
+    assert history.came_late(LateObservation(0, np.full(1, 1e6))) is not None
+    assert history.is_lost
+
+
+def test_a_suspect_sensor_is_no_lost_robot() -> None:
+    """Twice outside, and between them another sensor inside."""
+    history = TrialHistory(Planner(PROBLEM, PLANNING_EACH_STEP), 5, 0, 2 / 80)
+    kinds = []
+    for action in (0, 1, 0):
+        inside = history.planner.problem.observation_mean(history.state.belief.states, action)
+        history.observed(action, np.full(1, 1e6) if action == 0 else inside[0], 0.0)
+        kinds.append(None if history.alarm is None else history.alarm.kind)
+        assert not history.is_lost
+        history.pending = np.zeros(3)
+        history.performed(PerformedRecord(history.state.step, None))
+    assert kinds == [None, None, "sensor_suspect"]
+
+
+def test_what_has_begun() -> None:
+    """Any of an input, a step or an action that is in the journal alone."""
+
+    def begun(history: TrialHistory) -> bool:
+        return history.begun
+
+    planner = Planner(PROBLEM, PLANNING)
+    assert not begun(TrialHistory(planner, 1, 0))
+    history = TrialHistory(planner, 1, 0)
+    history.observed(0, None, 0.0)
+    assert begun(history)
+    history = TrialHistory(planner, 1, 0)
+    history.pending = np.zeros(3)
+    assert begun(history)
+    history = TrialHistory(planner, 1, 0)
+    history.state = history.state._replace(step=1)
+    assert begun(history)
+
+
+def test_what_a_record_has_shown() -> None:
+    shown = encode_floats(np.zeros(1))
+    assert not has_shown(PerformedRecord(0, None))
+    assert has_shown(PerformedRecord(0, None, shown))
+    assert has_shown(PerformedRecord(0, None, b"", shown))
+    assert has_shown(LateRecord(2, 0, shown, bytes(32)))
+    assert not has_shown(first_record())
+    anew = ReinitialisedRecord(2, bytes(32))
+    for moved in (PerformedRecord(1, None, shown), PerformedRecord(1, None, b"", shown)):
+        assert reinitialised_after([first_record(), moved, anew]) == {2}
+    assert reinitialised_after([first_record(), PerformedRecord(0, None), anew]) == {1}
