@@ -106,6 +106,9 @@ class TestSealing:
         assert service.decrypt(renumbered.encrypt(b"x")) is None
         other = DatagramCipher(keys, service=True)
         assert other.decrypt(robot.encrypt(b"x")) is None
+        # The number alone is enough, though the nonce would be the right one.
+        same_keys = AssociationKeys(9, keys.to_service, keys.to_robot)
+        assert other.decrypt(DatagramCipher(same_keys, service=False).encrypt(b"x")) is None
 
     def test_no_counter_is_used_beyond_the_bound(
         self, ends: tuple[DatagramCipher, DatagramCipher], monkeypatch: pytest.MonkeyPatch
@@ -116,6 +119,15 @@ class TestSealing:
             robot.encrypt(b"")
         with pytest.raises(KeysExhaustedError, match="association 7 has encrypted 3 datagrams"):
             robot.encrypt(b"")
+
+    def test_none_beyond_the_bound_is_taken(
+        self, ends: tuple[DatagramCipher, DatagramCipher], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Of an end that goes on all the same."""
+        robot, service = ends
+        datagrams = [robot.encrypt(b"x") for _ in range(5)]
+        monkeypatch.setattr(datagram_cipher, "MAX_DATAGRAMS", 3)
+        assert [service.decrypt(each) for each in datagrams] == [b"x"] * 3 + [None] * 2
 
     def test_keys_are_never_the_same_and_not_shown(self) -> None:
         drawn = [AssociationKeys.draw(1) for _ in range(100)]
@@ -155,6 +167,21 @@ class TestReplayWindow:
                 window.note(counter)
                 came.add(counter)
                 assert window.newest == max(came)
+
+    @pytest.mark.parametrize("behind", [0, 1, WINDOW - 1, WINDOW, WINDOW + 1, 2 * WINDOW])
+    def test_no_replay_is_fresh_wherever_the_window_is(self, behind: int) -> None:
+        """Also at its edges, whether the newest is reached step by step or in one."""
+        for counters in (range(behind + 1), (0, behind)):
+            window = ReplayWindow()
+            for counter in counters:
+                window.note(counter)
+            assert window.newest == behind
+            assert not window.is_fresh(0)
+        # What has not come is fresh as long as the window can tell.
+        window = ReplayWindow()
+        window.note(behind)
+        assert window.is_fresh(0) == (0 < behind < WINDOW)
+        assert window.is_fresh(behind + 1)
 
     def test_none_is_lost_when_all_come(self) -> None:
         window = ReplayWindow()

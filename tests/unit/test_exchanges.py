@@ -14,11 +14,13 @@ from hypothesis import strategies as st
 
 from holdfast.transport.datagram_cipher import OVERHEAD, ReplayWindow
 from holdfast.transport.exchanges import (
+    ECHO,
     KEEP_ALIVE_S,
     MAX_CACHED_REQUESTS,
     MAX_DATAGRAM_BYTES,
     MAX_PAYLOAD_BYTES,
     MAX_REORDERED_BYTES,
+    PROBE,
     ReceivedReply,
     RobotExchange,
     ServiceExchange,
@@ -546,6 +548,48 @@ class TestTheStream:
         network.service.reply(2, b"too large", 0.0, last=True)
         network.run(lambda: 6 in network.done_at)
         assert network.parts_of[6] == [ReceivedReply(6, b"too large", True)]
+
+
+class TestOfOneEnd:
+    """A robot's end, whose messages are looked at."""
+
+    def setup_method(self) -> None:
+        self.datagrams: list[bytes] = []
+        self.streamed: list[bytes] = []
+        self.robot = RobotExchange(
+            Paths(self.datagrams.append, lambda _, message: self.streamed.append(message), int)
+        )
+
+    def test_a_probe_of_the_service_is_echoed_and_shows_no_more_than_it_does(self) -> None:
+        for now in range(40):
+            self.robot.probe(float(now))
+        assert self.robot.unanswered_probes == 40
+        self.datagrams.clear()
+        probe = bytes((PROBE, 0)) + b"12345678"
+        for odd, datagram in ((probe, False), (probe[:-1], True), (probe + b"9", True)):
+            assert self.robot.received(odd, 1.0, datagram=datagram) == []
+        assert self.datagrams == []
+        assert self.robot.unanswered_probes == 40
+        assert self.robot.received(probe, 1.0, datagram=True) == []
+        assert self.datagrams == [bytes((ECHO, 0)) + b"12345678"]
+        assert self.robot.unanswered_probes == 0  # both directions work: no other socket is needed
+        assert not self.robot.open  # but the replies may go to another address
+        assert self.robot.received(self.datagrams[0], 1.0, datagram=True) == []
+        assert self.robot.open
+
+    def test_a_probe_on_suspicion_changes_nothing_else(self) -> None:
+        self.robot.begin(1.0)
+        before = self.robot.due, self.robot.unanswered_probes
+        self.robot.probe(2.0, counted=False)
+        assert (self.robot.due, self.robot.unanswered_probes) == before
+        assert len(self.datagrams) == 2
+
+    @pytest.mark.parametrize(("lost", "hedged"), [(31, False), (32, True)])
+    def test_at_a_quarter_lost_the_stream_helps_at_once(self, lost: int, hedged: bool) -> None:
+        self.robot.received(bytes((ECHO, lost)) + bytes(8), 1.0, datagram=True)
+        self.robot.send(1, b"question", 1.0)
+        assert [message[0] for message in self.datagrams] == [1]
+        assert [message[0] for message in self.streamed] == ([6] if hedged else [])
 
 
 class TestBounds:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from holdfast.protocol.expected_time import ExpectedTime
+from holdfast.protocol.expected_time import _TYPICAL_INERTIA, ExpectedTime
 
 
 def test_one_that_others_made_longer_counts_little_and_a_shorter_one_at_once() -> None:
@@ -32,3 +32,14 @@ def test_the_mean_follows_and_one_outlier_moves_it_little() -> None:
     for _ in range(80):
         time.learn(0.002)
     assert time.mean_s == pytest.approx(0.002, rel=1e-2)
+
+
+def test_a_longer_one_moves_what_is_typical_by_a_part_of_the_difference() -> None:
+    time = ExpectedTime(0.001)
+    time.learn(0.004)
+    assert time.typical_s == 0.004
+    time.learn(0.012)
+    grown = time.typical_s
+    assert grown == pytest.approx(0.004 + 0.008 / _TYPICAL_INERTIA)
+    time.learn(grown)
+    assert time.typical_s == grown

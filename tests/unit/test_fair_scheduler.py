@@ -75,3 +75,14 @@ async def test_between_turns_there_may_be_a_pause() -> None:
     while len(taken) < 2:
         await asyncio.sleep(0.001)
     assert taken == [1e-4, 1e-4]
+
+
+async def test_a_slice_that_is_used_up_is_over_and_a_window_ends_on_time() -> None:
+    scheduler = FairScheduler()
+    assert scheduler.may_run("mallory", 1.0)
+    scheduler.charge("mallory", SLICE_S)
+    assert not scheduler.may_run("mallory", 1.0)
+    ends_at = scheduler._window_ends_at
+    assert ends_at == 1.005
+    assert not scheduler.may_run("mallory", 1.0049)
+    assert scheduler.may_run("mallory", ends_at)

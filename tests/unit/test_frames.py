@@ -179,3 +179,32 @@ def test_a_goodbye_is_cut_and_fit_to_be_shown() -> None:
     text = read_goodbye(frame.payload)
     assert text.startswith(r"\x1bxxx")
     assert len(text) < 1100
+
+
+def test_a_lease_of_a_millisecond_or_an_hour() -> None:
+    for lease_ms in (1.0, 3.6e6):
+        assert decode_hello(changed(lease_ms=lease_ms)).lease_ms == lease_ms
+    with pytest.raises(FrameError, match=r"a lease of 3\.60001e\+06 ms"):
+        decode_hello(changed(lease_ms=3.60001e6))
+
+
+def test_a_whole_frame_is_held_to_the_same_bounds_as_a_piece() -> None:
+    """It takes a short way of its own."""
+    for size, skipped in ((MAX_BYTES, 0), (MAX_BYTES + 1, MAX_BYTES + 1)):
+        decoder = FrameDecoder(MAX_BYTES)
+        decoder.feed(GREETING)
+        ((kind, call, payload, rest),) = decoder.feed(encode_frame(CALL, 7, bytes(size)))
+        assert (kind, call, len(payload), rest) == (CALL, 7, 0 if skipped else size, skipped)
+        # What looks like a frame within one that is skipped is none.
+    decoder.feed(encode_frame(CALL, 8, bytes(MAX_BYTES + 9))[:-9])
+    inside = encode_frame(PING)
+    assert decoder.feed(inside) == []
+    assert decoder.feed(inside) == [Frame(PING, 0, b"")]
+
+
+def test_a_kind_of_its_own_has_a_bound_of_its_own() -> None:
+    decoder = FrameDecoder(MAX_BYTES, more={77: 2})
+    decoder.feed(GREETING)
+    assert decoder.feed(encode_frame(77, 1, b"xy")) == [Frame(77, 1, b"xy")]
+    assert decoder.feed(encode_frame(77, 1, b"xyz")) == []
+    assert str(decoder.error) == "sends a frame of kind 77 with 3 bytes"

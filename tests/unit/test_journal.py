@@ -25,6 +25,8 @@ from holdfast.protocol.records import (
     PerformedRecord,
     Record,
 )
+from holdfast.recording import journal as journal_module
+from holdfast.recording import journal_reader
 from holdfast.recording.journal import Journal
 from holdfast.recording.journal_file import Survives
 from holdfast.recording.journal_reader import UnfinishedTrial
@@ -78,6 +80,8 @@ import os, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from tests.unit.test_journal import TRIAL, records_of, result_of
+from holdfast.recording import journal as journal_module
+from holdfast.recording import journal_reader
 from holdfast.recording.journal import Journal
 
 journal = Journal.create(Path(sys.argv[2]), {"configuration": "x" * 100}, survives=sys.argv[3])
@@ -373,6 +377,8 @@ class TestProcesses:
         """Closing any descriptor of a file drops the locks that a process has on it."""
         opener = f"""
 from pathlib import Path
+from holdfast.recording import journal as journal_module
+from holdfast.recording import journal_reader
 from holdfast.recording.journal import Journal
 Journal.open(Path({str(path)!r}))
 """
@@ -411,6 +417,36 @@ class TestRun:
             journal.set_meta("epoch", str(2**32 - 1))
             with pytest.raises(OutputError, match="its epoch is '4294967295'"):
                 journal.raise_epoch()
+
+    @pytest.mark.parametrize("survives", ["process_crash", "power_cut"])
+    def test_the_epoch_outlives_the_log(self, path: Path, survives: Survives) -> None:
+        """No two processes have the same: each leaves only its main file, as it was then."""
+        Journal.create(path, {}, survives=survives).close()
+        for expected in (1, 2, 3):
+            with Journal.open(path, survives=survives) as journal:
+                assert journal.raise_epoch() == expected
+                main = path.read_bytes()
+            path.write_bytes(main)
+            path.with_name(f"{path.name}-wal").unlink(missing_ok=True)
+
+    @pytest.mark.parametrize("written", [None, "", "a boot"])
+    @pytest.mark.parametrize("now", [None, "another boot"])
+    def test_a_boot_that_is_not_known_is_not_the_same(
+        self, path: Path, monkeypatch: pytest.MonkeyPatch, written: str | None, now: str | None
+    ) -> None:
+        """At neither end: in a container, say, that hides it."""
+        monkeypatch.setattr(journal_module, "boot_id", lambda: written)
+        monkeypatch.setattr(journal_reader, "boot_id", lambda: now)
+        with Journal.create(path, {}) as journal:
+            journal.append(TRIAL, records_of(0))
+            for state in (journal.unfinished(), None):
+                if state is None:  # an older journal says nothing of it
+                    with journal._connection:
+                        journal._connection.execute("DELETE FROM meta WHERE key = 'steps_boot'")
+                    state = journal.unfinished()
+                assert state is not None
+                assert not state.same_boot
+                assert not state.is_complete
 
     @pytest.mark.skipif(
         not Path("/proc/sys/kernel/random/boot_id").exists(), reason="the kernel names no boot"

@@ -21,6 +21,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from holdfast.errors import CredentialsError, OutputError
 from holdfast.files import NewFile, create_directory_atomically
+from holdfast.transport import key_ring
 from holdfast.transport.credentials import load_credentials
 from holdfast.transport.key_ring import (
     list_credentials,
@@ -341,6 +342,27 @@ class TestArguments:
     def test_days_have_bounds(self, tmp_path: Path, days: int) -> None:
         with pytest.raises(CredentialsError, match=f"days: {days} is not between 1 and 3650"):
             make_credentials(tmp_path, days=days)
+
+    @pytest.mark.parametrize("days", [1, 3650])
+    def test_the_least_and_the_most_days(self, tmp_path: Path, days: int) -> None:
+        made = make_credentials(tmp_path, robots=["arm"], days=days)
+        assert made.made[0].expires - datetime.now(UTC) > (days - 1) * DAY
+
+    def test_a_name_of_64_letters_and_an_empty_directory_of_it(self, tmp_path: Path) -> None:
+        name = "x" * 64
+        (tmp_path / name).mkdir()
+        make_credentials(tmp_path, robots=[name])
+        assert (tmp_path / name / "key.pem").exists()
+        with pytest.raises(CredentialsError, match="at most 64 letters"):
+            make_credentials(tmp_path, robots=[name + "x"])
+
+    def test_as_many_names_as_one_call_may_have(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(key_ring, "MAX_PARTIES", 2)
+        make_credentials(tmp_path, robots=["a"], services=["b"])
+        with pytest.raises(CredentialsError, match="3 names are more than 2 at once"):
+            make_credentials(tmp_path, robots=["c", "d"], services=["e"])
 
 
 def run_keys(*arguments: str) -> subprocess.CompletedProcess[str]:

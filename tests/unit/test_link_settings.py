@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import cast
 
+from holdfast.transport.frames import HEADER_BYTES
 from holdfast.transport.link_settings import LinkSettings, MemoryBudget
 from holdfast.transport.links import Link
 
@@ -70,3 +71,25 @@ def test_ends_do_not_share_a_buffer() -> None:
     first[0] = 7
     assert second[0] == 0
     assert len(first) == 256 * 1024
+
+
+def test_the_bound_is_for_two_of_the_largest_messages() -> None:
+    settings = LinkSettings(bytes, 1000.0, 1000, pauses_for_readers=False)
+    first, second = Holder("a"), Holder("b")
+    for holder in (first, second):
+        holder.holds(settings.partial_messages, 1000 + HEADER_BYTES)
+    assert not first.reason
+    assert not second.reason
+    second.holds(settings.partial_messages, 1001 + HEADER_BYTES)
+    assert first.reason
+
+
+def test_who_holds_half_of_the_most_may_be_the_one() -> None:
+    """So of near equals the one that began first goes, not the one with a byte more."""
+    for held, ended in ((40, True), (39, False)):
+        budget = MemoryBudget(100, "sends too slowly")
+        first, most = Holder("first"), Holder("most")
+        first.holds(budget, held)
+        most.holds(budget, 80)
+        assert bool(first.reason) == ended
+        assert bool(most.reason) != ended

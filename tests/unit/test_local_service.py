@@ -94,6 +94,32 @@ class TestRestartPolicy:
         launches.begin(1.0)
         assert launches.next_wakeup(present=False) == 6.0
 
+    def test_pauses_double_up_to_a_factor_of_32(self) -> None:
+        launches = RestartPolicy(RecoverySettings(relaunch_delay_ms=100.0))
+        assert launches.next_wakeup(present=False) is None  # nothing is wanted yet
+        assert launches.overdue_launch_age_s(1e9, present=False) is None
+        launches.want(0.0)
+        pauses = []
+        for _ in range(9):
+            launches.begin(0.0)
+            launches.failed(10.0)
+            launches.failed(11.0)  # one that is to be launched cannot fail
+            due = launches.next_wakeup(present=False)
+            assert due is not None
+            pauses.append(round(due - 10.0, 9))
+        assert pauses == [0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 3.2, 3.2]
+
+    def test_a_life_of_a_second_is_none_yet(self) -> None:
+        for lived_s, pause_s in ((1.0, 0.2), (1.125, 0.0)):
+            launches = RestartPolicy(RecoverySettings(relaunch_delay_ms=100.0))
+            for _ in range(2):
+                launches.begin(0.0)
+                launches.failed(0.0)
+            launches.begin(0.0)
+            launches.appeared(4.0)
+            launches.ended(4.0 + lived_s)
+            assert launches.next_wakeup(present=False) == 4.0 + lived_s + pause_s
+
 
 def awaited_since(needed_at: float | None) -> Question:
     planner = Planner(PegInHole2D(), PlanningSettings())

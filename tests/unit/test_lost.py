@@ -37,6 +37,25 @@ def test_a_run_of_one_sensor_while_others_are_explained() -> None:
     assert (at, verdict) == (14, Verdict("sensor_suspect", 1, 5, 5))
 
 
+def test_the_limit_itself_is_an_alarm_and_what_inside_counts() -> None:
+    """Outside counts 10, inside 10/19: 100 reaches 100, and 52.6 reaches 52 but not 53."""
+    assert alarms(2 / 100, [(0, False), (1, False)]) == [(2, Verdict("lost", None, 2, 2))]
+    seen = [(0, False), (1, True), (2, False)]
+    assert alarms(2 / 52, seen) == [(3, Verdict("lost", None, 2, 3))]
+    assert not alarms(2 / 53, seen)
+
+
+def test_after_a_suspect_all_evidence_is_collected_anew() -> None:
+    test = LostTest(2 / 100)
+    found = [test.observed(*each) for each in [(1, False), (0, True), (1, False), (0, False)]]
+    assert found == [None, None, Verdict("sensor_suspect", 1, 2, 2), None]
+    assert test.observed(0, False) == Verdict("lost", 0, 2, 2)
+    assert (test.num_suspect, test.num_lost) == (1, 1)
+    assert test.observed(1, False) is None  # it counts again, from the beginning
+    assert test.observed(1, False) == Verdict("lost", 1, 2, 2)
+    assert (test.num_suspect, test.num_lost) == (1, 2)
+
+
 def test_the_only_sensor_cannot_be_told_from_a_lost_robot() -> None:
     assert alarms(1e-4, [(0, True)] * 9 + [(0, False)] * 5) == [(14, Verdict("lost", 0, 5, 5))]
 

@@ -15,7 +15,7 @@ from holdfast.errors import HeldError
 from holdfast.lost import MOVE, Verdict
 from holdfast.outcome import MoveResult, TrialResult
 from holdfast.planning import ObservationInfo, Planner
-from holdfast.protocol.events import Effects, LogEvent, RobotEffect, WriteRecords
+from holdfast.protocol.events import Effects, Halt, LogEvent, RobotEffect, WriteRecords
 from holdfast.protocol.observation_reports import ObservationReports
 from holdfast.protocol.records import ObservedRecord, Record, ReinitialisedRecord, replay
 from holdfast.robot.environment import SimulatedEnvironment
@@ -163,3 +163,19 @@ def test_a_suspect_sensor_is_named_and_the_robot_is_not_lost(action: int, named:
     assert told.name == "sensor_suspect"
     assert (told.fields["step"], told.fields["sensing_action"]) == (3, named)
     assert (told.fields["outside"], told.fields["observations"]) == (5, 6)
+
+
+def test_what_else_comes_at_once_does_not_find_a_lost_robot_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of several late observations the first finds it lost, and the last is explained."""
+    world = World(simulator=SIMULATOR, on_lost="hold")
+    world.start()
+    robot = world.robot
+    found = iter(["hold", None])
+    monkeypatch.setattr(robot.reports, "observed", lambda *_, **__: next(found))
+    for step in (3, 2):
+        robot._judge(step, ObservationInfo(1.0, True, True))
+    robot._hold_if_lost()
+    (halt,) = [each for each in robot._take() if isinstance(each, Halt)]
+    assert "step 3" in str(halt.error)

@@ -51,3 +51,18 @@ def test_an_illegal_cause_changes_nothing() -> None:
     assert tracker.is_recovering
     assert tracker.change(Cause.CLOUD_ANSWERED, "back", 3.5)["outage_ms"] == 1500.0
     assert (tracker.status, tracker.recoveries) == (Status.KEEP_ALIVE, 1)
+
+
+def test_each_loss_is_counted_and_timed_from_its_own_beginning() -> None:
+    tracker = StatusTracker()
+    assert not tracker.is_recovering
+    for turn, start in enumerate((2.0, 10.0), 1):
+        lost = tracker.change(Cause.CLOUD_LOST, "gone", start)
+        assert (lost["to"], lost["reason"]) == ("local_recovery", "gone")
+        assert "silent_ms" not in lost  # it was never there
+        assert "outage_ms" not in lost
+        back = tracker.change(Cause.CLOUD_ANSWERED, "back", start + 0.5)
+        assert (back["from"], back["to"]) == ("local_recovery", "keep_alive")
+        assert back["outage_ms"] == 500.0
+        assert tracker.recoveries == turn
+    assert not tracker.is_recovering

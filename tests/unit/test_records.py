@@ -23,6 +23,7 @@ from holdfast.protocol.records import (
     TrialHistory,
     decode_record,
     encode_record,
+    has_shown,
     reinitialised_after,
     replay,
 )
@@ -32,6 +33,7 @@ PROBLEM = PegInHole2D()
 PLANNING = PlanningSettings(
     particle_filter=ParticleFilterSettings(num_particles=12), sensing_interval=3
 )
+PLANNING_EACH_STEP = msgspec.structs.replace(PLANNING, sensing_interval=0)
 RECORDS: list[Record] = [
     ObservedRecord(8, 1, encode_floats([0.5]), bytes(32), 1.5),
     ActingRecord(8, encode_floats([0.25, -0.5, 0.0])),
@@ -112,3 +114,74 @@ def test_when_a_belief_was_begun_anew_is_in_the_records() -> None:
         ReinitialisedRecord(2, bytes(32)),
     ]
     assert reinitialised_after(records) == {2, 4}
+
+
+def test_a_lost_robot_stays_lost_when_an_explained_observation_comes_late() -> None:
+    """It held still, or was killed, before the new belief was written down."""
+    history = TrialHistory(Planner(PROBLEM, PLANNING_EACH_STEP), 5, 0, 1.0)
+    explained = history.planner.problem.observation_mean(history.state.belief.states[:1], 0)[0]
+    history.observed(0, None, 0.0)
+    history.pending = np.zeros(3)
+    history.performed(PerformedRecord(0, None))
+    history.observed(0, np.full(1, 1e6), 0.0)
+    assert history.is_lost
+    found = history.came_late(LateObservation(0, explained))
+    assert found is not None
+    assert found[0].within_gate
+    assert history.is_lost
+    history.reinitialised()
+    assert not history.is_lost
+
+
+def test_an_unexplained_observation_that_comes_late_can_find_it_lost() -> None:
+    history = TrialHistory(Planner(PROBLEM, PLANNING_EACH_STEP), 5, 0, 1.0)
+    history.observed(0, None, 0.0)
+    assert not history.is_lost
+    assert history.came_late(LateObservation(0, np.full(1, 1e6))) is not None
+    assert history.is_lost
+
+
+def test_a_suspect_sensor_is_no_lost_robot() -> None:
+    """Twice outside, and between them another sensor inside."""
+    history = TrialHistory(Planner(PROBLEM, PLANNING_EACH_STEP), 5, 0, 2 / 80)
+    kinds = []
+    for action in (0, 1, 0):
+        inside = history.planner.problem.observation_mean(history.state.belief.states, action)
+        history.observed(action, np.full(1, 1e6) if action == 0 else inside[0], 0.0)
+        kinds.append(None if history.alarm is None else history.alarm.kind)
+        assert not history.is_lost
+        history.pending = np.zeros(3)
+        history.performed(PerformedRecord(history.state.step, None))
+    assert kinds == [None, None, "sensor_suspect"]
+
+
+def test_what_has_begun() -> None:
+    """Any of an input, a step or an action that is in the journal alone."""
+
+    def begun(history: TrialHistory) -> bool:
+        return history.begun
+
+    planner = Planner(PROBLEM, PLANNING)
+    assert not begun(TrialHistory(planner, 1, 0))
+    history = TrialHistory(planner, 1, 0)
+    history.observed(0, None, 0.0)
+    assert begun(history)
+    history = TrialHistory(planner, 1, 0)
+    history.pending = np.zeros(3)
+    assert begun(history)
+    history = TrialHistory(planner, 1, 0)
+    history.state = history.state._replace(step=1)
+    assert begun(history)
+
+
+def test_what_a_record_has_shown() -> None:
+    shown = encode_floats(np.zeros(1))
+    assert not has_shown(PerformedRecord(0, None))
+    assert has_shown(PerformedRecord(0, None, shown))
+    assert has_shown(PerformedRecord(0, None, b"", shown))
+    assert has_shown(LateRecord(2, 0, shown, bytes(32)))
+    assert not has_shown(first_record())
+    anew = ReinitialisedRecord(2, bytes(32))
+    for moved in (PerformedRecord(1, None, shown), PerformedRecord(1, None, b"", shown)):
+        assert reinitialised_after([first_record(), moved, anew]) == {2}
+    assert reinitialised_after([first_record(), PerformedRecord(0, None), anew]) == {1}

@@ -18,13 +18,14 @@ class Sent:
     """Two paths that remember what was sent."""
 
     def __init__(self) -> None:
+        self.num_lost = 300
         self.datagrams: list[bytes] = []
         self.on_stream: list[tuple[int, bytes]] = []
         self.sender = RedundantSender(
             Paths(
                 self.datagrams.append,
                 lambda number, message: self.on_stream.append((number, message)),
-                lambda: 300,
+                lambda: self.num_lost,
             )
         )
 
@@ -67,6 +68,37 @@ class TestSender:
         for _ in range(1000):
             sent.sender.retransmit(1, bytes(1000))
         assert len(sent.datagrams) - burst in (3, 4)  # itself, twice again, and what was left
+
+    def test_the_budget_counts_whole_packets_to_the_last_byte(self) -> None:
+        """A message's kind and loss (2), header and tag (24), IPv4's and UDP's headers (28)."""
+        body = bytes(4096 - 54)
+        sent = Sent()
+        for _ in range(9):
+            sent.sender.retransmit(1, body)
+        assert len(sent.datagrams) == 2  # of 8,192 bytes
+        sent.sender.num_lost = 0
+        for _ in range(9):
+            sent.sender.send_first(1, body, 0.0, lambda: True)  # no more than the burst is kept
+        before = len(sent.datagrams)
+        for _ in range(9):
+            sent.sender.retransmit(1, body)
+        assert len(sent.datagrams) == before + 2
+        sent.sender.send_first(1, bytes(46), 0.0, lambda: True)  # 100 bytes earn 200
+        sent.sender.retransmit(1, bytes(147))
+        assert len(sent.datagrams) == before + 3
+        sent.sender.hedge(7, 1, bytes(146))
+        assert len(sent.on_stream) == 1
+        sent.sender.retransmit(1, b"")
+        assert len(sent.datagrams) == before + 3
+
+    def test_the_loss_is_said_as_it_is_up_to_a_byte(self) -> None:
+        for lost in (0, 3, 255, 256):
+            sent = Sent()
+            sent.num_lost = lost
+            sent.sender.send_unbudgeted(4, b"")
+            sent.sender.send_on_stream(1, 4, b"")
+            said = bytes((4, min(lost, 255)))
+            assert (sent.datagrams, sent.on_stream) == ([said], [(1, said)])
 
 
 class TestRoundTrips:

@@ -119,3 +119,230 @@ class TestRequestQueue:
         self.finish(first)
         self.finish(second)
         assert (self.queue.num_running, self.queue.num_waiting) == (0, 0)
+
+
+def made(
+    number: int,
+    owner: str | None = None,
+    *,
+    size: int = 10,
+    newcomer: bool = False,
+    prefetched: bool = False,
+    since: float = 0.0,
+) -> PendingTask:
+    """Return a task that is expected to take 50 ms."""
+    robot = Robot(key=number)
+    request = robot.request()
+    session = Session(
+        (owner, request.session),
+        request,
+        robot.session_configuration,
+        ExpectedTime(0.05),
+        ExpectedTime(0.05),
+    )
+    session.newcomer = newcomer
+    return PendingTask(
+        session,
+        b"%d" % number,
+        sensing=True,
+        request=None if prefetched else request,
+        state=None,
+        size=size,
+        since=since,
+    )
+
+
+def job_of(task: PendingTask) -> Job:
+    configuration = Robot().session_configuration
+    return Job(
+        "sensing",
+        None,
+        make_problem,
+        str,
+        pack_configuration(configuration),
+        configuration.planning,
+        5,
+        ServiceLimits(),
+        task.request,
+        None,
+    )
+
+
+def turns(queue: RequestQueue, count: int, now: float) -> list[bytes]:
+    taken = [queue.take(now) for _ in range(count)]
+    return [task.digest for task in taken if task is not None]
+
+
+class TestTurns:
+    """Prefetches are patient for 20 ms, newcomers for 100 ms."""
+
+    def order(self, *tasks: PendingTask, now: float) -> list[bytes]:
+        queue = RequestQueue(99, ServiceLimits(prefetch_patience_ms=20.0, max_wait_ms=100.0))
+        for task in tasks:
+            queue.enqueue(task)
+        return turns(queue, len(tasks), now)
+
+    def test_a_prefetch_that_has_waited_no_longer_than_its_patience(self) -> None:
+        prefetch = made(1, "anna", prefetched=True)
+        assert self.order(prefetch, made(2, "berta", since=0.02), now=0.02) == [b"2", b"1"]
+        assert self.order(prefetch, made(2, "berta", since=0.021), now=0.03) == [b"1", b"2"]
+
+    @pytest.mark.parametrize(("since", "prefetch", "first"), [(0.0, 0.6, b"3"), (2.0, 1.5, b"3")])
+    def test_who_had_a_turn_waits_since_then(
+        self, since: float, prefetch: float, first: bytes
+    ) -> None:
+        """Or since the task came, if that was later."""
+        queue = RequestQueue(99, ServiceLimits(prefetch_patience_ms=20.0))
+        for task in (made(1, "anna"), made(2, "anna", since=since)):
+            queue.enqueue(task)
+        begun = queue.take(1.0)
+        assert begun is not None
+        assert begun.digest == b"1"
+        queue.enqueue(made(3, "berta", prefetched=True, since=prefetch))
+        assert turns(queue, 2, 2.0) == [first, b"2"]
+        assert queue._urgent._last_turn == {}  # of owners with tasks alone
+
+    @pytest.mark.parametrize(("known", "first"), [(0.1, b"1"), (0.101, b"2")])
+    def test_a_newcomer_waits_for_a_known_robot(self, known: float, first: bytes) -> None:
+        """Unless that came more than 100 ms later."""
+        tasks = made(1, "anna", since=known), made(2, "berta", newcomer=True)
+        assert self.order(*tasks, now=0.5)[0] == first
+
+    def test_newcomers_have_every_second_turn_at_most(self) -> None:
+        newcomers = [made(k, f"new {k}", newcomer=True) for k in range(3)]
+        known = [made(k + 3, f"known {k}", since=0.5) for k in range(3)]
+        assert self.order(*newcomers, *known, now=0.5) == [b"0", b"3", b"1", b"4", b"2", b"5"]
+
+    @pytest.mark.parametrize(
+        ("now", "came", "first"),
+        [(0.02, 0.02, b"2"), (0.03, 0.02, b"2"), (0.03, 0.021, b"1"), (0.02, 0.021, b"2")],
+    )
+    def test_a_newcomer_and_a_prefetch(self, now: float, came: float, first: bytes) -> None:
+        """It goes first while the prefetch is patient, and later if it came in that time."""
+        tasks = made(1, "anna", prefetched=True), made(2, "berta", newcomer=True, since=came)
+        assert self.order(*tasks, now=now)[0] == first
+
+    def test_newcomers_do_not_stop_prefetches_for_ever(self) -> None:
+        newcomers = [made(k, f"new {k}", newcomer=True) for k in range(3)]
+        known = [made(k + 3, f"known {k}", prefetched=True) for k in range(3)]
+        assert self.order(*newcomers, *known, now=0.5) == [b"0", b"3", b"1", b"4", b"2", b"5"]
+        assert self.order(*newcomers, *known, now=0.0)[:3] == [b"0", b"1", b"2"]
+
+
+class TestTheWait:
+    """Four workers; each task is expected to take 50 ms."""
+
+    def setup_method(self) -> None:
+        self.limits = ServiceLimits(max_wait_ms=100.0)
+        self.queue = RequestQueue(4, self.limits)
+
+    def add(
+        self, number: int, owner: str | None = None, *, size: int = 10, newcomer: bool = False
+    ) -> None:
+        self.queue.enqueue(made(number, owner, size=size, newcomer=newcomer))
+
+    def overloaded(self, owner: str | None = None, *, newcomer: bool = False) -> bool:
+        return self.queue.is_overloaded(0.0, owner, newcomer=newcomer)
+
+    def test_the_longest_wait_is_that_of_all_workers_together(self) -> None:
+        for number in range(8):
+            self.add(number)
+        assert self.queue.wait_s(0.0, None, newcomer=False) == pytest.approx(0.1)
+        assert not self.overloaded()
+        self.add(8)
+        assert self.overloaded()
+
+    def test_nobody_is_turned_away_while_a_worker_is_free(self) -> None:
+        self.limits = ServiceLimits(max_waiting=1, max_wait_ms=1.0)
+        self.queue = RequestQueue(4, self.limits)
+        for number in range(3):
+            self.add(number)
+            assert not self.overloaded()
+        self.add(3)
+        assert self.overloaded()
+
+    @pytest.mark.parametrize("bound", ["max_waiting", "max_waiting_bytes"])
+    def test_half_of_the_room_is_kept_for_those_that_were_served(self, bound: str) -> None:
+        limits = {"max_waiting": 16, "max_waiting_bytes": 16_000, "max_wait_ms": 1e6}
+        limits["max_waiting_bytes" if bound == "max_waiting" else "max_waiting"] = 10**6
+        self.queue = RequestQueue(4, ServiceLimits(**limits))  # type: ignore[arg-type]
+        for number in range(16):
+            assert not self.overloaded()
+            assert self.overloaded(newcomer=True) == (number >= 8)
+            self.add(number, size=1000, newcomer=True)
+        assert not self.overloaded()  # of those that go before it, none waits
+        self.queue = RequestQueue(4, ServiceLimits(**limits))  # type: ignore[arg-type]
+        for number in range(16):
+            assert not self.overloaded()
+            self.add(number, size=1000)
+        assert self.overloaded()
+
+    def test_one_robot_has_no_more_than_its_share(self) -> None:
+        limits = ServiceLimits(max_waiting_per_robot=6, max_wait_ms=1e6, max_waiting_bytes=1000)
+        self.queue = RequestQueue(4, limits)
+        for number in range(6):
+            assert not self.overloaded("anna")
+            self.add(number, "anna")
+        assert self.overloaded("anna")
+        assert not self.overloaded("berta")
+        assert not self.overloaded()  # those without a certificate are many
+        self.queue = RequestQueue(4, limits)
+        for number in range(5):
+            self.add(number, "anna", size=100)
+            assert self.overloaded("anna") == (number == 4)
+        assert not self.overloaded("berta")
+
+    def test_what_runs_counts_for_the_rest_of_its_time(self) -> None:
+        task = made(1)
+        self.queue.enqueue(task)
+        assert self.queue.take(1.0) is task
+        assert self.wait_s(1.0) == 0.0
+        job = job_of(task)
+        self.queue.handed_out(task, job, 1.0)
+        running = [task.running]
+        assert self.wait_s(1.02) == pytest.approx(0.03 / 4)
+        self.queue.started(job, 1.5)
+        assert self.wait_s(1.51) == pytest.approx(0.04 / 4)
+        assert self.wait_s(9.0) == 0.0  # longer than was expected
+        assert self.queue.end(job) is task
+        assert [*running, task.running] == [True, False]
+        assert (self.queue.num_running, self.wait_s(1.5)) == (0, 0.0)
+
+    def wait_s(self, now: float) -> float:
+        return self.queue.wait_s(now, None, newcomer=False)
+
+    def test_what_is_removed_or_replaced_counts_no_more(self) -> None:
+        limits = ServiceLimits(max_waiting_bytes=100, max_wait_ms=1e6)
+        self.queue = RequestQueue(1, limits)
+        first, second = made(1, size=60), made(2, size=50)
+        for task in (first, second):
+            self.queue.enqueue(task)
+        assert self.overloaded()
+        self.queue.replace(second, Robot().request(step=7), sensing=False, size=30)
+        assert (second.sensing, second.size, second.cost_s) == (False, 30, 0.1)
+        assert not self.overloaded()
+        assert self.wait_s(0.0) == pytest.approx(0.15)
+        self.queue.remove(first)
+        assert self.queue.num_waiting == 1
+        assert self.wait_s(0.0) == pytest.approx(0.1)
+        self.queue.remove(second)
+        assert (self.queue.num_waiting, self.wait_s(0.0)) == (0, 0.0)
+        assert self.queue._waiting_of == {}
+        assert self.queue.take(1.0) is None
+
+    def test_newcomers_ahead_are_as_many_as_the_others_at_most(self) -> None:
+        for number in range(6):
+            self.add(number, f"new {number}", newcomer=True)
+        assert self.wait_s(0.0) == 0.0
+        for number in range(6, 8):
+            self.add(number, f"known {number}")
+        assert self.wait_s(0.0) == pytest.approx((2 + 2) * 0.05 / 4)
+        assert self.queue.wait_s(0.0, None, newcomer=True) == pytest.approx((2 + 6) * 0.05 / 4)
+
+    def test_before_an_owners_next_task_go_its_own_and_one_more_of_each(self) -> None:
+        for number in range(12):
+            self.add(number, "anna" if number < 8 else f"other {number}")
+        assert self.queue.wait_s(0.0, "berta", newcomer=False) == pytest.approx(5 * 0.05 / 4)
+        self.add(12, "berta")
+        assert self.queue.wait_s(0.0, "berta", newcomer=False) == pytest.approx(7 * 0.05 / 4)
+        assert self.queue.wait_s(0.0, "anna", newcomer=False) == pytest.approx(13 * 0.05 / 4)

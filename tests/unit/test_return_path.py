@@ -94,6 +94,16 @@ def test_an_echo_of_the_old_address_counts_for_a_second() -> None:
         assert where(path) == address
 
 
+def test_a_second_echo_of_the_new_address_does_not_make_the_old_one_forgotten() -> None:
+    path = proved()
+    sent = probes(path, ELSEWHERE, 1.0)
+    path.echoed(sent[ELSEWHERE], ELSEWHERE, 1.1)
+    path.echoed(sent[ELSEWHERE], ELSEWHERE, 1.2)
+    assert where(path) == ELSEWHERE
+    path.echoed(sent[ROBOT], ELSEWHERE, 1.3)
+    assert where(path) == ROBOT
+
+
 def test_an_echo_from_before_a_change_says_nothing_about_the_old_address() -> None:
     path = ReturnPath()
     (probe,) = path.heard(ROBOT, 0.0, newest=True)

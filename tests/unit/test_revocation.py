@@ -144,6 +144,11 @@ class TestRevoking:
         with pytest.raises(CredentialsError, match="serial number"):
             revoke_credentials(home, serials=[serial])
 
+    def test_the_least_and_the_largest_number(self, home: Path) -> None:
+        for serial in (1, 2**159 - 1):
+            assert [each.serial for each in revoke_credentials(home, serials=[serial])] == [serial]
+        assert revoked_serials(home / "cloud" / REVOKED_FILE) == {1, 2**159 - 1}
+
     def test_without_the_authoritys_key(self, home: Path) -> None:
         (home / "authority" / "authority.key").unlink()
         with pytest.raises(CredentialsError, match=r"authority\.key: cannot be read"):

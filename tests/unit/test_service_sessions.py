@@ -12,11 +12,18 @@ from tests.questions import received
 from tests.unit.test_protocol_service import Bench, Robot, content, only, refused
 
 from holdfast.problems.problem import Problem
+from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.messages import NeedState, Request, SessionConfiguration, encode
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect, StartJob
 from holdfast.protocol.service_limits import ServiceLimits
-from holdfast.protocol.service_sessions import ForgottenEpochs
+from holdfast.protocol.service_sessions import (
+    CachedAnswer,
+    ForgottenEpochs,
+    PendingTask,
+    Session,
+    SessionTable,
+)
 
 
 def test_an_epoch_is_kept_until_its_session_is_held_again() -> None:
@@ -28,6 +35,12 @@ def test_an_epoch_is_kept_until_its_session_is_held_again() -> None:
     epochs.forget(("arm", b"1"))
     assert epochs.get(("arm", b"1")) == 0
     assert list(epochs) == []
+    assert not epochs._of
+    # One that is noted again and again takes nobody's place.
+    epochs.note(("arm", b"2"), 1)
+    for _ in range(9):
+        epochs.note(("arm", b"1"), 3)
+    assert epochs.get(("arm", b"2")) == 1
 
 
 def test_the_owner_with_the_most_loses_its_oldest() -> None:
@@ -449,3 +462,246 @@ def test_each_owner_is_answered_as_if_it_were_alone(
             while service.jobs[owner]:
                 service.run(owner)
         assert together.replies[owner] == alone[owner].replies[owner]
+
+
+def session_of(number: int, owner: str | None = "anna") -> Session:
+    robot = Robot(key=number)
+    request = robot.request()
+    return Session(
+        (owner, request.session),
+        request,
+        robot.session_configuration,
+        ExpectedTime(),
+        ExpectedTime(),
+    )
+
+
+def held(table: SessionTable, *sessions: Session) -> list[bool]:
+    return [table.get(session.key) is session for session in sessions]
+
+
+class TestTheTable:
+    def table(self, **limits: Any) -> SessionTable:
+        return SessionTable(ServiceLimits(**limits))
+
+    def test_an_epoch_outlives_its_session_and_no_other(self) -> None:
+        table, session = self.table(), session_of(1)
+        assert table.epoch_of(session.key) == 0
+        session.epoch = 7
+        table.add(session)
+        assert table.epoch_of(session.key) == 7
+        session.epoch = 8
+        table.forget(session)
+        assert session.closed
+        assert len(table) == 0
+        assert table.epoch_of(session.key) == 8
+        assert table.epoch_of((None, session.key[1])) == 0
+        again = session_of(1)
+        again.epoch = 9
+        table.add(again)
+        assert table.epoch_of(session.key) == 9
+        assert list(table._epochs) == []
+
+    def test_forgotten_epochs_are_kept_for_four_times_the_sessions(self) -> None:
+        for most, kept in ((10, 4096), (1025, 4100)):
+            assert self.table(max_sessions=most)._epochs._most == kept
+
+    def test_who_is_a_newcomer(self) -> None:
+        table = self.table()
+        first, second, third = (session_of(number) for number in range(3))
+        assert table.is_newcomer(None)
+        assert not table.is_newcomer("anna")
+        table.add(first)
+        ranks = [first.newcomer]
+        assert table.is_newcomer("anna")
+        table.add(second)
+        ranks.append(second.newcomer)
+        assert not table.is_newcomer("berta")
+        for _ in range(2):  # once served is served
+            table.mark_served(first)
+        assert table.is_newcomer("anna")
+        table.mark_served(second)
+        assert [*ranks, second.newcomer] == [False, True, False]
+        assert not table.is_newcomer("anna")
+        table.add(third)
+        table.forget(third)
+        assert not table.is_newcomer("anna")
+
+    def test_when_there_is_room(self) -> None:
+        sessions = [session_of(number) for number in range(4)]
+        size = len(sessions[0].configuration)
+        others = [session_of(number, "berta") for number in range(4)]
+        for limits, fit in (
+            ({"max_sessions": 3}, [3, 0]),
+            ({"max_sessions_per_robot": 2}, [2, 2]),
+            ({"max_configuration_bytes": 3 * size}, [3, 0]),
+            ({"max_configuration_bytes": 3 * size - 1}, [2, 0]),
+            ({"max_configuration_bytes": 1}, [1, 0]),  # the only one always fits
+        ):
+            table = self.table(**limits)
+            for each, most in ((sessions, fit[0]), (others, fit[1])):
+                for number, session in enumerate(each):
+                    fits = table.has_room_for(session)
+                    assert fits == (number < most), limits
+                    if fits:
+                        table.add(session)
+        table = self.table(max_sessions_per_robot=1)
+        for session in (session_of(1, None), session_of(2, None)):
+            assert table.has_room_for(session)  # those without a certificate are many
+            table.add(session)
+
+    def test_who_makes_room(self) -> None:
+        """Of those that hold at least half of the largest holding, who was used longest ago."""
+        table = self.table(max_sessions=7)
+        annas = [session_of(number) for number in range(4)]
+        bertas = [session_of(number, "berta") for number in range(2)]
+        carl = session_of(1, "carl")
+        for session in (carl, *bertas, *annas):
+            table.add(session)
+            table.mark_served(session)
+        new = session_of(9, "dora")
+        assert table.evictable_for(new) is bertas[0]
+        table.use(bertas[0], 1.0)
+        assert table.evictable_for(new) is bertas[1]
+        for session in bertas:
+            session.pending[b""] = task_of(session)
+        assert table.evictable_for(new) is annas[0]
+        for session in annas:
+            session.pending[b""] = task_of(session)
+        assert table.evictable_for(new) is carl  # all of those have tasks
+        carl.pending[b""] = task_of(carl)
+        assert table.evictable_for(new) is None
+
+    def test_what_was_never_served_makes_room_once_it_fills_half(self) -> None:
+        table = self.table(max_sessions=4)
+        sessions = [session_of(number) for number in range(4)]
+        for session in sessions:
+            table.add(session)
+        for session in sessions[:3]:
+            table.mark_served(session)
+        assert table.evictable_for(session_of(9)) is sessions[0]
+        table.forget(sessions[2])
+        table.add(sessions[2])  # two of four: it counts as served already
+        assert table.evictable_for(session_of(9)) is sessions[0]
+        unserved = session_of(5)
+        table.forget(sessions[1])
+        table.add(unserved)
+        assert table.evictable_for(session_of(9)) is sessions[3]
+
+    def test_of_one_that_has_its_most_its_own_goes(self) -> None:
+        table = self.table(max_sessions_per_robot=2)
+        berta = session_of(0, "berta")
+        annas = [session_of(number) for number in range(2)]
+        for session in (berta, *annas):
+            table.add(session)
+        assert table.evictable_for(session_of(9)) is annas[0]
+
+    def test_bytes_are_counted_and_given_back(self) -> None:
+        table = self.table(max_state_bytes=100)
+        sessions = [session_of(number, owner) for number, owner in ((1, "anna"), (2, "berta"))]
+        for session in sessions:
+            table.add(session)
+            session.answers[b"1"] = CachedAnswer(0, 0, True, 1, actions=b"x" * 50)
+            table.update_size(session)
+            table.update_size(session)
+        assert (table.state_bytes, table.over_budget) == (100, False)
+        sessions[0].answers[b"2"] = CachedAnswer(0, 0, True, 1, actions=b"x")
+        table.update_size(sessions[0])
+        assert (table.state_bytes, table.over_budget) == (101, True)
+        assert table.largest_evictable() is sessions[0]
+        table.drop_states(sessions[0])
+        assert sessions[0].answers == {}
+        assert table.state_bytes == 50
+        table.forget(sessions[1])
+        assert table.state_bytes == 0
+        assert table.configuration_bytes == len(sessions[0].configuration)
+        assert set(table._holdings) == {"anna"}
+
+    def test_what_was_not_used_for_long(self) -> None:
+        table = self.table(max_idle_s=10.0)
+        assert (table.idle(1e9), table.idle_at()) == (None, None)
+        first, second = session_of(1), session_of(2)
+        for number, session in enumerate((first, second)):
+            table.add(session)
+            table.use(session, float(number))
+        assert table.idle_at() == 10.0
+        assert table.idle(9.99) is None
+        assert table.idle(10.0) is first
+        table.use(first, 5.0)
+        assert table.idle(11.0) is second
+        second.pending[b""] = task_of(second)
+        assert table.idle(99.0) is None
+
+
+def task_of(session: Session) -> PendingTask:
+    return PendingTask(session, b"", sensing=True, request=None, state=None, size=0, since=0.0)
+
+
+def test_cached_answers_are_bounded_and_the_newest_stay() -> None:
+    session = session_of(1)
+    answers = [CachedAnswer(0, 0, True, 1, actions=bytes(number)) for number in range(4)]
+    for number in (0, 1, 2, 0, 3):
+        session.remember(b"%d" % number, answers[number], 3)
+    assert list(session.answers) == [b"2", b"0", b"3"]
+    assert session.size() == 2 + 0 + 3
+
+
+def test_a_task_whose_place_was_taken_removes_nothing() -> None:
+    session = session_of(1)
+    old, new = task_of(session), task_of(session)
+    session.pending[b""] = new
+    session.remove_task(old)
+    assert session.pending == {b"": new}
+    session.remove_task(new)
+    assert session.pending == {}
+
+
+def test_the_nearest_state_before_a_request() -> None:
+    robot = Robot(key=1)
+    request = robot.request()
+    session = session_of(1)
+    state = robot.state
+    assert session.state_before(request) is None
+    assert not session.knows_trial(state.trial)
+    session.acknowledged = state._replace(step=request.step, sensed=request.sensed)
+    assert session.state_before(request) is session.acknowledged
+    session.ahead = state._replace(step=request.step + 1, sensed=False)
+    assert session.state_before(request) is session.acknowledged
+    session.ahead = state._replace(step=request.step, sensed=request.sensed)
+    assert session.state_before(request) is session.ahead
+    session.ahead = session.ahead._replace(trial=state.trial + 1)
+    assert session.state_before(request) is session.acknowledged
+    assert session.knows_trial(state.trial + 1)
+    assert not session.knows_trial(state.trial + 2)
+    session.acknowledged = state._replace(step=request.step, sensed=not request.sensed)
+    assert (session.state_before(request) is None) == (not request.sensed)
+
+
+def test_which_tasks_earlier_times_predict() -> None:
+    session = session_of(1)
+    session.built_in = True
+    interval = session.planning.sensing_interval
+    robot = Robot(key=1)
+    robot.sense()
+    request = msgspec.structs.replace(robot.request(), step=32, checkpoint=None)
+    one = request.inputs[:1]
+    assert len(one) == 1
+
+    def typical(request: Request | None, state: int | None = None, *, sensing: bool = True) -> bool:
+        task = PendingTask(
+            session, b"", sensing=sensing, request=request, state=None, size=0, since=0.0
+        )
+        return task.is_typical(None if state is None else robot.state._replace(step=state))
+
+    request = msgspec.structs.replace(request, inputs=one)
+    assert typical(request)
+    assert typical(None)
+    assert not typical(msgspec.structs.replace(request, inputs=one * 2))
+    assert not typical(msgspec.structs.replace(request, checkpoint=b"state"))
+    later = msgspec.structs.replace(request, step=33)
+    assert not typical(later)
+    assert typical(later, state=1)
+    assert not typical(later, state=interval, sensing=False)
+    assert typical(later, state=1 + interval, sensing=False)
+    session.built_in = False
+    assert not typical(None)

@@ -289,6 +289,36 @@ def test_links_end_whose_authority_is_replaced_and_no_others(tmp_path: Path) -> 
     asyncio.run(run())
 
 
+def test_who_has_shown_a_certificate_and_said_no_hello_is_ended_with_the_others(
+    tmp_path: Path,
+) -> None:
+    make_credentials(tmp_path, robots=["anna", "berta"], services=["cloud"])
+
+    async def run() -> None:
+        cloud = Cloud(tmp_path / "cloud")
+        endpoint = await cloud.start()
+        loop = asyncio.get_running_loop()
+        async with (
+            shaken_hands(endpoint, tmp_path / "anna") as (connection, tls),
+            shaken_hands(endpoint, tmp_path / "berta") as (other, other_tls),
+        ):
+            for each, its_tls in ((connection, tls), (other, other_tls)):
+                await loop.sock_sendall(each, its_tls.take())
+            waiting = cloud.transport._without_hello
+            await until(lambda: [link.peer is not None for link in waiting] == [True, True])
+            revoke_credentials(tmp_path, names=["anna"])
+            assert cloud.transport.reload_credentials() == 1
+            told = b""
+            while data := await loop.sock_recv(connection, 65536):
+                told += tls.receive(data)
+            (last,) = FrameDecoder(1000).feed(told)
+            assert read_goodbye(last.payload) == REVOKED
+            assert [link.peer.name for link in waiting if link.peer] == ["berta"]
+        await cloud.transport.close()
+
+    asyncio.run(run())
+
+
 @pytest.mark.parametrize("reason", [REVOKED, FOREIGN])
 def test_who_shook_hands_before_the_files_came_is_not_let_in_after_them(
     tmp_path: Path, reason: str

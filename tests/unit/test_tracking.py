@@ -271,3 +271,133 @@ def test_the_result_has_the_ending(outcome: Any) -> None:
     result = trial.result(Ending(outcome, "hit the wall"))
     assert (result.outcome, result.reason) == (outcome, "hit the wall")
     assert Trial(trial.planner, 1, 0).result(None).outcome == "truncated"
+
+
+def test_one_observation_at_a_time_may_come_late_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only what happened since the oldest awaited one is bounded."""
+    monkeypatch.setattr(module, "MAX_INPUTS_SINCE", 6)
+    trial = Trial(Planner(Cart(), SETTINGS), 1, 0)
+    for step in range(0, 30, 3):
+        observed(trial, None)
+        acted(trial)
+        acted(trial)
+        late = LateObservation(step, np.array([0.2]))
+        assert trial.observe_late(late) is not None
+        acted(trial)
+        assert trial._inputs == []
+
+
+def test_the_bounds_are_what_may_still_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MAX_INPUTS_SINCE", 3)
+    trial = Trial(Planner(Cart(), PlanningSettings(sensing_interval=20)), 1, 0)
+    observed(trial, None)
+    awaited = []
+    for _ in range(3):
+        acted(trial)
+        awaited.append(trial.awaited)
+    assert awaited == [(0,), (0,), ()]  # with the sensing action, three inputs
+    monkeypatch.setattr(module, "MAX_INPUTS_SINCE", 100)
+    monkeypatch.setattr(module, "MAX_AWAITED", 2)
+    trial = Trial(Planner(Cart(), PlanningSettings(sensing_interval=0)), 1, 0)
+    for step in range(4):
+        assert trial.awaited == tuple(range(max(0, step - 2), step))
+        observed(trial, None)
+        acted(trial)
+    observed(trial, np.array([0.2]))  # one that is there takes nobody's place
+    assert trial.awaited == (2, 3)
+
+
+def test_the_account_of_a_trial() -> None:
+    """What each kind of input counts for, one after the other."""
+    problem = Cart()
+    trial = Trial(Planner(problem, PlanningSettings(sensing_interval=0)), 1, 0)
+    counts = [(trial.num_sensed, trial.num_inputs, trial.num_unexplained)]
+    far = np.array([1e3])
+
+    def note() -> None:
+        counts.append((trial.num_sensed, trial.num_inputs, trial.num_unexplained))
+
+    trial.observe(0, far, 2.0)
+    note()
+    trial.move(np.zeros(1), reward=-1.0)
+    note()
+    trial.observe(0, None, 4.0)
+    note()
+    trial.move(np.zeros(1), reward=-0.5, observation=np.array([1.0]))
+    note()
+    trial.observe(trial.planner.no_sensing, None, 0.0)
+    note()
+    trial.move(np.zeros(1), motion=np.zeros(1))
+    note()
+    assert trial.observe_late(LateObservation(1, far)) is not None
+    note()
+    trial.reinitialise()
+    note()
+    assert counts == [
+        *((0, 0, 0), (1, 1, 1), (1, 1, 1), (2, 2, 1), (2, 3, 1), (2, 4, 1), (2, 5, 1)),
+        *((2, 6, 2), (2, 7, 2)),
+    ]
+    result = trial.result(None)
+    assert (result.sensing_decisions, result.unexplained_observations) == (2, 2)
+    assert (result.sensing_ms, result.mean_sensing_ms) == ((2.0, 4.0, 0.0), 2.0)
+    assert result.recoveries == 0
+    digests = {result.digest}
+    for shorter in (trial.reinitialise, lambda: trial.result(None)):
+        shorter()
+        digests.add(trial.result(None).digest)
+    assert len(digests) == 3  # the log has the new belief, and each ending
+
+
+@pytest.mark.parametrize("kind", ["observed", "moved", "late"])
+def test_an_alarm_is_that_of_the_last_input(kind: str) -> None:
+    """With a rate of 1, two observations outside the gate raise one; the next input ends it."""
+    trial = Trial(Planner(Cart(), PlanningSettings(sensing_interval=0)), 1, 0, 1.0)
+    far = np.array([1e3])
+    observed(trial, None)
+    acted(trial)
+    if kind == "late":
+        assert trial.observe_late(LateObservation(0, far)) is not None
+    else:
+        trial.observe(0, far, 0.0)
+    assert alarm_of(trial) == "lost"
+    if kind == "observed":
+        acted(trial)
+        observed(trial, None)
+    elif kind == "moved":
+        acted(trial)
+    else:
+        trial.reinitialise()
+    assert alarm_of(trial) is None
+
+
+def alarm_of(trial: Trial) -> str | None:
+    return None if trial.alarm is None else trial.alarm.kind
+
+
+def test_a_new_belief_has_no_evidence_against_it() -> None:
+    trial = Trial(Planner(Cart(), PlanningSettings(sensing_interval=0)), 1, 0, 0.1)
+    far = np.array([1e3])
+    for alarmed in (False, True):
+        trial.observe(0, far, 0.0)
+        assert (trial.alarm is not None) == alarmed
+        acted(trial)
+    trial.observe(0, far, 0.0)
+    trial.reinitialise()
+    acted(trial)
+    trial.observe(0, far, 0.0)
+    assert trial.alarm is None
+
+
+def test_what_moves_show_can_be_suspect() -> None:
+    class Bumpless(Cart):
+        def move_log_likelihood(
+            self, states: FloatArray, action: FloatArray, observation: FloatArray
+        ) -> FloatArray:
+            return np.full(states.shape[:-1], -np.inf)
+
+    trial = Trial(Planner(Bumpless(), PlanningSettings(sensing_interval=0)), 1, 0, 1.0)
+    observed(trial, np.array([0.0]))
+    acted(trial, observation=np.array([1.0]))
+    assert trial.alarm is not None
+    assert trial.alarm.kind == "sensor_suspect"
+    assert trial.num_unexplained == 1

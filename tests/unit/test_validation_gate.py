@@ -8,11 +8,18 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from holdfast import numerics, randomness
+from holdfast import numerics, randomness, validation_gate
 from holdfast.belief import Belief, uniform_weights, update
 from holdfast.planning import Planner
 from holdfast.problems.problem import ProblemBase
-from holdfast.validation_gate import OUTSIDE_PROBABILITY, _squared_distance, gate, is_within
+from holdfast.validation_gate import (
+    NUM_RANKED,
+    OUTSIDE_PROBABILITY,
+    _squared_distance,
+    gate,
+    is_typical,
+    is_within,
+)
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 6, 20, 100, 1000])
@@ -222,3 +229,26 @@ def test_a_problem_asks_for_the_rank_test() -> None:
         assert info.explained
         reached.append(planner.digest(after))
     assert reached[0] == reached[1], "it draws from a stream of its own"
+
+
+def test_an_equally_likely_draw_decides_the_rank_test() -> None:
+    """Else whatever takes few values, all of them likely, would be outside."""
+    assert is_typical(-1.0, lambda _: -1.0)
+    assert not is_typical(-1.0, lambda _: -0.5)
+    asked: list[int] = []
+
+    def draw(number: int) -> float:
+        asked.append(number)
+        return -1.0 if number == NUM_RANKED - 1 else 0.0
+
+    assert is_typical(-1.0, draw)  # the last of 19 counts
+    assert asked == list(range(19))
+
+
+def test_at_the_gate_is_within(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four states and a noise whose variances add up to 4: the distance of 4 is exact."""
+    mean = np.array([[-1.0], [1.0], [-1.0], [1.0]])
+    weights = np.full(4, 0.25)
+    for limit, within in ((4.0, True), (3.9999999999999996, False)):
+        monkeypatch.setattr(validation_gate, "gate", lambda _, limit=limit: limit)
+        assert is_within(np.array([4.0]), mean, np.array([3.0]), weights) is within

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from tests.robot_world import LOCAL, PROBLEM, World
 
+from holdfast.arrays import FloatArray
 from holdfast.errors import OwnDecisionError, ServiceRefusedError
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.events import (
@@ -16,6 +17,7 @@ from holdfast.protocol.events import (
     ComputeOwnAnswer,
     Effects,
     Halt,
+    LogEvent,
     OwnAnswer,
     RobotEffect,
     VerificationNoted,
@@ -89,6 +91,7 @@ def test_an_action_outside_the_limits_is_never_performed() -> None:
     assert "outside the limits of the problem's execute" in reason
     assert world.statuses() == ["local_recovery"]
     assert verdicts(world) == [("cloud", "task", "different"), ("cloud", "sensing", "same")]
+    assert not world.reports("limits_unknown")
     # Impossible as it is, the planner need not be asked twice.
     assert len([e for _, e in world.trace if isinstance(e, ComputeOwnAnswer)]) == 1
 
@@ -407,3 +410,109 @@ def test_without_a_local_service_the_robot_stops_when_all_have_lied() -> None:
     assert isinstance(world.stopped, Halt)
     assert isinstance(world.stopped.error, ServiceRefusedError)
     assert "the robot's own planner" in str(world.stopped.error)
+
+
+def test_two_services_that_give_the_same_wrong_answer_are_both_found_out() -> None:
+    """They agree, so nothing is disputed; the robot's own planner says otherwise."""
+    effects: Effects[RobotEffect] = Effects()
+    verification = Verification(1.0, b"secret", None, PROBLEM, effects)
+    question = question_of(3)
+    for service in ("first", "second", "first"):
+        reply = SensingAnswer(1, question.state.step, 0, question.digest, 0)
+        part = AnswerPart(service, None, reply)
+        verification.take(question, part, Provenance(service, 0.0, 0.0))
+    assert [part.service for part in question.parts] == ["first", "second"]
+    assert not question.disputed
+    while asked := [each for each in effects.take() if isinstance(each, ComputeOwnAnswer)]:
+        for each in asked:
+            verification.decided(OwnAnswer(each.number, (), 1, question.digest), None)
+    wrong = [(each.service, each.step, each.kind) for each in verification.take_wrong()]
+    assert wrong == [("first", 0, "sensing"), ("second", 0, "sensing")]
+    assert verification.take_wrong() == []
+
+
+def test_a_second_liar_that_agrees_with_the_first_is_found_out_in_a_run() -> None:
+    world = World(services=("first", "second"), verify_share=1.0)
+    for name in ("first", "second"):
+        lie(world, name, other_sensing)
+    world.start()
+    world.run()
+    assert world.stopped is None
+    assert {service for service, _ in wrong(world)} == {"first", "second"}
+    assert world.statuses()[-1] == "local_recovery"
+
+
+def choice(service: str, question: Question, sensing_action: int) -> AnswerPart:
+    reply = SensingAnswer(1, question.state.step, sensing_action, question.digest, 0)
+    return AnswerPart(service, None, reply)
+
+
+def test_of_many_answers_that_differ_it_is_said_and_asked_once() -> None:
+    effects: Effects[RobotEffect] = Effects()
+    verification = Verification(0.0, b"secret", None, PROBLEM, effects)
+    question = question_of(3)
+    for number, service in enumerate(("first", "second", "third", "fourth")):
+        part = choice(service, question, number % 3)
+        verification.take(question, part, Provenance(service, 0.0, 0.0))
+        assert question.disputed == (number > 0)
+    taken = effects.take()
+    assert [type(each) for each in taken if isinstance(each, LogEvent)] == [LogEvent]
+    (asked,) = [each for each in taken if isinstance(each, ComputeOwnAnswer)]
+    assert asked.urgent
+    verification.decided(OwnAnswer(asked.number, (), 1, question.digest), question)
+    assert not question.disputed
+    assert question.sensing is not None
+    assert question.sensing.sensing_action == 1
+    # Once it has decided, what still comes is compared, and disputes nothing.
+    verification.take(question, choice("fifth", question, 2), Provenance("fifth", 0.0, 0.0))
+    assert not question.disputed
+    assert question.sensing.sensing_action == 1
+
+
+def test_one_service_that_answers_in_two_ways_is_wrong_in_one() -> None:
+    effects: Effects[RobotEffect] = Effects()
+    verification = Verification(0.0, b"secret", None, PROBLEM, effects)
+    question = question_of(3)
+    for action in (1, 0, 1):
+        verification.take(question, choice("cloud", question, action), Provenance("cloud", 0, 0))
+    assert question.disputed
+    while asked := [each for each in effects.take() if isinstance(each, ComputeOwnAnswer)]:
+        for each in asked:
+            verification.decided(OwnAnswer(each.number, (), 1, question.digest), None)
+    assert [each.service for each in verification.take_wrong()] == ["cloud"]
+
+
+def test_the_robots_own_service_is_not_sampled_but_a_suspect_is_disputed() -> None:
+    effects: Effects[RobotEffect] = Effects()
+    verification = Verification(1.0, b"secret", "local", PROBLEM, effects)
+    for service, sampled in (("local", False), ("cloud", True)):
+        question = question_of(3)
+        verification.take(question, choice(service, question, 0), Provenance(service, 0.0, 0.0))
+        assert question.check_decided == sampled
+    (asked,) = [each for each in effects.take() if isinstance(each, ComputeOwnAnswer)]
+    verification.decided(OwnAnswer(asked.number, (), 1, question.digest), None)
+    suspected = question_of(4)
+    verification.take(suspected, choice("cloud", suspected, 0), Provenance("cloud", 0.0, 0.0))
+    assert suspected.disputed
+    trusted = question_of(5)
+    verification.take(trusted, choice("local", trusted, 0), Provenance("local", 0.0, 0.0))
+    assert not trusted.disputed
+
+
+def test_a_rounding_error_is_no_excess() -> None:
+    class Clipped(PegInHole2D):
+        limit = 0.0
+
+        def execute(self, actions: FloatArray) -> FloatArray:
+            return np.full_like(actions, self.limit)
+
+    problem = Clipped()
+    verification = Verification(0.0, b"", None, problem, Effects[RobotEffect]())
+    for limit, slack in ((0.0, 1e-9), (1e6, 0.95e-3)):
+        problem.limit = limit
+        assert verification.outside_limits(np.full((2, 3), limit + slack)) is None
+        outside = np.full((2, 3), limit)
+        outside[1, 2] -= 1.1 * slack
+        told = verification.outside_limits(outside)
+        assert told is not None
+        assert told.startswith("task action (")
