@@ -89,7 +89,7 @@ def test_no_real_number(value: Any) -> None:
 )
 def test_no_real_numbers(value: Any) -> None:
     assert real_numbers(value) is None
-    with pytest.raises(InvalidValueError, match="^points is .*must be real numbers"):
+    with pytest.raises(InvalidValueError, match=r"^points is .*must be real numbers"):
         floats("points", value)
 
 
