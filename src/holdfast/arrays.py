@@ -119,7 +119,8 @@ def whole(what: str, value: object, least: int, most: int | None = None) -> int:
     number = integer(value)
     if number is None or number < least or (most is not None and number > most):
         limits = f"from {least}" if most is None else f"from {least} to {most}"
-        raise InvalidValueError(f"{what} {value!r:.80}: allowed are whole numbers {limits}")
+        came = value if number is None else number
+        raise InvalidValueError(f"{what} {came!r:.80}: allowed are whole numbers {limits}")
     return number
 
 

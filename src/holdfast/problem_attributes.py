@@ -12,7 +12,6 @@ functions here return tuples of Python's own numbers and texts, and arrays of fl
 
 from __future__ import annotations
 
-import difflib
 import functools
 import inspect
 import warnings
@@ -156,6 +155,10 @@ def _misspelt(kind: type, of_instance: frozenset[str]) -> str:
     theirs = [base for base in kind.__mro__ if not base.__module__.startswith("holdfast.")]
     names = {name for base in theirs for name in vars(base) if name[0] != "_"} | of_instance
     known = {*PARAMETERS, *KNOWN_ATTRIBUTES}
+    if names <= known:
+        return ""
+    import difflib
+
     # One that the problem has was hardly meant by another.
     lacking = sorted(known - names)
     found = [

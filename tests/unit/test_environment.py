@@ -17,6 +17,7 @@ from holdfast.config.loader import load
 from holdfast.errors import (
     ConfigurationError,
     EnvironmentFailedError,
+    HoldfastError,
     InvalidValueError,
     ProblemError,
 )
@@ -164,6 +165,25 @@ def test_task_action_not_finite(problem: Problem, bad: float) -> None:
         environment.perform(np.full(problem.action_size, bad))
     assert environment.state.tobytes() == before
     assert environment.step == 0
+
+
+def test_a_move_that_fails_leaves_the_world_as_it_was() -> None:
+    class Unpaid(PegInHole2D):
+        paid = False
+
+        def reward(self, states: FloatArray, actions: FloatArray) -> FloatArray:
+            return super().reward(states, actions) if self.paid else np.full(2, np.nan)
+
+    problem = Unpaid()
+    world, other = SimulatedEnvironment(problem, 1), SimulatedEnvironment(problem, 1)
+    action = np.array([0.1, 0.0, 0.0])
+    for wrong in (action, np.zeros(2), "0.1", [True, 0.0, 0.0]):
+        with pytest.raises((HoldfastError, ValueError)):
+            world.perform(wrong)  # type: ignore[arg-type]
+    problem.paid = True
+    assert world.step == 0
+    assert world.perform(action) == other.perform(action)
+    assert world.state.tolist() == other.state.tolist()
 
 
 @pytest.mark.parametrize(("seed", "trial"), [(-1, 0), (2**63, 0), (0, -1), (0, 2**32)])

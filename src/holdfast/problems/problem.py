@@ -31,7 +31,6 @@ too, but then another machine needs the checkpoint of a state and cannot compute
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -39,7 +38,6 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast.arrays import BoolArray, FloatArray, IntArray, real_numbers
-from holdfast.config.validation import close_match
 from holdfast.errors import ProblemError
 from holdfast.randomness import Stream
 
@@ -376,6 +374,10 @@ class KnownStateReturnProblem(Protocol):
 
 def _meant(kind: type, given: list[str]) -> str:
     """Return what to ask after a setting that a constructor does not take; empty for nothing."""
+    import inspect
+
+    from holdfast.config.validation import close_match
+
     try:
         takes = list(inspect.signature(kind).parameters)
     except (TypeError, ValueError):

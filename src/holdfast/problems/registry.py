@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import msgspec
 
 from holdfast.arrays import plain
-from holdfast.config.validation import close_match
 from holdfast.errors import InvalidValueError, UnknownProblemError
 from holdfast.floating_mode import in_own_mode
 from holdfast.problems.problem import Problem
@@ -87,6 +86,8 @@ def make(name: str, **settings: Any) -> Problem:
         allowed = [*model_keys, *planner_keys]
         for key in settings:
             if key not in model_keys:
+                from holdfast.config.validation import close_match
+
                 raise InvalidValueError(
                     f"{name} has no setting {key!r}{close_match(key, allowed)}; allowed: "
                     f"{', '.join(allowed)}"
