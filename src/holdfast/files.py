@@ -5,7 +5,7 @@ after a crash, and for every reader, the path holds the old file or the new one,
 Directories whose files belong together, such as a key and its certificate, appear the same way. One
 that is there is never swapped for another: who has mounted it would see the old one for ever.
 
-All functions but :func:`read_bounded` raise :class:`~holdfast.errors.OutputError` if the system
+All functions but those that read raise :class:`~holdfast.errors.OutputError` if the system
 refuses something, or what they would write is there already.
 """
 
@@ -26,6 +26,7 @@ from holdfast.errors import OutputError
 
 __all__ = [
     "NewFile",
+    "bounded_lines",
     "claim_directory",
     "create_directory_atomically",
     "directory_beside",
@@ -48,6 +49,7 @@ _started_in: Path | None = None
 
 _UNFINISHED = re.compile(r"\..+\.\d+\.tmp")
 _LONGEST_WRITE_S = 600.0
+_MAX_LINE = 1 << 20
 
 _PIPE_TIMEOUT_S = 10.0
 _PIPE_PAUSE_S = 0.02
@@ -83,6 +85,21 @@ def read_bounded(path: Path, most: int) -> bytes:
             return file.read(most)
     finally:
         os.close(descriptor)
+
+
+def bounded_lines(path: Path) -> Iterator[str]:
+    """Yield the lines of a UTF-8 file that anybody may have written, longer ones in pieces.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read, or is no file: a pipe would be waited for, and a device has no end.
+    """
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, "it is no file")
+    with path.open(encoding="utf-8", errors="replace", newline="") as file:
+        while line := file.readline(_MAX_LINE):
+            yield line
 
 
 def _read_pipe(descriptor: int, most: int, *, named: bool) -> bytes:

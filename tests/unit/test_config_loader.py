@@ -1008,3 +1008,35 @@ class TestProblems:
     def test_what_a_problem_itself_refuses(self, write: Write) -> None:
         message = complaint(write("problem: capsule_robot\nmodel:\n  num_walls: 5"))
         assert "run.yaml, line 3: model.num_walls" in message
+
+
+def test_paths_are_those_of_the_directory_it_was_read_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A problem's module, which reading imports, may go elsewhere, as simulators do."""
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "keys").mkdir()
+    (tmp_path / "wanders.py").write_text(
+        "import os\n"
+        "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
+        "os.chdir('elsewhere')\n"
+        "class Wanders(PegInHole2D): pass\n"
+    )
+    (tmp_path / "wanders.yaml").write_text("problem: wanders:Wanders\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path.copy())
+    services = ["unix/robot.sock", "unix//run/s", "tcp/127.0.0.1:1"]
+    overrides = {"offload.services": services, "offload.tls": "keys"}
+    configuration = load("wanders.yaml", overrides=overrides)
+    assert Path.cwd() == tmp_path / "elsewhere"
+    assert configuration.path == tmp_path / "wanders.yaml"
+    assert configuration.problem_directory == tmp_path
+    assert configuration.offload.tls == str(tmp_path / "keys")
+    assert configuration.offload.services == (
+        f"unix/{tmp_path / 'robot.sock'}",
+        "unix//run/s",
+        "tcp/127.0.0.1:1",
+    )
+    again = Configuration.from_plain(configuration.plain())
+    assert again == configuration
+    sys.modules.pop("wanders")

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from holdfast.errors import OutputError
 from holdfast.recording.run_clock import RunClock
 from holdfast.recording.step_times import (
     MOMENTS,
@@ -16,7 +19,7 @@ from holdfast.recording.step_times import (
     read_events,
     trial_ends,
 )
-from holdfast.recording.timings import TimingRow
+from holdfast.recording.timings import TimingRow, rows_by_trial
 
 
 def row(step: int, kind: str, time_ns: int) -> TimingRow:
@@ -53,6 +56,19 @@ def test_a_clock_that_was_set_back_is_not_followed() -> None:
     times = StepClock(NS_PER_S).next_trial(3, rows, None)
     assert np.all(np.diff(times) > 0)
     assert times[MOMENTS] == start + NS_PER_S
+
+
+def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
+    """In somebody else's run; and a line has its bound."""
+    path = tmp_path / "events.jsonl"
+    os.mkfifo(path)
+    with pytest.raises(OutputError, match="it is no file"):
+        read_events(path)
+    with pytest.raises(OutputError, match="it is no file"):
+        rows_by_trial(path)
+    path.unlink()
+    path.write_text("[" * 3_000_000 + '\n{"time": "2023-11-14T22:13:21Z", "event": "trial"}\n')
+    assert [event.name for event in read_events(path)] == ["trial"]
 
 
 def test_events_in_order_without_the_damaged_ones(tmp_path: Path) -> None:

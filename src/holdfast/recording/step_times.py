@@ -15,6 +15,7 @@ import numpy as np
 
 from holdfast.arrays import IntArray
 from holdfast.errors import OutputError
+from holdfast.files import bounded_lines
 from holdfast.recording.facts import Decider, EventFact
 from holdfast.recording.run_clock import RunClock, Stamp
 from holdfast.recording.timings import TimingRow, nanoseconds
@@ -94,15 +95,14 @@ def read_events(path: Path) -> list[EventFact]:
     """Return the lines of ``events.jsonl`` as they are there, with the wall clock's times."""
     events = []
     try:
-        with path.open(encoding="utf-8", errors="replace") as file:
-            for line in file:
-                try:
-                    fields = json.loads(line)
-                    moment, name = fields.pop("time"), fields.pop("event")
-                    stamp = Stamp.of(fields.pop("boot", None), fields.pop("uptime_s", None))
-                    events.append(EventFact(nanoseconds(moment), str(name), fields, stamp))
-                except (ValueError, KeyError, TypeError, AttributeError):
-                    continue  # a line that a power cut has corrupted
+        for line in bounded_lines(path):
+            try:
+                fields = json.loads(line)
+                moment, name = fields.pop("time"), fields.pop("event")
+                stamp = Stamp.of(fields.pop("boot", None), fields.pop("uptime_s", None))
+                events.append(EventFact(nanoseconds(moment), str(name), fields, stamp))
+            except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+                continue  # a line that a power cut has corrupted
     except FileNotFoundError:
         return []
     except OSError as error:

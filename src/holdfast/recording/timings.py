@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from holdfast.errors import OutputError
+from holdfast.files import bounded_lines
 from holdfast.printable import cell
 from holdfast.protocol.events import Timing, VerificationNoted
 from holdfast.recording.run_clock import Stamp, read_clocks
@@ -268,7 +269,6 @@ def nanoseconds(moment: str) -> int:
 
 def _rows(path: Path, least: int) -> Iterator[list[str]]:
     """Yield the rows of a table that have enough columns."""
-    with path.open(encoding="utf-8", errors="replace", newline="") as file:
-        for row in csv.reader(line.replace("\0", "") for line in file):
-            if len(row) >= least:
-                yield row
+    for row in csv.reader(line.replace("\0", "") for line in bounded_lines(path)):
+        if len(row) >= least:
+            yield row

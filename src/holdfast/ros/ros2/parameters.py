@@ -176,10 +176,11 @@ def read_parameters(values: Mapping[str, Any]) -> NodeParameters:
             "configuration is empty; it must name the configuration file (YAML) of the run, as in "
             "-p configuration:=peg_in_hole_2d.yaml"
         )
+    here = Path.cwd()  # before the problem's code, which may go elsewhere
     configuration = load(own.configuration, problem=own.problem or None, overrides=overrides)
     default = Path("runs") / f"{Path(own.configuration).stem}-seed{configuration.simulator.seed}"
     mapping["environment.timeout_ms"] = configuration.environment.timeout_ms
-    run_directory = Path(own.run_directory or default).absolute()
+    run_directory = here / (own.run_directory or default)
     return NodeParameters(own, configuration, run_directory, mapping)
 
 
