@@ -227,8 +227,8 @@ class LaunchFault(_Item, frozen=True, kw_only=True, tag="launch", tag_field="ite
 class Late(_Item, frozen=True, kw_only=True, tag="late", tag_field="item"):
     """The observation of a step comes so many task actions later; ``none`` for never.
 
-    With the move by which it is there, at the earliest with the next one. Of a step that has
-    several such lines it comes several times.
+    It comes with the move by which it is there, at the earliest with the next one; of a step that
+    has several such lines several times. Never is no reading, and is told at once.
     """
 
     step: Count
