@@ -22,6 +22,7 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 from tests.fuzz import corpus, strategies
+from tests.fuzz.attack_messages import hostile_settings, odd_requests
 from tests.fuzz.targets import SPECIMENS
 from tests.unit.test_protocol_service import Bench, Robot, content, planning_of
 
@@ -113,6 +114,11 @@ class HostileRobots(RuleBasedStateMachine):
     @rule(payload=strategies.spoilt(SPECIMENS["request"]), seals=st.booleans())
     def spoilt_bytes(self, payload: bytes, seals: bool) -> None:
         self.hostile(with_checksum(payload) if seals else payload)
+
+    @rule(seed=st.integers(0, 2**32))
+    def odd_values_and_hostile_settings(self, seed: int) -> None:
+        chance = random.Random(seed)
+        self.hostile(next(chance.choice((odd_requests, hostile_settings))(chance)))
 
     @rule(request=strategies.requests)
     def a_request_of_any_content(self, request: Request) -> None:
