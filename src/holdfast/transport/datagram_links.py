@@ -412,6 +412,7 @@ class RobotDatagramLink(_DatagramLink):
             now,
         )
 
+    @ends_link
     def _probe(self) -> None:
         if not self._ended:
             self._exchange.probe(self._loop.time())
