@@ -32,8 +32,10 @@ import msgspec
 from holdfast.errors import InvalidValueError, MessageError
 from holdfast.planning import needs_sensing
 from holdfast.problems.problem import Problem
+from holdfast.protocol.decision_cost import Cost, Pricing
 from holdfast.protocol.events import Effects
 from holdfast.protocol.expected_time import ExpectedTime
+from holdfast.protocol.lanes import Lanes
 from holdfast.protocol.messages import (
     MAX_WORD,
     Request,
@@ -68,6 +70,8 @@ __all__ = ["Service"]
 _INERTIA_OF_ONE = 4.0
 """Of the mean times of one session, whose decisions are alike."""
 
+_ANY_MACHINE = Pricing()
+
 _NO_ROOM_RETRY_MS = 100.0
 """Shortest retry time for a robot that finds no free session."""
 
@@ -84,6 +88,8 @@ class Service:
         Jobs that may run at a time.
     describe_error : callable, optional
         Turns an error of a problem's code into a message.
+    pricing : Pricing, optional
+        How fast this machine is.
     """
 
     def __init__(
@@ -92,6 +98,7 @@ class Service:
         workers: int,
         limits: ServiceLimits | None = None,
         describe_error: Callable[[BaseException], str] | None = None,
+        pricing: Pricing = _ANY_MACHINE,
     ) -> None:
         if workers < 1:
             raise InvalidValueError(f"workers {workers}: a service needs at least 1")
@@ -102,7 +109,8 @@ class Service:
         self._effects: Effects[ServiceEffect] = Effects()
         self._sessions = SessionTable(self._limits)
         self._problems = ProblemPool(self._limits.max_problems)
-        self._queue = RequestQueue(workers, self._limits)
+        self._pricing = pricing
+        self._queue = Lanes(workers, self._limits)
         self._calls = WaitingCalls(self._limits, self._statistics, self._effects)
         # Of all robots; each session has its own, which begin here.
         self._task_time = ExpectedTime(1e-3)
@@ -160,6 +168,7 @@ class Service:
         """Handle the result of a job that was handed out."""
         task = self._queue.end(job)
         session = task.session
+        is_awaited = session.pending.get(task.digest) is task
         session.remove_task(task)
         self._problems.release(session.problem_key, outcome.problem)
         if not session.closed:
@@ -167,20 +176,43 @@ class Service:
             # The first job of a problem also imports and builds it: no measure of the next ones.
             typical = session.built
             session.built = session.built or outcome.problem is not None
-            if outcome.failure is not None or outcome.lacks_state:
+            session.price = outcome.price or session.price
+            if outcome.cancelled:
+                self._calls.end(task)
+            elif outcome.postponed is not None:
+                if is_awaited and not self._queue.postpone(task, outcome.postponed, now):
+                    for record in self._calls.detach(task):
+                        call, number, newcomer = record.call, record.number, task.newcomer
+                        self._reject_busy(call, number, session.key, now, newcomer=newcomer)
+            elif outcome.failure is not None or outcome.lacks_state:
                 self._failed(task, outcome)
             else:
                 if typical:
                     computed_s = now - task.started_at
-                    (self._sensing_time if task.sensing else self._task_time).learn(computed_s)
+                    if not task.is_long:
+                        # What newcomers are expected to take.
+                        (self._sensing_time if task.sensing else self._task_time).learn(computed_s)
                     task.expected_time.learn(computed_s)
                 self._succeeded(task, outcome, now)
             self._queue.release_held(session)
         self._dispatch(now)
         return self._effects.take()
 
+    def gone(self, call: int, now: float) -> list[ServiceEffect]:
+        """Handle the end of a call by itself: its link has ended, and nobody awaits replies."""
+        task = self._calls.drop(call)
+        if task is not None and not task.calls:
+            self._statistics.superseded += self._queue.drop(task)
+        self._dispatch(now)
+        return self._effects.take()
+
     def tick(self, now: float) -> list[ServiceEffect]:
         """Handle the passing of time."""
+        for task in self._queue.overdue(now):
+            for record in self._calls.detach(task):
+                text = self._queue.overdue_in_words(task, now)
+                self._calls.send_refused(record.call, record.number, "invalid", text)
+            self._queue.cancel(task)
         self._calls.send_progress(now)
         while (session := self._sessions.idle(now)) is not None:
             self._forget(session, "idle")
@@ -188,7 +220,7 @@ class Service:
 
     def next_wakeup(self) -> float | None:
         """Return when :meth:`tick` is due if nothing happens before; None if never."""
-        due = (self._calls.progress_at(), self._sessions.idle_at())
+        due = (self._calls.progress_at(), self._sessions.idle_at(), self._queue.overdue_at())
         return min((at for at in due if at is not None), default=None)
 
     # -- requests --------------------------------------------------------------------------------
@@ -268,7 +300,7 @@ class Service:
             ExpectedTime(self._task_time.mean_s, _INERTIA_OF_ONE),
             ExpectedTime(self._sensing_time.mean_s, _INERTIA_OF_ONE),
         )
-        session.used_at = now
+        session.used_at, session.max_short_s = now, limits.max_short_s
         while not self._sessions.has_room_for(session):
             unused = self._sessions.evictable_for(session)
             if unused is None:
@@ -359,12 +391,13 @@ class Service:
             (
                 task
                 for task in session.pending.values()
-                if task.slot == REQUESTED and not task.running
+                if task.slot == REQUESTED and not task.running and not task.is_long
             ),
             None,
         )
         newcomer = session.newcomer
-        if waiting is None and self._queue.is_overloaded(now, session.owner, newcomer=newcomer):
+        full = self._queue.is_overloaded(now, session.owner, newcomer=newcomer)
+        if waiting is None and full:
             self._reject_busy(call, request.number, session.key, now, newcomer=newcomer)
             return None
         if waiting is not None:
@@ -394,10 +427,7 @@ class Service:
         for task in list(session.pending.values()):
             if task is not keep:
                 self._calls.end(task)
-                if not task.running:
-                    self._statistics.superseded += 1
-                    session.remove_task(task)
-                    self._queue.remove(task)
+                self._statistics.superseded += self._queue.drop(task)
 
     # -- work ------------------------------------------------------------------------------------
 
@@ -427,8 +457,13 @@ class Service:
                 for record in self._calls.detach(task):
                     self._calls.send_need_state(record.call, record.number, differs=True)
                 return
-        alone = self._queue.num_running == 0 and self._queue.num_waiting == 0
+        alone = self._queue.is_alone(task)
+        limits = self._limits
         problem = self._problems.acquire(session.problem_key)
+        expected_s = math.inf
+        if problem is not None and task.is_typical(state):
+            expected_s = task.expected_time.typical_s
+        most_s = limits.max_short_s if expected_s == math.inf else limits.max_brief_s
         job = Job(
             task.kind,
             problem,
@@ -440,11 +475,11 @@ class Service:
             self._limits,
             request,
             state,
+            self._pricing,
+            session.price,
+            None if task.is_long else Cost(most_s, limits.max_short_bytes),
         )
         self._queue.handed_out(task, job, now)
-        expected_s = math.inf
-        if problem is not None and task.is_typical(state):
-            expected_s = task.expected_time.typical_s
         self._effects.append(StartJob(job, expected_s))
 
     # -- outcomes --------------------------------------------------------------------------------
@@ -527,10 +562,9 @@ class Service:
         newcomer: bool,
         least_ms: float = 1.0,
     ) -> None:
-        queue = self._queue
         owner, session = key
-        wait_ms = max(least_ms, 1e3 * queue.wait_s(now, owner, newcomer=newcomer))
-        self._calls.send_busy(call, number, session, wait_ms, queue.num_waiting)
+        wait_ms = max(least_ms, 1e3 * self._queue.wait_s(now, owner, newcomer=newcomer))
+        self._calls.send_busy(call, number, session, wait_ms, self._queue.num_waiting)
 
     # -- sessions --------------------------------------------------------------------------------
 

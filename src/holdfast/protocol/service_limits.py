@@ -39,8 +39,15 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
         From one progress reply to the next; twice that where many calls wait.
     prefetch_patience_ms : float
         Time for which a prefetch lets urgent tasks go first.
-    max_work : int
-        Size of one decision: particles x observation samples x sensing actions x horizon.
+    max_decision_s : float
+        Estimated time of one decision on one core (:mod:`holdfast.protocol.decision_cost`).
+    max_short_s, max_brief_s : float
+        Estimated time of a decision in the short lane (:mod:`holdfast.protocol.lanes`), and of one
+        on the thread of the event loop, where its robot's earlier ones were brief.
+    max_decision_bytes : int
+        Estimated memory of one decision, and of all long ones that run at a time.
+    max_short_bytes : int
+        Estimated memory of a decision in the short lane.
     max_steps : int
         Steps by which a state is rolled forward for one request.
     max_problems : int
@@ -62,7 +69,11 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
     progress_interval_ms: float = 50.0
     prefetch_patience_ms: float = 20.0
     max_particles: int = 1_000_000
-    max_work: int = 10**9
+    max_decision_s: float = 10.0
+    max_short_s: float = 0.1
+    max_brief_s: float = 0.02
+    max_decision_bytes: int = 512 << 20
+    max_short_bytes: int = 32 << 20
     max_steps: int = 16 * MAX_INPUTS
     max_problems: int = 32
     answers_per_session: int = 8

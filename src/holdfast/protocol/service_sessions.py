@@ -15,6 +15,7 @@ calls. A part is identified by the digest of its state, so equal questions share
 from __future__ import annotations
 
 import hashlib
+import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple, TypeAlias
@@ -24,6 +25,7 @@ import msgspec
 from holdfast.config.settings import PlanningSettings
 from holdfast.planning import PlanningState
 from holdfast.problems.registry import BUILT_IN
+from holdfast.protocol.decision_cost import Cost, Price
 from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.messages import Request, SessionConfiguration, pack_configuration
 from holdfast.protocol.service_limits import ServiceLimits
@@ -103,6 +105,13 @@ class PendingTask:
         Bytes of the request.
     since : float
         When it was queued; of one that carries a newer request, the first of them.
+
+    Attributes
+    ----------
+    is_long : bool
+        Whether it is in the long lane (:mod:`~holdfast.protocol.lanes`).
+    num_bytes : float
+        Estimated memory of a long one.
     """
 
     def __init__(
@@ -127,6 +136,8 @@ class PendingTask:
         self.urgent = request is not None
         self.newcomer = session.newcomer
         self.calls: dict[int, WaitingCall] = {}
+        self.is_long = False
+        self.num_bytes = 0.0
         self.cost_s = self._expected_s()
         self.running = False
         self.started_at = since
@@ -144,7 +155,15 @@ class PendingTask:
     def _expected_s(self) -> float:
         """Return how long it may take, with the sensing part that follows a task part."""
         session = self.session
-        return session.sensing_time.mean_s + (0.0 if self.sensing else session.task_time.mean_s)
+        mean_s = session.sensing_time.mean_s + (0.0 if self.sensing else session.task_time.mean_s)
+        # In the short lane it takes no longer: it moves to the other one instead.
+        return mean_s if self.is_long else min(mean_s, session.max_short_s)
+
+    def lengthen(self, cost: Cost) -> None:
+        """Move to the long lane, for an estimated cost; nowhere does it wait meanwhile."""
+        self.is_long = True
+        self.num_bytes = cost.num_bytes
+        self.cost_s = self._expected_s()
 
     def is_typical(self, state: PlanningState | None) -> bool:
         """Return whether earlier times predict this task's, if it starts at ``state``.
@@ -153,7 +172,7 @@ class PendingTask:
         may choose their number. Its problem must be built in: other code may take any time.
         """
         request = self.request
-        if not self.session.built_in:
+        if not (self.session.built_in and self.session.is_brief):
             return False
         if request is None:
             return True
@@ -187,6 +206,12 @@ class Session:
         Digest that identifies the problem among those kept for reuse.
     built, built_in : bool
         Whether the problem was built before, and whether it is part of holdfast.
+    max_short_s : float
+        Bound on the time of a task in the short lane.
+    is_brief : bool
+        Whether no decision was estimated to be too long for the event loop's thread.
+    price : Price or None
+        What its decisions cost; None before the first.
     planning : PlanningSettings
         With the threads that a decision has when it is computed alone.
     served, newcomer : bool
@@ -227,6 +252,9 @@ class Session:
             )
         )
         self.built = False
+        self.max_short_s = math.inf
+        self.is_brief = True
+        self.price: Price | None = None
         self.built_in = configuration.problem in BUILT_IN
         # The number of threads changes no result, so the service may choose it.
         most = min(configuration.planning.active_sensing.num_cores, _MAX_THREADS)

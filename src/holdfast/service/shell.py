@@ -83,7 +83,7 @@ class ServiceShell:
     ) -> None:
         self._service = service
         self._transport = transport
-        self._jobs = ThreadPool(workers, "holdfast-worker", self._broke)
+        self._jobs = ThreadPool(max(2, workers), "holdfast-worker", self._broke)
         self._decoder = ThreadPool(1, "holdfast-decoder", self._broke)
         self._events = events
         self._on_decision = on_decision
@@ -237,8 +237,15 @@ class ServiceShell:
     def _decoded(self, call: IncomingCall, size: int, request: Request | MessageError) -> None:
         number = next(self._numbers)
         self._calls[number] = call
+        # Later: a reply may end the link while effects are carried out.
+        call.on_gone = functools.partial(self._loop.call_soon, self._guarded, self._gone, number)
         now = self._loop.time()
         self._carry_out(self._service.receive(number, request, size, now, call.robot))
+
+    def _gone(self, number: int) -> None:
+        """Handle the end of a link on which a call was open."""
+        if self._calls.pop(number, None) is not None:
+            self._carry_out(self._service.gone(number, self._loop.time()))
 
     def _run_brief_job(self) -> None:
         job = self._brief_jobs.popleft()
