@@ -79,13 +79,14 @@ def _greatest(bounds: Bounds) -> object:
 
 def _made_fit(settings: PlanningSettings) -> PlanningSettings:
     """Change what the method cannot use, but for what costs."""
-    particles = settings.particle_filter.num_particles
     for _ in range(8):
+        particles = settings.particle_filter.num_particles
         unfit = unfit_for_the_method(settings)
         if unfit is None:
             return settings
         (section, name), _ = unfit
-        key, value = f"{section}.{name}", 1
+        key = f"{section}.{name}"
+        value: object = 1
         if name == "num_nearest_neighbors":
             value = particles - 1
         elif name == "num_particles":
@@ -125,8 +126,9 @@ def random_settings(chance: random.Random, most: float = 1.0) -> PlanningSetting
     """
     settings = PlanningSettings()
 
-    def drawn(least: float, greatest: float) -> int:
-        return round(least * (1.0 + most * (greatest / least - 1.0)) ** chance.random())
+    def drawn(least: int, greatest: int) -> int:
+        found: float = float(least)
+        return round(found * (1.0 + most * (greatest / least - 1.0)) ** chance.random())
 
     values: dict[str, object] = {
         "selector.method": chance.choice(get_args(Method)),

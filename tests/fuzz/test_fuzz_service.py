@@ -67,7 +67,8 @@ class HostileRobots(RuleBasedStateMachine):
         max_calls_per_request=st.integers(1, 3),
         max_sessions_per_robot=st.sampled_from((None, 1, 2)),
         max_waiting_per_robot=st.sampled_from((1, 2, 50)),
-        max_short_s=st.sampled_from((0.0, 0.001, 0.1)),
+        max_brief_s=st.sampled_from((0.0, 0.001, 0.02)),
+        max_medium_s=st.sampled_from((0.0, 0.1)),
         certificates=st.sampled_from(((None, None), ("honest", "hostile"), ("honest", None))),
     )
     def begin(
@@ -242,11 +243,13 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     assert all(len(session.answers) <= limits["answers_per_session"] for session in kept)
     # Works.
     tasks = [task for session in kept for task in works_of(session)]
-    lanes = (queue._short, queue._long)
+    lanes = queue._lanes
     running = [task for lane in lanes for task in lane._running.values()]
     waiting = [task for task in tasks if not task.running]
-    assert statistics.running == len(running) == len(bench.jobs) <= max(2, bench.workers)
-    assert queue._long.num_running <= max(1, bench.workers - 1)
+    assert statistics.running == len(running) == len(bench.jobs)
+    fewer = max(1, bench.workers - 1)
+    assert all(lane.num_running <= fewer for lane in lanes[1:])
+    assert sum(lane.num_running for lane in lanes[:2]) <= bench.workers
     assert statistics.waiting == len(waiting)
     for lane in lanes:
         check_lane(lane, [task for task in waiting if queue._of(task) is lane])

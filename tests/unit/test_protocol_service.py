@@ -127,7 +127,7 @@ class Bench:
                 self.trace.append((f"run {effect.job.kind}", -1))
             elif isinstance(effect, LogEvent):
                 self.notes.append(effect)
-        assert len(self.jobs) <= max(2, self.workers)  # one short and one long
+        assert len(self.jobs) <= self.workers + max(1, self.workers - 1)  # these are long
 
     def send(self, message: Request | bytes, owner: str | None = None) -> int:
         call = len(self.replies)

@@ -1,17 +1,19 @@
-"""Two lanes for the tasks of a service, so that long decisions never hold all its workers.
+"""Three lanes for the tasks of a service, so that long decisions never hold all its threads.
 
 A robot chooses how long its decisions take. In one queue a few that take seconds would keep all
 other robots waiting, whoever sent them and even after their senders had gone. So each task begins
-in the *short* lane. Its job first estimates what it costs
-(:mod:`~holdfast.protocol.decision_cost`); if that is too much for the lane, the task moves to the
-*long* lane, which has all workers but one. The last worker is for short decisions. With one worker
-there is a second thread for a long decision beside it.
+in the lane of the *brief* ones. Its job first estimates what it costs
+(:mod:`~holdfast.protocol.decision_cost`); if that is too much for the lane, nothing is computed,
+and the task moves to that of the *medium* ones or of the *long* ones:
 
-No owner can hold all workers for longer than short decisions take. (Without certificates all robots
-are one owner, and nothing tells them apart; that is why the lanes go by cost.) Where tasks wait in
-both lanes, these take turns. Each lane is a
-:class:`~holdfast.protocol.request_queue.RequestQueue`; the long one also bounds the memory of what
-runs in it.
+- Brief tasks may have all workers.
+- Medium ones have all workers but one. They take turns with the brief ones.
+- Long ones have as many threads of their own, at least one, so that the system divides the cores
+  between them and the others. They also share a bound on memory.
+
+So no owner holds all threads, with one worker either (there brief and medium tasks share it). The
+lanes go by cost and not by owner, because without certificates all robots are one owner, and
+nothing tells them apart. Each lane is a :class:`~holdfast.protocol.request_queue.RequestQueue`.
 """
 
 from __future__ import annotations
@@ -23,7 +25,15 @@ from holdfast.protocol.messages import Request
 from holdfast.protocol.request_queue import RequestQueue
 from holdfast.protocol.service_jobs import Job
 from holdfast.protocol.service_limits import ServiceLimits
-from holdfast.protocol.service_sessions import REQUESTED, Owner, PendingTask, Session
+from holdfast.protocol.service_sessions import (
+    BRIEF,
+    LONG,
+    MEDIUM,
+    REQUESTED,
+    Owner,
+    PendingTask,
+    Session,
+)
 
 __all__ = ["Lanes"]
 
@@ -37,43 +47,49 @@ class Lanes:
     Parameters
     ----------
     workers : int
-        Tasks that may run at a time; with one worker, one short task and one long one.
+        Tasks that may run at a time, besides the long ones.
+
+    Attributes
+    ----------
+    limits_s : tuple of float
+        Bounds on the estimated time of a task in each lane.
     """
 
     def __init__(self, workers: int, limits: ServiceLimits) -> None:
-        self._most = max(2, workers)
+        self._workers = workers
         self._limits = limits
+        fewer = max(1, workers - 1)
+        self._lanes = [RequestQueue(number, limits) for number in (workers, fewer, fewer)]
+        self.limits_s = (limits.max_brief_s, limits.max_medium_s, limits.max_decision_s)
         self._overdue_s = _OVERDUE * limits.max_decision_s
-        self._short = RequestQueue(workers, limits)
-        self._long = RequestQueue(max(1, workers - 1), limits)
-        self._long_went_last = False
+        self._brief_went_last = False
         self._cancelled: set[Job] = set()
 
     @property
     def num_waiting(self) -> int:
         """Tasks not yet begun."""
-        return self._short.num_waiting + self._long.num_waiting
+        return sum(lane.num_waiting for lane in self._lanes)
 
     @property
     def num_running(self) -> int:
         """Tasks that workers have."""
-        return self._short.num_running + self._long.num_running
+        return sum(lane.num_running for lane in self._lanes)
 
     def is_overloaded(self, now: float, owner: Owner, *, newcomer: bool) -> bool:
-        """Return whether a new request is to be turned away: each begins in the short lane."""
-        return self._short.is_overloaded(now, owner, newcomer=newcomer)
+        """Return whether a new request is to be turned away; each begins as a brief one."""
+        return self._lanes[BRIEF].is_overloaded(now, owner, newcomer=newcomer)
 
     def wait_s(self, now: float, owner: Owner, *, newcomer: bool) -> float:
         """Estimate the wait of a new request."""
-        return self._short.wait_s(now, owner, newcomer=newcomer)
+        return self._lanes[BRIEF].wait_s(now, owner, newcomer=newcomer)
 
     def _of(self, task: PendingTask) -> RequestQueue:
         """Return the lane of a task."""
-        return self._long if task.is_long else self._short
+        return self._lanes[task.lane]
 
     def is_alone(self, task: PendingTask) -> bool:
         """Return whether a task that is to be started may have all cores."""
-        if task.is_long and self._most == 2:
+        if task.lane == LONG and self._workers <= 2:
             return True  # no other long one runs beside it
         return self.num_running == 0 and self.num_waiting == 0
 
@@ -97,31 +113,21 @@ class Lanes:
 
     def release_held(self, session: Session) -> None:
         """Queue a session's tasks that were held back behind those that have run."""
-        self._short.release_held(session)
-        self._long.release_held(session)
+        for lane in self._lanes:
+            lane.release_held(session)
 
     # -- running ---------------------------------------------------------------------------------
 
     def take(self, now: float) -> PendingTask | None:
-        """Remove and return the next task; None if none waits or no worker is free."""
-        if self.num_running >= self._most:
-            return None
-        first, second = self._short, self._long
-        if not self._long_went_last:
-            first, second = second, first
-        for lane in (first, second):
-            # So that both lanes have their turn, if both wait.
-            room = math.inf if lane is self._short else self._room()
-            task = lane.take(now, room)
-            if task is not None:
-                self._long_went_last = lane is self._long
-                return task
-        return None
-
-    def _room(self) -> float:
-        """Return the bytes that a long task may take beside those that run."""
-        taken = self._long.running_bytes
-        return self._limits.max_decision_bytes - taken if taken else math.inf
+        """Remove and return the next task; None if none waits or no thread is free."""
+        brief, medium, long = self._lanes
+        if brief.num_running + medium.num_running < self._workers:
+            for lane in (medium, brief) if self._brief_went_last else (brief, medium):
+                if (task := lane.take(now)) is not None:
+                    self._brief_went_last = lane is brief
+                    return task
+        taken = long.running_bytes
+        return long.take(now, self._limits.max_decision_bytes - taken if taken else math.inf)
 
     def handed_out(self, task: PendingTask, job: Job, now: float) -> None:
         """Note that a worker has a task."""
@@ -137,7 +143,7 @@ class Lanes:
         return self._running_in(job).end(job)
 
     def _running_in(self, job: Job) -> RequestQueue:
-        return self._long if self._long.runs(job) else self._short
+        return next(lane for lane in self._lanes if lane.runs(job))
 
     def postpone(self, task: PendingTask, cost: Cost, now: float) -> bool:
         """Queue a task again that costs more than its job was allowed, if a call waits for it.
@@ -148,12 +154,12 @@ class Lanes:
         session.is_brief = False
         if not task.calls:
             return True  # nobody awaits it
-        if cost.seconds > limits.max_short_s or cost.num_bytes > limits.max_short_bytes:
-            task.lengthen(cost)
-            if task.slot == REQUESTED and self._long.is_overloaded(
-                now, session.owner, newcomer=task.newcomer
-            ):
-                return False
+        fits = cost.seconds <= limits.max_medium_s and cost.num_bytes <= limits.max_medium_bytes
+        task.move_to(MEDIUM if fits else LONG, cost)
+        if task.slot == REQUESTED and self._of(task).is_overloaded(
+            now, session.owner, newcomer=task.newcomer
+        ):
+            return False
         session.pending[task.digest] = task
         self.enqueue(task)
         return True
@@ -167,7 +173,7 @@ class Lanes:
         for again, over the robot's next link.
         """
         if task.running:
-            if task.is_long:
+            if task.lane == LONG:
                 self.cancel(task)
             return False
         task.session.remove_task(task)
@@ -195,7 +201,7 @@ class Lanes:
         due = now - self._overdue_s
         return [
             task
-            for lane in (self._short, self._long)
+            for lane in self._lanes
             for job, task in lane.running()
             if task.started_at <= due and job not in self._cancelled
         ]
@@ -205,7 +211,7 @@ class Lanes:
         return min(
             (
                 task.started_at + self._overdue_s
-                for lane in (self._short, self._long)
+                for lane in self._lanes
                 for job, task in lane.running()
                 if job not in self._cancelled
             ),

@@ -55,6 +55,8 @@ from holdfast.protocol.service_jobs import (
 )
 from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
 from holdfast.protocol.service_sessions import (
+    BRIEF,
+    LONG,
     REQUESTED,
     CachedAnswer,
     Owner,
@@ -189,7 +191,7 @@ class Service:
             else:
                 if typical:
                     computed_s = now - task.started_at
-                    if not task.is_long:
+                    if task.lane == BRIEF:
                         # What newcomers are expected to take.
                         (self._sensing_time if task.sensing else self._task_time).learn(computed_s)
                     task.expected_time.learn(computed_s)
@@ -300,7 +302,7 @@ class Service:
             ExpectedTime(self._task_time.mean_s, _INERTIA_OF_ONE),
             ExpectedTime(self._sensing_time.mean_s, _INERTIA_OF_ONE),
         )
-        session.used_at, session.max_short_s = now, limits.max_short_s
+        session.used_at = now
         while not self._sessions.has_room_for(session):
             unused = self._sessions.evictable_for(session)
             if unused is None:
@@ -391,7 +393,7 @@ class Service:
             (
                 task
                 for task in session.pending.values()
-                if task.slot == REQUESTED and not task.running and not task.is_long
+                if task.slot == REQUESTED and not task.running and task.lane == BRIEF
             ),
             None,
         )
@@ -458,12 +460,11 @@ class Service:
                     self._calls.send_need_state(record.call, record.number, differs=True)
                 return
         alone = self._queue.is_alone(task)
-        limits = self._limits
+        most_s = self._queue.limits_s[task.lane]
         problem = self._problems.acquire(session.problem_key)
         expected_s = math.inf
         if problem is not None and task.is_typical(state):
             expected_s = task.expected_time.typical_s
-        most_s = limits.max_short_s if expected_s == math.inf else limits.max_brief_s
         job = Job(
             task.kind,
             problem,
@@ -477,7 +478,7 @@ class Service:
             state,
             self._pricing,
             session.price,
-            None if task.is_long else Cost(most_s, limits.max_short_bytes),
+            None if task.lane == LONG else Cost(most_s, self._limits.max_medium_bytes),
         )
         self._queue.handed_out(task, job, now)
         self._effects.append(StartJob(job, expected_s))

@@ -41,13 +41,12 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
         Time for which a prefetch lets urgent tasks go first.
     max_decision_s : float
         Estimated time of one decision on one core (:mod:`holdfast.protocol.decision_cost`).
-    max_short_s, max_brief_s : float
-        Estimated time of a decision in the short lane (:mod:`holdfast.protocol.lanes`), and of one
-        on the thread of the event loop, where its robot's earlier ones were brief.
+    max_brief_s, max_medium_s : float
+        Estimated time of a decision in the lanes of these names (:mod:`holdfast.protocol.lanes`).
     max_decision_bytes : int
         Estimated memory of one decision, and of all long ones that run at a time.
-    max_short_bytes : int
-        Estimated memory of a decision in the short lane.
+    max_medium_bytes : int
+        Estimated memory of a decision that is not long.
     max_steps : int
         Steps by which a state is rolled forward for one request.
     max_problems : int
@@ -70,10 +69,10 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
     prefetch_patience_ms: float = 20.0
     max_particles: int = 1_000_000
     max_decision_s: float = 10.0
-    max_short_s: float = 0.1
     max_brief_s: float = 0.02
+    max_medium_s: float = 0.1
     max_decision_bytes: int = 512 << 20
-    max_short_bytes: int = 32 << 20
+    max_medium_bytes: int = 32 << 20
     max_steps: int = 16 * MAX_INPUTS
     max_problems: int = 32
     answers_per_session: int = 8

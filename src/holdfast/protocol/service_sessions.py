@@ -15,7 +15,6 @@ calls. A part is identified by the digest of its state, so equal questions share
 from __future__ import annotations
 
 import hashlib
-import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple, TypeAlias
@@ -31,6 +30,9 @@ from holdfast.protocol.messages import Request, SessionConfiguration, pack_confi
 from holdfast.protocol.service_limits import ServiceLimits
 
 __all__ = [
+    "BRIEF",
+    "LONG",
+    "MEDIUM",
     "PREFETCHED",
     "REQUESTED",
     "CachedAnswer",
@@ -58,6 +60,12 @@ Owner: TypeAlias = str | None
 
 SessionKey: TypeAlias = tuple[Owner, bytes]
 """Owner and session id."""
+
+_ESTIMATING_S = 1e-4
+"""Time of a job that does no more than that."""
+
+BRIEF, MEDIUM, LONG = 0, 1, 2
+"""Lanes."""
 
 REQUESTED, PREFETCHED = 0, 1
 """A session's slots: the robot waits for the first kind of task; the second is ahead of it."""
@@ -108,10 +116,10 @@ class PendingTask:
 
     Attributes
     ----------
-    is_long : bool
-        Whether it is in the long lane (:mod:`~holdfast.protocol.lanes`).
+    lane : int
+        Where it waits and runs (:mod:`~holdfast.protocol.lanes`).
     num_bytes : float
-        Estimated memory of a long one.
+        Estimated memory, unless it is brief.
     """
 
     def __init__(
@@ -136,7 +144,7 @@ class PendingTask:
         self.urgent = request is not None
         self.newcomer = session.newcomer
         self.calls: dict[int, WaitingCall] = {}
-        self.is_long = False
+        self.lane = BRIEF
         self.num_bytes = 0.0
         self.cost_s = self._expected_s()
         self.running = False
@@ -156,12 +164,12 @@ class PendingTask:
         """Return how long it may take, with the sensing part that follows a task part."""
         session = self.session
         mean_s = session.sensing_time.mean_s + (0.0 if self.sensing else session.task_time.mean_s)
-        # In the short lane it takes no longer: it moves to the other one instead.
-        return mean_s if self.is_long else min(mean_s, session.max_short_s)
+        # One that may be too long for its lane is only estimated there.
+        return mean_s if self.lane != BRIEF or session.is_brief else _ESTIMATING_S
 
-    def lengthen(self, cost: Cost) -> None:
-        """Move to the long lane, for an estimated cost; nowhere does it wait meanwhile."""
-        self.is_long = True
+    def move_to(self, lane: int, cost: Cost) -> None:
+        """Move to another lane, for an estimated cost; it waits in none meanwhile."""
+        self.lane = lane
         self.num_bytes = cost.num_bytes
         self.cost_s = self._expected_s()
 
@@ -206,10 +214,8 @@ class Session:
         Digest that identifies the problem among those kept for reuse.
     built, built_in : bool
         Whether the problem was built before, and whether it is part of holdfast.
-    max_short_s : float
-        Bound on the time of a task in the short lane.
     is_brief : bool
-        Whether no decision was estimated to be too long for the event loop's thread.
+        Whether no decision was estimated to be too long for the lane of brief ones.
     price : Price or None
         What its decisions cost; None before the first.
     planning : PlanningSettings
@@ -252,7 +258,6 @@ class Session:
             )
         )
         self.built = False
-        self.max_short_s = math.inf
         self.is_brief = True
         self.price: Price | None = None
         self.built_in = configuration.problem in BUILT_IN

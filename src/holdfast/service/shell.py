@@ -83,7 +83,7 @@ class ServiceShell:
     ) -> None:
         self._service = service
         self._transport = transport
-        self._jobs = ThreadPool(max(2, workers), "holdfast-worker", self._broke)
+        self._jobs = ThreadPool(workers + max(1, workers - 1), "holdfast-worker", self._broke)
         self._decoder = ThreadPool(1, "holdfast-decoder", self._broke)
         self._events = events
         self._on_decision = on_decision

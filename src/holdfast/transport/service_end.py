@@ -76,7 +76,7 @@ class _StreamCall(msgspec.Struct, eq=False):
     is_open: bool = True
     is_being_delivered: bool = True
     waiting: bytes | None = None  # a reply
-    on_gone: Callable[[], None] | None = None
+    on_gone: Callable[[], object] | None = None
 
     @property
     def robot(self) -> str | None:
