@@ -82,15 +82,16 @@ def main() -> None:
         reach = cost_of_answer(
             problem, settings, own, slowness, steps=steps, inputs=inputs, begins=True, num_bytes=0
         )
-        kind = method
+        kind: str = method
         if method in ("action_entropy", "path_entropy", "state_entropy"):
             kind += f" {settings.selector.estimator}"
         ratios.setdefault("reach", []).append(reached_s / reach.seconds)
         ratios.setdefault(kind, []).append(took_s / sensing.seconds)
         if options.memory:
             ratios.setdefault("memory", []).append(peak / sensing.num_bytes)
+        estimated_ms, took_ms = 1e3 * sensing.seconds, 1e3 * took_s
         print(
-            f"{took_s / sensing.seconds:6.2f} {took_s * 1e3:9.2f} ms of {sensing.seconds * 1e3:9.2f}"
+            f"{took_s / sensing.seconds:6.2f} {took_ms:9.2f} ms of {estimated_ms:9.2f}"
             f" {peak / 2**20:6.1f} MB of {sensing.num_bytes / 2**20:6.1f} | reach"
             f" {reached_s / reach.seconds:5.2f} | {name} {in_words(problem, settings)}"
             f" estimator {settings.selector.estimator} {settings.particle_filter.estimate}"

@@ -2,8 +2,9 @@
 
     python -m tests.fuzz.costly ENDPOINT --seconds 60
 
-It tries every numeric setting at its maximum, with every method, and random ones below; it hangs up
-or asks for the next thing without waiting for an answer. What honest robots wait is printed as JSON.
+It tries every numeric setting at its maximum, with every method, and random ones below; it hangs
+up, or asks for the next thing without waiting for an answer. What an honest robot waits is printed
+as JSON.
 """
 
 from __future__ import annotations

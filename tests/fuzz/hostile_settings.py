@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import random
 from collections.abc import Iterator
 from typing import NamedTuple, get_args
@@ -127,8 +128,8 @@ def random_settings(chance: random.Random, most: float = 1.0) -> PlanningSetting
     settings = PlanningSettings()
 
     def drawn(least: int, greatest: int) -> int:
-        found: float = float(least)
-        return round(found * (1.0 + most * (greatest / least - 1.0)) ** chance.random())
+        growth = 1.0 + most * (greatest / least - 1.0)
+        return round(least * math.exp(math.log(growth) * chance.random()))
 
     values: dict[str, object] = {
         "selector.method": chance.choice(get_args(Method)),

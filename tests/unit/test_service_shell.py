@@ -311,6 +311,7 @@ class LargeCall:
     """A large request of a robot with a certificate."""
 
     payload = LARGE
+    on_gone: Callable[[], object] | None = None
 
     def __init__(self, robot: str) -> None:
         self.robot = robot
@@ -482,6 +483,7 @@ class Call:
 
     payload = b""
     robot = "a robot"
+    on_gone: Callable[[], object] | None = None
 
     def __init__(self, trace: list[str]) -> None:
         self._trace = trace

@@ -2,8 +2,9 @@
 
 A robot chooses its settings, and a service has to know what they ask of it before it begins. So
 everything that a computation repeats is a factor here: particles, samples, sensing actions, steps
-of a horizon, of a path, of a rollout, neighbours, inputs of the request, steps to roll forward. Each
-numeric setting is either in :data:`COSTLY` or, with the reason, in :data:`FREE`; a test holds it.
+of a horizon, of a path, of a rollout, neighbours, inputs of the request, steps to roll forward.
+Each numeric setting is either in :data:`COSTLY` or, with the reason, in :data:`FREE`; a test holds
+it.
 
 What the problem's own functions take is measured (:class:`ProblemCost`), because a problem is
 anybody's code and its model may have any number of walls. What holdfast's code takes was measured
@@ -173,8 +174,8 @@ _CONTACT = 2.0
 """A move in contact takes so many times as long as a free one, which is measured."""
 _PYTHON = 60e3
 """Of the code around a handful of calls."""
-_MODE_PARTICLES, _MODE_KERNELS, _MODE_SPLITS = 1000, 16 * 12, 3
-"""Of :mod:`holdfast.modes`: particles that show a density, kernels at each, repetitions."""
+_MODE_PARTICLES, _MODE_STARTS, _MODE_CLIMBS, _MODE_SPLITS = 1000, 16, 10, 3
+"""Of :mod:`holdfast.modes`."""
 
 _CLOUD = 8.0
 """Particles that follow each estimate of a rollout."""
@@ -212,8 +213,10 @@ class _Sizes:
         found = 15e3 + number * self.particles
         if self.planning.particle_filter.estimate == "heaviest_mode":
             shown = min(self.particles, float(_MODE_PARTICLES))
-            passes = _MODE_SPLITS * self.coordinates
-            found += passes * (200e3 + 200.0 * self.particles + 20.0 * _MODE_KERNELS * shown)
+            found += _MODE_SPLITS * (
+                self.coordinates * (100e3 + 200.0 * self.particles + _MODE_STARTS * shown * 10.0)
+                + _MODE_CLIMBS * _MODE_STARTS * shown * 10.0
+            )
         return found * self.unit_s
 
     @property

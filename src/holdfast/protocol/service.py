@@ -42,7 +42,6 @@ from holdfast.protocol.messages import (
     SessionConfiguration,
     pack_configuration,
 )
-from holdfast.protocol.request_queue import RequestQueue
 from holdfast.protocol.service_calls import WaitingCalls
 from holdfast.protocol.service_jobs import (
     Computed,
