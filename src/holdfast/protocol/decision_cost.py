@@ -225,7 +225,7 @@ class _Sizes:
 
     def act_s(self, times: float) -> float:
         """Return the seconds of so many task actions, each of a belief's estimate."""
-        one = self.own.act.of(1.0) + self.own.stage.of(1.0) + 10e3 * self.unit_s
+        one = self.own.act.of(1.0) + self.own.stage.of(1.0) + 25e3 * self.unit_s
         return times * (self.estimate_s() + one)
 
     def step_s(self) -> float:
