@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Any, get_args
 
+import numpy as np
 import pytest
 from tests.fuzz.hostile_settings import with_key
 
+from holdfast import _kernel
 from holdfast.config.settings import Method, PlanningSettings
 from holdfast.errors import InterruptedComputationError
 from holdfast.interruption import Interruption, check, interruptible
@@ -75,3 +77,31 @@ def test_an_interruption_that_is_not_set_changes_no_decision() -> None:
     assert info.entropies is not None
     assert again.entropies is not None
     assert info.entropies.tobytes() == again.entropies.tobytes()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_kernel_ends_between_its_tasks(threads: int) -> None:
+    points, rows = np.arange(600.0).reshape(200, 3), np.zeros((40, 200))
+    arguments = (points, rows, True, 0, 5, 1e-3, 0.0, 0.0, threads, (1.0,), np.empty(0))
+    expected = _kernel.entropies(*arguments)[0]
+    interruption = Interruption()
+    before = _kernel.use_threads_from(0.0)
+    try:
+        with interruptible(interruption):
+            assert _kernel.entropies(*arguments)[0].tobytes() == expected.tobytes()
+        interruption.set()
+        with pytest.raises(InterruptedComputationError), interruptible(interruption):
+            _kernel.entropies(*arguments)
+        assert _kernel.entropies(*arguments)[0].tobytes() == expected.tobytes()
+    finally:
+        _kernel.use_threads_from(before)
+
+
+def test_the_outer_interruption_is_watched_again_after_the_inner_one() -> None:
+    points, rows = np.arange(600.0).reshape(200, 3), np.zeros((4, 200))
+    outer = Interruption()
+    with pytest.raises(InterruptedComputationError), interruptible(outer):  # noqa: PT012
+        with interruptible(Interruption()):
+            outer.set()
+            _kernel.all_finite(points)
+        _kernel.entropies(points, rows, True, 0, 5, 1e-3, 0.0, 0.0, 1, (1.0,), np.empty(0))
