@@ -61,7 +61,7 @@ def main() -> None:
             for _ in range(steps):
                 action, _ = planner.choose_task_action(state)
                 state = planner.advance(state, action)
-            shown = problem.observation_mean(planner.estimate(state), 0)
+            shown = problem.observation_mean(state.belief.states[0], 0)
             for _ in range(inputs):
                 state, _ = planner.observe(state, 0, shown)
             planner.digest(state)

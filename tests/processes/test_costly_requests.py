@@ -29,7 +29,7 @@ def test_the_same_seed_asks_the_same() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_costly_requests_stop_nobody(site: Site, workers: int) -> None:
-    service = site.service(options=("--workers", str(workers))).start()
+    service = site.service("--workers", str(workers)).start()
     outcome = attack(service.endpoint, _SECONDS)
     assert outcome.turns > 10
     assert outcome.longest_s < _STANDSTILL_S

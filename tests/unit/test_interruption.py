@@ -53,7 +53,7 @@ def test_a_long_decision_ends_after_few_more_calls(method: Method) -> None:
         settings = with_key(settings, "active_sensing.horizon", 1000)
     problem = Counting(20)
     planner = Planner(problem, settings, particles=50)
-    with interruptible(problem.interruption), pytest.raises(InterruptedComputationError):
+    with pytest.raises(InterruptedComputationError), interruptible(problem.interruption):
         planner.choose_sensing_action(planner.init(1))
     assert problem.calls <= 22
 
@@ -62,7 +62,7 @@ def test_rolling_a_state_forward_ends() -> None:
     problem = Counting(5)
     planner = Planner(problem, PlanningSettings(sensing_interval=5000), particles=20)
     state = planner.init(1)._replace(sensed=True)
-    with interruptible(problem.interruption), pytest.raises(InterruptedComputationError):
+    with pytest.raises(InterruptedComputationError), interruptible(problem.interruption):
         planner.plan_until_sensing(state, 10_000)
     assert problem.calls <= 6
 
@@ -100,7 +100,7 @@ def test_the_kernel_ends_between_its_tasks(threads: int) -> None:
 def test_the_outer_interruption_is_watched_again_after_the_inner_one() -> None:
     points, rows = np.arange(600.0).reshape(200, 3), np.zeros((4, 200))
     outer = Interruption()
-    with pytest.raises(InterruptedComputationError), interruptible(outer):  # noqa: PT012
+    with pytest.raises(InterruptedComputationError), interruptible(outer):
         with interruptible(Interruption()):
             outer.set()
             _kernel.all_finite(points)

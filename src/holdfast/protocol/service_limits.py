@@ -71,7 +71,7 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
     max_decision_s: float = 10.0
     max_brief_s: float = 0.02
     max_medium_s: float = 0.1
-    max_decision_bytes: int = 512 << 20
+    max_decision_bytes: int = 256 << 20
     max_medium_bytes: int = 32 << 20
     max_steps: int = 16 * MAX_INPUTS
     max_problems: int = 32

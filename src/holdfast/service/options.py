@@ -141,7 +141,7 @@ class ServeOptions(Options):
     )
     max_decision_mb: int = option(
         read=whole_number(1, 1_000_000),
-        default=512,
+        default=256,
         metavar="MB",
         help="The same for the memory of a decision, and a bound on that of all long decisions "
         "that a process computes at a time.",
