@@ -419,7 +419,7 @@ def cost_of_answer(
     """
     sizes = _Sizes(problem, planning, own, slowness)
     particles, size = sizes.particles, float(own.observation_size)
-    seconds = (_PYTHON + 2.0 * sizes.state_bytes + 4.0 * num_bytes) * sizes.unit_s
+    seconds = (2.0 * _PYTHON + 2.0 * sizes.state_bytes + 4.0 * num_bytes) * sizes.unit_s
     if begins:
         seconds += own.initial.of(particles)
     seconds += steps * sizes.step_s()
