@@ -67,9 +67,11 @@ class WithoutInterpreter {
 };
 
 /// Adds a function to the module; all run in the standard floating-point mode.
-template <class Function>
-void define(nanobind::module_& module, const char* name, Function&& function) {
-    module.def(name, static_cast<Function&&>(function), nanobind::call_guard<StandardRounding>());
+template <class Function, class... Extra>
+void define(nanobind::module_& module, const char* name, Function&& function,
+            const Extra&... extra) {
+    module.def(name, static_cast<Function&&>(function), nanobind::call_guard<StandardRounding>(),
+               extra...);
 }
 
 using StreamWords = std::array<std::uint32_t, 5>;

@@ -1,10 +1,12 @@
 #include "entropy.hpp"
 
 #include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/vector.h>
 
 #include <chrono>
 #include <cstring>
+#include <optional>
 #include <vector>
 
 #include "bindings.hpp"
@@ -17,6 +19,8 @@ using namespace holdfast;
 using namespace holdfast::bindings;
 
 namespace {
+
+using Flag = nb::ndarray<const std::uint8_t, nb::shape<1>, nb::c_contig, nb::device::cpu>;
 
 // About what one particle of a posterior takes; from it follows how many threads are worth their
 // waking.
@@ -82,6 +86,11 @@ void holdfast::bind_entropy(nb::module_& module) {
     define(module, "use_threads_from",
            [](double nanoseconds) { return use_threads_from(nanoseconds); });
     define(module, "threads_started", [] { return threads_started(); });
+    // The caller keeps the flag alive until it watches another one, or none.
+    define(
+        module, "watch_interruption",
+        [](std::optional<Flag> flag) { watch_interruption(flag ? flag->data() : nullptr); },
+        nb::arg("flag").none());
 
     define(module, "entropies",
            [](const Input<2>& points, const Input<2>& rows_in, bool logarithms, int number,

@@ -26,6 +26,13 @@ constexpr int max_threads = 256;
 /// on it.
 constexpr int patience = 100;
 
+thread_local const std::uint8_t* interruption = nullptr;
+
+/// Raises Interrupted if a flag is set; a task that has begun is not cut short.
+void require_awaited(const std::uint8_t* flag) {
+    if (flag != nullptr && __atomic_load_n(flag, __ATOMIC_RELAXED) != 0) throw Interrupted();
+}
+
 /// One call's tasks. Helpers hold it by shared pointer: one that comes late finds nothing left to
 /// do.
 struct Job {
@@ -36,6 +43,7 @@ struct Job {
     std::atomic<std::size_t> finished{0};
     std::atomic<bool> failed{false};
     std::exception_ptr failure;
+    const std::uint8_t* interrupted = interruption;
 
     /// Works until no task is left; tells whether there was any.
     bool work() {
@@ -43,6 +51,7 @@ struct Job {
         for (std::size_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < tasks; ++mine) {
             if (failed.load(std::memory_order_relaxed)) continue;
             try {
+                require_awaited(interrupted);
                 function(context, i);
             } catch (...) {
                 if (!failed.exchange(true)) failure = std::current_exception();
@@ -183,6 +192,8 @@ double use_threads_from(double nanoseconds) {
     return threads_from.exchange(nanoseconds);
 }
 
+void watch_interruption(const std::uint8_t* flag) { interruption = flag; }
+
 int threads_started() {
     return pool().helpers();
 }
@@ -197,7 +208,10 @@ int threads_for(double work, std::size_t tasks, int asked) {
 void run_tasks(std::size_t tasks, int threads, void (*function)(void*, std::size_t),
                void* context) {
     if (threads <= 1 || tasks <= 1) {
-        for (std::size_t i = 0; i < tasks; ++i) function(context, i);
+        for (std::size_t i = 0; i < tasks; ++i) {
+            require_awaited(interruption);
+            function(context, i);
+        }
         return;
     }
     pool().run(tasks, threads, function, context);

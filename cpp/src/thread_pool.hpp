@@ -11,6 +11,8 @@
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
+#include <exception>
 #include <type_traits>
 
 namespace holdfast {
@@ -27,6 +29,17 @@ double use_threads_from(double nanoseconds);
 
 /// Helper threads that exist. For tests.
 int threads_started();
+
+/// What `run_tasks` raises where the interruption of the calling thread has been set.
+struct Interrupted : std::exception {
+    const char* what() const noexcept override {
+        return "nobody awaits this computation any more";
+    }
+};
+
+/// Sets the flag that ends what the calling thread computes, once it is not 0 any more; another
+/// thread may set it at any time. Null for none.
+void watch_interruption(const std::uint8_t* flag);
 
 /// Calls `function(context, i)` for every i < tasks; passes on the first exception.
 void run_tasks(std::size_t tasks, int threads, void (*function)(void*, std::size_t), void* context);

@@ -45,6 +45,10 @@ class ProblemError(HoldfastError):
     """A function of the problem violated its contract."""
 
 
+class InterruptedComputationError(HoldfastError):
+    """A computation was ended from another thread, because nobody awaits its result."""
+
+
 class EnvironmentFailedError(HoldfastError):
     """The environment raised, stalled, or violated its contract."""
 

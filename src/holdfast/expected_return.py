@@ -37,7 +37,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from holdfast import checked, numerics
+from holdfast import checked, interruption, numerics
 from holdfast.arrays import BoolArray, FloatArray, IntArray
 from holdfast.belief import Belief, estimate
 from holdfast.circular import differences
@@ -149,6 +149,7 @@ def _sampled_returns(
     at = (np.arange(_CLOUD) + stream.substream(_CLOUDS).uniform((samples, 1))) / _CLOUD
     for j in range(actions):
         for i in range(samples):
+            interruption.check()
             own = _without(weights[j, i], truths[i])
             if own is None:
                 raise ProblemError(
@@ -205,6 +206,7 @@ def rollout_returns(
     costs = sensing_costs(problem, optional=settings.selector.sensing_is_optional)
     price = numerics.sum(costs) / costs.shape[0]
     for step in range(settings.selector.rollout_steps):
+        interruption.check()
         later, between = divmod(step, interval)
         if between == 0 and later > 0:
             rollouts.pay(price)

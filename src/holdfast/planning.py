@@ -30,7 +30,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from holdfast import checked, numerics, sensing
+from holdfast import checked, interruption, numerics, sensing
 from holdfast.arrays import FloatArray, floats, in_brief, integer, plain, whole
 from holdfast.belief import (
     Belief,
@@ -260,6 +260,7 @@ class Planner:
             If the sensing action does not exist, the observation is not finite or of the wrong
             size, or the state is another problem's.
         """
+        interruption.check()
         problem = self.problem
         self._require_size(state)
         known = len(problem.sensing_actions) + (observation is None)
@@ -378,6 +379,7 @@ class Planner:
             If the problem moves a particle to a state that is not finite, or has no
             ``move_by_measurement``.
         """
+        interruption.check()
         problem = self.problem
         action = floats("task action", task_action)
         if action.shape != (problem.action_size,) or not numerics.all_finite(action):

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from holdfast import checked
+from holdfast import checked, interruption
 from holdfast.arrays import FloatArray, IntArray, in_brief
 from holdfast.config.settings import PlanningSettings, path_steps, unfit_for_the_method
 from holdfast.errors import InvalidValueError, ProblemError
@@ -100,6 +100,7 @@ def _followed(
     step = 0
     for number, offset in enumerate(offsets):
         while step < offset:
+            interruption.check()
             own_stages = stages if several_stages else stage
             actions = checked.executed_action(problem, checked.policy(problem, states, own_stages))
             noise_free = NoiseFreeStream(_MOST_DRAWS)

@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from holdfast import _kernel, checked, numerics
+from holdfast import _kernel, checked, interruption, numerics
 from holdfast.arrays import FloatArray, in_brief
 from holdfast.belief import Belief, estimate
 from holdfast.circular import embedded, unwrapped
@@ -425,6 +425,7 @@ def _general_hypotheses(
     rows = []
     for action in actions:
         for i, particle in enumerate(particles):
+            interruption.check()
             observation = checked.sample_observation(
                 problem, belief.states[particle], action, streams.substream(i)
             )
@@ -474,6 +475,7 @@ def _later_entropies(
         for step in range(1, sensing.horizon):
             actions = np.empty((len(own), problem.action_size))
             for row, each in enumerate(own):
+                interruption.check()
                 # One by one, as in planning: the policy of a user who does not keep to exact
                 # operations may have other bits for many estimates at once.
                 estimated = estimate(
@@ -484,6 +486,7 @@ def _later_entropies(
                 stages[row] = checked.next_stage(problem, estimated, stages[row])
                 commanded = checked.policy(problem, estimated, stages[row])
                 actions[row] = checked.executed_action(problem, commanded)
+            interruption.check()
             streams = [own_motion.substream(step) for own_motion in motions[block]]
             states = checked.move_each(problem, states, actions, streams, sensing.num_cores)
             factor *= sensing.discount

@@ -38,6 +38,27 @@ from holdfast.transport.service_end import StreamServiceTransport
 from holdfast.transport.tls import client_context
 
 
+class TestEndedLinks:
+    async def test_open_calls_are_told_and_others_are_not(self, tcp: StreamWire) -> None:
+        told: list[bytes] = []
+
+        def serve(call: IncomingCall) -> None:
+            call.on_gone = lambda: told.append(call.payload)
+            if call.payload == b"answered":
+                call.end()
+
+        await tcp.service("cloud", "b1").start(serve)
+        robot, inbox = tcp.robot("cloud"), Inbox()
+        robot.start(inbox)
+        await inbox.wait_for(ServiceAppeared("cloud", "b1"))
+        robot.call("cloud", 1, b"answered")
+        assert await inbox.of_call(1) == [CallEnded(1)]
+        robot.call("cloud", 2, b"open")
+        await robot.close()
+        await until(lambda: bool(told))
+        assert told == [b"open"]
+
+
 class TestCertificates:
     async def test_strangers_see_nothing(
         self, tls: StreamWire, robot_tls: TlsFiles, tmp_path: Path

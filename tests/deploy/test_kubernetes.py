@@ -228,7 +228,8 @@ def test_an_overlay(overlay: str) -> None:
         assert kinds(base) == sorted([*kinds(manifests), "PodDisruptionBudget"])
         assert of_kind(manifests, "Deployment")["spec"]["replicas"] == 1
         assert "topologySpreadConstraints" not in pod_of(manifests)
-        assert container_of(manifests)["args"] == container_of(base)["args"]
+        args = [*container_of(base)["args"], "--max-decision-mb=64"]
+        assert container_of(manifests)["args"] == args
         assert "cpu" not in container_of(manifests)["resources"]["limits"]
         return
     assert kinds(manifests) == sorted([*kinds(base), "HorizontalPodAutoscaler"])

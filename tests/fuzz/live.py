@@ -67,19 +67,32 @@ class HonestRobots:
     ----------
     trials : int
         Of each run.
+    problems : sequence of str
+        For each a robot.
+    options : sequence of str
+        Further ones of ``holdfast run``.
     """
 
     def __init__(
-        self, site: Site, service: Service, seed: int, trials: int, max_steps: int = 60
+        self,
+        site: Site,
+        service: Service,
+        seed: int,
+        trials: int,
+        max_steps: int = 60,
+        problems: Sequence[str] = PROBLEMS,
+        options: Sequence[str] = (),
     ) -> None:
         self._site = site
         self._service = service
+        self._problems = problems
+        self._options = options
         self._stopped = threading.Event()
         self.failures: list[str] = []
         self.runs: list[tuple[Path, Path]] = []
         self._threads = [
             threading.Thread(target=self._series, args=(index, seed, trials, max_steps))
-            for index in range(len(PROBLEMS))
+            for index in range(len(problems))
         ]
         for thread in self._threads:
             thread.start()
@@ -95,14 +108,17 @@ class HonestRobots:
         while not self._stopped.is_set() and not self.failures:
             name = f"robot-{seed}-{index}-{count}"
             document = document_of(
-                PROBLEMS[index],
+                self._problems[index],
                 trials=trials,
                 max_steps=max_steps,
                 seed=1000 * seed + 100 * index + count,
             )
             file = self._site.configure(document, name, recovery={"launch": "never"})
             robot: Robot = self._site.run(
-                file, "--rate", str(_RATE_HZ), services=[self._service], out=f"{name}-out"
+                file,
+                *("--rate", str(_RATE_HZ), *self._options),
+                services=[self._service],
+                out=f"{name}-out",
             )
             code = robot.wait()
             if code != 0:

@@ -7,17 +7,23 @@ import subprocess
 import sys
 from pathlib import Path
 
+import msgspec
 import pytest
+from tests.fuzz.attack_messages import numeric_keys
+from tests.fuzz.attacker import TRANSPORTS, attacked
 from tests.fuzz.hostile_client import HostileMessages
 from tests.fuzz.live import run_live
 from tests.fuzz.measuring import Held, flatness
 from tests.fuzz.soak import run_soak
 from tests.fuzz.targets import TARGETS
 
+from holdfast.config.settings import PlanningSettings
+
 ROOT = Path(__file__).parents[2]
 RUNS = 20_000
 LIVE_MESSAGES = 20_000
 SOAK_S = 75.0
+ATTACK_S = 4.0
 
 
 @pytest.mark.slow
@@ -43,6 +49,34 @@ def test_decoders_guided_by_coverage(target: str, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr[-3000:]
     assert f"Done {runs} runs" in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS)
+def test_an_attacker_ends_no_process_and_changes_no_decision(
+    transport: str, tmp_path: Path
+) -> None:
+    """The long form, which also looks at the robot's waits, is the program itself."""
+    report, findings = attacked(transport, ATTACK_S, 1, tmp_path)
+    assert not findings, (findings, report)
+    assert report["service_lives"]
+    assert report["decides_identically"]
+    assert report["robot"]["decisions"] > 0
+    # Each class of attack has come about.
+    assert len(report["attacks"]) == (10 if transport == "udp" else 7)
+    assert all(report["attacks"].values())
+
+
+def test_every_number_of_the_settings_is_attacked() -> None:
+    keys = {".".join(key.path) for key in numeric_keys(PlanningSettings)}
+    plain = msgspec.to_builtins(PlanningSettings())
+    numbers = {
+        f"{section}.{key}"
+        for section, values in plain.items()
+        if isinstance(values, dict)
+        for key, value in values.items()
+        if isinstance(value, int | float | tuple | list) and not isinstance(value, bool)
+    }
+    assert numbers | {"sensing_interval", "selector.resolution"} == keys
 
 
 def test_the_same_seed_sends_the_same_messages() -> None:

@@ -22,6 +22,7 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 from tests.fuzz import corpus, strategies
+from tests.fuzz.attack_messages import hostile_settings, odd_requests
 from tests.fuzz.targets import SPECIMENS
 from tests.unit.test_protocol_service import Bench, Robot, content, planning_of
 
@@ -33,6 +34,7 @@ from holdfast.protocol.messages import (
     encode,
     with_checksum,
 )
+from holdfast.protocol.request_queue import RequestQueue
 from holdfast.protocol.service_sessions import PendingTask, Session
 
 HONEST = (1, 2)
@@ -66,6 +68,8 @@ class HostileRobots(RuleBasedStateMachine):
         max_calls_per_request=st.integers(1, 3),
         max_sessions_per_robot=st.sampled_from((None, 1, 2)),
         max_waiting_per_robot=st.sampled_from((1, 2, 50)),
+        max_brief_s=st.sampled_from((0.0, 0.001, 0.02)),
+        max_medium_s=st.sampled_from((0.0, 0.1)),
         certificates=st.sampled_from(((None, None), ("honest", "hostile"), ("honest", None))),
     )
     def begin(
@@ -74,7 +78,7 @@ class HostileRobots(RuleBasedStateMachine):
         self.limits = limits
         self.honest_owner, self.hostile_owner = certificates
         self.bench = Bench(
-            workers=workers, max_particles=200, max_work=100_000, max_steps=200, **limits
+            workers=workers, max_particles=200, max_decision_s=0.2, max_steps=200, **limits
         )
 
     # -- the honest ones -------------------------------------------------------------------------
@@ -95,7 +99,8 @@ class HostileRobots(RuleBasedStateMachine):
 
     @rule(seconds=st.sampled_from((0.0, 0.02, 0.05, 1.0, 601.0)))
     def time_passes(self, seconds: float) -> None:
-        self.bench.now += seconds
+        # A job that runs for longer than four times the longest decision is given up.
+        self.bench.now += min(seconds, 0.1) if self.bench.jobs else seconds
         self.bench.apply(self.bench.service.tick(self.bench.now))
 
     # -- the others ------------------------------------------------------------------------------
@@ -113,6 +118,11 @@ class HostileRobots(RuleBasedStateMachine):
     @rule(payload=strategies.spoilt(SPECIMENS["request"]), seals=st.booleans())
     def spoilt_bytes(self, payload: bytes, seals: bool) -> None:
         self.hostile(with_checksum(payload) if seals else payload)
+
+    @rule(seed=st.integers(0, 2**32))
+    def odd_values_and_hostile_settings(self, seed: int) -> None:
+        chance = random.Random(seed)
+        self.hostile(next(chance.choice((odd_requests, hostile_settings))(chance)))
 
     @rule(request=strategies.requests)
     def a_request_of_any_content(self, request: Request) -> None:
@@ -239,32 +249,25 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     assert all(len(session.answers) <= limits["answers_per_session"] for session in kept)
     # Works.
     tasks = [task for session in kept for task in works_of(session)]
-    running = list(queue._running.values())
+    lanes = queue._lanes
+    running = [task for lane in lanes for task in lane._running.values()]
     waiting = [task for task in tasks if not task.running]
-    assert statistics.running == len(running) == len(bench.jobs) <= bench.workers
+    assert statistics.running == len(running) == len(bench.jobs)
+    fewer = max(1, bench.workers - 1)
+    assert all(lane.num_running <= fewer for lane in lanes[1:])
+    assert sum(lane.num_running for lane in lanes[:2]) <= bench.workers
     assert statistics.waiting == len(waiting)
-    lined_up = [*queue._urgent, *queue._newcomers, *queue._later]
-    held = list(queue._held.values())
-    assert {id(task) for task in waiting} == {id(task) for task in (*lined_up, *held)}
-    assert set(queue._waiting_of) == {task.session.owner for task in waiting}
-    for owner in (*queue._waiting_of, "all"):
-        loads = queue._waiting if owner == "all" else queue._waiting_of[owner]
-        for newcomer in (False, True):
-            some = [
-                task
-                for task in waiting
-                if task.newcomer == newcomer and owner in ("all", task.session.owner)
-            ]
-            load = loads.of(newcomer=newcomer)
-            assert load.num == len(some)
-            assert load.num_bytes == sum(task.size for task in some)
-            assert abs(load.cost_s - sum(task.cost_s for task in some)) < 1e-6
-    requested = [task for task in waiting if task.request is not None]
-    # Whoever was served before finds room, if newcomers have taken that of all, and so does one
-    # owner, if another has.
-    assert len(requested) <= max(limits["max_waiting"], 2 * bench.workers) + 2 * bench.workers
-    newcomers = sum(task.newcomer for task in requested)
-    assert newcomers <= max((limits["max_waiting"] + 1) // 2, bench.workers)
+    for lane in lanes:
+        check_lane(lane, [task for task in waiting if queue._of(task) is lane])
+    for lane in lanes:
+        requested = [
+            task for task in waiting if task.request is not None and queue._of(task) is lane
+        ]
+        # Whoever was served before finds room, if newcomers have taken that of all, and so does
+        # one owner, if another has.
+        assert len(requested) <= max(limits["max_waiting"], 2 * bench.workers) + 2 * bench.workers
+        newcomers = sum(task.newcomer for task in requested)
+        assert newcomers <= max((limits["max_waiting"] + 1) // 2, bench.workers)
     for session in kept:
         assert sum(not task.running for task in works_of(session)) <= 2
         assert len(session.pending) <= 4
@@ -282,6 +285,26 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     pool = service._problems._idle
     assert len(pool) <= 32
     assert sum(map(len, pool.values())) <= 32 * bench.workers
+
+
+def check_lane(queue: RequestQueue, waiting: list[PendingTask]) -> None:
+    """Check that a lane's counts are those of its tasks."""
+    lined_up = [*queue._urgent, *queue._newcomers, *queue._later]
+    held = list(queue._held.values())
+    assert {id(task) for task in waiting} == {id(task) for task in (*lined_up, *held)}
+    assert set(queue._waiting_of) == {task.session.owner for task in waiting}
+    for owner in (*queue._waiting_of, "all"):
+        loads = queue._waiting if owner == "all" else queue._waiting_of[owner]
+        for newcomer in (False, True):
+            some = [
+                task
+                for task in waiting
+                if task.newcomer == newcomer and owner in ("all", task.session.owner)
+            ]
+            load = loads.of(newcomer=newcomer)
+            assert load.num == len(some)
+            assert load.num_bytes == sum(task.size for task in some)
+            assert abs(load.cost_s - sum(task.cost_s for task in some)) < 1e-6
 
 
 @pytest.mark.parametrize(

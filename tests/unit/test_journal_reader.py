@@ -19,6 +19,7 @@ from holdfast.protocol.records import (
     replay,
 )
 from holdfast.recording.journal import Journal
+from holdfast.recording.journal_file import of_trials
 from holdfast.recording.journal_reader import TABLES, JournalReader
 from holdfast.robot.trial import run_trial
 
@@ -40,6 +41,22 @@ class TestJournal:
             assert list(journal.results()) == expected
             for result in results:
                 assert journal.decisions(result.trial) == result.decisions
+
+    def test_a_result_that_nests_without_end_is_damage(self, tmp_path: Path) -> None:
+        """A journal of somebody else may have the right checksums."""
+        path = tmp_path / "journal.sqlite"
+        with Journal.create(path, {}) as journal:
+            journal.add(result_of(0))
+        blob = msgspec.msgpack.encode(without_decisions(result_of(0)))
+        assert blob[:1] == b"\xde"  # one field more, which no reader knows
+        blob = b"\xde" + (int.from_bytes(blob[1:3]) + 1).to_bytes(2) + blob[3:]
+        blob += b"\xa1x" + b"\x91" * 5000 + b"\x90"
+        with contextlib.closing(sqlite3.connect(path)) as connection, connection:
+            connection.execute(
+                "UPDATE trials SET result = ?, result_checksum = ?", (blob, of_trials(0, 0, blob))
+            )
+        with Journal.read(path) as journal, pytest.raises(OutputError, match="recursion"):
+            list(journal.results())
 
     def test_how_a_trial_ended_comes_back(self, tmp_path: Path) -> None:
         path = tmp_path / "journal.sqlite"

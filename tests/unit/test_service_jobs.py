@@ -50,7 +50,12 @@ def test_a_state_that_does_not_follow_is_asked_for() -> None:
 
 
 @pytest.mark.parametrize(
-    ("limits", "says"), [(ServiceLimits(max_work=1), "max_work"), (ServiceLimits(), None)]
+    ("limits", "says"),
+    [
+        (ServiceLimits(max_decision_s=1e-6), "--max-decision-s"),
+        (ServiceLimits(max_decision_bytes=1000), "--max-decision-mb"),
+        (ServiceLimits(), None),
+    ],
 )
 def test_a_decision_has_a_bounded_size(limits: ServiceLimits, says: str | None) -> None:
     robot = Robot()

@@ -312,6 +312,7 @@ class LargeCall:
     """A large request of a robot with a certificate."""
 
     payload = LARGE
+    on_gone: Callable[[], object] | None = None
 
     def __init__(self, robot: str) -> None:
         self.robot = robot
@@ -471,6 +472,10 @@ class Script(Service):
         self.times.append(now)
         return []
 
+    def gone(self, call: int, now: float) -> list[ServiceEffect]:
+        self.trace.append(f"gone {call}")
+        return []
+
 
 class Scripted:
     """A job of a script."""
@@ -485,6 +490,7 @@ class Call:
 
     payload = b""
     robot = "a robot"
+    on_gone: Callable[[], object] | None = None
 
     def __init__(self, trace: list[str]) -> None:
         self._trace = trace
@@ -499,6 +505,23 @@ class Call:
 def scripted(*jobs: tuple[str, float, Callable[[], object]]) -> tuple[Script, ServiceShell]:
     machine = Script(*(StartJob(cast(Job, Scripted(kind, run)), s) for kind, s, run in jobs))
     return machine, ServiceShell(machine, InProcessNetwork().service("service", "boot"), 2, Log())
+
+
+@on_a_loop
+async def test_a_call_whose_link_has_ended_is_reported_once_and_not_within_a_reply() -> None:
+    machine, both = scripted()
+    await both.start()
+    call = Call(machine.trace)
+    both.deliver(call)
+    assert call.on_gone is not None
+    call.on_gone()
+    call.on_gone()
+    assert "gone 1" not in machine.trace, "effects may still be carried out"
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert machine.trace.count("gone 1") == 1
+    await both.drain(PATIENCE_S)  # it waits for no such call
+    await both.close()
 
 
 @on_a_loop

@@ -16,6 +16,7 @@ so at once, so that the robot can ask another.
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Iterator
 
@@ -198,18 +199,25 @@ class RequestQueue:
 
     # -- running ---------------------------------------------------------------------------------
 
-    def take(self, now: float) -> PendingTask | None:
-        """Remove and return the next task; None if none waits or no worker is free."""
+    def take(self, now: float, room_bytes: float = math.inf) -> PendingTask | None:
+        """Remove and return the next task; None if none waits or no worker is free.
+
+        None, too, if it takes more than ``room_bytes`` of memory: it goes first all the same.
+        """
         if len(self._running) >= self._workers:
             return None
         known = self._next_of_known()
         newcomer = self._newcomers.first()
+        went_first = self._newcomer_went_first
         if known is None or newcomer is None:
             task = known or newcomer
         elif self._goes_first(newcomer, known, now):
-            task, self._newcomer_went_first = newcomer, True
+            task, went_first = newcomer, True
         else:
-            task, self._newcomer_went_first = known, False
+            task, went_first = known, False
+        if task is not None and task.num_bytes > room_bytes:
+            return None
+        self._newcomer_went_first = went_first
         if task is not None:
             order = self._order_of(task)
             order.remove(task)
@@ -253,9 +261,22 @@ class RequestQueue:
         self._running_of[task.session, task.slot] = task
         self._running[job] = task
 
-    def is_running(self, job: Job) -> bool:
+    @property
+    def running_bytes(self) -> float:
+        """Estimated memory of all running tasks."""
+        return sum(task.num_bytes for task in self._running.values())
+
+    def running(self) -> list[tuple[Job, PendingTask]]:
+        """Return the jobs that workers have, and their tasks."""
+        return list(self._running.items())
+
+    def runs(self, job: Job) -> bool:
         """Return whether a worker has a job of this queue."""
         return job in self._running
+
+    def job_of(self, task: PendingTask) -> Job:
+        """Return the job of a running task."""
+        return next(job for job, other in self._running.items() if other is task)
 
     def started(self, job: Job, now: float) -> None:
         """Note that a worker starts its task only now."""

@@ -32,15 +32,16 @@ import msgspec
 from holdfast.errors import InvalidValueError, MessageError
 from holdfast.planning import needs_sensing
 from holdfast.problems.problem import Problem
+from holdfast.protocol.decision_cost import Cost, Pricing
 from holdfast.protocol.events import Effects
 from holdfast.protocol.expected_time import ExpectedTime
+from holdfast.protocol.lanes import Lanes
 from holdfast.protocol.messages import (
     MAX_WORD,
     Request,
     SessionConfiguration,
     pack_configuration,
 )
-from holdfast.protocol.request_queue import RequestQueue
 from holdfast.protocol.service_calls import WaitingCalls
 from holdfast.protocol.service_jobs import (
     Computed,
@@ -53,6 +54,8 @@ from holdfast.protocol.service_jobs import (
 )
 from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
 from holdfast.protocol.service_sessions import (
+    BRIEF,
+    LONG,
     REQUESTED,
     CachedAnswer,
     Owner,
@@ -67,6 +70,8 @@ __all__ = ["Service"]
 
 _INERTIA_OF_ONE = 4.0
 """Of the mean times of one session, whose decisions are alike."""
+
+_ANY_MACHINE = Pricing()
 
 _NO_ROOM_RETRY_MS = 100.0
 """Shortest retry time for a robot that finds no free session."""
@@ -84,6 +89,8 @@ class Service:
         Jobs that may run at a time.
     describe_error : callable, optional
         Turns an error of a problem's code into a message.
+    pricing : Pricing, optional
+        How fast this machine is.
     """
 
     def __init__(
@@ -92,26 +99,29 @@ class Service:
         workers: int,
         limits: ServiceLimits | None = None,
         describe_error: Callable[[BaseException], str] | None = None,
+        pricing: Pricing = _ANY_MACHINE,
     ) -> None:
         if workers < 1:
             raise InvalidValueError(f"workers {workers}: a service needs at least 1")
         self._make_problem = make_problem
-        self._describe_error = describe_error or _described
+        self._describe_error = describe_error or (lambda error: f"{type(error).__name__}: {error}")
         self._workers = workers
         self._limits = limits or ServiceLimits()
+        self._pricing = pricing
         self._statistics = ServiceStatistics()
+        self._queue = Lanes(workers, self._limits)
         self.forget_everything()
 
     def forget_everything(self) -> None:
-        """Forget all sessions, tasks and calls, as a new process would have none.
+        """Begin anew, as a process would: the remedy after an exception of a method.
 
-        The remedy after an exception of a method: nothing here cannot be lost. The caller ends the
-        calls. Results of jobs that were handed out before are ignored.
+        The caller ends the calls. Jobs that run are cancelled, and their results are ignored.
         """
+        self._queue.cancel_all()
+        self._queue = Lanes(self._workers, self._limits)
         self._effects: Effects[ServiceEffect] = Effects()
         self._sessions = SessionTable(self._limits)
         self._problems = ProblemPool(self._limits.max_problems)
-        self._queue = RequestQueue(self._workers, self._limits)
         self._calls = WaitingCalls(self._limits, self._statistics, self._effects)
         # Of all robots; each session has its own, which begin here.
         self._task_time = ExpectedTime(1e-3)
@@ -143,16 +153,11 @@ class Service:
         Parameters
         ----------
         call : int
-            Unique number of the call, used in effects.
+            Unique; used in effects.
         request : Request or MessageError
             What :func:`~holdfast.protocol.messages.decode_request` returned or raised.
-        size : int
-            Bytes of the message.
-        now : float
-            Seconds of any monotonic clock.
         owner : str or None, optional
-            Name in the robot's verified certificate; None without one. The request reaches only
-            sessions of this owner.
+            Name in the robot's verified certificate. It reaches only sessions of this owner.
         """
         if isinstance(request, MessageError):
             self._calls.send_refused(call, 0, request.code, str(request))
@@ -163,15 +168,15 @@ class Service:
 
     def started(self, job: Job, now: float) -> None:
         """Note that a job that was handed out starts only now."""
-        if self._queue.is_running(job):
-            self._queue.started(job, now)
+        self._queue.started(job, now)
 
     def finished(self, job: Job, outcome: JobResult, now: float) -> list[ServiceEffect]:
         """Handle the result of a job that was handed out."""
-        if not self._queue.is_running(job):
+        if not self._queue.runs(job):
             return []  # handed out before everything was forgotten
         task = self._queue.end(job)
         session = task.session
+        is_awaited = session.pending.get(task.digest) is task
         session.remove_task(task)
         self._problems.release(session.problem_key, outcome.problem)
         if not session.closed:
@@ -179,20 +184,43 @@ class Service:
             # The first job of a problem also imports and builds it: no measure of the next ones.
             typical = session.built
             session.built = session.built or outcome.problem is not None
-            if outcome.failure is not None or outcome.lacks_state:
+            session.price = outcome.price or session.price
+            if outcome.cancelled:
+                self._calls.end(task)
+            elif outcome.postponed is not None:
+                if is_awaited and not self._queue.postpone(task, outcome.postponed, now):
+                    for record in self._calls.detach(task):
+                        call, number, newcomer = record.call, record.number, task.newcomer
+                        self._reject_busy(call, number, session.key, now, newcomer=newcomer)
+            elif outcome.failure is not None or outcome.lacks_state:
                 self._failed(task, outcome)
             else:
                 if typical:
                     computed_s = now - task.started_at
-                    (self._sensing_time if task.sensing else self._task_time).learn(computed_s)
+                    if task.lane == BRIEF:
+                        # What newcomers are expected to take.
+                        (self._sensing_time if task.sensing else self._task_time).learn(computed_s)
                     task.expected_time.learn(computed_s)
                 self._succeeded(task, outcome, now)
             self._queue.release_held(session)
         self._dispatch(now)
         return self._effects.take()
 
+    def gone(self, call: int, now: float) -> list[ServiceEffect]:
+        """Handle the end of a call by itself: its link has ended, and nobody awaits replies."""
+        task = self._calls.drop(call)
+        if task is not None and not task.calls:
+            self._statistics.superseded += self._queue.drop(task)
+        self._dispatch(now)
+        return self._effects.take()
+
     def tick(self, now: float) -> list[ServiceEffect]:
         """Handle the passing of time."""
+        for task in self._queue.overdue(now):
+            for record in self._calls.detach(task):
+                text = self._queue.overdue_in_words(task, now)
+                self._calls.send_refused(record.call, record.number, "invalid", text)
+            self._queue.cancel(task)
         self._calls.send_progress(now)
         while (session := self._sessions.idle(now)) is not None:
             self._forget(session, "idle")
@@ -200,7 +228,7 @@ class Service:
 
     def next_wakeup(self) -> float | None:
         """Return when :meth:`tick` is due if nothing happens before; None if never."""
-        due = (self._calls.progress_at(), self._sessions.idle_at())
+        due = (self._calls.progress_at(), self._sessions.idle_at(), self._queue.overdue_at())
         return min((at for at in due if at is not None), default=None)
 
     # -- requests --------------------------------------------------------------------------------
@@ -371,12 +399,13 @@ class Service:
             (
                 task
                 for task in session.pending.values()
-                if task.slot == REQUESTED and not task.running
+                if task.slot == REQUESTED and not task.running and task.lane == BRIEF
             ),
             None,
         )
         newcomer = session.newcomer
-        if waiting is None and self._queue.is_overloaded(now, session.owner, newcomer=newcomer):
+        full = self._queue.is_overloaded(now, session.owner, newcomer=newcomer)
+        if waiting is None and full:
             self._reject_busy(call, request.number, session.key, now, newcomer=newcomer)
             return None
         if waiting is not None:
@@ -406,10 +435,7 @@ class Service:
         for task in list(session.pending.values()):
             if task is not keep:
                 self._calls.end(task)
-                if not task.running:
-                    self._statistics.superseded += 1
-                    session.remove_task(task)
-                    self._queue.remove(task)
+                self._statistics.superseded += self._queue.drop(task)
 
     # -- work ------------------------------------------------------------------------------------
 
@@ -439,8 +465,12 @@ class Service:
                 for record in self._calls.detach(task):
                     self._calls.send_need_state(record.call, record.number, differs=True)
                 return
-        alone = self._queue.num_running == 0 and self._queue.num_waiting == 0
+        alone = self._queue.is_alone(task)
+        most_s = self._queue.limits_s[task.lane]
         problem = self._problems.acquire(session.problem_key)
+        expected_s = math.inf
+        if problem is not None and task.is_typical(state):
+            expected_s = task.expected_time.typical_s
         job = Job(
             task.kind,
             problem,
@@ -452,11 +482,11 @@ class Service:
             self._limits,
             request,
             state,
+            self._pricing,
+            session.price,
+            None if task.lane == LONG else Cost(most_s, self._limits.max_medium_bytes),
         )
         self._queue.handed_out(task, job, now)
-        expected_s = math.inf
-        if problem is not None and task.is_typical(state):
-            expected_s = task.expected_time.typical_s
         self._effects.append(StartJob(job, expected_s))
 
     # -- outcomes --------------------------------------------------------------------------------
@@ -539,10 +569,9 @@ class Service:
         newcomer: bool,
         least_ms: float = 1.0,
     ) -> None:
-        queue = self._queue
         owner, session = key
-        wait_ms = max(least_ms, 1e3 * queue.wait_s(now, owner, newcomer=newcomer))
-        self._calls.send_busy(call, number, session, wait_ms, queue.num_waiting)
+        wait_ms = max(least_ms, 1e3 * self._queue.wait_s(now, owner, newcomer=newcomer))
+        self._calls.send_busy(call, number, session, wait_ms, self._queue.num_waiting)
 
     # -- sessions --------------------------------------------------------------------------------
 
@@ -569,7 +598,3 @@ class Service:
         owner, key = session.key
         named = {} if owner is None else {"robot": owner}
         self._effects.report(event, **named, session=key[:4].hex(), **fields)
-
-
-def _described(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}"

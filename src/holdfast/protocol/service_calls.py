@@ -88,6 +88,14 @@ class WaitingCalls:
         """End the calls of a task."""
         self._effects += [EndCall(record.call) for record in self.detach(task)]
 
+    def drop(self, call: int) -> PendingTask | None:
+        """Remove a call that has ended by itself; return its task, None if it waits for none."""
+        record = self._calls.pop(call, None)
+        if record is None:
+            return None
+        del record.task.calls[call]
+        return record.task
+
     # -- replies to calls that go on -------------------------------------------------------------
 
     def send_task_to_all(self, task: PendingTask, answer: CachedAnswer, now: float) -> None:

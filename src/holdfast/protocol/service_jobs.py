@@ -20,13 +20,16 @@ from holdfast.errors import (
     CheckpointError,
     ConfigurationError,
     HoldfastError,
+    InterruptedComputationError,
     InvalidValueError,
     MessageError,
     OtherCodeError,
     UnknownProblemError,
 )
+from holdfast.interruption import Interruption, interruptible
 from holdfast.planning import Planner, PlanningState
 from holdfast.problems.problem import Problem
+from holdfast.protocol.decision_cost import Cost, Price, Pricing, cost_of_answer, in_words
 from holdfast.protocol.events import LogEvent
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
@@ -55,6 +58,9 @@ __all__ = [
 ]
 
 
+_ANY_MACHINE = Pricing()
+
+
 class JobResult(NamedTuple):
     """The result of a job.
 
@@ -75,6 +81,12 @@ class JobResult(NamedTuple):
         where it depends on what a move will show.
     sensing_action : int
         The chosen one; -1 if none was to be chosen.
+    price : Price or None
+        What this session's decisions cost, as far as that is known.
+    postponed : Cost or None
+        The estimated cost; nothing was computed, because it is more than this job may take.
+    cancelled : bool
+        It was ended from outside.
     """
 
     failure: tuple[str, str] | None = None
@@ -89,6 +101,9 @@ class JobResult(NamedTuple):
     ahead: PlanningState | None = None
     ahead_digest: bytes = b""
     sensing_action: int = -1
+    price: Price | None = None
+    postponed: Cost | None = None
+    cancelled: bool = False
 
 
 class _LacksStateError(Exception):
@@ -114,6 +129,11 @@ class Job:
         Names the state; None if ``state`` is that state.
     state : PlanningState or None
         Where to start; None for the trial's beginning.
+    price : Price or None
+        From an earlier job of this session.
+    most : Cost or None
+        What it may take; if it is estimated to take more, nothing is computed. None: what a
+        decision may take at all.
     """
 
     def __init__(
@@ -128,8 +148,15 @@ class Job:
         limits: ServiceLimits,
         request: Request | None,
         state: PlanningState | None,
+        pricing: Pricing = _ANY_MACHINE,
+        price: Price | None = None,
+        most: Cost | None = None,
     ) -> None:
         self.kind = kind
+        self._pricing = pricing
+        self._price = price
+        self._most = most
+        self._interruption = Interruption()
         self._problem = problem
         self._make_problem = make_problem
         self._describe_error = describe_error
@@ -156,6 +183,10 @@ class Job:
             )
         return self.kind, self._seed, named
 
+    def cancel(self) -> None:
+        """End it as soon as it can be; from any thread."""
+        self._interruption.set()
+
     def run(self) -> JobResult:
         """Compute. Anything that the problem's functions raise becomes part of the result.
 
@@ -166,8 +197,19 @@ class Job:
         try:
             if problem is None:
                 problem = self._make_problem(unpack_configuration(self._configuration))
-            _check_work(problem, self._planning, self._limits)
-            return self._computed(problem)
+            if self._price is None:
+                self._price = self._pricing.price_of(problem, self._planning)
+            cost = self._checked_cost(problem, self._price)
+            most = self._most
+            if most is not None and (
+                cost.seconds > most.seconds or cost.num_bytes > most.num_bytes
+            ):
+                return JobResult(problem=problem, price=self._price, postponed=cost)
+            with interruptible(self._interruption):
+                return self._computed(problem)._replace(price=self._price)
+        except InterruptedComputationError:
+            # The problem was left in the middle of something.
+            return JobResult(cancelled=True)
         except _LacksStateError as lack:
             differs = lack.differs or self.state is not None
             return JobResult(
@@ -175,7 +217,7 @@ class Job:
             )
         except MemoryError as error:
             text = _account(error, self._describe_error)
-            asked = _work_in_words(problem, self._planning)
+            asked = in_words(problem, self._planning)
             text = f"out of memory for a decision of {asked}: {text}"
             return JobResult(failure=("out_of_memory", text), problem=problem)
         except MessageError as error:
@@ -185,6 +227,64 @@ class Job:
         except BaseException as error:  # noqa: BLE001 - the problem is anybody's code
             text = _account(error, self._describe_error)
             return JobResult(failure=("failed", text), problem=problem)
+
+    def _checked_cost(self, problem: Problem, price: Price) -> Cost:
+        """Return what this job takes; if that, or any decision of the session, is too much, raise.
+
+        The robot hears of it before it moves.
+        """
+        if problem.action_size > MAX_ACTION_SIZE:
+            raise InvalidValueError(
+                f"action_size of {problem.name} is {problem.action_size}: a service takes at most "
+                f"{MAX_ACTION_SIZE}"
+            )
+        request, planning = self._request, self._planning
+        reached = Cost(0.0, 0.0)
+        if request is not None:
+            steps, state = 0, self.state
+            size = sum(len(each.observation) for each in request.inputs)
+            if request.checkpoint is not None:
+                size += len(request.checkpoint)
+            else:
+                steps = min(
+                    max(0, request.step - (0 if state is None else state.step)),
+                    self._limits.max_steps,
+                )
+            if self.kind == "task":
+                steps += min(planning.sensing_interval, MAX_TASK_ACTIONS) + 1
+            reached = cost_of_answer(
+                problem,
+                planning,
+                price.problem,
+                self._pricing.slowness,
+                steps=steps,
+                inputs=len(request.inputs),
+                begins=state is None and request.checkpoint is None,
+                num_bytes=size,
+            )
+        longest = Cost(
+            max(reached.seconds, price.sensing.seconds),
+            max(reached.num_bytes, price.sensing.num_bytes),
+        )
+        limits = self._limits
+        for estimated, limit, unit, what, option in (
+            (longest.seconds, limits.max_decision_s, "s", "on one core", "--max-decision-s"),
+            (
+                longest.num_bytes / 2**20,
+                limits.max_decision_bytes / 2**20,
+                "MB",
+                "of memory",
+                "--max-decision-mb",
+            ),
+        ):
+            if estimated > limit:
+                raise InvalidValueError(
+                    f"a decision of about {estimated:.3g} {unit} {what}: this service takes at "
+                    f"most {limit:.3g} {unit} ({option}). It has {in_words(problem, planning)}"
+                )
+        if self.kind == "task":
+            return reached
+        return Cost(reached.seconds + price.sensing.seconds, longest.num_bytes)
 
     def _computed(self, problem: Problem) -> JobResult:
         planning, request = self._planning, self._request
@@ -273,35 +373,6 @@ def _with_input(planner: Planner, state: PlanningState, given: Input) -> Plannin
     if observation is None:
         return state
     return planner.observe_move(state, action, observation)[0]
-
-
-def _check_work(problem: Problem, planning: PlanningSettings, limits: ServiceLimits) -> None:
-    """Check that a decision's size is within the limits."""
-    count = planning.particle_filter.num_particles
-    sensing = planning.active_sensing
-    actions = len(problem.sensing_actions)
-    work = count * sensing.num_observation_samples * actions * sensing.horizon
-    if work > limits.max_work:
-        raise InvalidValueError(
-            f"a decision of {work} units of work ({_work_in_words(problem, planning)}): this "
-            f"service takes at most {limits.max_work} (max_work)"
-        )
-    if problem.action_size > MAX_ACTION_SIZE:
-        raise InvalidValueError(
-            f"action_size of {problem.name} is {problem.action_size}: a service takes at most "
-            f"{MAX_ACTION_SIZE}"
-        )
-
-
-def _work_in_words(problem: Problem | None, planning: PlanningSettings) -> str:
-    """Describe a decision's size by the keys of the configuration."""
-    sensing = planning.active_sensing
-    actions = "" if problem is None else f"{len(problem.sensing_actions)} sensing actions x "
-    return (
-        f"particle_filter.num_particles {planning.particle_filter.num_particles} x "
-        f"active_sensing.num_observation_samples {sensing.num_observation_samples} x "
-        f"{actions}active_sensing.horizon {sensing.horizon}"
-    )
 
 
 def _account(error: BaseException, describe: Callable[[BaseException], str]) -> str:

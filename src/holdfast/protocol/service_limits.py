@@ -39,8 +39,14 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
         From one progress reply to the next; twice that where many calls wait.
     prefetch_patience_ms : float
         Time for which a prefetch lets urgent tasks go first.
-    max_work : int
-        Size of one decision: particles x observation samples x sensing actions x horizon.
+    max_decision_s : float
+        Estimated time of one decision on one core (:mod:`holdfast.protocol.decision_cost`).
+    max_brief_s, max_medium_s : float
+        Estimated time of a decision in the lanes of these names (:mod:`holdfast.protocol.lanes`).
+    max_decision_bytes : int
+        Estimated memory of one decision, and of all long ones that run at a time.
+    max_medium_bytes : int
+        Estimated memory of a decision that is not long.
     max_steps : int
         Steps by which a state is rolled forward for one request.
     max_problems : int
@@ -62,7 +68,11 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
     progress_interval_ms: float = 50.0
     prefetch_patience_ms: float = 20.0
     max_particles: int = 1_000_000
-    max_work: int = 10**9
+    max_decision_s: float = 10.0
+    max_brief_s: float = 0.02
+    max_medium_s: float = 0.1
+    max_decision_bytes: int = 256 << 20
+    max_medium_bytes: int = 32 << 20
     max_steps: int = 16 * MAX_INPUTS
     max_problems: int = 32
     answers_per_session: int = 8

@@ -24,11 +24,15 @@ import msgspec
 from holdfast.config.settings import PlanningSettings
 from holdfast.planning import PlanningState
 from holdfast.problems.registry import BUILT_IN
+from holdfast.protocol.decision_cost import Cost, Price
 from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.messages import Request, SessionConfiguration, pack_configuration
 from holdfast.protocol.service_limits import ServiceLimits
 
 __all__ = [
+    "BRIEF",
+    "LONG",
+    "MEDIUM",
     "PREFETCHED",
     "REQUESTED",
     "CachedAnswer",
@@ -56,6 +60,12 @@ Owner: TypeAlias = str | None
 
 SessionKey: TypeAlias = tuple[Owner, bytes]
 """Owner and session id."""
+
+_ESTIMATING_S = 1e-4
+"""Time of a job that does no more than that."""
+
+BRIEF, MEDIUM, LONG = 0, 1, 2
+"""Lanes."""
 
 REQUESTED, PREFETCHED = 0, 1
 """A session's slots: the robot waits for the first kind of task; the second is ahead of it."""
@@ -103,6 +113,13 @@ class PendingTask:
         Bytes of the request.
     since : float
         When it was queued; of one that carries a newer request, the first of them.
+
+    Attributes
+    ----------
+    lane : int
+        Where it waits and runs (:mod:`~holdfast.protocol.lanes`).
+    num_bytes : float
+        Estimated memory, unless it is brief.
     """
 
     def __init__(
@@ -127,6 +144,8 @@ class PendingTask:
         self.urgent = request is not None
         self.newcomer = session.newcomer
         self.calls: dict[int, WaitingCall] = {}
+        self.lane = BRIEF
+        self.num_bytes = 0.0
         self.cost_s = self._expected_s()
         self.running = False
         self.started_at = since
@@ -144,7 +163,15 @@ class PendingTask:
     def _expected_s(self) -> float:
         """Return how long it may take, with the sensing part that follows a task part."""
         session = self.session
-        return session.sensing_time.mean_s + (0.0 if self.sensing else session.task_time.mean_s)
+        mean_s = session.sensing_time.mean_s + (0.0 if self.sensing else session.task_time.mean_s)
+        # One that may be too long for its lane is only estimated there.
+        return mean_s if self.lane != BRIEF or session.is_brief else _ESTIMATING_S
+
+    def move_to(self, lane: int, cost: Cost) -> None:
+        """Move to another lane, for an estimated cost; it waits in none meanwhile."""
+        self.lane = lane
+        self.num_bytes = cost.num_bytes
+        self.cost_s = self._expected_s()
 
     def is_typical(self, state: PlanningState | None) -> bool:
         """Return whether earlier times predict this task's, if it starts at ``state``.
@@ -153,7 +180,7 @@ class PendingTask:
         may choose their number. Its problem must be built in: other code may take any time.
         """
         request = self.request
-        if not self.session.built_in:
+        if not (self.session.built_in and self.session.is_brief):
             return False
         if request is None:
             return True
@@ -187,6 +214,10 @@ class Session:
         Digest that identifies the problem among those kept for reuse.
     built, built_in : bool
         Whether the problem was built before, and whether it is part of holdfast.
+    is_brief : bool
+        Whether no decision was estimated to be too long for the lane of brief ones.
+    price : Price or None
+        What its decisions cost; None before the first.
     planning : PlanningSettings
         With the threads that a decision has when it is computed alone.
     served, newcomer : bool
@@ -227,6 +258,8 @@ class Session:
             )
         )
         self.built = False
+        self.is_brief = True
+        self.price: Price | None = None
         self.built_in = configuration.problem in BUILT_IN
         # The number of threads changes no result, so the service may choose it.
         most = min(configuration.planning.active_sensing.num_cores, _MAX_THREADS)

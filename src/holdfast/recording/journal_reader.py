@@ -188,7 +188,7 @@ class JournalReader:
             yield
         except sqlite3.Error as error:
             raise self._output_error(error) from error
-        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise self._damaged(str(error)) from error
 
     def _output_error(self, error: sqlite3.Error) -> OutputError:

@@ -122,6 +122,8 @@ def make_links(configuration: Configuration, log_path: Path | None, events: Even
             )
             arguments = ["--name", RECOVERY_SERVICE, "--connect", local.endpoint]
             arguments += ["--lease-ms", f"{offload.lease_ms:g}", "--until-stdin-closes"]
+            # The most there is: it decides for this robot alone, as a run without services would.
+            arguments += ["--max-decision-s", "3600", "--max-decision-mb", "1000000"]
             if ":" in configuration.problem_name:
                 arguments += ["--problem", configuration.problem_name]
                 if configuration.problem_directory is not None:

@@ -140,6 +140,20 @@ class ServeOptions(Options):
         help="Runs remembered for the certificate of one robot (default: as many as there is room "
         "for).",
     )
+    max_decision_s: float = option(
+        read=number(0.01, 3600.0, "s"),
+        default=10.0,
+        metavar="S",
+        help="Refuse a robot whose settings ask for decisions that are estimated to take longer, "
+        "on one core of this machine.",
+    )
+    max_decision_mb: int = option(
+        read=whole_number(1, 1_000_000),
+        default=256,
+        metavar="MB",
+        help="The same for the memory of a decision, and a bound on that of all long decisions "
+        "that a process computes at a time.",
+    )
     problem: tuple[str, ...] = option(
         many=True,
         metavar="NAME",

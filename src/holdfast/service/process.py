@@ -242,22 +242,29 @@ class _ServiceProcess:
 
         import msgspec
 
+        from holdfast.protocol.decision_cost import Pricing
         from holdfast.protocol.service import Service
         from holdfast.protocol.service_limits import ServiceLimits
         from holdfast.runtime.logs import EventLog
         from holdfast.runtime.service_manager import ServiceManager
         from holdfast.service.allocator import limit_arenas
+        from holdfast.service.calibration import measure_problem, measure_slowness
         from holdfast.service.metrics import DecisionTimes
         from holdfast.service.problem_factory import ProblemFactory
         from holdfast.service.shell import ServiceShell
 
         limit_arenas()
-        limits = ServiceLimits(max_sessions_per_robot=options.max_sessions_per_robot)
+        limits = ServiceLimits(
+            max_sessions_per_robot=options.max_sessions_per_robot,
+            max_decision_s=options.max_decision_s,
+            max_decision_bytes=options.max_decision_mb << 20,
+        )
         if options.max_sessions is not None:
             limits = msgspec.structs.replace(limits, max_sessions=options.max_sessions)
         workers = options.workers or len(os.sched_getaffinity(0))
         problems = ProblemFactory(options.problem, options.problem_directory or Path.cwd())
-        service = Service(problems, workers, limits, _describe_error)
+        pricing = Pricing(measure_slowness(), measure_problem)
+        service = Service(problems, workers, limits, _describe_error, pricing)
         self.events = EventLog(sys.stderr, format=options.log, component=options.name)
         self._times = DecisionTimes()
         self._shell = ServiceShell(service, self._transport, workers, self.events, self._times.add)

@@ -89,7 +89,7 @@ class ServiceShell:
     ) -> None:
         self._service = service
         self._transport = transport
-        self._jobs = ThreadPool(workers, "holdfast-worker")
+        self._jobs = ThreadPool(workers + max(1, workers - 1), "holdfast-worker")
         self._decoder = ThreadPool(1, "holdfast-decoder")
         self._events = events
         self._on_decision = on_decision
@@ -239,6 +239,8 @@ class ServiceShell:
     def _decoded(self, call: IncomingCall, size: int, request: Request | MessageError) -> None:
         number = next(self._numbers)
         self._calls[number] = call
+        # Later: a reply may end the link while effects are carried out.
+        call.on_gone = functools.partial(self._loop.call_soon, self._guarded, self._gone, number)
         now = self._loop.time()
         try:
             effects = self._service.receive(number, request, size, now, call.robot)
@@ -248,6 +250,11 @@ class ServiceShell:
             call.end()
             raise
         self._carry_out(effects)
+
+    def _gone(self, number: int) -> None:
+        """Handle the end of a link on which a call was open."""
+        if self._calls.pop(number, None) is not None:
+            self._carry_out(self._service.gone(number, self._loop.time()))
 
     def _run_brief_job(self) -> None:
         if not self._brief_jobs:

@@ -61,6 +61,9 @@ class RobotTransport(Protocol):
 class IncomingCall(Protocol):
     """A request as the service sees it."""
 
+    on_gone: Callable[[], object] | None
+    """Called when the link has ended before the call: nobody awaits replies any more."""
+
     @property
     def payload(self) -> bytes:
         """The request."""

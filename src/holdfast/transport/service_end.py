@@ -79,6 +79,7 @@ class _StreamCall(msgspec.Struct, eq=False):
     is_open: bool = True
     is_being_delivered: bool = True
     waiting: bytes | None = None  # a reply
+    on_gone: Callable[[], object] | None = None
 
     @property
     def robot(self) -> str | None:
@@ -481,7 +482,12 @@ class StreamServiceTransport(LinkOwner):
         """Note that a link has ended."""
         self._without_hello.pop(link, None)
         self._protocols.pop(link, None)
-        was_there = self._links.pop(link, None) is not None
+        calls = self._links.pop(link, None)
+        was_there = calls is not None
+        for call in calls or ():
+            call.is_open = False
+            if call.on_gone is not None:
+                call.on_gone()
         if was_there and link.hello is not None:
             reason = link.reason or (_SAID_GOODBYE if link.said_goodbye else _NO_GOODBYE)
             robot = _name(link, link.hello)

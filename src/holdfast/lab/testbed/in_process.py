@@ -58,6 +58,7 @@ class _InProcessCall(msgspec.Struct, eq=False):
     robot_end: InProcessRobotTransport
     service_end: InProcessServiceTransport
     payload: bytes
+    on_gone: Callable[[], object] | None = None  # no link here ends before its calls
 
     @property
     def robot(self) -> str | None:

@@ -1,0 +1,459 @@
+"""What an answer costs, in seconds of one core and in bytes, before it is computed.
+
+A robot chooses its settings, and a service has to know what they ask of it before it begins. So
+everything that a computation repeats is a factor here: particles, samples, sensing actions, steps
+of a horizon, of a path, of a rollout, neighbours, inputs of the request, steps to roll forward.
+Each numeric setting is either in :data:`COSTLY` or, with the reason, in :data:`FREE`; a test holds
+it.
+
+What the problem's own functions take is measured (:class:`ProblemCost`), because a problem is
+anybody's code and its model may have any number of walls. What holdfast's code takes was measured
+once; ``slowness`` is how many times as long it takes on this machine. The estimate is for the worst
+belief, so most computations take less. ``python -m benchmarks.decision_cost`` compares.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from holdfast.config.settings import (
+    ENTROPY_METHODS,
+    UNINFORMED_METHODS,
+    PlanningSettings,
+    estimator_of,
+    path_steps,
+)
+from holdfast.problem_attributes import has_general_observations, has_own
+from holdfast.problems.problem import Problem
+
+__all__ = [
+    "COSTLY",
+    "FREE",
+    "TYPICAL_PROBLEM",
+    "CallCost",
+    "Cost",
+    "Price",
+    "Pricing",
+    "ProblemCost",
+    "cost_of_answer",
+    "cost_of_sensing",
+    "in_words",
+]
+
+COSTLY: Mapping[str, str] = {
+    "particle_filter.num_particles": "every method",
+    "active_sensing.num_observation_samples": "informed",
+    "active_sensing.horizon": "entropy, covariance",
+    "active_sensing.num_nearest_neighbors": "neighbours",
+    "selector.path_offsets": "path_entropy",
+    "selector.rollout_steps": "expected_return",
+    "selector.rollout_looks": "expected_return",
+    "selector.max_observation_samples": "expected_return",
+    "sensing_interval": "every method",
+}
+"""Numeric settings that are factors, and for which methods."""
+
+FREE: Mapping[str, str] = {
+    "particle_filter.resampling_threshold": "resampling is counted for each observation",
+    "active_sensing.discount": "a factor of values, not of their number",
+    "active_sensing.num_cores": "the service chooses it; seconds are those of one core",
+    "selector.sensing_action": "a choice that is returned as it is",
+    "selector.nats_per_cost": "a factor of values",
+    "selector.resolution": "the cost is that of the worst resolution",
+    "selector.path_discount": "a factor of values",
+}
+"""Numeric settings that are none, and why."""
+
+
+class CallCost(NamedTuple):
+    """Seconds of a function: of a call, and of each state that it is given."""
+
+    call_s: float
+    state_s: float
+
+    def of(self, states: float, calls: float = 1.0) -> float:
+        """Return the seconds of some calls with so many states together."""
+        return calls * self.call_s + states * self.state_s
+
+
+class ProblemCost(NamedTuple):
+    """Seconds that a problem's functions take.
+
+    Attributes
+    ----------
+    initial, move, stage : CallCost
+        Of ``initial_states``, ``move`` and ``next_stage``.
+    act : CallCost
+        Of ``policy`` and ``execute``.
+    sense : CallCost
+        Mean and variance of one sensing action's observation; for a general likelihood to draw an
+        observation and to evaluate its likelihood.
+    judge : CallCost
+        Of ``reward`` and ``is_goal``.
+    path_step : CallCost
+        Of one step of a noise-free path.
+    known_return : CallCost or None
+        Of ``known_state_return``, if it has one.
+    observation_size : int
+        Of the largest observation.
+    """
+
+    initial: CallCost
+    move: CallCost
+    stage: CallCost
+    act: CallCost
+    sense: CallCost
+    judge: CallCost
+    path_step: CallCost
+    known_return: CallCost | None
+    observation_size: int
+
+
+TYPICAL_PROBLEM = ProblemCost(
+    initial=CallCost(8e-6, 70e-9),
+    move=CallCost(7e-6, 80e-9),
+    stage=CallCost(3e-6, 20e-9),
+    act=CallCost(12e-6, 40e-9),
+    sense=CallCost(2e-6, 5e-9),
+    judge=CallCost(8e-6, 30e-9),
+    path_step=CallCost(2e-6, 15e-9),
+    known_return=None,
+    observation_size=2,
+)
+"""Where nothing was measured."""
+
+
+class Cost(NamedTuple):
+    """Seconds of one core, and the most bytes that are taken at a time."""
+
+    seconds: float
+    num_bytes: float
+
+
+class Price(NamedTuple):
+    """What is the same for all decisions of a session: what its problem and its sensing cost."""
+
+    problem: ProblemCost
+    sensing: Cost
+
+
+class Pricing(NamedTuple):
+    """What a service knows of the machine that it runs on.
+
+    Attributes
+    ----------
+    slowness : float
+        How many times as long it takes as the one for which the model was made.
+    measure : callable or None
+        Measures a problem's functions. None takes what is typical.
+    """
+
+    slowness: float = 1.0
+    measure: Callable[[Problem], ProblemCost] | None = None
+
+    def price_of(self, problem: Problem, planning: PlanningSettings) -> Price:
+        """Return what decisions cost."""
+        own = TYPICAL_PROBLEM if self.measure is None else self.measure(problem)
+        return Price(own, cost_of_sensing(problem, planning, own, self.slowness))
+
+
+# Nanoseconds, on the machine on which they were measured.
+_LIKELIHOOD = 8.0
+"""Of a posterior's weight, and of each coordinate of the observation."""
+_NEAREST_ALONE, _NEAREST_TOGETHER, _GROUP = 420.0, 90.0, 32
+"""Of a point's neighbours in one posterior, and in one of a group."""
+_NEIGHBOR, _SQUARED_NEIGHBOR = 50.0, 0.17
+"""Of each of many neighbours, which are kept in order."""
+_MIXTURE_PAIR = 0.28
+_PRIOR_PAIR, _PRIOR_MEMBER, _PRIOR_LANES = 4.0, 4.0, 8
+_ADD = 2.0
+"""Of a pass over an array, for each number."""
+_CONTACT = 2.0
+"""A move in contact takes so many times as long as a free one, which is measured."""
+_PYTHON = 60e3
+"""Of the code around a handful of calls."""
+_MODE_PARTICLES, _MODE_STARTS, _MODE_CLIMBS, _MODE_SPLITS = 1000, 16, 10, 3
+"""Of :mod:`holdfast.modes`."""
+
+_CLOUD = 8.0
+"""Particles that follow each estimate of a rollout."""
+_WEIGHTS_BYTES = 64 << 20
+_GROUP_BYTES = 400
+_BLOCK = 1 << 20
+"""Of the kernel's batches and of :mod:`holdfast.sensing`'s blocks."""
+
+
+class _Sizes:
+    """The numbers of one decision, and what all its parts are made of."""
+
+    def __init__(
+        self, problem: Problem, planning: PlanningSettings, own: ProblemCost, slowness: float
+    ) -> None:
+        sensing, selector = planning.active_sensing, planning.selector
+        self.problem = problem
+        self.planning = planning
+        self.own = own
+        self.unit_s = 1e-9 * slowness
+        self.particles = float(planning.particle_filter.num_particles)
+        self.coordinates = float(max(problem.state_size, 1))
+        self.action_size = float(max(problem.action_size, 1))
+        self.senses = float(len(problem.sensing_actions))
+        self.choices = self.senses + selector.sensing_is_optional
+        self.samples = float(sensing.num_observation_samples)
+        self.general = has_general_observations(problem)
+        self.state_bytes = 8.0 * self.particles * (self.coordinates + 1.0)
+
+    def estimate_s(self) -> float:
+        """Return the seconds of a state that stands for a belief."""
+        number = 4.0 + _ADD * self.coordinates
+        if self.problem_has_angles:
+            number += 60.0 * self.coordinates
+        found = 15e3 + number * self.particles
+        if self.planning.particle_filter.estimate == "heaviest_mode":
+            shown = min(self.particles, float(_MODE_PARTICLES))
+            found += _MODE_SPLITS * (
+                self.coordinates * (100e3 + 200.0 * self.particles + _MODE_STARTS * shown * 10.0)
+                + _MODE_CLIMBS * _MODE_STARTS * shown * 10.0
+            )
+        return found * self.unit_s
+
+    @property
+    def problem_has_angles(self) -> bool:
+        return len(getattr(self.problem, "circular", ())) > 0
+
+    def act_s(self, times: float) -> float:
+        """Return the seconds of so many task actions, each of a belief's estimate."""
+        one = self.own.act.of(1.0) + self.own.stage.of(1.0) + 25e3 * self.unit_s
+        return times * (self.estimate_s() + one)
+
+    def step_s(self) -> float:
+        """Return the seconds of a task action and the move of all particles."""
+        # Choosing and moving each ask for the estimate.
+        return 1.3 * self.act_s(2.0) + self.move_s(self.particles)
+
+    def move_s(self, states: float, calls: float = 1.0) -> float:
+        """Return the seconds of moves."""
+        return _CONTACT * self.own.move.of(states, calls)
+
+    def hypotheses_s(self, actions: float, samples: float) -> float:
+        """Return the seconds of hypothetical observations and their posteriors."""
+        size = self.own.observation_size
+        weights = actions * samples * self.particles
+        likelihoods = weights * (_LIKELIHOOD + _ADD * size) * self.unit_s
+        if self.general:
+            likelihoods += actions * samples * 5e3 * self.unit_s
+            return likelihoods + self.own.sense.of(weights, actions * samples)
+        predicted = self.own.sense.of(actions * self.particles, actions)
+        return predicted + likelihoods + actions * size * self.particles * 10.0 * self.unit_s
+
+    def entropies_s(self, posteriors: float, sets: float, dimension: float) -> float:
+        """Return the seconds of the entropies of posteriors, each of several sets of points."""
+        selector, particles = self.planning.selector, self.particles
+        if selector.method == "action_covariance":
+            return posteriors * sets * particles * 2.0 * _ADD * dimension * self.unit_s
+        kind = estimator_of(selector, int(particles))
+        neighbors = min(float(self.planning.active_sensing.num_nearest_neighbors), particles)
+        wide = 1.0 + max(0.0, dimension - 3.0) / 3.0
+        if kind == "nearest_neighbor":
+            together = min(posteriors, float(_GROUP))
+            point = _NEAREST_TOGETHER + (_NEAREST_ALONE - _NEAREST_TOGETHER) / together
+            # A tree is descended.
+            point *= 1.0 + math.log2(1.0 + particles / 1000.0) / 2.0
+            point += _NEIGHBOR * max(0.0, neighbors - 5.0)
+            point += _SQUARED_NEIGHBOR * neighbors * neighbors
+            found = posteriors * sets * particles * point * wide
+        elif kind == "prior_neighbors":
+            pair = _PRIOR_PAIR + min(0.45 * neighbors, 9.0 * math.log2(1.0 + neighbors))
+            pieces = math.ceil(posteriors / _PRIOR_LANES)
+            members = particles * particles
+            found = sets * (
+                particles * particles * (pair + dimension)
+                + pieces * (_PRIOR_MEMBER * members + 20.0 * _PRIOR_LANES * particles)
+            )
+        else:
+            groups = math.ceil(posteriors / _GROUP)
+            pairs = particles * particles * sets * groups * _GROUP
+            found = (pairs * _MIXTURE_PAIR + posteriors * sets * particles * 100.0) * wide
+        return (found + sets * particles * 400.0) * self.unit_s
+
+    def entropy_bytes(self, posteriors: float, sets: float, dimension: float) -> float:
+        """Return what the kernel takes for these."""
+        particles = self.particles
+        batch = min(posteriors, max(float(_GROUP), (_WEIGHTS_BYTES >> 3) / particles))
+        together = max(particles, min(sets * particles, float(_BLOCK)))
+        kept = sets * particles * (8.0 * dimension + 64.0)
+        if estimator_of(self.planning.selector, int(particles)) == "prior_neighbors":
+            return 8.0 * batch * particles + kept + 4.0 * particles * particles
+        return 8.0 * batch * particles + kept + 2.0 * _GROUP_BYTES * together
+
+
+def cost_of_sensing(
+    problem: Problem,
+    planning: PlanningSettings,
+    own: ProblemCost = TYPICAL_PROBLEM,
+    slowness: float = 1.0,
+) -> Cost:
+    """Return the most that the choice of a sensing action takes."""
+    sizes = _Sizes(problem, planning, own, slowness)
+    method = planning.selector.method
+    if method in UNINFORMED_METHODS:
+        return Cost(2.0 * _PYTHON * sizes.unit_s, sizes.state_bytes)
+    if method == "expected_return":
+        return _expected_return(sizes)
+    dimension = sizes.coordinates if method == "state_entropy" else sizes.action_size
+    posteriors = sizes.choices * sizes.samples
+    sets = 1.0
+    seconds = _PYTHON * sizes.unit_s + sizes.hypotheses_s(sizes.senses, sizes.samples)
+    predicted = 24.0 * sizes.senses * own.observation_size * sizes.particles
+    if sizes.general:
+        predicted = 16.0 * posteriors * sizes.particles
+    num_bytes = 4.0 * sizes.state_bytes + predicted + 16.0 * posteriors
+    if method == "path_entropy":
+        offsets = path_steps(planning)
+        sets = float(len(offsets))
+        seconds += _path_s(sizes, float(max(offsets, default=0)))
+        num_bytes += sets * sizes.particles * 8.0 * (2.0 * sizes.coordinates + 4.0 * dimension + 2)
+    if method in ENTROPY_METHODS and len(getattr(problem, "circular_actions", ())):
+        seconds += sets * sizes.particles * dimension * 150.0 * sizes.unit_s
+    seconds += own.act.of(sets * sizes.particles)
+    seconds += sizes.entropies_s(posteriors, sets, dimension)
+    num_bytes += sizes.entropy_bytes(posteriors, sets, dimension)
+    later = float(planning.active_sensing.horizon - 1)
+    if later > 0.0:
+        each = (
+            sizes.act_s(1.0)
+            + sizes.move_s(sizes.particles)
+            + own.act.of(sizes.particles)
+            + sizes.entropies_s(1.0, 1.0, dimension)
+            + _PYTHON * sizes.unit_s
+        )
+        seconds += sizes.hypotheses_s(sizes.senses, sizes.samples) + later * posteriors * each
+        block = max(
+            sizes.particles * sizes.coordinates,
+            min(float(_BLOCK), posteriors * sizes.particles * sizes.coordinates),
+        )
+        num_bytes += 24.0 * posteriors * sizes.particles + 64.0 * block
+    return Cost(seconds, num_bytes)
+
+
+def _path_s(sizes: _Sizes, steps: float) -> float:
+    """Return the seconds in which all particles follow their paths."""
+    own = sizes.own
+    if has_own(sizes.problem, "expected_path", ("policy", "execute", "move", "next_stage")):
+        return own.path_step.of(steps * sizes.particles)
+    one = own.act.of(sizes.particles) + sizes.move_s(sizes.particles)
+    return steps * (one + own.stage.of(sizes.particles) + 10e3 * sizes.unit_s)
+
+
+def _expected_return(sizes: _Sizes) -> Cost:
+    """Return the cost of the method ``expected_return``, if no sensing action is given up early."""
+    planning, own, unit_s = sizes.planning, sizes.own, sizes.unit_s
+    selector = planning.selector
+    choices, particles = sizes.choices, sizes.particles
+    samples = max(sizes.samples, float(selector.max_observation_samples))
+    # Each round doubles the samples.
+    rounds = 1.0 + math.ceil(math.log2(samples / sizes.samples))
+    posteriors = choices * samples
+    seconds = sizes.hypotheses_s(sizes.senses, samples)
+    seconds += posteriors * (sizes.estimate_s() + (25e3 + 14.0 * particles) * unit_s)
+    steps = float(selector.rollout_steps)
+    interval = planning.sensing_interval + 1.0
+    # Columns of a rollout: it forks at each of the next looks, and carries a cloud up to the last.
+    looks = min(float(selector.rollout_looks), math.floor((steps - 1.0) / interval))
+    forks = 0.0 if own.known_return is not None else looks
+    unknown_steps = min(steps, interval * selector.rollout_looks)
+    column_steps = unknown_steps * (1.0 + forks / 2.0)
+    if own.known_return is None:
+        column_steps += (steps - unknown_steps) * forks
+    else:
+        seconds += own.known_return.of(posteriors * looks, rounds * looks)
+    cloud_steps = _CLOUD * unknown_steps
+    state_s = own.act.state_s + own.stage.state_s + own.judge.state_s + sizes.move_s(1.0, 0.0)
+    numbers = sizes.coordinates + sizes.action_size
+    state_s += (150.0 + 30.0 * numbers) * unit_s
+    cloud_s = sizes.move_s(1.0, 0.0) + (10.0 + 12.0 * numbers) * unit_s
+    if sizes.problem_has_angles:
+        cloud_s += 60.0 * sizes.coordinates * unit_s
+    seconds += posteriors * (column_steps * state_s + cloud_steps * cloud_s)
+    call_s = own.act.call_s + own.stage.call_s + own.judge.call_s
+    call_s += choices * (own.move.call_s + 3e3 * unit_s) + 3.0 * _PYTHON * unit_s
+    seconds += rounds * steps * call_s
+    last = samples if rounds == 1.0 else max(sizes.samples, samples / 2.0)
+    columns = 1.0 + forks
+    num_bytes = (
+        6.0 * sizes.state_bytes
+        + 16.0 * choices * last * particles
+        + 8.0 * choices * last * (columns * (4.0 * numbers + 8.0) + 4.0 * _CLOUD * numbers)
+        + 24.0 * choices * samples * rounds
+    )
+    if not sizes.general:
+        num_bytes += 24.0 * sizes.senses * own.observation_size * particles
+    return Cost(seconds, num_bytes)
+
+
+def cost_of_answer(
+    problem: Problem,
+    planning: PlanningSettings,
+    own: ProblemCost = TYPICAL_PROBLEM,
+    slowness: float = 1.0,
+    *,
+    steps: float,
+    inputs: float,
+    begins: bool,
+    num_bytes: float,
+) -> Cost:
+    """Return the most that it takes to reach a state.
+
+    Parameters
+    ----------
+    steps : float
+        By which it is rolled forward, those of the task part included.
+    inputs : float
+        Observations to be folded in.
+    begins : bool
+        Whether it begins with the initial belief.
+    num_bytes : float
+        Of the request.
+    """
+    sizes = _Sizes(problem, planning, own, slowness)
+    particles, size = sizes.particles, float(own.observation_size)
+    seconds = (2.0 * _PYTHON + 2.0 * sizes.state_bytes + 4.0 * num_bytes) * sizes.unit_s
+    if begins:
+        seconds += own.initial.of(particles)
+    seconds += steps * sizes.step_s()
+    # Likelihood, gate and resampling.
+    number = 30.0 + 10.0 * size + 6.0 * size * size + 6.0 * sizes.coordinates
+    fold_s = (2.0 * _PYTHON + particles * number) * sizes.unit_s + own.sense.of(particles)
+    if sizes.general and getattr(problem, "rank_test", False):
+        fold_s += 19.0 * (own.sense.of(particles) + 20.0 * particles * sizes.unit_s)
+    seconds += inputs * (fold_s + own.stage.of(1.0))
+    return Cost(seconds, 8.0 * sizes.state_bytes + 3.0 * num_bytes + 24.0 * size * particles)
+
+
+def in_words(problem: Problem | None, planning: PlanningSettings) -> str:
+    """Name the settings that a decision's cost comes from, with their values."""
+    sensing, selector = planning.active_sensing, planning.selector
+    parts = [
+        f"selector.method {selector.method}",
+        f"particle_filter.num_particles {planning.particle_filter.num_particles}",
+    ]
+    if selector.method not in UNINFORMED_METHODS:
+        parts.append(f"active_sensing.num_observation_samples {sensing.num_observation_samples}")
+    if problem is not None:
+        parts.append(f"{len(problem.sensing_actions)} sensing actions")
+    if selector.method == "expected_return":
+        parts += [
+            f"selector.max_observation_samples {selector.max_observation_samples}",
+            f"selector.rollout_steps {selector.rollout_steps}",
+            f"selector.rollout_looks {selector.rollout_looks}",
+        ]
+    elif selector.method not in UNINFORMED_METHODS:
+        parts.append(f"active_sensing.num_nearest_neighbors {sensing.num_nearest_neighbors}")
+        if selector.method == "path_entropy":
+            parts.append(f"selector.path_offsets {list(selector.path_offsets)}")
+        else:
+            parts.append(f"active_sensing.horizon {sensing.horizon}")
+    parts.append(f"sensing_interval {planning.sensing_interval}")
+    return ", ".join(parts)

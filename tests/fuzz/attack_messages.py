@@ -1,0 +1,184 @@
+"""Requests that mean harm, drawn from classes: odd values at every place, every number too large.
+
+The places come from the structs themselves: a setting that is added is attacked as well.
+"""
+
+from __future__ import annotations
+
+import itertools
+import random
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple, get_args
+
+import msgspec
+from msgspec import inspect
+from tests.fuzz import corpus
+from tests.fuzz.odd_values import OddValues, replaced
+
+from holdfast.config.settings import Estimator, Method, PlanningSettings
+from holdfast.problems import registry
+from holdfast.protocol.messages import (
+    CHECKSUM_SIZE,
+    encode,
+    settings_digest,
+    unpack_configuration,
+    with_checksum,
+)
+
+__all__ = ["NumericKey", "hostile_settings", "numeric_keys", "odd_requests"]
+
+_CONFIGURATION, _SETTINGS = 9, 11
+"""Places of a request's fields."""
+
+_MODEL, _PLANNER, _PLANNING, _SEED = 1, 2, 3, 4
+"""Places of a session configuration's."""
+
+_BEYOND = (0, 1, -1, 2**31, 2**32, 2**63 - 1, 2**63, 2**64 - 1, 1e-320, 1e150, 1e308)
+
+
+class NumericKey(NamedTuple):
+    """A key whose value is a number, or a list of numbers."""
+
+    path: tuple[str, ...]
+    least: float
+    most: float
+    is_whole: bool
+    length: int = 0
+
+    def values(self, chance: random.Random) -> Any:
+        """Return a value at a bound, just beyond it, or far beyond all bounds."""
+        step = 1 if self.is_whole else 1e-9
+        bound = chance.choice((self.most, self.most, self.most + step, self.least - step))
+        value = chance.choice((bound, bound, bound, chance.choice(_BEYOND)))
+        if self.is_whole and abs(value) < 2**63 and chance.random() < 0.9:
+            value = int(value)
+        if not self.length:
+            return value
+        if not isinstance(value, int) or chance.random() < 0.1:
+            return [value] * (self.length + 1)
+        return list(range(max(0, value - self.length + 1), value + 1))
+
+
+def numeric_keys(kind: type) -> list[NumericKey]:
+    """Return all numeric keys of a struct and of the structs in it, with their bounds."""
+    return list(_numeric(inspect.type_info(kind), ()))
+
+
+def _numeric(kind: inspect.Type, path: tuple[str, ...], length: int = 0) -> Iterator[NumericKey]:
+    if isinstance(kind, inspect.StructType):
+        for field in kind.fields:
+            yield from _numeric(field.type, (*path, field.encode_name))
+    elif isinstance(kind, inspect.UnionType):
+        for each in kind.types:
+            yield from _numeric(each, path)
+    elif isinstance(kind, inspect.VarTupleType | inspect.ListType):
+        yield from _numeric(kind.item_type, path, min(kind.max_length or 64, 10_000))
+    elif isinstance(kind, inspect.TupleType):
+        yield from _numeric(kind.item_types[0], path, len(kind.item_types))
+    elif isinstance(kind, inspect.IntType | inspect.FloatType):
+        least = next((each for each in (kind.ge, kind.gt) if each is not None), -1e18)
+        most = next((each for each in (kind.le, kind.lt) if each is not None), 1e18)
+        yield NumericKey(path, least, most, isinstance(kind, inspect.IntType), length)
+
+
+def _set(data: dict[str, Any], path: tuple[str, ...], value: object) -> None:
+    for name in path[:-1]:
+        inner = data.get(name)
+        data = data.setdefault(name, {}) if not isinstance(inner, dict) else inner
+    data[path[-1]] = value
+
+
+def _fields_of(array: object) -> list[bytes]:
+    return [
+        msgspec.msgpack.encode(each)
+        for each in msgspec.msgpack.decode(msgspec.msgpack.encode(array))
+    ]
+
+
+def _request(fields: list[bytes], configuration: bytes) -> bytes:
+    """Return a request with a packed session configuration, and the digest that it has here."""
+    try:
+        settings = settings_digest(unpack_configuration(configuration))
+    except Exception:  # noqa: BLE001 - a service will not come to the digest either
+        settings = b"s" * 16
+    fields = replaced_fields(
+        fields,
+        {
+            _CONFIGURATION: msgspec.msgpack.encode(configuration),
+            _SETTINGS: msgspec.msgpack.encode(settings),
+        },
+    )
+    return with_checksum(bytes([0x90 | len(fields)]) + b"".join(fields))
+
+
+def replaced_fields(fields: list[bytes], changes: Mapping[int, bytes]) -> list[bytes]:
+    """Return fields with others at some places."""
+    return [changes.get(place, each) for place, each in enumerate(fields)]
+
+
+def _opening(chance: random.Random, name: str = corpus.PROBLEM) -> tuple[list[bytes], list[bytes]]:
+    """Return the fields of a request that opens a session of its own, and its configuration's."""
+    request = next(
+        each for each in corpus.requests(chance.randbytes(16)) if each.session_configuration
+    )
+    request = msgspec.structs.replace(request, checkpoint=None, inputs=())
+    fields = _fields_of(msgspec.msgpack.decode(encode(request)[:-CHECKSUM_SIZE]))
+    return fields, _fields_of(corpus.session_configuration_of(name, chance.randrange(2**63)))
+
+
+def odd_requests(chance: random.Random) -> Iterator[bytes]:
+    """Yield requests with a value of any type at any place, at the top and in the configuration."""
+    odd = OddValues(chance)
+    while True:
+        fields, opening = _opening(chance)
+        draw = chance.random()
+        if draw < 0.25:
+            yield with_checksum(replaced(fields, chance.randrange(len(fields)), odd.value()))
+        elif draw < 0.5:
+            packed = replaced(opening, chance.randrange(len(opening)), odd.value())
+            yield _request(fields, packed)
+        elif draw < 0.95:
+            # A section that is a mapping as it should be, and anything in it.
+            items = [b"\xa1" + bytes([97 + k]) + odd.value() for k in range(chance.randrange(1, 4))]
+            section = bytes([0x80 | len(items)]) + b"".join(items)
+            yield _request(fields, replaced(opening, chance.choice((_MODEL, _PLANNER)), section))
+        else:
+            yield with_checksum(odd.value(5))
+
+
+def hostile_settings(chance: random.Random) -> Iterator[bytes]:
+    """Yield openings with numbers at their bounds and beyond, of every method and problem.
+
+    One key, some or all of them; those of the settings, and those of the problem's own sections.
+    """
+    planning_keys = numeric_keys(PlanningSettings)
+    methods, estimators = get_args(Method), (None, *get_args(Estimator))
+    rounds = itertools.cycle(itertools.product(methods, estimators, tuple(registry.BUILT_IN)))
+    while True:
+        for key in chance.sample(planning_keys, len(planning_keys)):
+            method, estimator, name = next(rounds)
+            fields, opening = _opening(chance, name)
+            planning = msgspec.to_builtins(PlanningSettings())
+            planning["selector"] |= {"method": method, "estimator": estimator}
+            # Few enough to be worth the attempt, where they are not what is attacked.
+            planning["particle_filter"]["num_particles"] = chance.choice((12, 300, 4096))
+            others = chance.sample(planning_keys, chance.choice((0, 0, 1, 3, len(planning_keys))))
+            for each in (key, *others):
+                _set(planning, each.path, each.values(chance))
+            changes = {_PLANNING: msgspec.msgpack.encode(planning)}
+            if chance.random() < 0.3:
+                changes |= dict(_hostile_sections(chance, name))
+            if chance.random() < 0.05:
+                changes[_SEED] = msgspec.msgpack.encode(chance.choice(_BEYOND))
+            opening = replaced_fields(opening, changes)
+            yield _request(fields, bytes([0x90 | len(opening)]) + b"".join(opening))
+
+
+def _hostile_sections(chance: random.Random, name: str) -> Iterator[tuple[int, bytes]]:
+    problem = registry.problem_class(name)
+    for place, attribute in ((_MODEL, "Model"), (_PLANNER, "StateSpacePlanner")):
+        keys = numeric_keys(getattr(problem, attribute)) if hasattr(problem, attribute) else []
+        section: dict[str, Any] = {}
+        for key in chance.sample(keys, min(len(keys), chance.choice((1, 1, 2, 99)))):
+            _set(section, key.path, key.values(chance))
+        yield place, msgspec.msgpack.encode(section)

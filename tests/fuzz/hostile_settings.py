@@ -1,0 +1,152 @@
+"""Settings that cost as much as they can, found by looking at the settings' own bounds."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+from collections.abc import Iterator
+from typing import NamedTuple, get_args
+
+import msgspec
+from msgspec import inspect
+
+from holdfast.config.settings import Estimator, Method, PlanningSettings, unfit_for_the_method
+
+__all__ = ["Hostile", "hostile_settings", "numeric_keys", "random_settings", "with_key"]
+
+UNBOUNDED = 10**9
+"""Tried where a key has no upper bound."""
+
+
+class Hostile(NamedTuple):
+    """Settings, the method among them, and the key that is at its maximum."""
+
+    key: str
+    settings: PlanningSettings
+
+
+class Bounds(NamedTuple):
+    """What a numeric key allows; ``length`` is that of a tuple, 0 for a single number."""
+
+    least: float
+    most: float
+    is_whole: bool
+    length: int = 0
+
+
+def numeric_keys() -> dict[str, Bounds]:
+    """Return all keys of the settings whose values are numbers or tuples of numbers."""
+    found: dict[str, Bounds] = {}
+    for field in inspect.type_info(PlanningSettings).fields:  # type: ignore[attr-defined]
+        if isinstance(field.type, inspect.StructType):
+            for own in field.type.fields:
+                if (bounds := _bounds_of(own.type)) is not None:
+                    found[f"{field.name}.{own.name}"] = bounds
+        elif (bounds := _bounds_of(field.type)) is not None:
+            found[field.name] = bounds
+    return found
+
+
+def _bounds_of(kind: inspect.Type) -> Bounds | None:
+    if isinstance(kind, inspect.IntType | inspect.FloatType):
+        whole = isinstance(kind, inspect.IntType)
+        least = kind.ge if kind.ge is not None else kind.gt if kind.gt is not None else -UNBOUNDED
+        most = kind.le if kind.le is not None else kind.lt if kind.lt is not None else UNBOUNDED
+        return Bounds(least, most, whole)
+    if isinstance(kind, inspect.VarTupleType):
+        own = _bounds_of(kind.item_type)
+        return None if own is None else own._replace(length=kind.max_length or 64)
+    if isinstance(kind, inspect.UnionType):
+        return next((own for each in kind.types if (own := _bounds_of(each))), None)
+    return None
+
+
+def with_key(settings: PlanningSettings, key: str, value: object) -> PlanningSettings:
+    """Return settings with another value of a key."""
+    section, _, name = key.rpartition(".")
+    if not section:
+        return msgspec.structs.replace(settings, **{name: value})
+    own = msgspec.structs.replace(getattr(settings, section), **{name: value})
+    return msgspec.structs.replace(settings, **{section: own})
+
+
+def _greatest(bounds: Bounds) -> object:
+    most = int(bounds.most) if bounds.is_whole else bounds.most
+    if not bounds.length:
+        return most
+    return tuple(range(int(most) - bounds.length + 1, int(most) + 1))
+
+
+def _made_fit(settings: PlanningSettings) -> PlanningSettings:
+    """Change what the method cannot use, but for what costs."""
+    for _ in range(8):
+        particles = settings.particle_filter.num_particles
+        unfit = unfit_for_the_method(settings)
+        if unfit is None:
+            return settings
+        (section, name), _ = unfit
+        key = f"{section}.{name}"
+        value: object = 1
+        if name == "num_nearest_neighbors":
+            value = particles - 1
+        elif name == "num_particles":
+            value = 4096
+        elif name == "max_observation_samples":
+            value = settings.active_sensing.num_observation_samples
+        elif name == "path_offsets":
+            settings = with_key(settings, "selector.path_unit", "steps")
+            value = settings.selector.path_offsets
+        settings = with_key(settings, key, value)
+    raise AssertionError(f"{settings} cannot be made fit")
+
+
+def hostile_settings(most_particles: int = 1_000_000) -> Iterator[Hostile]:
+    """Return for each method settings with each numeric key at its maximum, and with all of them.
+
+    ``most_particles`` stands in for the maximum of the particles, of which a service takes fewer.
+    """
+    keys = numeric_keys()
+    greatest = {key: _greatest(bounds) for key, bounds in keys.items()}
+    greatest["particle_filter.num_particles"] = most_particles
+    estimators: tuple[str | None, ...] = (None, *get_args(Estimator))
+    for method, estimator in itertools.product(get_args(Method), estimators):
+        plain = with_key(PlanningSettings(), "selector.method", method)
+        plain = with_key(plain, "selector.estimator", estimator)
+        everything = plain
+        for key, value in greatest.items():
+            yield Hostile(key, _made_fit(with_key(plain, key, value)))
+            everything = with_key(everything, key, value)
+        yield Hostile("all", _made_fit(everything))
+
+
+def random_settings(chance: random.Random, most: float = 1.0) -> PlanningSettings:
+    """Return settings whose costly numbers are drawn, by their logarithms, up to a share of most.
+
+    What changes no cost stays as it is.
+    """
+    settings = PlanningSettings()
+
+    def drawn(least: int, greatest: int) -> int:
+        growth = 1.0 + most * (greatest / least - 1.0)
+        return round(least * math.exp(math.log(growth) * chance.random()))
+
+    values: dict[str, object] = {
+        "selector.method": chance.choice(get_args(Method)),
+        "selector.estimator": chance.choice((None, *get_args(Estimator))),
+        "selector.resolution": chance.choice((None, 10.0 ** chance.uniform(-4.0, 3.0))),
+        "selector.sensing_is_optional": chance.random() < 0.3,
+        "particle_filter.num_particles": drawn(30, 30_000),
+        "particle_filter.estimate": chance.choice(("mean", "mean", "heaviest_mode")),
+        "active_sensing.num_observation_samples": drawn(1, 200),
+        "active_sensing.num_nearest_neighbors": drawn(1, 300) if chance.random() < 0.4 else 5,
+        "active_sensing.horizon": drawn(1, 30),
+        "selector.rollout_steps": drawn(1, 2000),
+        "selector.rollout_looks": drawn(1, 100),
+        "selector.max_observation_samples": drawn(1, 400),
+        "selector.path_offsets": tuple(range(drawn(1, 16))),
+        "sensing_interval": drawn(1, 60),
+    }
+    for key, value in values.items():
+        settings = with_key(settings, key, value)
+    return _made_fit(settings)

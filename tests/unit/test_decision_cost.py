@@ -1,0 +1,179 @@
+"""Every number of the settings is a factor of the cost, or is listed as none."""
+
+from __future__ import annotations
+
+import math
+import random
+from typing import Any, get_args
+
+import pytest
+from tests.fuzz.hostile_settings import (
+    hostile_settings,
+    numeric_keys,
+    random_settings,
+    with_key,
+)
+
+from holdfast.config.settings import Method, PlanningSettings
+from holdfast.problems import registry
+from holdfast.problems.capsule_robot import CapsuleRobot
+from holdfast.protocol.decision_cost import (
+    COSTLY,
+    FREE,
+    TYPICAL_PROBLEM,
+    CallCost,
+    Cost,
+    ProblemCost,
+    cost_of_answer,
+    cost_of_sensing,
+    in_words,
+)
+from holdfast.protocol.service_limits import ServiceLimits
+
+METHODS = get_args(Method)
+PEG = registry.problem_class("peg_in_hole_2d").from_settings({}, {})
+
+
+def answer(settings: PlanningSettings, **changes: Any) -> Cost:
+    asked: dict[str, Any] = {"steps": 9.0, "inputs": 1.0, "begins": True, "num_bytes": 100.0}
+    return cost_of_answer(PEG, settings, **{**asked, **changes})
+
+
+def is_least(less: Cost, more: Cost) -> bool:
+    return less.seconds <= more.seconds and less.num_bytes <= more.num_bytes
+
+
+def test_each_numeric_setting_is_a_factor_or_listed_as_none() -> None:
+    known = {*COSTLY, *FREE}
+    assert set(numeric_keys()) == known, "list a new key in COSTLY and count it, or in FREE"
+    assert not set(COSTLY) & set(FREE)
+
+
+def test_numeric_settings_are_found_by_themselves() -> None:
+    keys = numeric_keys()
+    assert keys["selector.rollout_steps"].most == 100_000
+    assert keys["selector.path_offsets"].length == 64
+    assert "selector.method" not in keys
+    assert "sensing_interval" in keys
+
+
+@pytest.mark.parametrize("key", [*COSTLY])
+def test_a_costly_setting_never_lowers_the_cost_and_raises_it_somewhere(key: str) -> None:
+    plain = PlanningSettings()
+    if key == "selector.rollout_looks":
+        plain = with_key(plain, "sensing_interval", 1)
+    rises = False
+    for method in METHODS:
+        settings = with_key(plain, "selector.method", method)
+        before: tuple[Cost, Cost] | None = None
+        for factor in (1, 2, 10, 100):
+            value: object = 40 * factor
+            if key == "active_sensing.num_nearest_neighbors":
+                settings = with_key(settings, "particle_filter.num_particles", 5000)
+            if key == "selector.path_offsets":
+                value = tuple(range(10 * factor))[:64]
+            changed = with_key(settings, key, value)
+            steps = float(changed.sensing_interval)
+            found = cost_of_sensing(PEG, changed), answer(changed, steps=steps)
+            if key == "sensing_interval":
+                # A robot that senses less often has fewer forks in its rollouts, not more.
+                found = found[1], found[1]
+            assert all(math.isfinite(each.seconds) for each in found)
+            if before is not None:
+                assert all(map(is_least, before, found)), (key, method, factor)
+                rises |= any(
+                    less.seconds < more.seconds for less, more in zip(before, found, strict=True)
+                )
+            before = found
+    assert rises, key
+
+
+@pytest.mark.parametrize("key", [*FREE])
+def test_a_setting_that_is_no_factor_changes_nothing(key: str) -> None:
+    for method in METHODS:
+        settings = with_key(PlanningSettings(), "selector.method", method)
+        bounds = numeric_keys()[key]
+        other = 1 if bounds.is_whole else 0.5
+        assert cost_of_sensing(PEG, settings) == cost_of_sensing(
+            PEG, with_key(settings, key, other)
+        )
+
+
+@pytest.mark.parametrize("factor", ["steps", "inputs", "num_bytes", "begins"])
+def test_what_a_request_asks_for_counts(factor: str) -> None:
+    settings = PlanningSettings()
+    few: dict[str, Any] = {factor: False if factor == "begins" else 1.0}
+    many: dict[str, Any] = {factor: True if factor == "begins" else 1000.0}
+    assert answer(settings, **few).seconds < answer(settings, **many).seconds
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_slower_functions_and_machines_count(method: Method) -> None:
+    settings = with_key(PlanningSettings(), "selector.method", method)
+    settings = with_key(settings, "active_sensing.horizon", 1 if method == "path_entropy" else 2)
+    base = cost_of_sensing(PEG, settings)
+    assert cost_of_sensing(PEG, settings, slowness=3.0).seconds > base.seconds
+    slow = CallCost(1e-3, 1e-5)
+    if method in ("random", "fixed"):
+        return
+    raised = [
+        cost_of_sensing(PEG, settings, own).seconds
+        for own in (
+            TYPICAL_PROBLEM._replace(act=slow),
+            TYPICAL_PROBLEM._replace(sense=slow),
+            TYPICAL_PROBLEM._replace(move=slow),
+            TYPICAL_PROBLEM._replace(path_step=slow),
+        )
+    ]
+    assert max(raised) > 2.0 * base.seconds
+    assert min(raised) >= base.seconds
+
+
+def test_more_sensing_actions_cost_more() -> None:
+    many_actions = CapsuleRobot()
+    many_actions.sensing_actions = tuple(map(str, range(200)))
+    for method in METHODS:
+        settings = with_key(PlanningSettings(), "selector.method", method)
+        few, many = (cost_of_sensing(each, settings) for each in (CapsuleRobot(), many_actions))
+        assert is_least(few, many)
+        if method not in ("random", "fixed"):
+            assert many.seconds > 10.0 * few.seconds
+
+
+def test_estimates_are_finite_whatever_is_set() -> None:
+    limits = ServiceLimits()
+    for hostile in hostile_settings():
+        cost = cost_of_sensing(PEG, hostile.settings)
+        assert math.isfinite(cost.seconds), hostile
+        assert math.isfinite(cost.num_bytes), hostile
+        method = hostile.settings.selector.method
+        if hostile.key == "all" and method not in ("random", "fixed"):
+            assert cost.seconds > limits.max_decision_s, hostile
+        assert method in in_words(PEG, hostile.settings)
+
+
+def test_the_defaults_are_brief() -> None:
+    limits = ServiceLimits()
+    for name in ("peg_in_hole_2d", "multitier_peg_in_hole_2d", "capsule_robot", "peg_in_hole_3d"):
+        problem = registry.problem_class(name).from_settings({}, {})
+        assert cost_of_sensing(problem, PlanningSettings()).seconds < limits.max_brief_s
+        failed_over = cost_of_answer(
+            problem, PlanningSettings(), steps=100, inputs=11, begins=True, num_bytes=500
+        )
+        assert failed_over.seconds < limits.max_medium_s
+
+
+def test_the_words_name_the_keys_of_the_method() -> None:
+    settings = with_key(PlanningSettings(), "selector.method", "expected_return")
+    words = in_words(PEG, settings)
+    for key in ("rollout_steps 200", "rollout_looks 4", "max_observation_samples 40"):
+        assert f"selector.{key}" in words
+    assert "3 sensing actions" in words
+    assert "path_offsets" not in words
+
+
+def test_drawn_settings_can_be_used() -> None:
+    chance = random.Random(4)
+    for _ in range(200):
+        cost = cost_of_sensing(PEG, random_settings(chance), ProblemCost(*TYPICAL_PROBLEM))
+        assert cost.seconds > 0.0

@@ -1,0 +1,107 @@
+"""A computation ends at its next check, once nobody awaits it."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from tests.fuzz.hostile_settings import with_key
+
+from holdfast import _kernel
+from holdfast.config.settings import Method, PlanningSettings
+from holdfast.errors import InterruptedComputationError
+from holdfast.interruption import Interruption, check, interruptible
+from holdfast.planning import Planner
+from holdfast.problems.capsule_robot import CapsuleRobot
+
+
+class Counting(CapsuleRobot):
+    """Sets an interruption in the n-th call of its policy."""
+
+    def __init__(self, last: int) -> None:
+        super().__init__()
+        self.interruption = Interruption()
+        self.calls = 0
+        self._last = last
+
+    def policy(self, states: Any, stage: Any) -> Any:
+        self.calls += 1
+        if self.calls == self._last:
+            self.interruption.set()
+        return super().policy(states, stage)
+
+
+def test_without_an_interruption_a_check_does_nothing() -> None:
+    check()
+    interruption = Interruption()
+    with interruptible(interruption):
+        check()
+        interruption.set()
+        with pytest.raises(InterruptedComputationError):
+            check()
+    check()
+
+
+@pytest.mark.parametrize("method", ["expected_return", "path_entropy", "action_entropy"])
+def test_a_long_decision_ends_after_few_more_calls(method: Method) -> None:
+    assert method in get_args(Method)
+    settings = with_key(PlanningSettings(), "selector.method", method)
+    settings = with_key(settings, "selector.rollout_steps", 10_000)
+    settings = with_key(settings, "selector.path_offsets", (0, 1000))
+    if method != "path_entropy":
+        settings = with_key(settings, "active_sensing.horizon", 1000)
+    problem = Counting(20)
+    planner = Planner(problem, settings, particles=50)
+    with pytest.raises(InterruptedComputationError), interruptible(problem.interruption):
+        planner.choose_sensing_action(planner.init(1))
+    assert problem.calls <= 22
+
+
+def test_rolling_a_state_forward_ends() -> None:
+    problem = Counting(5)
+    planner = Planner(problem, PlanningSettings(sensing_interval=5000), particles=20)
+    state = planner.init(1)._replace(sensed=True)
+    with pytest.raises(InterruptedComputationError), interruptible(problem.interruption):
+        planner.plan_until_sensing(state, 10_000)
+    assert problem.calls <= 6
+
+
+def test_an_interruption_that_is_not_set_changes_no_decision() -> None:
+    planner = Planner(CapsuleRobot(), method="expected_return", particles=50)
+    state = planner.init(3)
+    expected, info = planner.choose_sensing_action(state)
+    with interruptible(Interruption()):
+        found, again = planner.choose_sensing_action(state)
+    assert found == expected
+    assert info.entropies is not None
+    assert again.entropies is not None
+    assert info.entropies.tobytes() == again.entropies.tobytes()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_kernel_ends_between_its_tasks(threads: int) -> None:
+    points, rows = np.arange(600.0).reshape(200, 3), np.zeros((40, 200))
+    arguments = (points, rows, True, 0, 5, 1e-3, 0.0, 0.0, threads, (1.0,), np.empty(0))
+    expected = _kernel.entropies(*arguments)[0]
+    interruption = Interruption()
+    before = _kernel.use_threads_from(0.0)
+    try:
+        with interruptible(interruption):
+            assert _kernel.entropies(*arguments)[0].tobytes() == expected.tobytes()
+        interruption.set()
+        with pytest.raises(InterruptedComputationError), interruptible(interruption):
+            _kernel.entropies(*arguments)
+        assert _kernel.entropies(*arguments)[0].tobytes() == expected.tobytes()
+    finally:
+        _kernel.use_threads_from(before)
+
+
+def test_the_outer_interruption_is_watched_again_after_the_inner_one() -> None:
+    points, rows = np.arange(600.0).reshape(200, 3), np.zeros((4, 200))
+    outer = Interruption()
+    with pytest.raises(InterruptedComputationError), interruptible(outer):
+        with interruptible(Interruption()):
+            outer.set()
+            _kernel.all_finite(points)
+        _kernel.entropies(points, rows, True, 0, 5, 1e-3, 0.0, 0.0, 1, (1.0,), np.empty(0))
