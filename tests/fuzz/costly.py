@@ -157,7 +157,7 @@ def attack(endpoint: str, seconds: float, seed: int = 1, keys: Path | None = Non
                 if robot.state.step > _STEPS:
                     trial += 1
                     robot.begin(trial)
-        assert other.returncode == 0
+        assert other.returncode == 0, other.returncode
         assert other.stdout is not None
         counts = json.loads(other.stdout.read())
     waits.sort()

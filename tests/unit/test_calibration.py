@@ -71,6 +71,23 @@ def test_a_slow_function_is_asked_seldom(clock: Clock) -> None:
     assert slow.asked < quick.asked / 10
 
 
+def test_of_many_sensing_actions_some_are_asked() -> None:
+    asked = set()
+
+    class Many(CapsuleRobot):
+        def observation_mean(self, states: Any, sensing_action: int) -> Any:
+            asked.add(sensing_action)
+            return super().observation_mean(states, 0)
+
+    problem = Many()
+    for count in (1, 16, 17, 10_000):
+        asked.clear()
+        problem.sensing_actions = tuple(map(str, range(count)))
+        measure_problem(problem)
+        assert 1 <= len(asked) <= 16
+        assert max(asked) < count
+
+
 def test_a_problem_that_fails_is_typical_from_there_on() -> None:
     class Broken(CapsuleRobot):
         def move(self, states: Any, actions: Any, stream: Any) -> Any:

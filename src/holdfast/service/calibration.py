@@ -34,6 +34,9 @@ _LEAST, _MOST = 0.5, 20.0
 _FEW, _MANY = 16, 272
 """States of which a function is asked, to tell what a call takes from what a state takes."""
 
+_MOST_ACTIONS = 16
+"""Of many sensing actions so many are measured."""
+
 _SLOW_S = 0.3e-3
 """What takes longer is asked once."""
 
@@ -94,7 +97,9 @@ def _measure(problem: Any, own: dict[str, Any]) -> None:
     if has_own(problem, "expected_path", ("policy", "execute", "move", "next_stage")):
         path = _measured(lambda states: problem.expected_path(states, 0, (0, 8), 1), few, many)
         own["path_step"] = CallCost(path.call_s, path.state_s / 8.0)
-    sensed = [_sensed(problem, number, few, many) for number in range(len(problem.sensing_actions))]
+    count = len(problem.sensing_actions)
+    asked = range(0, count, 1 + count // _MOST_ACTIONS)
+    sensed = [_sensed(problem, number, few, many) for number in asked]
     own["sense"] = CallCost(
         max(cost.call_s for cost, _ in sensed), max(cost.state_s for cost, _ in sensed)
     )
