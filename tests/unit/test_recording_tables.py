@@ -123,6 +123,7 @@ class TestTables:
         summary = builder.build(problem="p", seed=5, version="1", trials=3, wall_time_s=2.0)
         assert summary.missing_observations == 3
         assert dict(_summary_rows(summary))["no reading"] == "3 of 15 looks had no observation"
+
     def test_the_fewest_particles_are_those_of_the_worst_trial(self) -> None:
         builder = SummaryBuilder()
         for trial, fewest in enumerate((None, 300, 4, 20)):
