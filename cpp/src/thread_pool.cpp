@@ -192,7 +192,9 @@ double use_threads_from(double nanoseconds) {
     return threads_from.exchange(nanoseconds);
 }
 
-void watch_interruption(const std::uint8_t* flag) { interruption = flag; }
+void watch_interruption(const std::uint8_t* flag) {
+    interruption = flag;
+}
 
 int threads_started() {
     return pool().helpers();

@@ -32,9 +32,7 @@ int threads_started();
 
 /// What `run_tasks` raises where the interruption of the calling thread has been set.
 struct Interrupted : std::exception {
-    const char* what() const noexcept override {
-        return "nobody awaits this computation any more";
-    }
+    const char* what() const noexcept override { return "nobody awaits this computation any more"; }
 };
 
 /// Sets the flag that ends what the calling thread computes, once it is not 0 any more; another
