@@ -193,9 +193,14 @@ def test_faults_under_systemd_change_no_decision(lab: Lab, tmp_path: Path) -> No
     # The cloud comes up again by itself. The robot does so only if a person says that it may.
     machine.reboot()
     machine.wait_for(CLOUD, "ActiveState", "active")
-    # A container has the boot of the machine that it runs on. systemd reads its own early.
-    another = "cat /proc/sys/kernel/random/uuid >/run/boot_id"
-    machine.do(f"{another}; mount --bind /run/boot_id {BOOT_ID}")
+    # A container has the boot of the machine that it runs on. Where /proc is not a new one for the
+    # unit, it sees another.
+    machine.do(f"""
+        cat /proc/sys/kernel/random/uuid >/run/boot_id
+        mount --bind /run/boot_id {BOOT_ID}
+        mkdir -p /etc/systemd/system/{ROBOT}.service.d
+        printf '[Service]\nProtectProc=default\n' >/etc/systemd/system/{ROBOT}.service.d/boot.conf
+        systemctl daemon-reload""")
     assert machine.show(ROBOT, "ActiveState") == "inactive"
     machine.do(f"! systemctl start {ROBOT}")
     assert machine.show(ROBOT, "ExecMainStatus") == "5"
