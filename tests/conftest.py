@@ -166,6 +166,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.ros)
 
 
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item: pytest.Item) -> None:
+    """Forget the modules of users that a test has written, for others write some of their names."""
+    user_modules = sys.modules.get("holdfast.config.user_modules")
+    if user_modules is None or not user_modules._FOUND:
+        return
+    base = item.config._tmp_path_factory.getbasetemp()  # type: ignore[attr-defined]
+    if not any(place.is_relative_to(base) for place, _ in user_modules._FOUND.values()):
+        return
+    user_modules._FOUND.clear()
+    for name, module in list(sys.modules.items()):
+        if Path(getattr(module, "__file__", None) or "").is_relative_to(base):
+            del sys.modules[name]
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     """Hold a test that is not real to what it says of itself."""
