@@ -167,18 +167,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.hookimpl(trylast=True)
-def pytest_runtest_teardown(item: pytest.Item) -> None:
-    """Forget the modules of users that a test has written, for others write some of their names."""
+def pytest_runtest_teardown() -> None:
+    """Forget the modules of users that a test has loaded: others have copies of them elsewhere."""
     user_modules = sys.modules.get("holdfast.config.user_modules")
-    if user_modules is None or not user_modules._FOUND:
-        return
-    base = item.config._tmp_path_factory.getbasetemp()  # type: ignore[attr-defined]
-    if not any(place.is_relative_to(base) for place, _ in user_modules._FOUND.values()):
-        return
-    user_modules._FOUND.clear()
-    for name, module in list(sys.modules.items()):
-        if Path(getattr(module, "__file__", None) or "").is_relative_to(base):
-            del sys.modules[name]
+    found = [] if user_modules is None else list(user_modules._FOUND.values())
+    for directory, names in found:
+        for name, module in list(sys.modules.items()):
+            if name.partition(".")[0] in names:
+                file = getattr(module, "__file__", None)
+                if file is None or Path(file).is_relative_to(directory):
+                    del sys.modules[name]
+    if user_modules is not None:
+        user_modules._FOUND.clear()
 
 
 @pytest.hookimpl(wrapper=True)
