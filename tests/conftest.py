@@ -167,6 +167,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.ros)
 
 
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown() -> None:
+    """Forget the modules of users that a test has loaded: others have copies of them elsewhere."""
+    user_modules = sys.modules.get("holdfast.config.user_modules")
+    found = [] if user_modules is None else list(user_modules._FOUND.values())
+    for directory, names in found:
+        for name, module in list(sys.modules.items()):
+            if name.partition(".")[0] in names:
+                file = getattr(module, "__file__", None)
+                if file is None or Path(file).is_relative_to(directory):
+                    del sys.modules[name]
+    if user_modules is not None:
+        user_modules._FOUND.clear()
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     """Hold a test that is not real to what it says of itself."""
