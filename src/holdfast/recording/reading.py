@@ -99,8 +99,8 @@ class RunArrays:
     trials : tuple of int
         Numbers of all its trials, the one that was begun and not finished included.
     results : dict of arrays
-        The columns of ``trials.csv``, one entry for each finished trial. A reward that there is
-        not is NaN.
+        The columns of ``trials.csv``, one entry for each finished trial. A number that
+        there is not, such as a reward, is NaN.
     problem_directory : Path or None
         As :func:`open_run` was given it; absolute.
     """
