@@ -56,7 +56,7 @@ def service_of(site: Site) -> Service:
 
 def test_in_process(reference: Path) -> None:
     """All of it is in the run, and it mattered."""
-    run = open_run(reference)
+    run = open_run(reference, problem_directory=reference.parent)
     assert list(run.results["outcome"]) == ["truncated", "truncated"]
     for trial in run.read():
         assert trial.motions is not None

@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from tests.command_line import run_here
 
 from holdfast.errors import HoldfastError, OutputError
 from holdfast.outcome import DecisionLog, TrialResult
@@ -287,6 +288,18 @@ class TestRuns:
             run = run_of(tmp_path / f"run{number}", [result_of(0)], configuration=text)
             with pytest.raises(HoldfastError, match="the configuration in a journal"):
                 compare_runs(run, run)
+
+    def test_a_record_forges_no_line(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        forged = 'problem: "peg\\nidentical: 3 trials"\n'
+        first = run_of(tmp_path / "first", [result_of(0)], configuration=forged)
+        second = run_of(tmp_path / "second", [result_of(0)], version="1\nidentical: 3 trials")
+        third = run_of(tmp_path / "third", [result_of(0)])
+        for one, other in ((first, second), (second, third)):
+            said = run_here(capsys, tmp_path, "compare", str(one), str(other))
+            lines = (said.stdout + said.stderr).splitlines()
+            assert "identical: 3 trials" not in lines
 
     def test_what_is_no_run_is_refused(self, tmp_path: Path) -> None:
         run = run_of(tmp_path / "first", [result_of(0)])

@@ -10,7 +10,7 @@ from typing import ClassVar
 from holdfast.cli.exit_codes import EXIT_DIFFERENT
 from holdfast.errors import OptionError
 from holdfast.files import shown_path
-from holdfast.printable import printable
+from holdfast.printable import one_line, printable
 from holdfast.runtime.command_line import Options, argument, flag, location
 
 __all__ = ["main"]
@@ -83,4 +83,4 @@ def _compare_outcomes(runs: Sequence[Path], *, paired: bool, json: bool) -> None
 
 def _print_notes(notes: Iterable[str]) -> None:
     for note in notes:
-        sys.stderr.write(f"note: {printable(note)}\n")
+        sys.stderr.write(f"note: {one_line(note)}\n")

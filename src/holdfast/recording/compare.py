@@ -19,6 +19,7 @@ from typing import Any
 import msgspec
 
 from holdfast.outcome import Decisions, SensingDecision, TaskDecision
+from holdfast.printable import one_line
 from holdfast.protocol.records import ActingRecord, ObservedRecord, decisions_of
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.recording.run_directory import configuration_difference, recorded_configuration
@@ -141,7 +142,7 @@ def _difference_of_runs(
     for what, keys in (("problem", ("problem",)), ("seed", ("simulator", "seed"))):
         one, other = (_value(configuration, keys) for configuration in configurations)
         if one != other:
-            return Difference(what=what, first=str(one), second=str(other))
+            return Difference(what=what, first=one_line(str(one)), second=one_line(str(other)))
     versions = [meta.get("holdfast_version", "of an unknown version") for meta in (first, second)]
     if versions[0] != versions[1]:
         notes.append(f"made by holdfast {versions[0]} and by holdfast {versions[1]}")

@@ -86,8 +86,12 @@ _WIDTH = 11.0
 _SMALLEST = 8.0
 """In points: 9 pixels high where the picture is 900 pixels wide."""
 
-# Typed loosely: matplotlib's releases differ in how they type these keys.
+_OF_WINDOWS = ("backend", "backend_fallback", "interactive", "toolbar")
+
+# Typed loosely: matplotlib's releases differ in how they type these keys. All of them, so that a
+# figure is the same whatever the user's matplotlibrc says.
 STYLE: Any = {
+    **{key: value for key, value in mpl.rcParamsDefault.items() if key not in _OF_WINDOWS},
     "font.family": "sans-serif",
     "font.size": 9.0,
     "axes.titlesize": 10.0,
@@ -122,9 +126,7 @@ def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) 
     rows = max(0.75, _ROW * max(label.count("\n") + 1 for label in labels) * len(labels))
     ratios = [1.0] * problem.state_size + [rows, 1.0]
     height = max(6.2, 1.12 * max(sum(ratios), num_panels) + 1.6)
-    with mpl.rc_context():
-        mpl.rcdefaults()  # a figure looks the same whatever the user's matplotlibrc says
-        mpl.rcParams.update(STYLE)
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(_WIDTH if scene else 8.0, height), layout="constrained")
         FigureCanvasAgg(figure)
         figure.suptitle(_title(configuration, record), x=0.012, ha="left", fontsize=12.0)

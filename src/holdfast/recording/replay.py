@@ -33,6 +33,7 @@ from holdfast.errors import (
 from holdfast.floating_mode import in_own_mode
 from holdfast.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
 from holdfast.planning import Planner, PlanningState, digest
+from holdfast.printable import one_line
 from holdfast.protocol.records import decisions_of, reinitialised_after
 from holdfast.recording.facts import (
     Decider,
@@ -495,13 +496,14 @@ def _configuration(
 
 def _what_to_say(problem: str, recorded: object, path: Path, purpose: str) -> str:
     """Return how a caller says that a run's own problem may run."""
-    directory = recorded if isinstance(recorded, str) else "DIR"
+    # On one line each, for these are somebody's words as well.
+    directory = one_line(recorded) if isinstance(recorded, str) else "DIR"
     if purpose == "open":
         how = f"open_run(..., problem_directory={directory!r:.200})"
     else:
         how = f"--problem-directory {shlex.quote(f'{directory:.200}')}"
     told = "" if directory == "DIR" else ", where it lay when it was run"
     return (
-        f"{path}: its problem is {problem:.100}, and the code that a record names is not run "
-        f"unasked. If you know that module, say in which directory it lies: {how}{told}"
+        f"{path}: its problem is {one_line(problem):.100}, and the code that a record names is "
+        f"not run unasked. If you know that module, say in which directory it lies: {how}{told}"
     )
