@@ -20,8 +20,10 @@ from tests.contracts.test_datagram_links import (
     place_of,
     stranger,
 )
-from tests.contracts.wires import Inbox, StreamWire, until
+from tests.contracts.wires import Inbox, StreamWire, echo, until
+from tests.ports import free_port
 
+from holdfast.lab.testbed.proxy import Impairment, Proxy
 from holdfast.protocol.events import ServiceAppeared, ServiceVanished
 from holdfast.transport.datagram_links import DatagramScheme, RobotDatagramLink
 from holdfast.transport.endpoints import TlsFiles
@@ -126,6 +128,38 @@ class TestSpoofedAddresses:
         echoes = True
         await until(lambda: robot.sends_datagrams("cloud"))
         assert at_service._return_path.address is not None
+
+
+class TestOneWay:
+    async def test_where_only_the_robots_datagrams_get_through_the_stream_carries_all(
+        self, udp: StreamWire
+    ) -> None:
+        """The service's probes show nobody that it lives, so it goes on to say so there."""
+        udp.lease_ms = 500.0
+        await udp.service("cloud", "b1").start(echo)
+        _, target = place_of(udp)
+        udp._endpoints["cloud"] = f"udp/127.0.0.1:{free_port()}"
+        robot, inbox = udp.robot("cloud"), Inbox()
+        carried: list[str] = []
+        with Proxy(
+            place_of(udp)[1],
+            target,
+            "one way",
+            datagrams=True,
+            overhear=lambda carrier, way, _: carried.append(f"{carrier} {way}"),
+        ) as proxy:
+            blocked = Impairment(direction="to_robot", silent=True, carriers=("datagrams",))
+            await asyncio.to_thread(proxy.impair, blocked)
+            robot.start(inbox)
+            await inbox.appeared()
+            # Three leases, in which nothing is asked and the stream's slowest pings are too rare.
+            await asyncio.sleep(1.6)
+            await answers(robot, inbox, 1)
+            assert "datagrams to_service" in carried
+            assert "datagrams to_robot" not in carried
+            assert not robot.sends_datagrams("cloud")
+            assert ServiceVanished("cloud", "b1") not in inbox
+            await robot.close()
 
 
 class TestSocketsOfAService:

@@ -99,7 +99,7 @@ class TestMaking:
         with pytest.raises(
             InvalidValueError, match=rf"weight of particle 1 is {bad}: must be >= 0"
         ):
-            Belief.weighted(np.zeros((3, 1)), [0.5, bad, 0.5])
+            Belief.weighted(np.zeros((3, 1)), [0.0, bad, 0.5])
 
     @pytest.mark.parametrize("weights", [[0.0, 0.0], [1e308, 1e308]])
     def test_weights_must_have_a_sum(self, weights: list[float]) -> None:
@@ -205,7 +205,7 @@ class TestUnexplained:
         assert info.mahalanobis_distance == np.inf
         assert after is belief
 
-    @pytest.mark.parametrize(("away", "explained"), [(7.99, True), (8.01, False)])
+    @pytest.mark.parametrize(("away", "explained"), [(7.99, True), (8.0, True), (8.01, False)])
     def test_the_limit_is_eight_deviations_from_the_nearest(
         self, away: float, explained: bool
     ) -> None:
@@ -227,6 +227,7 @@ class TestUnexplained:
         after, info = update(General(), belief, 0, [1e6])
         assert after is belief
         assert not info.explained
+        assert not info.within_gate
         assert info.effective_sample_size == effective_sample_size(belief)
         assert info.mahalanobis_distance is None
 
@@ -241,6 +242,7 @@ class TestUnexplained:
         after, info = update(General(), belief, 0, [10.0])
         assert after is belief
         assert not info.explained
+        assert not info.within_gate
 
     @pytest.mark.parametrize("log_likelihood", [-1e300, -1e305, -1e6, 1e6])
     @pytest.mark.parametrize("count", [1, 4, 8, 13])

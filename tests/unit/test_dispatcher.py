@@ -539,3 +539,48 @@ def test_a_long_wait_is_told_although_the_service_shows_life() -> None:
     (told,) = world.reports("waiting")
     assert told["service"] == "cloud"
     assert float(str(told["waited_ms"])) >= 1000.0
+
+
+def test_another_process_of_a_service_that_refused_for_good_is_asked() -> None:
+    """It may have been updated; what is known of one process says nothing of the next."""
+    world = World()
+    cloud = world.services["cloud"]
+    cloud.rule = lambda r: [Refused(r.number, "other_code", "is another release")]
+
+    def update(performed: int) -> None:
+        if performed == 4 and cloud.boot == 1:
+            world.kill("cloud")
+            cloud.rule = lambda _: None
+            world.bring_up("cloud", 0.02)
+
+    world.on_act = update
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.statuses() == ["local_recovery", "keep_alive"]
+    assert len(world.reports("refused")) == 1
+    back_at = next(
+        at
+        for at, e in world.trace
+        if isinstance(e, LogEvent) and e.fields.get("to") == "keep_alive"
+    )
+    assert {sent.service for sent in world.sent if sent.at > back_at} == {"cloud"}
+
+
+def test_the_same_process_behind_another_link_still_refuses() -> None:
+    world = World()
+    cloud = world.services["cloud"]
+    cloud.rule = lambda r: [Refused(r.number, "other_code", "is another release")]
+
+    def reconnect(performed: int) -> None:
+        if performed == 4 and not world.results:
+            boot = str(cloud.boot)
+            world.after(0.01, lambda: world.robot.handle(ServiceVanished("cloud", boot), world.now))
+            world.after(0.02, lambda: world.robot.handle(ServiceAppeared("cloud", boot), world.now))
+
+    world.on_act = reconnect
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.statuses() == ["local_recovery"]
+    assert [sent.service for sent in world.sent].count("cloud") == 1

@@ -261,3 +261,16 @@ def test_it_is_closed_when_sensing_has_ended() -> None:
     robot.close()
     assert ended == ["sensed", "closed"]
     SenseInBackground(Slow()).close()
+
+
+def test_what_is_due_is_shown_once() -> None:
+    """Neither too early, nor again with the next move."""
+    inner = SimulatedEnvironment(PegInHole2D(), 3, 0)
+    later = SenseLater(inner, 2)
+    assert later.perform_sensing(0) is LATER
+    shown = []
+    for _ in range(4):
+        later.perform(ACTION)
+        shown.append([step for step, _ in later.late_observations()])
+        assert later.late_observations() == []
+    assert shown == [[], [0], [], []]

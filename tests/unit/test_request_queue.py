@@ -202,11 +202,15 @@ class TestTurns:
         assert turns(queue, 2, 2.0) == [first, b"2"]
         assert queue._urgent._last_turn == {}  # of owners with tasks alone
 
-    @pytest.mark.parametrize(("known", "first"), [(0.1, b"1"), (0.101, b"2")])
-    def test_a_newcomer_waits_for_a_known_robot(self, known: float, first: bytes) -> None:
+    @pytest.mark.parametrize(
+        ("came", "known", "first"), [(0.0, 0.1, b"1"), (0.0, 0.101, b"2"), (8.0, 8.05, b"1")]
+    )
+    def test_a_newcomer_waits_for_a_known_robot(
+        self, came: float, known: float, first: bytes
+    ) -> None:
         """Unless that came more than 100 ms later."""
-        tasks = made(1, "anna", since=known), made(2, "berta", newcomer=True)
-        assert self.order(*tasks, now=0.5)[0] == first
+        tasks = made(1, "anna", since=known), made(2, "berta", newcomer=True, since=came)
+        assert self.order(*tasks, now=9.0)[0] == first
 
     def test_newcomers_have_every_second_turn_at_most(self) -> None:
         newcomers = [made(k, f"new {k}", newcomer=True) for k in range(3)]

@@ -138,6 +138,7 @@ class _DatagramLink(Link):
     def _send_datagram(self, message: bytes) -> None:
         datagram = self._encrypted(message)
         if datagram is not None:
+            self._datagram_sent_at = self._loop.time()
             self._put(datagram)
 
     def _encrypted(self, message: bytes) -> bytes | None:
@@ -145,12 +146,10 @@ class _DatagramLink(Link):
         if self._ended or self._cipher is None:
             return None
         try:
-            datagram = self._cipher.encrypt(message)
+            return self._cipher.encrypt(message)
         except KeysExhaustedError as error:
             self.end(f"needs a new link: {error}")
             return None
-        self._datagram_sent_at = self._loop.time()
-        return datagram
 
     def _put(self, datagram: bytes) -> None:
         raise NotImplementedError
@@ -447,7 +446,7 @@ class RobotDatagramLink(_DatagramLink):
     def _detach(self) -> bool:
         if not self._exchange.open or not super()._detach():
             return False
-        self._verify_path(_BROKEN)
+        self._loop.call_soon(self._verify_path, _BROKEN)
         self._owner.on_stream_lost(self)
         return True
 
