@@ -77,7 +77,7 @@ def _measure(problem: Any, own: dict[str, Any]) -> None:
     random = stream(0, 0, 0, Purpose.INITIAL_BELIEF)
 
     def draw(count: int) -> FloatArray:
-        return _states(problem, problem.initial_states(random, count), count)
+        return checked.initial_states(problem, random, count)
 
     one_s = _shortest(lambda: draw(1))
     own["initial"] = CallCost(0.0, one_s)
@@ -85,7 +85,7 @@ def _measure(problem: Any, own: dict[str, Any]) -> None:
         own["initial"] = _measured(lambda states: draw(len(states)), draw(_FEW), draw(_MANY))
         few, many = draw(_FEW), draw(_MANY)
     else:
-        few, many = (_states(problem, np.repeat(draw(1), n, axis=0), n) for n in (_FEW, _MANY))
+        few, many = (np.repeat(draw(1), count, axis=0) for count in (_FEW, _MANY))
     own["act"] = _measured(lambda states: problem.execute(problem.policy(states, 0)), few, many)
     action = problem.execute(problem.policy(few[0], 0))
     own["move"] = _measured(lambda states: problem.move(states, action, random), few, many)
@@ -151,10 +151,6 @@ def _measured(call: Callable[[FloatArray], object], few: FloatArray, many: Float
         return CallCost(0.0, few_s / len(few))
     state_s = max(0.0, _shortest(lambda: call(many)) - few_s) / (len(many) - len(few))
     return CallCost(max(0.0, few_s - len(few) * state_s), state_s)
-
-
-def _states(problem: Any, drawn: FloatArray, count: int) -> FloatArray:
-    return checked.states_of(problem, "initial_states", drawn, (count, problem.state_size))
 
 
 def _stages(states: FloatArray) -> IntArray:
