@@ -12,6 +12,7 @@ import pytest
 from tests.processes.faults import COMMAND, PATIENCE_S, events_of
 
 import holdfast as hf
+from holdfast.recording.journal import Journal
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -69,9 +70,17 @@ def test_a_crash_is_a_failure_in_every_table_and_truncated_is_neither(tmp_path: 
     assert [each["outcome"] for each in told] == ["failed"] * 4
     assert [each["reason"] for each in told] == [row["reason"] for row in crashed]
 
-    opened = hf.open_run(tmp_path / "crash")
+    opened = hf.open_run(tmp_path / "crash", problem_directory=tmp_path)
     assert opened.results["outcome"].tolist() == ["failed"] * 4
     assert opened.results["reason"].tolist() == [row["reason"] for row in crashed]
+    refused = run(tmp_path, "compare", "--outcomes", "cut", "crash")
+    assert refused.returncode == 2
+    assert "env_arguments.max_episode_steps is not given here and 20 there" in refused.stderr
+    # As if both had had the same world.
+    journals = [Journal.open(tmp_path / name / "journal.sqlite") for name in ("cut", "crash")]
+    journals[0].set_meta("configuration", journals[1].meta()["configuration"])
+    for journal in journals:
+        journal.close()
     compared = run(tmp_path, "compare", "--outcomes", "cut", "crash")
     (line,) = (line for line in compared.stdout.splitlines() if line.startswith("  failed"))
     assert line.split()[1:4] == ["0.0%", "100.0%", "+100.0"]

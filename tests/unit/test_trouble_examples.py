@@ -69,7 +69,8 @@ def test_a_kidnapped_robot_is_told_and_finds_its_dock(
     (anew_at,) = [event["step"] for event in events if event["event"] == "reinitialised"]
     assert anew_at == lost["step"]
     # What was recorded can be believed again, the new belief included.
-    assert run_here(capsys, tmp_path, "export", "run", "--csv", "csv", "--quiet").code == 0
+    export = ("export", "run", "--csv", "csv", "--problem-directory", str(EXAMPLES))
+    assert run_here(capsys, tmp_path, *export).code == 0
 
 
 def test_a_robot_that_nobody_carries_is_not_lost() -> None:
@@ -100,7 +101,8 @@ def test_backlash_is_seen_in_the_measured_motion(
     assert successes(example("backlash")) == TRIALS
     assert successes(blind) <= 7
     run(capsys, "backlash", tmp_path / "run")
-    assert run_here(capsys, tmp_path, "export", "run", "--csv", "csv", "--quiet").code == 0
+    export = ("export", "run", "--csv", "csv", "--problem-directory", str(EXAMPLES))
+    assert run_here(capsys, tmp_path, *export).code == 0
     with (tmp_path / "csv" / "steps.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["action_0"]]
     back = [row for row in rows if row["stage"] == "1"]
