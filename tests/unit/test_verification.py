@@ -516,3 +516,22 @@ def test_a_rounding_error_is_no_excess() -> None:
         told = verification.outside_limits(outside)
         assert told is not None
         assert told.startswith("task action (")
+
+
+def test_the_robot_follows_the_first_of_each_part_and_keeps_a_bounded_number() -> None:
+    verification = Verification(0.0, b"secret", None, PROBLEM, Effects[RobotEffect]())
+    question = question_of(3)
+    step = PROBLEM.execute(np.full(3, 1e-3))
+    for number in range(70):
+        service = f"service {number}"
+        provenance = Provenance(service, 0.0, 0.0)
+        verification.take(question, choice(service, question, number % 2), provenance)
+        actions = [step * (0.5 if number else 1.0)]
+        verification.take(question, AnswerPart(service, actions, None), provenance)
+    assert question.sensing is not None
+    assert question.sensing.sensing_action == 0
+    assert question.task_actions is not None
+    assert np.array_equal(question.task_actions[0], step)
+    assert question.sensing_provenance == question.task_provenance
+    assert question.task_provenance == Provenance("service 0", 0.0, 0.0)
+    assert len(question.parts) == 64
