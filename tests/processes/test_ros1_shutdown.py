@@ -28,6 +28,8 @@ def is_gone(uri: str) -> bool:
             node.getPid(CALLER)
     except ConnectionRefusedError:
         return True
+    except ConnectionError:
+        pass  # it ends just now
     return False
 
 

@@ -291,6 +291,21 @@ async def test_a_call_larger_than_any_of_ros_is_not_read(master: Master) -> None
     await node.close()
 
 
+@pytest.mark.parametrize("turns", range(8))
+async def test_a_node_that_ends_leaves_no_connection_open(master: Master, turns: int) -> None:
+    """However little of it has begun: its client would wait for ever."""
+    node = RosNode("cloud", around(master))
+    await node.start(0.0)
+    with socket.create_connection(place_of(node)) as client:
+        client.setblocking(False)
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        await node.close()
+        with contextlib.suppress(ConnectionError):
+            answer = asyncio.get_running_loop().sock_recv(client, 100)
+            assert await asyncio.wait_for(answer, 5.0) == b""
+
+
 class Deaf:
     """A subscriber that never reads."""
 

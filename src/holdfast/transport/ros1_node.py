@@ -66,6 +66,10 @@ _MAX_UNREAD_BYTES: Final = 1 << 20
 _MAX_UNREAD_BYTES_OF_ALL: Final = 16 << 20
 """Of messages that wait for one subscriber of a topic, and for all; further ones are dropped."""
 
+_TURNS_TO_BEGIN: Final = 4
+"""Of the loop, in which asyncio begins to serve a connection that it has accepted: until then
+nobody knows it, and it would stay open."""
+
 _UNKNOWN: Final = -1
 _OK: Final = 1
 
@@ -195,6 +199,12 @@ class RosNode:
     async def close(self, within_s: float = 1.0) -> None:
         """Unregister, and end all connections; may be repeated."""
         registration, self._registration = self._registration, None
+        loop = asyncio.get_running_loop()
+        for server in self._servers:
+            for listening in server.sockets:
+                loop.remove_reader(listening.fileno())
+        for _ in range(_TURNS_TO_BEGIN):
+            await asyncio.sleep(0)
         self._stop()
         tasks = [*self._connections, *([] if registration is None else [registration])]
         for task in tasks:
