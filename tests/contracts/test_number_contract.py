@@ -190,7 +190,7 @@ REAL: dict[str, tuple[Callable[[Any], Any], Any]] = {
         [0.5, 0.25],
     ),
     "make": (
-        lambda x: hf.make("peg_in_hole_2d", init_mean=x).initial_states(INITIAL, 3),
+        lambda x: hf.make("peg_in_hole_2d", init_mean=x).initial_states(INITIAL.anew(), 3),
         [4.0, 2.0, 0.0],
     ),
     "load(overrides)": (

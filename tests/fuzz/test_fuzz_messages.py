@@ -13,7 +13,15 @@ from tests.fuzz.mutations import Mutator
 from tests.fuzz.targets import SPECIMENS, TARGETS
 
 from holdfast.planning import PlanningState, decode_checkpoint, digest, encode_checkpoint
-from holdfast.protocol.messages import Reply, Request, decode_reply, decode_request, encode
+from holdfast.printable import one_line
+from holdfast.protocol.messages import (
+    Refused,
+    Reply,
+    Request,
+    decode_reply,
+    decode_request,
+    encode,
+)
 from holdfast.protocol.records import Record, decode_record, encode_record
 
 DECODED = sorted(TARGETS)
@@ -30,7 +38,11 @@ def test_a_request_survives_its_journey(examples: int) -> None:
 @examples(quick=40, slow=4_000)
 def test_a_reply_survives_its_journey(examples: int) -> None:
     def check(reply: Reply) -> None:
-        assert decode_reply(encode(reply)) == reply
+        came = decode_reply(encode(reply))
+        if isinstance(reply, Refused):
+            # Its words are shown, so they come as one printable line.
+            reply = Refused(reply.number, one_line(reply.code), one_line(reply.text))
+        assert came == reply
 
     always(examples, check, strategies.replies)
 

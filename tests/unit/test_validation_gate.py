@@ -246,9 +246,9 @@ def test_an_equally_likely_draw_decides_the_rank_test() -> None:
 
 
 def test_at_the_gate_is_within(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four states and a noise whose variances add up to 4: the distance of 4 is exact."""
-    mean = np.array([[-1.0], [1.0], [-1.0], [1.0]])
+    """Four states that predict the same, and a noise of variance 4: the distance of 4 is exact."""
+    mean = np.zeros((4, 1))
     weights = np.full(4, 0.25)
     for limit, within in ((4.0, True), (3.9999999999999996, False)):
         monkeypatch.setattr(validation_gate, "gate", lambda _, limit=limit: limit)
-        assert is_within(np.array([4.0]), mean, np.array([3.0]), weights) is within
+        assert is_within(np.array([4.0]), mean, np.array([4.0]), weights) is within

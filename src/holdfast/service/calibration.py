@@ -77,7 +77,7 @@ def _measure(problem: Any, own: dict[str, Any]) -> None:
     random = stream(0, 0, 0, Purpose.INITIAL_BELIEF)
 
     def draw(count: int) -> FloatArray:
-        return checked.initial_states(problem, random, count)
+        return checked.initial_states(problem, random.anew(), count)
 
     one_s = _shortest(lambda: draw(1))
     own["initial"] = CallCost(0.0, one_s)
@@ -88,7 +88,7 @@ def _measure(problem: Any, own: dict[str, Any]) -> None:
         few, many = (np.repeat(draw(1), count, axis=0) for count in (_FEW, _MANY))
     own["act"] = _measured(lambda states: problem.execute(problem.policy(states, 0)), few, many)
     action = problem.execute(problem.policy(few[0], 0))
-    own["move"] = _measured(lambda states: problem.move(states, action, random), few, many)
+    own["move"] = _measured(lambda states: problem.move(states, action, random.anew()), few, many)
     own["stage"] = CallCost(0.0, 0.0)
     if problem.num_stages > 1:
         own["stage"] = _measured(
@@ -132,10 +132,10 @@ def _sensed(problem: Any, number: int, few: FloatArray, many: FloatArray) -> tup
             many,
         )
         return cost, int(size)
-    shown = checked.sample_observation(problem, few[0], number, random)
+    shown = checked.sample_observation(problem, few[0], number, random.anew())
     cost = _measured(
         lambda states: (
-            problem.sample_observation(states[0], number, random),
+            problem.sample_observation(states[0], number, random.anew()),
             problem.log_likelihood(states, number, shown),
         ),
         few,
