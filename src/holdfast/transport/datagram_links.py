@@ -7,15 +7,13 @@ datagram delays nothing but itself. Where none gets through, everything goes on 
 For its owner the link is like any other: it takes and delivers frames of calls, and is lost once:
 
 - at once when the other end closes the stream, which the system does for a process that dies;
-- a round trip after a report that the service's port is closed, unless a datagram comes meanwhile.
-  Anybody who sees the datagrams can send such a report (ICMP has no keys), so it only has the robot
-  probe the path;
+- a round trip after a report that the service's port is closed (anybody can forge one), unless a
+  datagram comes meanwhile;
 - when nothing comes for the lease on either path.
 
-It is not lost when the stream breaks in another way while datagrams still come, for instance
-because the robot's address has changed. Then it goes on with datagrams alone (``without_stream``),
-while its owner makes another link. A service replies to the address that was proved last
-(:mod:`~holdfast.transport.return_path`).
+When the stream breaks in another way while datagrams still come, the link goes on with datagrams
+alone (``without_stream``), while its owner makes another. A service replies to the address that
+was proved last (:mod:`~holdfast.transport.return_path`).
 """
 
 from __future__ import annotations
