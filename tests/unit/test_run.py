@@ -121,7 +121,8 @@ class TestResumeIfBegun:
         assert "2 finished before" in said.stderr
         tables = {path: path.stat().st_mtime_ns for path in workplace.directory.glob("out/*")}
         said = workplace.runs(*self.ARGUMENTS, "--trials", "5")
-        assert (said.stdout, said.stderr) == ("", "note: out: complete, with 5 trials\n")
+        out = workplace.directory / "out"
+        assert (said.stdout, said.stderr) == ("", f"note: {out}: complete, with 5 trials\n")
         del tables[workplace.directory / "out" / "journal.sqlite"]
         assert {path: path.stat().st_mtime_ns for path in tables} == tables
         workplace.runs("run", "peg.yaml", "--jobs", "1", "--out", "whole", "--trials", "5")

@@ -298,9 +298,7 @@ def _run(options: RunOptions) -> int:
         if options.resume_if_begun and (complete := directory.complete_summary()) is not None:
             manager.ready()  # otherwise it takes the end for a failed start
             manager.close()
-            notes.note(
-                f"{shown_path(directory_path)}: complete, with {counted(complete.trials, 'trial')}"
-            )
+            notes.note(f"{directory_path}: complete, with {counted(complete.trials, 'trial')}")
             return _exit_code(complete)
         before, now = directory.services_before, configuration.offload.services
         if before is not None and before != now:
