@@ -43,7 +43,7 @@ TRIAL = 2
 ROUTER = Path(__file__).parents[1] / "ros" / "zenoh_router.py"
 BEGIN = DecisionRequest(RequestKind.INITIALIZE, seed=1)
 
-SETTINGS = configuration(**{"particle_filter.num_particles": 100})
+SETTINGS = configuration(**{"particle_filter.num_particles": 500})
 """Of the services that are processes: they decide by the example as it is."""
 
 

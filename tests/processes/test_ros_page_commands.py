@@ -44,4 +44,4 @@ def test_a_run_is_exported_and_read(tmp_path: Path) -> None:
     ]
     lines = run("python", "-c", block("python")).splitlines()
     assert lines
-    assert all(int(line.split()[1]) == 100 for line in lines)
+    assert all(int(line.split()[1]) == 500 for line in lines)

@@ -25,7 +25,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 # name: the example, trials, and what is changed in it.
 RUNS: dict[str, tuple[str, int, dict[str, dict[str, object]]]] = {
-    "peg": ("peg_in_hole_2d", 15, {}),
+    "peg": ("peg_in_hole_2d", 15, {"particle_filter": {"num_particles": 100}}),
     "more particles": (
         "peg_in_hole_2d",
         10,
