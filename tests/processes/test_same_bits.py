@@ -41,7 +41,7 @@ RUNS: dict[str, tuple[str, int, dict[str, dict[str, object]]]] = {
         "peg_in_hole_2d",
         4,
         {
-            "particle_filter": {"resampling_threshold": 0.3},
+            "particle_filter": {"num_particles": 100, "resampling_threshold": 0.3},
             "selector": {
                 "method": "action_entropy",
                 "estimator": "gaussian_mixture_upper",
