@@ -25,11 +25,11 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 # name: the example, trials, and what is changed in it.
 RUNS: dict[str, tuple[str, int, dict[str, dict[str, object]]]] = {
-    "peg": ("peg_in_hole_2d", 15, {"particle_filter": {"num_particles": 100}}),
+    "peg": ("peg_in_hole_2d", 15, {}),
     "more particles": (
         "peg_in_hole_2d",
         10,
-        {"particle_filter": {"num_particles": 500}, "simulator": {"max_steps": 60}},
+        {"particle_filter": {"num_particles": 700}, "simulator": {"max_steps": 60}},
     ),
     # From 4,096 particles on, motion runs on several threads, too.
     "many particles": (
