@@ -38,7 +38,7 @@ from holdfast.protocol.service_sessions import (
 __all__ = ["Lanes"]
 
 _OVERDUE = 4.0
-"""So many times the longest decision a job may run; estimates are right within a factor of 3."""
+"""So many times the longest decision a job may run; hardly any takes 3 times its estimate."""
 
 
 class Lanes:
