@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast.errors import InvalidValueError
+from holdfast.printable import one_line
 
 __all__ = [
     "BoolArray",
@@ -66,7 +67,7 @@ def in_brief(values: object) -> str:
     try:
         array = np.asarray(values)
     except (TypeError, ValueError):
-        return " ".join(repr(values).split())[:80]  # A ragged list.
+        return f"{one_line(repr(values)):.80}"  # A ragged list.
     return np.array2string(array, max_line_width=sys.maxsize, threshold=2 * _EDGE, edgeitems=_EDGE)
 
 
@@ -106,7 +107,7 @@ def real_number(value: object) -> float | None:
 
 def integer(value: object) -> int | None:
     """Return a whole number, NumPy's too; None for anything else, 3.0 and True included."""
-    if isinstance(value, bool | np.bool_) or _hides_something(value):
+    if _hides_something(value):
         return None
     try:
         return operator.index(value)  # type: ignore[arg-type]
@@ -128,10 +129,9 @@ def floats(what: str, value: object) -> FloatArray:
     """Return real numbers as float64, in C order; InvalidValueError says which are none."""
     numbers = real_numbers(value)
     if numbers is None:
-        came = " ".join(repr(value).split())
         raise InvalidValueError(
-            f"{what} is {came:.80}: must be real numbers (no text, truth value, date or masked "
-            "entry)"
+            f"{what} is {one_line(repr(value)):.80}: must be real numbers (no text, truth value, "
+            "date or masked entry)"
         )
     return np.ascontiguousarray(numbers, dtype=np.float64).reshape(numbers.shape)
 

@@ -5,7 +5,7 @@ something, a variance for one coordinate of two to something else, and the decis
 wrong. So every call of a problem's function passes through here. A result that does not fit is an
 error that names the function, what it returned and what was needed. Every array is copied as it
 comes: a function may return the same buffer each time. A stream that a function was given ends with
-the call. And a user's function runs in the floating-point mode of who called holdfast.
+the call. And a user's function runs in the caller's floating-point mode.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from holdfast.arrays import (
     real_numbers,
 )
 from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.floating_mode import as_caller, modes_agree
+from holdfast.floating_mode import as_caller
+from holdfast.printable import one_line
 from holdfast.problem_attributes import has_own, name_of
 from holdfast.randomness import Stream
 
@@ -166,7 +167,7 @@ def sample_observation(
     problem: Any, state: FloatArray, sensing_action: int, stream: Stream
 ) -> FloatArray:
     """Return an observation that was drawn in one state, shape ``(observation_size,)``."""
-    drawn = _draw(problem, "sample_observation", state, sensing_action, stream, streams=(stream,))
+    drawn = _ask(problem, "sample_observation", state, sensing_action, stream)
     return _shown(problem, f"sample_observation of sensing action {sensing_action}", drawn)
 
 
@@ -224,7 +225,7 @@ def moved_by_measurement(
             f"{function}(states, motion, stream) that could move the belief by it"
         )
     measured.setflags(write=False)
-    moved = _draw(problem, function, states, measured, stream, streams=(stream,))
+    moved = _ask(problem, function, states, measured, stream)
     return _states(problem, function, moved, states.shape)
 
 
@@ -233,7 +234,7 @@ def measured_motion(
 ) -> FloatArray:
     """Return the measurement of a true move, shape ``(n,)``."""
     function = "measure_motion"
-    drawn = _draw(problem, function, before, after, stream, streams=(stream,))
+    drawn = _ask(problem, function, before, after, stream)
     return _shown(problem, function, drawn)
 
 
@@ -242,7 +243,7 @@ def move_observation(
 ) -> FloatArray:
     """Return what comes with a move into one state, shape ``(n,)``."""
     function = "sample_move_observation"
-    drawn = _draw(problem, function, state, action, stream, streams=(stream,))
+    drawn = _ask(problem, function, state, action, stream)
     return _shown(problem, function, drawn)
 
 
@@ -351,7 +352,7 @@ def known_state_return(problem: Any, states: FloatArray, stages: IntArray) -> Fl
 
 def initial_states(problem: Any, stream: Stream, count: int) -> FloatArray:
     """Return states drawn from the initial belief, shape ``(count, state_size)``, read-only."""
-    drawn = _draw(problem, "initial_states", stream, count, streams=(stream,))
+    drawn = _ask(problem, "initial_states", stream, count)
     return _states(problem, "initial_states", drawn, (count, problem.state_size))
 
 
@@ -360,13 +361,13 @@ def reinitial_states(problem: Any, states: FloatArray, stream: Stream) -> FloatA
     function = "reinitial_states"
     if getattr(problem, function, None) is None:
         return initial_states(problem, stream, states.shape[0])
-    drawn = _draw(problem, function, states, stream, streams=(stream,))
+    drawn = _ask(problem, function, states, stream)
     return _states(problem, function, drawn, states.shape)
 
 
 def move(problem: Any, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
     """Return the states after executed actions, of the shape of ``states``, read-only."""
-    moved = _draw(problem, "move", states, actions, stream, streams=(stream,))
+    moved = _ask(problem, "move", states, actions, stream)
     return _states(problem, "move", moved, states.shape)
 
 
@@ -394,7 +395,9 @@ def move_each(
     counts if the problem has a ``move_each``.
     """
     if has_own(problem, "move_each", ("move",)):
-        moved = _draw(problem, "move_each", states, actions, streams, threads, streams=streams)
+        moved = _ask(problem, "move_each", states, actions, streams, threads)
+        for stream in streams:
+            stream.end()
         return _states(problem, "move_each", moved, states.shape)
     together = np.empty(states.shape)
     for row, (own, action, stream) in enumerate(zip(states, actions, streams, strict=True)):
@@ -431,16 +434,11 @@ def is_goal(problem: Any, state: FloatArray) -> bool:
 
 
 def _ask(problem: Any, function: str, *arguments: object) -> Any:
-    """Call a function of the problem."""
-    called = getattr(problem, function)
-    return called(*arguments) if modes_agree() else as_caller(called, *arguments)
-
-
-def _draw(problem: Any, function: str, *arguments: object, streams: Sequence[Stream]) -> Any:
-    """Call a function of the problem that draws; ``streams`` are those among its arguments."""
-    found = _ask(problem, function, *arguments)
-    for stream in streams:
-        stream.end()
+    """Call a function of the problem; streams among the arguments end with the call."""
+    found = as_caller(getattr(problem, function), *arguments)
+    for each in arguments:
+        if isinstance(each, Stream):
+            each.end()
     return found
 
 
@@ -498,7 +496,7 @@ def _returned(problem: Any, function: str, value: object, need: str) -> ProblemE
         masked = ", masked in part," if is_masked(value) else ""
         came = f"{value.dtype}{masked} of shape {value.shape}"
     else:
-        came = f"{type(value).__name__} ({' '.join(repr(value).split())[:40]})"
+        came = f"{type(value).__name__} ({one_line(repr(value)):.40})"
     return ProblemError(f"{function} of {name_of(problem)} returned {came}: need {need}")
 
 

@@ -26,7 +26,7 @@ _STANDARD = [path for name in ("stdlib", "platstdlib") if (path := sysconfig.get
 _STANDARD += [str(Path(path) / "lib-dynload") for path in _STANDARD]
 
 _FOUND: dict[str, tuple[Path, frozenset[str]]] = {}
-"""Of each module that was asked for: its directory, and the names there that it needs."""
+"""Directory of each module that was asked for, and the names there that it needs."""
 
 
 class _Finder:

@@ -27,7 +27,7 @@ _SHARE = 0.2
 """Of the beliefs after an observation, from which on it is worth a remark."""
 
 _FEW = 0.03
-"""Of the values that a coordinate had at first: what is left of a depleted one."""
+"""Share of its first values that a depleted coordinate still has, at most."""
 
 
 @in_own_mode
@@ -77,7 +77,7 @@ def belief_remarks(problem: Any, settings: PlanningSettings, record: TrialRecord
 def _depleted(record: TrialRecord) -> list[tuple[int, int, int]]:
     """Return the depleted coordinates, with the values left at the last observation, and its step.
 
-    Of what does not move the particles have after a move the values that they had before it.
+    A coordinate does not move if all particles have the same values after each move as before it.
     """
     steps = record.sensing
     found = []

@@ -156,7 +156,7 @@ class Link(asyncio.BufferedProtocol):
         self._peer_lease_s = 0.0
         self._progress_at = now
         self._said_hello = False
-        self._holds = self._has_unsent = False
+        self._holds = False
         # Received: undecoded bytes, the offset of the next one, and decoded frames.
         self._unread, self._unread_at = b"", 0
         self._frames: deque[Frame] = deque()
@@ -246,8 +246,7 @@ class Link(asyncio.BufferedProtocol):
         unsent_bytes = self.unsent_bytes
         if unsent_bytes > self._max_unsent_bytes:
             self.end("does not read what it is sent", abort=True)
-        elif unsent_bytes or self._has_unsent:
-            self._has_unsent = unsent_bytes > 0
+        else:
             self._settings.unsent.note(self, unsent_bytes)
 
     def send_message(self, kind: int, call: int, payload: bytes = b"") -> None:
