@@ -84,8 +84,7 @@ def draw_figure(
 ) -> Remark | None:
     """Draw the recorder's trial, which is finished, and return a remark if there is one.
 
-    The trials are in the journal, and a figure is none of them: that it cannot be drawn, for
-    whatever reason, is a remark.
+    The trials are in the journal already, so whatever prevents a figure becomes a remark.
     """
     remarks: list[Remark] = []
     try:

@@ -65,7 +65,7 @@ FREE: Mapping[str, str] = {
     "selector.resolution": "the cost is that of the worst resolution",
     "selector.path_discount": "a factor of values",
 }
-"""Numeric settings that are none, and why."""
+"""Numeric settings that are no factors, and why."""
 
 
 class CallCost(NamedTuple):

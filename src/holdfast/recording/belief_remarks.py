@@ -36,8 +36,8 @@ def belief_remarks(problem: Any, settings: PlanningSettings, record: TrialRecord
 
     A coordinate counts as an angle that wraps if its label has the unit rad, and its particles
     span more than half a circle as numbers, but less than that on the circle. Several modes are
-    told of where the trial failed: a sharp observation may leave particles in a few heaps, too,
-    which does no harm. A coordinate that does not move is told of if hardly any of the values are
+    reported where the trial failed: a sharp observation may leave particles in a few heaps, too,
+    which does no harm. A coordinate that does not move is reported if hardly any of the values are
     left that its particles had at first, unless these were few, as those of a switch.
     """
     count = len(record.sensing)

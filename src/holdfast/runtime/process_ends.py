@@ -10,7 +10,7 @@ _MOST_DOUBLINGS = 30
 
 
 def signal_name(number: int) -> str:
-    """Return a signal's name; a real-time signal has none, and is told by its number."""
+    """Return a signal's name; a real-time signal has none, and is named by its number."""
     try:
         return signal.Signals(number).name
     except ValueError:
