@@ -26,6 +26,7 @@ from holdfast.errors import OutputError
 
 __all__ = [
     "NewFile",
+    "absolute_endpoint",
     "bounded_lines",
     "claim_directory",
     "create_directory_atomically",
@@ -147,6 +148,14 @@ def shown_path(path: Path) -> str:
     if _started_in is not None and path.is_relative_to(_started_in):
         return str(path.relative_to(_started_in))
     return str(path)
+
+
+def absolute_endpoint(endpoint: str, directory: Path | None = None) -> str:
+    """Return an endpoint, the path of a local socket absolute; by default from where we are now."""
+    protocol, _, place = endpoint.partition("/")
+    if protocol != "unix" or not place:
+        return endpoint
+    return f"unix/{(directory or Path.cwd()) / place}"
 
 
 @contextlib.contextmanager
