@@ -167,8 +167,8 @@ def sample_observation(
     problem: Any, state: FloatArray, sensing_action: int, stream: Stream
 ) -> FloatArray:
     """Return an observation that was drawn in one state, shape ``(observation_size,)``."""
-    drawn = _ask(problem, "sample_observation", state, sensing_action, stream)
-    return _shown(problem, f"sample_observation of sensing action {sensing_action}", drawn)
+    what = f" of sensing action {sensing_action}"
+    return _shown(problem, "sample_observation", state, sensing_action, stream, what=what)
 
 
 def log_likelihood(
@@ -225,30 +225,26 @@ def moved_by_measurement(
             f"{function}(states, motion, stream) that could move the belief by it"
         )
     measured.setflags(write=False)
-    moved = _ask(problem, function, states, measured, stream)
-    return _states(problem, function, moved, states.shape)
+    return _states(problem, function, states.shape, states, measured, stream)
 
 
 def measured_motion(
     problem: Any, before: FloatArray, after: FloatArray, stream: Stream
 ) -> FloatArray:
     """Return the measurement of a true move, shape ``(n,)``."""
-    function = "measure_motion"
-    drawn = _ask(problem, function, before, after, stream)
-    return _shown(problem, function, drawn)
+    return _shown(problem, "measure_motion", before, after, stream)
 
 
 def move_observation(
     problem: Any, state: FloatArray, action: FloatArray, stream: Stream
 ) -> FloatArray:
     """Return what comes with a move into one state, shape ``(n,)``."""
-    function = "sample_move_observation"
-    drawn = _ask(problem, function, state, action, stream)
-    return _shown(problem, function, drawn)
+    return _shown(problem, "sample_move_observation", state, action, stream)
 
 
-def _shown(problem: Any, function: str, value: object) -> FloatArray:
-    """Return what a function of the problem says that the world shows, shape ``(n,)``."""
+def _shown(problem: Any, function: str, *arguments: object, what: str = "") -> FloatArray:
+    """Ask a function of the problem for what the world shows, shape ``(n,)``."""
+    value, function = _ask(problem, function, *arguments), f"{function}{what}"
     if not isinstance(value, np.ndarray) or real_numbers(value) is None or value.ndim != 1:
         raise _misfit(problem, function, value, "(n,)")
     if not 1 <= value.size <= MAX_OBSERVATION_SIZE or not np.isfinite(value).all():
@@ -352,8 +348,7 @@ def known_state_return(problem: Any, states: FloatArray, stages: IntArray) -> Fl
 
 def initial_states(problem: Any, stream: Stream, count: int) -> FloatArray:
     """Return states drawn from the initial belief, shape ``(count, state_size)``, read-only."""
-    drawn = _ask(problem, "initial_states", stream, count)
-    return _states(problem, "initial_states", drawn, (count, problem.state_size))
+    return _states(problem, "initial_states", (count, problem.state_size), stream, count)
 
 
 def reinitial_states(problem: Any, states: FloatArray, stream: Stream) -> FloatArray:
@@ -361,18 +356,17 @@ def reinitial_states(problem: Any, states: FloatArray, stream: Stream) -> FloatA
     function = "reinitial_states"
     if getattr(problem, function, None) is None:
         return initial_states(problem, stream, states.shape[0])
-    drawn = _ask(problem, function, states, stream)
-    return _states(problem, function, drawn, states.shape)
+    return _states(problem, function, states.shape, states, stream)
 
 
 def move(problem: Any, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
     """Return the states after executed actions, of the shape of ``states``, read-only."""
-    moved = _ask(problem, "move", states, actions, stream)
-    return _states(problem, "move", moved, states.shape)
+    return _states(problem, "move", states.shape, states, actions, stream)
 
 
-def _states(problem: Any, function: str, found: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    states = _array(problem, function, found, shape)
+def _states(problem: Any, function: str, shape: tuple[int, ...], *arguments: object) -> FloatArray:
+    """Ask a function of the problem for states."""
+    states = _array(problem, function, _ask(problem, function, *arguments), shape)
     if not _kernel.all_finite(states):
         rows = states.reshape(-1, shape[-1])
         bad = int(np.argmin(np.isfinite(rows).all(axis=-1)))
@@ -395,10 +389,10 @@ def move_each(
     counts if the problem has a ``move_each``.
     """
     if has_own(problem, "move_each", ("move",)):
-        moved = _ask(problem, "move_each", states, actions, streams, threads)
+        moved = _states(problem, "move_each", states.shape, states, actions, streams, threads)
         for stream in streams:
             stream.end()
-        return _states(problem, "move_each", moved, states.shape)
+        return moved
     together = np.empty(states.shape)
     for row, (own, action, stream) in enumerate(zip(states, actions, streams, strict=True)):
         together[row] = move(problem, own, action, stream)
