@@ -108,40 +108,31 @@ def _measure(problem: Any, own: dict[str, Any]) -> None:
         own["known_return"] = _measured(
             lambda states: problem.known_state_return(states, _stages(states)), few, many
         )
-    own["judge"] = _measured(
-        lambda states: (
-            problem.reward(states, np.broadcast_to(action, (len(states), action.size))),
-            problem.is_goal(states),
-        ),
-        few,
-        many,
-    )
+
+    def judge(states: FloatArray) -> None:
+        problem.reward(states, np.broadcast_to(action, (len(states), action.size)))
+        problem.is_goal(states)
+
+    own["judge"] = _measured(judge, few, many)
 
 
 def _sensed(problem: Any, number: int, few: FloatArray, many: FloatArray) -> tuple[CallCost, int]:
     """Return what the predictions of a sensing action take, and the size of its observation."""
     random = stream(0, 0, 0, Purpose.HYPOTHESES)
-    if not has_general_observations(problem):
-        size = problem.observation_mean(few, number).shape[-1]
-        cost = _measured(
-            lambda states: (
-                problem.observation_mean(states, number),
-                problem.observation_variance(states, number),
-            ),
-            few,
-            many,
-        )
-        return cost, int(size)
-    shown = checked.sample_observation(problem, few[0], number, random.anew())
-    cost = _measured(
-        lambda states: (
-            problem.sample_observation(states[0], number, random.anew()),
-            problem.log_likelihood(states, number, shown),
-        ),
-        few,
-        many,
-    )
-    return cost, int(shown.size)
+    if has_general_observations(problem):
+        shown = checked.sample_observation(problem, few[0], number, random.anew())
+
+        def sense(states: FloatArray) -> None:
+            problem.sample_observation(states[0], number, random.anew())
+            problem.log_likelihood(states, number, shown)
+    else:
+        shown = problem.observation_mean(few, number)
+
+        def sense(states: FloatArray) -> None:
+            problem.observation_mean(states, number)
+            problem.observation_variance(states, number)
+
+    return _measured(sense, few, many), int(shown.shape[-1])
 
 
 def _measured(call: Callable[[FloatArray], object], few: FloatArray, many: FloatArray) -> CallCost:
