@@ -83,38 +83,24 @@ def predictions(
     They are the sizes of the observations, D in all; their means, shape ``(D, n)``; and their
     variances, shape ``(D, n)``, or ``(D, 1)`` if none depends on the state.
     """
-    sizes: list[int] = []
-    means, variances = np.empty((0, states.shape[0])), np.empty((0, 1))
-    row = 0
-    for number, action in enumerate(sensing_actions):
-        # What comes is kept before the next call, which may return the same buffer.
+    shown, spread = [np.empty((0, states.shape[0]))], [np.empty((0, 1))]
+    for action in sensing_actions:
+        # What comes is copied before the next call, which may return the same buffer.
         mean = _mean(problem, states, action)
-        shape, size = mean.shape, mean.shape[-1]
-        if row + size > means.shape[0]:
-            # Mostly all sensing actions show as many numbers as the first.
-            rows = row + size * (len(sensing_actions) - number)
-            means, variances = _with_rows(means, rows), _with_rows(variances, rows)
-        means[row : row + size] = mean.T
-        variance = _variance(problem, states, action, shape)
-        if variance.ndim > 1 and variances.shape[1] == 1:
-            variances = np.repeat(variances, states.shape[0], axis=1)
-        variances[row : row + size] = variance.T if variance.ndim > 1 else variance.reshape(-1, 1)
-        sizes.append(size)
-        row += size
-    if row < means.shape[0]:
-        means, variances = means[:row], variances[:row]
+        shown.append(mean.T.copy())
+        variance = _variance(problem, states, action, mean.shape)
+        rows = variance.T if variance.ndim > 1 else variance.reshape(-1, 1)
+        spread.append(rows.astype(np.float64, order="C"))
+    if any(each.shape[1] > 1 for each in spread):
+        spread = [np.repeat(each, len(states) // each.shape[1], axis=1) for each in spread]
+    sizes = [len(each) for each in shown[1:]]
+    means, variances = np.concatenate(shown), np.concatenate(spread)
     # A comparison with NaN is false.
     usable = ((variances > 0.0) & (variances < np.inf)).all()
     if not usable or not _kernel.all_finite(means):
         for action in sensing_actions:
             require_usable(problem, action, *prediction(problem, states, action))
     return sizes, means, variances
-
-
-def _with_rows(array: FloatArray, rows: int) -> FloatArray:
-    larger = np.empty((rows, array.shape[1]))
-    larger[: array.shape[0]] = array
-    return larger
 
 
 def _mean(problem: Any, states: FloatArray, sensing_action: int) -> FloatArray:
