@@ -23,7 +23,7 @@ from holdfast.errors import HoldfastError
 from holdfast.planning import Planner
 from holdfast.problems import registry
 from holdfast.problems.registry import BUILT_IN
-from holdfast.protocol.decision_cost import cost_of_answer, cost_of_sensing, in_words
+from holdfast.protocol.decision_cost import cost_of_answer, cost_of_sensing, describe_cost
 from holdfast.protocol.service_sessions import with_cores
 from holdfast.service.calibration import measure_problem, measure_slowness
 
@@ -93,7 +93,7 @@ def main() -> None:
         print(
             f"{took_s / sensing.seconds:6.2f} {took_ms:9.2f} ms of {estimated_ms:9.2f}"
             f" {peak / 2**20:6.1f} MB of {sensing.num_bytes / 2**20:6.1f} | reach"
-            f" {reached_s / reach.seconds:5.2f} | {name} {in_words(problem, settings)}"
+            f" {reached_s / reach.seconds:5.2f} | {name} {describe_cost(problem, settings)}"
             f" estimator {settings.selector.estimator} {settings.particle_filter.estimate}"
             f" resolution {settings.selector.resolution}",
             flush=True,

@@ -1,8 +1,8 @@
 """Arrays and numbers: the types that holdfast uses, how they are read, how a message shows one.
 
-NumPy makes numbers of almost anything: of the text "4.0", of True, of a date, of what a mask hides.
-The readers here take what is a real number and nothing else, so they stand at every entry of
-the public interface, and wherever something comes from a user's function.
+NumPy makes numbers of almost anything: the text "4.0", True, a date, masked entries. The readers
+here take real numbers and nothing else. They stand at every entry of the public interface, and
+wherever something comes from a user's function.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast.errors import InvalidValueError
+from holdfast.printable import one_line
 
 __all__ = [
     "BoolArray",
@@ -66,14 +67,14 @@ def in_brief(values: object) -> str:
     try:
         array = np.asarray(values)
     except (TypeError, ValueError):
-        return " ".join(repr(values).split())[:80]  # A ragged list.
+        return f"{one_line(repr(values)):.80}"  # A ragged list.
     return np.array2string(array, max_line_width=sys.maxsize, threshold=2 * _EDGE, edgeitems=_EDGE)
 
 
 def real_numbers(value: object) -> npt.NDArray[Any] | None:
     """Return an array of a number or of numbers; None for anything else.
 
-    Truth values are none, nor are texts, dates, objects, or an array of which a mask hides entries.
+    Truth values, texts, dates, objects and arrays with masked entries are something else.
     """
     if _hides_something(value):
         return None
@@ -106,7 +107,7 @@ def real_number(value: object) -> float | None:
 
 def integer(value: object) -> int | None:
     """Return a whole number, NumPy's too; None for anything else, 3.0 and True included."""
-    if isinstance(value, bool | np.bool_) or _hides_something(value):
+    if _hides_something(value):
         return None
     try:
         return operator.index(value)  # type: ignore[arg-type]
@@ -115,7 +116,7 @@ def integer(value: object) -> int | None:
 
 
 def whole(what: str, value: object, least: int, most: int | None = None) -> int:
-    """Return a whole number within bounds; InvalidValueError says which ``what`` is not."""
+    """Return a whole number within bounds; otherwise InvalidValueError names ``what``."""
     number = integer(value)
     if number is None or number < least or (most is not None and number > most):
         limits = f"from {least}" if most is None else f"from {least} to {most}"
@@ -125,13 +126,12 @@ def whole(what: str, value: object, least: int, most: int | None = None) -> int:
 
 
 def floats(what: str, value: object) -> FloatArray:
-    """Return real numbers as float64, in C order; InvalidValueError says which are none."""
+    """Return real numbers as float64, in C order; otherwise InvalidValueError names ``what``."""
     numbers = real_numbers(value)
     if numbers is None:
-        came = " ".join(repr(value).split())
         raise InvalidValueError(
-            f"{what} is {came:.80}: must be real numbers (no text, truth value, date or masked "
-            "entry)"
+            f"{what} is {one_line(repr(value)):.80}: must be real numbers (no text, truth value, "
+            "date or masked entry)"
         )
     return np.ascontiguousarray(numbers, dtype=np.float64).reshape(numbers.shape)
 

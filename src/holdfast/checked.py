@@ -5,7 +5,7 @@ something, a variance for one coordinate of two to something else, and the decis
 wrong. So every call of a problem's function passes through here. A result that does not fit is an
 error that names the function, what it returned and what was needed. Every array is copied as it
 comes: a function may return the same buffer each time. A stream that a function was given ends with
-the call. And a user's function runs in the floating-point mode of who called holdfast.
+the call. And a user's function runs in the caller's floating-point mode.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from holdfast.arrays import (
     real_numbers,
 )
 from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.floating_mode import as_caller, modes_agree
+from holdfast.floating_mode import as_caller
+from holdfast.printable import one_line
 from holdfast.problem_attributes import has_own, name_of
 from holdfast.randomness import Stream
 
@@ -82,38 +83,24 @@ def predictions(
     They are the sizes of the observations, D in all; their means, shape ``(D, n)``; and their
     variances, shape ``(D, n)``, or ``(D, 1)`` if none depends on the state.
     """
-    sizes: list[int] = []
-    means, variances = np.empty((0, states.shape[0])), np.empty((0, 1))
-    row = 0
-    for number, action in enumerate(sensing_actions):
-        # What comes is kept before the next call, which may return the same buffer.
+    shown, spread = [np.empty((0, states.shape[0]))], [np.empty((0, 1))]
+    for action in sensing_actions:
+        # What comes is copied before the next call, which may return the same buffer.
         mean = _mean(problem, states, action)
-        shape, size = mean.shape, mean.shape[-1]
-        if row + size > means.shape[0]:
-            # Mostly all sensing actions show as many numbers as the first.
-            rows = row + size * (len(sensing_actions) - number)
-            means, variances = _with_rows(means, rows), _with_rows(variances, rows)
-        means[row : row + size] = mean.T
-        variance = _variance(problem, states, action, shape)
-        if variance.ndim > 1 and variances.shape[1] == 1:
-            variances = np.repeat(variances, states.shape[0], axis=1)
-        variances[row : row + size] = variance.T if variance.ndim > 1 else variance.reshape(-1, 1)
-        sizes.append(size)
-        row += size
-    if row < means.shape[0]:
-        means, variances = means[:row], variances[:row]
+        shown.append(mean.T.copy())
+        variance = _variance(problem, states, action, mean.shape)
+        rows = variance.T if variance.ndim > 1 else variance.reshape(-1, 1)
+        spread.append(rows.astype(np.float64, order="C"))
+    if any(each.shape[1] > 1 for each in spread):
+        spread = [np.repeat(each, len(states) // each.shape[1], axis=1) for each in spread]
+    sizes = [len(each) for each in shown[1:]]
+    means, variances = np.concatenate(shown), np.concatenate(spread)
     # A comparison with NaN is false.
     usable = ((variances > 0.0) & (variances < np.inf)).all()
     if not usable or not _kernel.all_finite(means):
         for action in sensing_actions:
             require_usable(problem, action, *prediction(problem, states, action))
     return sizes, means, variances
-
-
-def _with_rows(array: FloatArray, rows: int) -> FloatArray:
-    larger = np.empty((rows, array.shape[1]))
-    larger[: array.shape[0]] = array
-    return larger
 
 
 def _mean(problem: Any, states: FloatArray, sensing_action: int) -> FloatArray:
@@ -166,8 +153,8 @@ def sample_observation(
     problem: Any, state: FloatArray, sensing_action: int, stream: Stream
 ) -> FloatArray:
     """Return an observation that was drawn in one state, shape ``(observation_size,)``."""
-    drawn = _draw(problem, "sample_observation", state, sensing_action, stream, streams=(stream,))
-    return _shown(problem, f"sample_observation of sensing action {sensing_action}", drawn)
+    what = f" of sensing action {sensing_action}"
+    return _shown(problem, "sample_observation", state, sensing_action, stream, what=what)
 
 
 def log_likelihood(
@@ -224,30 +211,26 @@ def moved_by_measurement(
             f"{function}(states, motion, stream) that could move the belief by it"
         )
     measured.setflags(write=False)
-    moved = _draw(problem, function, states, measured, stream, streams=(stream,))
-    return _states(problem, function, moved, states.shape)
+    return _states(problem, function, states.shape, states, measured, stream)
 
 
 def measured_motion(
     problem: Any, before: FloatArray, after: FloatArray, stream: Stream
 ) -> FloatArray:
     """Return the measurement of a true move, shape ``(n,)``."""
-    function = "measure_motion"
-    drawn = _draw(problem, function, before, after, stream, streams=(stream,))
-    return _shown(problem, function, drawn)
+    return _shown(problem, "measure_motion", before, after, stream)
 
 
 def move_observation(
     problem: Any, state: FloatArray, action: FloatArray, stream: Stream
 ) -> FloatArray:
     """Return what comes with a move into one state, shape ``(n,)``."""
-    function = "sample_move_observation"
-    drawn = _draw(problem, function, state, action, stream, streams=(stream,))
-    return _shown(problem, function, drawn)
+    return _shown(problem, "sample_move_observation", state, action, stream)
 
 
-def _shown(problem: Any, function: str, value: object) -> FloatArray:
-    """Return what a function of the problem says that the world shows, shape ``(n,)``."""
+def _shown(problem: Any, function: str, *arguments: object, what: str = "") -> FloatArray:
+    """Ask a function of the problem for what the world shows, shape ``(n,)``."""
+    value, function = _ask(problem, function, *arguments), f"{function}{what}"
     if not isinstance(value, np.ndarray) or real_numbers(value) is None or value.ndim != 1:
         raise _misfit(problem, function, value, "(n,)")
     if not 1 <= value.size <= MAX_OBSERVATION_SIZE or not np.isfinite(value).all():
@@ -351,8 +334,7 @@ def known_state_return(problem: Any, states: FloatArray, stages: IntArray) -> Fl
 
 def initial_states(problem: Any, stream: Stream, count: int) -> FloatArray:
     """Return states drawn from the initial belief, shape ``(count, state_size)``, read-only."""
-    drawn = _draw(problem, "initial_states", stream, count, streams=(stream,))
-    return _states(problem, "initial_states", drawn, (count, problem.state_size))
+    return _states(problem, "initial_states", (count, problem.state_size), stream, count)
 
 
 def reinitial_states(problem: Any, states: FloatArray, stream: Stream) -> FloatArray:
@@ -360,18 +342,17 @@ def reinitial_states(problem: Any, states: FloatArray, stream: Stream) -> FloatA
     function = "reinitial_states"
     if getattr(problem, function, None) is None:
         return initial_states(problem, stream, states.shape[0])
-    drawn = _draw(problem, function, states, stream, streams=(stream,))
-    return _states(problem, function, drawn, states.shape)
+    return _states(problem, function, states.shape, states, stream)
 
 
 def move(problem: Any, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
     """Return the states after executed actions, of the shape of ``states``, read-only."""
-    moved = _draw(problem, "move", states, actions, stream, streams=(stream,))
-    return _states(problem, "move", moved, states.shape)
+    return _states(problem, "move", states.shape, states, actions, stream)
 
 
-def _states(problem: Any, function: str, found: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    states = _array(problem, function, found, shape)
+def _states(problem: Any, function: str, shape: tuple[int, ...], *arguments: object) -> FloatArray:
+    """Ask a function of the problem for states."""
+    states = _array(problem, function, _ask(problem, function, *arguments), shape)
     if not _kernel.all_finite(states):
         rows = states.reshape(-1, shape[-1])
         bad = int(np.argmin(np.isfinite(rows).all(axis=-1)))
@@ -394,8 +375,10 @@ def move_each(
     counts if the problem has a ``move_each``.
     """
     if has_own(problem, "move_each", ("move",)):
-        moved = _draw(problem, "move_each", states, actions, streams, threads, streams=streams)
-        return _states(problem, "move_each", moved, states.shape)
+        moved = _states(problem, "move_each", states.shape, states, actions, streams, threads)
+        for stream in streams:
+            stream.end()
+        return moved
     together = np.empty(states.shape)
     for row, (own, action, stream) in enumerate(zip(states, actions, streams, strict=True)):
         together[row] = move(problem, own, action, stream)
@@ -431,16 +414,11 @@ def is_goal(problem: Any, state: FloatArray) -> bool:
 
 
 def _ask(problem: Any, function: str, *arguments: object) -> Any:
-    """Call a function of the problem."""
-    called = getattr(problem, function)
-    return called(*arguments) if modes_agree() else as_caller(called, *arguments)
-
-
-def _draw(problem: Any, function: str, *arguments: object, streams: Sequence[Stream]) -> Any:
-    """Call a function of the problem that draws; ``streams`` are those among its arguments."""
-    found = _ask(problem, function, *arguments)
-    for stream in streams:
-        stream.end()
+    """Call a function of the problem; streams among the arguments end with the call."""
+    found = as_caller(getattr(problem, function), *arguments)
+    for each in arguments:
+        if isinstance(each, Stream):
+            each.end()
     return found
 
 
@@ -498,7 +476,7 @@ def _returned(problem: Any, function: str, value: object, need: str) -> ProblemE
         masked = ", masked in part," if is_masked(value) else ""
         came = f"{value.dtype}{masked} of shape {value.shape}"
     else:
-        came = f"{type(value).__name__} ({' '.join(repr(value).split())[:40]})"
+        came = f"{type(value).__name__} ({one_line(repr(value)):.40})"
     return ProblemError(f"{function} of {name_of(problem)} returned {came}: need {need}")
 
 

@@ -7,6 +7,7 @@ has the file open, not this code.
 
 from __future__ import annotations
 
+import copyreg
 import traceback
 
 
@@ -15,11 +16,7 @@ class HoldfastError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         # Else a pool of processes, which passes errors on, would have to call __init__ again.
-        return _restored, (type(self), self.args), vars(self)
-
-
-def _restored(kind: type[HoldfastError], arguments: tuple[object, ...]) -> HoldfastError:
-    return kind.__new__(kind, *arguments)
+        return copyreg.__newobj__, (type(self), *self.args), vars(self)  # type: ignore[attr-defined]
 
 
 class InvalidValueError(HoldfastError, ValueError):

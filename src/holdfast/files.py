@@ -3,7 +3,7 @@
 A file is written under a temporary name in the same directory and then renamed. A rename is atomic:
 after a crash, and for every reader, the path holds the old file or the new one, never a part.
 Directories whose files belong together, such as a key and its certificate, appear the same way. One
-that is there is never swapped for another: who has mounted it would see the old one for ever.
+that exists is never swapped for another: a container that has mounted it would keep the old one.
 
 All functions but those that read raise :class:`~holdfast.errors.OutputError` if the system
 refuses something, or what they would write is there already.
@@ -20,12 +20,13 @@ import stat
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 from holdfast.errors import OutputError
 
 __all__ = [
     "NewFile",
+    "absolute_endpoint",
     "bounded_lines",
     "claim_directory",
     "create_directory_atomically",
@@ -149,6 +150,14 @@ def shown_path(path: Path) -> str:
     return str(path)
 
 
+def absolute_endpoint(endpoint: str, directory: Path | None = None) -> str:
+    """Return an endpoint, the path of a local socket absolute; by default from where we are now."""
+    protocol, _, place = endpoint.partition("/")
+    if protocol != "unix" or not place:
+        return endpoint
+    return f"unix/{(directory or Path.cwd()) / place}"
+
+
 @contextlib.contextmanager
 def _refusals(path: Path, what: str) -> Iterator[None]:
     """Turn the system's refusals into errors about the path."""
@@ -158,6 +167,36 @@ def _refusals(path: Path, what: str) -> Iterator[None]:
         raise OutputError(
             f"{shown_path(path)}: cannot be {what}: {error.strerror or error}"
         ) from error
+
+
+@contextlib.contextmanager
+def _synchronized(path: Path, mode: int) -> Iterator[BinaryIO]:
+    """Make a file, never through a link that is there; after the block its content is on the disk.
+
+    The mode is set at creation, so that a key is never readable by others.
+    """
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
+    with os.fdopen(os.open(path, flags, mode), "wb") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextlib.contextmanager
+def _replacing(path: Path, mode: int = 0o666) -> Iterator[BinaryIO]:
+    """Make a file that takes the place of a path after the block, if nothing fails."""
+    # In the same folder, because a rename is atomic only within one file system.
+    temporary = _unfinished(path)
+    with _refusals(path, "written"):
+        try:
+            temporary.unlink(missing_ok=True)
+            with _synchronized(temporary, mode) as file:
+                yield file
+            temporary.replace(path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+            raise
 
 
 def write_atomically(path: Path, content: bytes | Iterable[str]) -> None:
@@ -173,20 +212,8 @@ def write_atomically(path: Path, content: bytes | Iterable[str]) -> None:
         pieces = (content,)
     else:
         pieces = (piece.encode() for piece in ((content,) if isinstance(content, str) else content))
-    # In the same folder, because a rename is atomic only within one file system.
-    temporary = _unfinished(path)
-    with _refusals(path, "written"):
-        try:
-            temporary.unlink(missing_ok=True)
-            with temporary.open("xb") as file:  # never through a link that somebody has left there
-                file.writelines(pieces)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
-            raise
+    with _replacing(path) as file:
+        file.writelines(pieces)
 
 
 def remove_unfinished(directory: Path, *, below: bool = False) -> None:
@@ -227,12 +254,8 @@ def create_directory_atomically(path: Path, files: Mapping[str, NewFile]) -> Non
     try:
         with _unfinished_directory(path, 0o700) as temporary:
             for name, new in files.items():
-                # The mode is set at creation, so that a key is never readable by others.
-                flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
-                with os.fdopen(os.open(temporary / name, flags, new.mode), "wb") as file:
+                with _synchronized(temporary / name, new.mode) as file:
                     file.write(new.content)
-                    file.flush()
-                    os.fsync(file.fileno())
             temporary.rename(path)
     except OSError as error:
         # A rename onto a directory with files fails with one of several errors.
@@ -241,32 +264,22 @@ def create_directory_atomically(path: Path, files: Mapping[str, NewFile]) -> Non
 
 
 def replace_file(path: Path, content: bytes, mode: int, *, like: Path | None = None) -> None:
-    """Write a file atomically, for whoever could read the one that it replaces.
+    """Write a file atomically, readable by the same users as the one that it replaces.
 
     It gets the owner and permissions of that file, or of ``like``; a new one gets ``mode``, and the
     owner of its directory. (Only root can give a file to somebody else.)
     """
-    temporary = _unfinished(path)
     with _refusals(path, "written"):
         try:
             before = (like or path).stat()
             mode = stat.S_IMODE(before.st_mode)
         except FileNotFoundError:
             before = path.parent.stat()
-        try:
-            flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
-            with os.fdopen(os.open(temporary, flags, 0o600), "wb") as file:
-                if os.geteuid() == 0:
-                    os.fchown(file.fileno(), before.st_uid, before.st_gid)
-                os.fchmod(file.fileno(), mode)
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
-            raise
+        with _replacing(path, 0o600) as file:
+            if os.geteuid() == 0:
+                os.fchown(file.fileno(), before.st_uid, before.st_gid)
+            os.fchmod(file.fileno(), mode)
+            file.write(content)
 
 
 def remove_unfinished_of(directory: Path) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 
 from holdfast import _kernel
 
-__all__ = ["as_caller", "in_own_mode", "modes_agree"]
+__all__ = ["as_caller", "in_own_mode"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -27,11 +27,11 @@ R = TypeVar("R")
 _OWN: dict[str, Any] = {"divide": "warn", "over": "warn", "under": "ignore", "invalid": "warn"}
 
 _callers: ContextVar[dict[str, Any] | None] = ContextVar("callers_mode", default=None)
-"""NumPy's mode of who called, while it is not ours."""
+"""The caller's mode of NumPy; None while it is ours."""
 
 
 def in_own_mode(function: Callable[P, R]) -> Callable[P, R]:
-    """Make a function of the public face run in the standard floating-point mode."""
+    """Make a public function run in the standard floating-point mode."""
 
     @functools.wraps(function)
     def in_mode(*arguments: P.args, **keywords: P.kwargs) -> R:
@@ -51,13 +51,8 @@ def in_own_mode(function: Callable[P, R]) -> Callable[P, R]:
     return in_mode
 
 
-def modes_agree() -> bool:
-    """Tell whether who called us has our mode of NumPy, so that :func:`as_caller` does nothing."""
-    return _callers.get() is None
-
-
 def as_caller(function: Callable[P, R], *arguments: P.args, **keywords: P.kwargs) -> R:
-    """Call a user's function in NumPy's mode of who called us; one of ours in our own."""
+    """Call a user's function in the caller's mode of NumPy, and a function of holdfast in ours."""
     mode = _callers.get()
     if mode is None or (getattr(function, "__module__", None) or "").startswith("holdfast."):
         return function(*arguments, **keywords)

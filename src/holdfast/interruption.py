@@ -1,10 +1,9 @@
 """Ending a computation that nobody awaits any more, from another thread.
 
-Whoever computes calls :func:`check` between batches, and so does the kernel between its tasks;
-whoever started it makes an
-:class:`Interruption` the one of its thread, and may set it from anywhere. Without one the check
-does nothing: no result depends on it, since a computation either ends as it would have or not at
-all.
+A computation calls :func:`check` between batches, and the kernel looks between its tasks. Its
+caller makes an :class:`Interruption` that of its thread (:func:`interruptible`), and may set it
+from any other. Without one the check does nothing. No result depends on it: a computation ends as
+it would have, or with an exception.
 """
 
 from __future__ import annotations

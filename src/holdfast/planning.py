@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import checked, interruption, numerics, sensing
-from holdfast.arrays import FloatArray, floats, in_brief, integer, plain, whole
+from holdfast.arrays import FloatArray, floats, in_brief, plain, whole
 from holdfast.belief import (
     Belief,
     ObservationInfo,
@@ -52,7 +52,13 @@ from holdfast.config.settings import (
 )
 from holdfast.errors import CheckpointError, InvalidValueError, ProblemError
 from holdfast.floating_mode import in_own_mode
-from holdfast.problem_attributes import check_problem, check_sizes, circular_states, moves_show
+from holdfast.problem_attributes import (
+    check_problem,
+    check_sizes,
+    circular_states,
+    moves_show,
+    sensing_action_of,
+)
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
 from holdfast.sensing import SensingInfo
@@ -263,13 +269,7 @@ class Planner:
         interruption.check()
         problem = self.problem
         self._require_size(state)
-        known = len(problem.sensing_actions) + (observation is None)
-        chosen = integer(sensing_action)
-        if chosen is None or not 0 <= chosen < known:
-            raise InvalidValueError(
-                f"sensing action {sensing_action!r:.80}: {problem.name} has 0 to "
-                f"{len(problem.sensing_actions) - 1}"
-            )
+        chosen = sensing_action_of(problem, sensing_action, optional=observation is None)
         if observation is None:
             size = effective_sample_size(state.belief)
             distinct = distinct_particles(state.belief.states)

@@ -36,6 +36,7 @@ __all__ = [
     "moves_show",
     "name_of",
     "resolution_of",
+    "sensing_action_of",
     "sensing_costs",
     "sensing_labels",
     "sequence_of",
@@ -272,6 +273,20 @@ def sensing_labels(problem: Any) -> tuple[str, ...]:
                 f"sensing_actions of {name_of(problem)} has {label!r:.80}: labels must be text"
             )
     return tuple(map(str, labels))
+
+
+def sensing_action_of(problem: Any, given: object, *, optional: bool = False) -> int:
+    """Return the index of a sensing action, or with ``optional`` that of not to sense.
+
+    Raises InvalidValueError if the problem has no such one.
+    """
+    count = len(problem.sensing_actions)
+    chosen = integer(given)
+    if chosen is None or not 0 <= chosen < count + optional:
+        raise InvalidValueError(
+            f"sensing action {given!r:.80}: {problem.name} has 0 to {count - 1}"
+        )
+    return chosen
 
 
 def state_labels(problem: Any) -> tuple[str, ...]:

@@ -26,7 +26,7 @@ from holdfast.protocol.decision_cost import (
     ProblemCost,
     cost_of_answer,
     cost_of_sensing,
-    in_words,
+    describe_cost,
 )
 from holdfast.protocol.service_limits import ServiceLimits
 
@@ -149,7 +149,7 @@ def test_estimates_are_finite_whatever_is_set() -> None:
         method = hostile.settings.selector.method
         if hostile.key == "all" and method not in ("random", "fixed"):
             assert cost.seconds > limits.max_decision_s, hostile
-        assert method in in_words(PEG, hostile.settings)
+        assert method in describe_cost(PEG, hostile.settings)
 
 
 def test_the_defaults_are_brief() -> None:
@@ -165,7 +165,7 @@ def test_the_defaults_are_brief() -> None:
 
 def test_the_words_name_the_keys_of_the_method() -> None:
     settings = with_key(PlanningSettings(), "selector.method", "expected_return")
-    words = in_words(PEG, settings)
+    words = describe_cost(PEG, settings)
     for key in ("rollout_steps 200", "rollout_looks 4", "max_observation_samples 40"):
         assert f"selector.{key}" in words
     assert "3 sensing actions" in words

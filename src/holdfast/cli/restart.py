@@ -21,9 +21,9 @@ from holdfast.runtime.command_line import wants_json
 from holdfast.runtime.log_lines import LogFormat
 from holdfast.runtime.logs import EventLog
 from holdfast.runtime.parent_death import parent_death_prefix
-from holdfast.runtime.signal_names import signal_name
+from holdfast.runtime.process_ends import how_it_ended, restart_delay_s
 
-__all__ = ["delay_before", "ends_for_good", "run_until_it_ends"]
+__all__ = ["ends_for_good", "run_until_it_ends"]
 
 _ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
@@ -65,11 +65,11 @@ def run_until_it_ends(arguments: Sequence[str]) -> int:
         if received or ends_for_good(code):
             return code if code >= 0 else EXIT_SIGNAL - code
         early_ends = 0 if time.monotonic() - started >= _STEADY_S else early_ends + 1
-        delay_s = delay_before(early_ends)
+        delay_s = restart_delay_s(early_ends, _FIRST_DELAY_S, _LAST_DELAY_S)
         until = time.monotonic() + delay_s
         log: LogFormat = "json" if wants_json(arguments) else "text"
         EventLog(sys.stderr, format=log, component="robot").event(
-            "process_ended", reason=_words(code), again_in_s=delay_s
+            "process_ended", reason=how_it_ended(code), again_in_s=delay_s
         )
         while not received and time.monotonic() < until:
             time.sleep(_PAUSE_S)
@@ -82,13 +82,6 @@ def ends_for_good(code: int) -> bool:
     return code in (0, EXIT_WRONG_ANSWER, EXIT_REBOOTED) or code - EXIT_SIGNAL in _ENDING
 
 
-def delay_before(early_ends: int) -> float:
-    """Return the delay before the next start, in s, after so many short lives in a row."""
-    if early_ends <= 1:
-        return 0.0
-    return min(_FIRST_DELAY_S * 2.0 ** min(early_ends - 2, 10), _LAST_DELAY_S)
-
-
 def _wait_for(process: subprocess.Popen[bytes]) -> int:
     """Wait for a process, and reap those that became this one's, as a container's first process."""
     while True:
@@ -96,7 +89,3 @@ def _wait_for(process: subprocess.Popen[bytes]) -> int:
         if pid == process.pid:
             process.returncode = os.waitstatus_to_exitcode(status)
             return process.returncode
-
-
-def _words(code: int) -> str:
-    return f"ended with exit code {code}" if code >= 0 else f"was ended by {signal_name(-code)}"

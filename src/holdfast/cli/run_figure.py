@@ -84,12 +84,12 @@ def draw_figure(
 ) -> Remark | None:
     """Draw the recorder's trial, which is finished, and return a remark if there is one.
 
-    The trials are in the journal, and a figure is none of them: that it cannot be drawn, for
-    whatever reason, is a remark.
+    The trials are in the journal already, so whatever prevents a figure becomes a remark.
     """
     remarks: list[Remark] = []
     try:
-        _draw_figure(configuration, directory, recorder, remarks.append)
+        for remark in _drawn(configuration, directory, recorder):
+            remarks.append(remark)  # noqa: PERF402 - what was found before an error is kept
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # noqa: BLE001 - matplotlib, the disk and the user's own code
@@ -101,12 +101,10 @@ def draw_figure(
     return max(remarks, key=lambda each: each.exit_code, default=None)
 
 
-def _draw_figure(
-    configuration: Configuration,
-    directory: RunDirectory,
-    recorder: Recorder,
-    remark: Callable[[Remark], None],
-) -> None:
+def _drawn(
+    configuration: Configuration, directory: RunDirectory, recorder: Recorder
+) -> Iterator[Remark]:
+    """Draw, and yield remarks as they come."""
     from holdfast.recording.run_directory import FIGURE_NAME
 
     trial, path = recorder.trial, directory.path / FIGURE_NAME
@@ -118,20 +116,16 @@ def _draw_figure(
                 return
             make_world = _recorded_world(directory, result)
             if make_world is None:
-                remark(
-                    Remark(
-                        f"no figure, because trial {trial} ended in an earlier part of the run, "
-                        "which did not keep its observations"
-                    )
+                yield Remark(
+                    f"no figure, because trial {trial} ended in an earlier part of the run, which "
+                    "did not keep its observations"
                 )
                 return
         again_s = 1e-3 * result.mean_sensing_ms * result.sensing_decisions
         if again_s > _LONGEST_REPETITION_S:
-            remark(
-                Remark(
-                    f"no figure, because trial {trial} would have to be run again for it, "
-                    f"with {duration(again_s)} of sensing decisions"
-                )
+            yield Remark(
+                f"no figure, because trial {trial} would have to be run again for it, "
+                f"with {duration(again_s)} of sensing decisions"
             )
             return
     try:
@@ -140,7 +134,7 @@ def _draw_figure(
     except ImportError as error:
         if error.name is None or error.name.split(".")[0] != "matplotlib":
             raise
-        remark(Remark("no figure, because matplotlib is not installed: pip install matplotlib"))
+        yield Remark("no figure, because matplotlib is not installed: pip install matplotlib")
         return
 
     if recorder.record.result is None:
@@ -148,7 +142,7 @@ def _draw_figure(
         world = None if make_world is None else make_world()
         found = repeat(configuration, kept, trial, world, recorder=recorder)
         if found.deviation is not None:
-            remark(_remark_on(found, configuration, directory, kept, trial, make_world))
+            yield _remark_on(found, configuration, directory, kept, trial, make_world)
         if found.error is not None:
             return
         if make_world is not None:

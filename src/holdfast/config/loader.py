@@ -44,7 +44,7 @@ from holdfast.config.source import SECTIONS, SETTINGS, Source, module_directory
 from holdfast.config.validation import described, shown
 from holdfast.config.yaml_document import MAX_BYTES, Document, read, write
 from holdfast.errors import ConfigurationError, InvalidValueError
-from holdfast.files import read_bounded
+from holdfast.files import absolute_endpoint, read_bounded
 from holdfast.problem_attributes import resolution_of, sensing_labels
 from holdfast.problems.problem import Problem
 from holdfast.problems.registry import names
@@ -300,18 +300,12 @@ def _checked_offload(
             f"is {offload.detection_timeout_ms:g}; it must be at most offload.decision_timeout_ms,"
             f" after which a decision is given up, which is {timeout_ms:g}",
         )
-    services = tuple(_absolute(source, service) for service in offload.services)
+    services = tuple(absolute_endpoint(service, source.current) for service in offload.services)
     offload = msgspec.structs.replace(offload, services=services)
     if offload.tls is None:
         return offload
     directory = source.directory_of(("offload", "tls")) / offload.tls
     return msgspec.structs.replace(offload, tls=str(directory.resolve()))
-
-
-def _absolute(source: Source, service: str) -> str:
-    """Return an endpoint with an absolute path, if it has one."""
-    protocol, _, place = service.partition("/")
-    return f"unix/{source.current / place}" if protocol == "unix" and place else service
 
 
 def _located_environment(source: Source, settings: EnvironmentSettings) -> EnvironmentSettings:

@@ -26,7 +26,7 @@ _STANDARD = [path for name in ("stdlib", "platstdlib") if (path := sysconfig.get
 _STANDARD += [str(Path(path) / "lib-dynload") for path in _STANDARD]
 
 _FOUND: dict[str, tuple[Path, frozenset[str]]] = {}
-"""Of each module that was asked for: its directory, and the names there that it needs."""
+"""Directory of each module that was asked for, and the names there that it needs."""
 
 
 class _Finder:
@@ -104,9 +104,7 @@ def _require_alone(name: str, directory: Path) -> None:
             f"the module {name} is {here}, and Python's standard library has one of that name, "
             f"{own}; rename the first"
         )
-    others = [_place_of_module(sys.modules.get(name))]
-    others += [_place(_Finder.find_spec(name))]
-    for other in others:
+    for other in (_place_of_module(sys.modules.get(name)), _place(_Finder.find_spec(name))):
         if here is not None and other not in (None, here):
             raise ConfigurationError(
                 f"the module {name} is {here}, and this process has another one of that name, "

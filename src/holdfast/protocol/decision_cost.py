@@ -29,6 +29,7 @@ from holdfast.problem_attributes import has_general_observations, has_own
 from holdfast.problems.problem import Problem
 
 __all__ = [
+    "ANY_MACHINE",
     "COSTLY",
     "FREE",
     "TYPICAL_PROBLEM",
@@ -39,7 +40,7 @@ __all__ = [
     "ProblemCost",
     "cost_of_answer",
     "cost_of_sensing",
-    "in_words",
+    "describe_cost",
 ]
 
 COSTLY: Mapping[str, str] = {
@@ -64,7 +65,7 @@ FREE: Mapping[str, str] = {
     "selector.resolution": "the cost is that of the worst resolution",
     "selector.path_discount": "a factor of values",
 }
-"""Numeric settings that are none, and why."""
+"""Numeric settings that are no factors, and why."""
 
 
 class CallCost(NamedTuple):
@@ -84,20 +85,20 @@ class ProblemCost(NamedTuple):
     Attributes
     ----------
     initial, move, stage : CallCost
-        Of ``initial_states``, ``move`` and ``next_stage``.
+        Time of ``initial_states``, ``move`` and ``next_stage``.
     act : CallCost
-        Of ``policy`` and ``execute``.
+        Time of ``policy`` and ``execute`` together.
     sense : CallCost
-        Mean and variance of one sensing action's observation; for a general likelihood to draw an
-        observation and to evaluate its likelihood.
+        Time of the mean and variance of one sensing action's observation; with a general
+        likelihood, of drawing an observation and evaluating it.
     judge : CallCost
-        Of ``reward`` and ``is_goal``.
+        Time of ``reward`` and ``is_goal`` together.
     path_step : CallCost
-        Of one step of a noise-free path.
+        Time of one step of a noise-free path.
     known_return : CallCost or None
-        Of ``known_state_return``, if it has one.
+        Time of ``known_state_return``; None without one.
     observation_size : int
-        Of the largest observation.
+        Numbers in the largest observation.
     """
 
     initial: CallCost
@@ -122,7 +123,7 @@ TYPICAL_PROBLEM = ProblemCost(
     known_return=None,
     observation_size=2,
 )
-"""Where nothing was measured."""
+"""Of a problem that was not measured."""
 
 
 class Cost(NamedTuple):
@@ -159,30 +160,34 @@ class Pricing(NamedTuple):
         return Price(own, cost_of_sensing(problem, planning, own, self.slowness))
 
 
-# Nanoseconds, on the machine on which they were measured.
+ANY_MACHINE = Pricing()
+"""Where nothing was measured."""
+
+
+# Times are in nanoseconds, on the machine on which they were measured.
 _LIKELIHOOD = 8.0
-"""Of a posterior's weight, and of each coordinate of the observation."""
+"""For a posterior's weight, and again for each coordinate of the observation."""
 _NEAREST_ALONE, _NEAREST_TOGETHER, _GROUP = 420.0, 90.0, 32
-"""Of a point's neighbours in one posterior, and in one of a group."""
+"""For a point's neighbours in one posterior alone, and in one of a group of this size."""
 _NEIGHBOR, _SQUARED_NEIGHBOR = 50.0, 0.17
-"""Of each of many neighbours, which are kept in order."""
+"""For each neighbour beyond five; many are kept in order, so the square counts too."""
 _MIXTURE_PAIR = 0.28
 _PRIOR_PAIR, _PRIOR_MEMBER, _PRIOR_LANES = 4.0, 4.0, 8
 _ADD = 2.0
-"""Of a pass over an array, for each number."""
+"""For each number in a pass over an array."""
 _CONTACT = 2.0
 """A move in contact takes so many times as long as a free one, which is measured."""
 _PYTHON = 60e3
-"""Of the code around a handful of calls."""
+"""For the Python code around a handful of calls."""
 _MODE_PARTICLES, _MODE_STARTS, _MODE_CLIMBS, _MODE_SPLITS = 1000, 16, 10, 3
-"""Of :mod:`holdfast.modes`."""
+"""Sizes in :mod:`holdfast.modes`."""
 
 _CLOUD = 8.0
 """Particles that follow each estimate of a rollout."""
 _WEIGHTS_BYTES = 64 << 20
 _GROUP_BYTES = 400
 _BLOCK = 1 << 20
-"""Of the kernel's batches and of :mod:`holdfast.sensing`'s blocks."""
+"""Sizes of the kernel's batches and of :mod:`holdfast.sensing`'s blocks."""
 
 
 class _Sizes:
@@ -415,7 +420,7 @@ def cost_of_answer(
     begins : bool
         Whether it begins with the initial belief.
     num_bytes : float
-        Of the request.
+        Size of the request.
     """
     sizes = _Sizes(problem, planning, own, slowness)
     particles, size = sizes.particles, float(own.observation_size)
@@ -432,7 +437,7 @@ def cost_of_answer(
     return Cost(seconds, 8.0 * sizes.state_bytes + 3.0 * num_bytes + 24.0 * size * particles)
 
 
-def in_words(problem: Problem | None, planning: PlanningSettings) -> str:
+def describe_cost(problem: Problem | None, planning: PlanningSettings) -> str:
     """Name the settings that a decision's cost comes from, with their values."""
     sensing, selector = planning.active_sensing, planning.selector
     parts = [

@@ -1,7 +1,7 @@
 """Three lanes for the tasks of a service, so that long decisions never hold all its threads.
 
 A robot chooses how long its decisions take. In one queue a few that take seconds would keep all
-other robots waiting, whoever sent them and even after their senders had gone. So each task begins
+other robots waiting, even after their senders had gone. So each task begins
 in the lane of the *brief* ones. Its job first estimates what it costs
 (:mod:`~holdfast.protocol.decision_cost`); if that is too much for the lane, nothing is computed,
 and the task moves to that of the *medium* ones or of the *long* ones:
@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 
-from holdfast.protocol.decision_cost import Cost, in_words
+from holdfast.protocol.decision_cost import Cost, describe_cost
 from holdfast.protocol.messages import Request
 from holdfast.protocol.request_queue import RequestQueue
 from holdfast.protocol.service_jobs import Job
@@ -38,7 +38,7 @@ from holdfast.protocol.service_sessions import (
 __all__ = ["Lanes"]
 
 _OVERDUE = 4.0
-"""So many times the longest decision a job may run; estimates are right within a factor of 3."""
+"""So many times the longest decision a job may run; hardly any takes 3 times its estimate."""
 
 
 class Lanes:
@@ -63,7 +63,6 @@ class Lanes:
         self.limits_s = (limits.max_brief_s, limits.max_medium_s, limits.max_decision_s)
         self._overdue_s = _OVERDUE * limits.max_decision_s
         self._brief_went_last = False
-        self._cancelled: set[Job] = set()
 
     @property
     def num_waiting(self) -> int:
@@ -135,21 +134,22 @@ class Lanes:
 
     def started(self, job: Job, now: float) -> None:
         """Note that a worker starts its task only now, if it was not forgotten."""
-        for lane in self._lanes:
-            if lane.runs(job):
-                lane.started(job, now)
+        lane = self._running_in(job)
+        if lane is not None:
+            lane.started(job, now)
 
     def end(self, job: Job) -> PendingTask:
         """Note that a worker is free; return its task."""
-        self._cancelled.discard(job)
-        return self._running_in(job).end(job)
+        lane = self._running_in(job)
+        assert lane is not None
+        return lane.end(job)
 
     def runs(self, job: Job) -> bool:
         """Return whether a worker has a job of these tasks."""
-        return any(lane.runs(job) for lane in self._lanes)
+        return self._running_in(job) is not None
 
-    def _running_in(self, job: Job) -> RequestQueue:
-        return next(lane for lane in self._lanes if lane.runs(job))
+    def _running_in(self, job: Job) -> RequestQueue | None:
+        return next((lane for lane in self._lanes if lane.runs(job)), None)
 
     def postpone(self, task: PendingTask, cost: Cost, now: float) -> bool:
         """Queue a task again that costs more than its job was allowed, if a call waits for it.
@@ -188,11 +188,9 @@ class Lanes:
 
     def cancel(self, task: PendingTask) -> None:
         """End the job of a running task as soon as it can be; its worker is free then."""
-        # Whoever asks for the same from now on does not wait for this one.
+        # Further calls that ask for the same do not wait for this one.
         task.session.remove_task(task)
-        job = self._of(task).job_of(task)
-        self._cancelled.add(job)
-        job.cancel()
+        self._of(task).job_of(task).cancel()
 
     def cancel_all(self) -> None:
         """End all jobs that run, because nobody remembers them."""
@@ -205,27 +203,22 @@ class Lanes:
         return (
             f"a decision that has taken {now - task.started_at:.0f} s: this service expected less "
             f"and takes at most {self._limits.max_decision_s:g} s (--max-decision-s). It has "
-            f"{in_words(None, task.session.planning)}"
+            f"{describe_cost(None, task.session.planning)}"
         )
 
     def overdue(self, now: float) -> list[PendingTask]:
         """Return the running tasks that take much longer than any decision may."""
-        due = now - self._overdue_s
-        return [
-            task
-            for lane in self._lanes
-            for job, task in lane.running()
-            if task.started_at <= due and job not in self._cancelled
-        ]
+        return [task for due_at, task in self._ends() if due_at <= now]
 
     def overdue_at(self) -> float | None:
         """Return when the next running task will be; None if none runs."""
-        return min(
-            (
-                task.started_at + self._overdue_s
-                for lane in self._lanes
-                for job, task in lane.running()
-                if job not in self._cancelled
-            ),
-            default=None,
-        )
+        return min((due_at for due_at, _ in self._ends()), default=None)
+
+    def _ends(self) -> list[tuple[float, PendingTask]]:
+        """Return by when each running task must have ended, but for those that are cancelled."""
+        return [
+            (task.started_at + self._overdue_s, task)
+            for lane in self._lanes
+            for job, task in lane.running()
+            if not job.is_cancelled
+        ]

@@ -45,9 +45,8 @@ class ObservationReports:
         self._effects = effects
         self._lost = lost
         self.counts: Counter[str] = Counter()
-        # Of the trial that was heard of last.
         self._trial: int | None = None
-        self._reported: Counter[str] = Counter()
+        self._reported: Counter[str] = Counter()  # in that trial
 
     def observed(
         self, trial: Trial, step: int, info: ObservationInfo, **of_what: object

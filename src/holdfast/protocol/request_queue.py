@@ -202,27 +202,22 @@ class RequestQueue:
     def take(self, now: float, room_bytes: float = math.inf) -> PendingTask | None:
         """Remove and return the next task; None if none waits or no worker is free.
 
-        None, too, if it takes more than ``room_bytes`` of memory: it goes first all the same.
+        None, too, if it takes more than ``room_bytes`` of memory; it keeps its turn.
         """
         if len(self._running) >= self._workers:
             return None
-        known = self._next_of_known()
-        newcomer = self._newcomers.first()
-        went_first = self._newcomer_went_first
-        if known is None or newcomer is None:
-            task = known or newcomer
-        elif self._goes_first(newcomer, known, now):
-            task, went_first = newcomer, True
-        else:
-            task, went_first = known, False
-        if task is not None and task.num_bytes > room_bytes:
+        known, newcomer = self._next_of_known(), self._newcomers.first()
+        task = known or newcomer
+        if known is not None and newcomer is not None and self._goes_first(newcomer, known, now):
+            task = newcomer
+        if task is None or task.num_bytes > room_bytes:
             return None
-        self._newcomer_went_first = went_first
-        if task is not None:
-            order = self._order_of(task)
-            order.remove(task)
-            order.end_turn(task.session.owner, now)
-            self._count(task, -1)
+        if known is not None and newcomer is not None:
+            self._newcomer_went_first = task is newcomer
+        order = self._order_of(task)
+        order.remove(task)
+        order.end_turn(task.session.owner, now)
+        self._count(task, -1)
         return task
 
     def _next_of_known(self) -> PendingTask | None:

@@ -32,7 +32,7 @@ import msgspec
 from holdfast.errors import InvalidValueError, MessageError
 from holdfast.planning import needs_sensing
 from holdfast.problems.problem import Problem
-from holdfast.protocol.decision_cost import Cost, Pricing
+from holdfast.protocol.decision_cost import ANY_MACHINE, Cost, Pricing
 from holdfast.protocol.events import Effects
 from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.lanes import Lanes
@@ -71,8 +71,6 @@ __all__ = ["Service"]
 _INERTIA_OF_ONE = 4.0
 """Of the mean times of one session, whose decisions are alike."""
 
-_ANY_MACHINE = Pricing()
-
 _NO_ROOM_RETRY_MS = 100.0
 """Shortest retry time for a robot that finds no free session."""
 
@@ -99,7 +97,7 @@ class Service:
         workers: int,
         limits: ServiceLimits | None = None,
         describe_error: Callable[[BaseException], str] | None = None,
-        pricing: Pricing = _ANY_MACHINE,
+        pricing: Pricing = ANY_MACHINE,
     ) -> None:
         if workers < 1:
             raise InvalidValueError(f"workers {workers}: a service needs at least 1")

@@ -29,7 +29,14 @@ from holdfast.errors import (
 from holdfast.interruption import Interruption, interruptible
 from holdfast.planning import Planner, PlanningState
 from holdfast.problems.problem import Problem
-from holdfast.protocol.decision_cost import Cost, Price, Pricing, cost_of_answer, in_words
+from holdfast.protocol.decision_cost import (
+    ANY_MACHINE,
+    Cost,
+    Price,
+    Pricing,
+    cost_of_answer,
+    describe_cost,
+)
 from holdfast.protocol.events import LogEvent
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
@@ -56,9 +63,6 @@ __all__ = [
     "ServiceEffect",
     "StartJob",
 ]
-
-
-_ANY_MACHINE = Pricing()
 
 
 class JobResult(NamedTuple):
@@ -148,7 +152,7 @@ class Job:
         limits: ServiceLimits,
         request: Request | None,
         state: PlanningState | None,
-        pricing: Pricing = _ANY_MACHINE,
+        pricing: Pricing = ANY_MACHINE,
         price: Price | None = None,
         most: Cost | None = None,
     ) -> None:
@@ -182,6 +186,11 @@ class Job:
                 request.checkpoint,
             )
         return self.kind, self._seed, named
+
+    @property
+    def is_cancelled(self) -> bool:
+        """Whether it is to end."""
+        return self._interruption.is_set
 
     def cancel(self) -> None:
         """End it as soon as it can be; from any thread."""
@@ -217,7 +226,7 @@ class Job:
             )
         except MemoryError as error:
             text = _account(error, self._describe_error)
-            asked = in_words(problem, self._planning)
+            asked = describe_cost(problem, self._planning)
             text = f"out of memory for a decision of {asked}: {text}"
             return JobResult(failure=("out_of_memory", text), problem=problem)
         except MessageError as error:
@@ -280,7 +289,7 @@ class Job:
             if estimated > limit:
                 raise InvalidValueError(
                     f"a decision of about {estimated:.3g} {unit} {what}: this service takes at "
-                    f"most {limit:.3g} {unit} ({option}). It has {in_words(problem, planning)}"
+                    f"most {limit:.3g} {unit} ({option}). It has {describe_cost(problem, planning)}"
                 )
         if self.kind == "task":
             return reached

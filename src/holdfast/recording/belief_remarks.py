@@ -27,7 +27,7 @@ _SHARE = 0.2
 """Of the beliefs after an observation, from which on it is worth a remark."""
 
 _FEW = 0.03
-"""Of the values that a coordinate had at first: what is left of a depleted one."""
+"""Share of its first values that a depleted coordinate still has, at most."""
 
 
 @in_own_mode
@@ -36,8 +36,8 @@ def belief_remarks(problem: Any, settings: PlanningSettings, record: TrialRecord
 
     A coordinate counts as an angle that wraps if its label has the unit rad, and its particles
     span more than half a circle as numbers, but less than that on the circle. Several modes are
-    told of where the trial failed: a sharp observation may leave particles in a few heaps, too,
-    which does no harm. A coordinate that does not move is told of if hardly any of the values are
+    reported where the trial failed: a sharp observation may leave particles in a few heaps, too,
+    which does no harm. A coordinate that does not move is reported if hardly any of the values are
     left that its particles had at first, unless these were few, as those of a switch.
     """
     count = len(record.sensing)
@@ -77,7 +77,7 @@ def belief_remarks(problem: Any, settings: PlanningSettings, record: TrialRecord
 def _depleted(record: TrialRecord) -> list[tuple[int, int, int]]:
     """Return the depleted coordinates, with the values left at the last observation, and its step.
 
-    Of what does not move the particles have after a move the values that they had before it.
+    A coordinate does not move if all particles have the same values after each move as before it.
     """
     steps = record.sensing
     found = []

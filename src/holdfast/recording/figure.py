@@ -80,7 +80,7 @@ _ROW = 0.15
 
 _MOST_COLUMNS = 4
 _LEGEND_SHARE = 0.98
-"""Of the width of what it stands under."""
+"""Largest width of the legend, as a share of the figure's."""
 _DOTS_PER_INCH = 150
 _WIDTH = 11.0
 _SMALLEST = 8.0

@@ -59,7 +59,7 @@ _NUMBERS = struct.Struct("<qq")
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _BUSY_TIMEOUT_S = 1.0
 _MAX_ROW_BYTES = 2**29
-"""Of a file that somebody else has made; a trial of a million steps has a tenth of it."""
+"""Bound on a row, for a file of somebody else's; a trial of a million steps has a tenth of it."""
 
 _PAGE_BYTES = 1024
 """A step writes whole pages; larger ones take longer to write and to checksum."""

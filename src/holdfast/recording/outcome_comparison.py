@@ -213,7 +213,7 @@ def _read(path: Path) -> _Run:
         meta = journal.meta()
         results = {result.trial: result for result in journal.results()}
         journal.require_unchanged()
-    configuration = recorded_configuration(meta.get("configuration", ""))
+    configuration = recorded_configuration(meta.get("configuration", ""), journal.path)
     simulator = configuration["simulator"]
     environment = world_of(configuration.get("environment") or {})
     # An episode of gymnasium follows from seed and trial, too.

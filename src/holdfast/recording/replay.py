@@ -49,7 +49,7 @@ from holdfast.recording.fingerprint import difference, fingerprint
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.recording.recorded_environment import RecordedEnvironment
 from holdfast.recording.run_clock import RunClock
-from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME
+from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME, recorded_configuration
 from holdfast.recording.step_times import (
     NS_PER_S,
     StepClock,
@@ -479,10 +479,7 @@ def _configuration(
     A run may have been copied from the robot, whose environment, keys and directories are not here;
     or somebody else has made it, and names any module of any directory in it.
     """
-    from holdfast.config.yaml_document import read
-
-    text = meta.get("configuration", "")
-    plain = dict(read(text.encode(), f"the configuration in {path}").data)
+    plain = dict(recorded_configuration(meta.get("configuration", ""), path))
     environment = plain.pop("environment", None) or {}
     plain.pop("offload", None)
     recorded = plain.pop("problem_directory", None)

@@ -426,11 +426,11 @@ def configuration_difference(first: str, second: str) -> tuple[str, str, str] | 
     return first_difference(*(_compared(recorded_configuration(text)) for text in (first, second)))
 
 
-def recorded_configuration(text: str) -> Any:
+def recorded_configuration(text: str, journal: Path | str = "a journal") -> Any:
     """Return a configuration from a journal, as plain data; somebody else may have written it."""
     from holdfast.config.yaml_document import read
 
-    return read(text.encode(), "the configuration in a journal").data
+    return read(text.encode(), f"the configuration in {journal}").data
 
 
 def _compared(configuration: Any) -> Any:

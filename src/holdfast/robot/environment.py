@@ -20,14 +20,14 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import checked
-from holdfast.arrays import FloatArray, KeepsReadOnly, floats, integer, real_numbers, whole
+from holdfast.arrays import FloatArray, KeepsReadOnly, floats, real_numbers, whole
 from holdfast.config.settings import EnvironmentSettings
 from holdfast.config.user_code import find_class
 from holdfast.config.user_modules import find_in
-from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
+from holdfast.errors import ConfigurationError, EnvironmentFailedError
 from holdfast.floating_mode import in_own_mode
 from holdfast.outcome import Done, MoveResult
-from holdfast.problem_attributes import check_sizes, has_general_observations
+from holdfast.problem_attributes import check_sizes, has_general_observations, sensing_action_of
 from holdfast.problems.problem import Problem, ProblemBase
 from holdfast.randomness import Purpose, Stream, stream
 
@@ -190,13 +190,7 @@ class SimulatedEnvironment(KeepsReadOnly):
             If the sensing action does not exist.
         """
         problem = self._problem
-        chosen = integer(sensing_action)
-        if chosen is None or not 0 <= chosen < len(problem.sensing_actions):
-            raise InvalidValueError(
-                f"sensing action {sensing_action!r:.80}: {problem.name} has 0 to "
-                f"{len(problem.sensing_actions) - 1}"
-            )
-        sensing_action = chosen
+        sensing_action = sensing_action_of(problem, sensing_action)
         noise = stream(self._seed, self._trial, self.step, Purpose.WORLD_OBSERVATION)
         if hasattr(problem, "sample_observation"):
             return checked.sample_observation(problem, self.state, sensing_action, noise)
@@ -335,7 +329,7 @@ class EnvironmentMaker:
     sense_in_background : bool
         Whether the robot goes on while it senses.
     max_missing_in_a_row : int
-        Of :class:`MissingReadings`.
+        How often in a row sensing may give no reading.
 
     Raises
     ------

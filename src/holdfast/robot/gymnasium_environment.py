@@ -39,6 +39,7 @@ from holdfast.arrays import (
 )
 from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import Done, Ending, MoveResult
+from holdfast.printable import one_line
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
 
@@ -363,7 +364,7 @@ class GymnasiumEnvironment:
         numbers = real_numbers(shown)
         if numbers is None:
             raise EnvironmentFailedError(
-                f"{key} of {self._name} shows {' '.join(repr(shown).split()):.80}; it must be an "
+                f"{key} of {self._name} shows {one_line(repr(shown)):.80}; it must be an "
                 "array of numbers"
             )
         values = np.array(numbers, dtype=np.float64).reshape(-1)

@@ -18,7 +18,7 @@ from typing import IO
 from holdfast.files import started_in
 from holdfast.protocol.events import RecoveryExited
 from holdfast.runtime.pool import ThreadPool
-from holdfast.runtime.signal_names import signal_name
+from holdfast.runtime.process_ends import how_it_ended
 
 __all__ = ["RecoveryLauncher"]
 
@@ -85,10 +85,8 @@ class RecoveryLauncher:
                 process.stdin.close()
 
     def _account_of(self, code: int) -> str:
-        if code < 0:
-            return f"was ended by {signal_name(-code)}"
-        log = "" if self._log_path is None else f"; see {self._log_path}"
-        return f"ended with exit code {code}{log}"
+        log = "" if self._log_path is None or code < 0 else f"; see {self._log_path}"
+        return f"{how_it_ended(code)}{log}"
 
     def _output(self) -> contextlib.AbstractContextManager[IO[bytes] | int]:
         if self._log_path is None:

@@ -34,6 +34,7 @@ from holdfast.planning import (
     SensingInfo,
     TaskInfo,
 )
+from holdfast.printable import one_line
 from holdfast.protocol.messages import MAX_ACTION_SIZE
 from holdfast.robot.environment import (
     LATER,
@@ -276,7 +277,7 @@ def _reading(environment: Environment, method: str, shown: object) -> FloatArray
     numbers = real_numbers(shown)
     if numbers is None:
         raise EnvironmentFailedError(
-            f"{type(environment).__name__}: {method} returned {' '.join(repr(shown).split()):.80}; "
+            f"{type(environment).__name__}: {method} returned {one_line(repr(shown)):.80}; "
             "an observation must be an array of numbers"
         )
     return np.array(numbers, dtype=np.float64)
@@ -288,10 +289,9 @@ def _numbers(environment: Environment, what: str, shown: npt.ArrayLike | None) -
         return None
     array = real_numbers(shown)
     if array is None or array.ndim != 1 or not 1 <= array.size <= MAX_ACTION_SIZE:
-        came = " ".join(repr(shown).split())
         raise EnvironmentFailedError(
             f"{type(environment).__name__}: perform returned a MoveResult whose {what} is "
-            f"{came:.80}; it must be an array of 1 to {MAX_ACTION_SIZE} numbers"
+            f"{one_line(repr(shown)):.80}; it must be an array of 1 to {MAX_ACTION_SIZE} numbers"
         )
     return np.array(array, dtype=np.float64)
 

@@ -19,7 +19,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from holdfast.runtime.parent_death import end_with_parent
-from holdfast.runtime.signal_names import signal_name
+from holdfast.runtime.process_ends import signal_name
 
 __all__ = ["WorkerProcess", "end_workers"]
 

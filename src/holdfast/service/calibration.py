@@ -27,7 +27,7 @@ from holdfast.randomness import Purpose, stream
 __all__ = ["measure_problem", "measure_slowness"]
 
 _REFERENCE_S = 0.46e-3
-"""Of :func:`_work` on the machine on which the constants of the cost model were measured."""
+"""Time of :func:`_work` on the machine on which the cost model's constants were measured."""
 
 _TRIES = 3
 _LEAST, _MOST = 0.5, 20.0
@@ -35,10 +35,10 @@ _FEW, _MANY = 16, 272
 """States of which a function is asked, to tell what a call takes from what a state takes."""
 
 _MOST_ACTIONS = 16
-"""Of many sensing actions so many are measured."""
+"""Bound on the sensing actions that are measured."""
 
 _SLOW_S = 0.3e-3
-"""What takes longer is asked once."""
+"""A function that takes longer is called once."""
 
 
 def measure_slowness() -> float:
@@ -67,7 +67,7 @@ def measure_problem(problem: Problem) -> ProblemCost:
     A function that is slow is asked once, of few states: a robot chooses the problem's model.
     """
     own: dict[str, Any] = {}
-    # Whoever asks for a decision gets the error.
+    # The decision that is asked for will raise the error again.
     with contextlib.suppress(Exception):
         _measure(problem, own)
     return TYPICAL_PROBLEM._replace(**own)
@@ -82,8 +82,8 @@ def _measure(problem: Any, own: dict[str, Any]) -> None:
     one_s = _shortest(lambda: draw(1))
     own["initial"] = CallCost(0.0, one_s)
     if one_s < _SLOW_S:
-        own["initial"] = _measured(lambda states: draw(len(states)), draw(_FEW), draw(_MANY))
         few, many = draw(_FEW), draw(_MANY)
+        own["initial"] = _measured(lambda states: draw(len(states)), few, many)
     else:
         few, many = (np.repeat(draw(1), count, axis=0) for count in (_FEW, _MANY))
     own["act"] = _measured(lambda states: problem.execute(problem.policy(states, 0)), few, many)
@@ -108,40 +108,31 @@ def _measure(problem: Any, own: dict[str, Any]) -> None:
         own["known_return"] = _measured(
             lambda states: problem.known_state_return(states, _stages(states)), few, many
         )
-    own["judge"] = _measured(
-        lambda states: (
-            problem.reward(states, np.broadcast_to(action, (len(states), action.size))),
-            problem.is_goal(states),
-        ),
-        few,
-        many,
-    )
+
+    def judge(states: FloatArray) -> None:
+        problem.reward(states, np.broadcast_to(action, (len(states), action.size)))
+        problem.is_goal(states)
+
+    own["judge"] = _measured(judge, few, many)
 
 
 def _sensed(problem: Any, number: int, few: FloatArray, many: FloatArray) -> tuple[CallCost, int]:
     """Return what the predictions of a sensing action take, and the size of its observation."""
     random = stream(0, 0, 0, Purpose.HYPOTHESES)
-    if not has_general_observations(problem):
-        size = problem.observation_mean(few, number).shape[-1]
-        cost = _measured(
-            lambda states: (
-                problem.observation_mean(states, number),
-                problem.observation_variance(states, number),
-            ),
-            few,
-            many,
-        )
-        return cost, int(size)
-    shown = checked.sample_observation(problem, few[0], number, random.anew())
-    cost = _measured(
-        lambda states: (
-            problem.sample_observation(states[0], number, random.anew()),
-            problem.log_likelihood(states, number, shown),
-        ),
-        few,
-        many,
-    )
-    return cost, int(shown.size)
+    if has_general_observations(problem):
+        shown = checked.sample_observation(problem, few[0], number, random.anew())
+
+        def sense(states: FloatArray) -> None:
+            problem.sample_observation(states[0], number, random.anew())
+            problem.log_likelihood(states, number, shown)
+    else:
+        shown = problem.observation_mean(few, number)
+
+        def sense(states: FloatArray) -> None:
+            problem.observation_mean(states, number)
+            problem.observation_variance(states, number)
+
+    return _measured(sense, few, many), int(shown.shape[-1])
 
 
 def _measured(call: Callable[[FloatArray], object], few: FloatArray, many: FloatArray) -> CallCost:

@@ -36,8 +36,6 @@ class ServiceCredentials:
     ----------
     expires_s : float
         When the certificate in use expires, in seconds since 1970.
-    is_stale : bool
-        Whether they could not be read the last time, so that older ones are in use.
 
     Raises
     ------
@@ -52,8 +50,12 @@ class ServiceCredentials:
         self._used = self._seen = file_versions(self.files)
         self._failure: str | None = None
         self._gone: str | None = None
-        self.is_stale = False
         self.expires_s = load_credentials(directory, "service", warn=warn).expires_s
+
+    @property
+    def is_stale(self) -> bool:
+        """Whether they could not be read the last time, so that older ones are in use."""
+        return self._failure is not None
 
     def why_gone(self) -> str | None:
         """Return what is missing, unreadable, expired or revoked; None if nothing is."""
@@ -91,11 +93,11 @@ class ServiceCredentials:
             failure = f"{error}; the previous ones stay in use"
             if requested or failure != self._failure:
                 events.event("credentials", reason=failure)
-            self._failure, self.is_stale = failure, True
+            self._failure = failure
             self._gone = str(error) if isinstance(error, CredentialsGoneError) else None
             return
-        self._used, self._failure, self.expires_s = read_at, None, read.expires_s
-        self._gone, self.is_stale = None, False
+        self._used, self.expires_s = read_at, read.expires_s
+        self._failure = self._gone = None
         for text in warnings:
             self._warn(text)
         events.event(

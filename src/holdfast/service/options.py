@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.errors import InvalidValueError, TransportError
+from holdfast.files import absolute_endpoint
 from holdfast.runtime.command_line import (
     Options,
     flag,
@@ -57,12 +58,6 @@ def _descriptors(text: str) -> tuple[int, ...]:
     return tuple(int(word) for word in text.split(","))
 
 
-def endpoint_text(text: str) -> str:
-    """Read an endpoint; the path of a local socket is absolute from here on, as all others are."""
-    protocol, _, path = text.partition("/")
-    return f"unix/{location(path)}" if protocol == "unix" and path else text
-
-
 class ServeOptions(Options):
     """Decide for robots, as a service: many at once, on all cores."""
 
@@ -70,13 +65,13 @@ class ServeOptions(Options):
 
     listen: tuple[str, ...] = option(
         many=True,
-        read=endpoint_text,
+        read=absolute_endpoint,
         metavar="ENDPOINT",
         help=f"Where robots can connect (default: tcp/{_DEFAULT_PLACE}, with --tls over TLS).",
     )
     connect: tuple[str, ...] = option(
         many=True,
-        read=endpoint_text,
+        read=absolute_endpoint,
         metavar="ENDPOINT",
         help="A robot that listens. Then nothing listens here without --listen.",
     )

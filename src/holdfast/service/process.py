@@ -237,7 +237,7 @@ class _ServiceProcess:
             max_links=min(MAX_LINKS, max(allowed // 4, allowed - reserved)),
             tls=None if credentials is None else credentials.files,
             on_event=lambda event, **fields: self._shell.note(event, **fields),
-            on_shutdown=self._end_for_ros,
+            on_shutdown=functools.partial(self._end_for_ros, None),
         )
 
         import msgspec
@@ -294,8 +294,8 @@ class _ServiceProcess:
                 offered: dict[str, object] = {}
                 for each in self._extensions:
                     offered |= each.start(
-                        functools.partial(self._note, loop),
-                        functools.partial(self._ros_ends_extension, loop, each),
+                        functools.partial(_call_soon, loop, self._shell.note),
+                        functools.partial(_call_soon, loop, self._end_for_ros, each),
                     )
                 if options.until_stdin_closes:
                     _watch_stdin(loop, shell)
@@ -365,11 +365,6 @@ class _ServiceProcess:
         credentials.reload(self._transport, self.events)
         self._manager.ready()
 
-    def _note(self, loop: asyncio.AbstractEventLoop, event: str, /, **fields: object) -> None:
-        """Log an event, from any thread."""
-        with contextlib.suppress(RuntimeError):  # the loop is closed
-            loop.call_soon_threadsafe(functools.partial(self._shell.note, event, **fields))
-
     def _loop_failed(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """Log an exception that nothing else has handled, in a callback or task of the loop."""
         del loop
@@ -377,7 +372,7 @@ class _ServiceProcess:
         told = {"reason": str(context["message"])} if error is None else defect_fields(error)
         self._shell.note(DEFECT, **told)
 
-    def _end_for_ros(self, reason: str, part: Extension | None = None) -> None:
+    def _end_for_ros(self, part: Extension | None, reason: str) -> None:
         """Withdraw a part in ROS 1 that ROS asks to end: an extension, or the links.
 
         Anybody who reaches a node's port can ask for it, so it must not end what is served beside
@@ -401,12 +396,6 @@ class _ServiceProcess:
         task = asyncio.get_running_loop().create_task(self._withdraw(part))
         self._withdrawing.add(task)
         task.add_done_callback(self._withdrawing.discard)
-
-    def _ros_ends_extension(
-        self, loop: asyncio.AbstractEventLoop, part: Extension, reason: str
-    ) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop is closed
-            loop.call_soon_threadsafe(self._end_for_ros, reason, part)
 
     async def _withdraw(self, part: Extension | None) -> None:
         import asyncio
@@ -511,6 +500,14 @@ def _import_without_openssl() -> None:
 def _exit_status(reason: str) -> int:
     number = getattr(signal, reason, signal.SIGTERM)
     return 0 if number == signal.SIGTERM else 128 + int(number)
+
+
+def _call_soon(
+    loop: asyncio.AbstractEventLoop, call: Callable[..., None], /, *arguments: Any, **fields: Any
+) -> None:
+    """Call something on the loop's thread, from any thread."""
+    with contextlib.suppress(RuntimeError):  # the loop is closed
+        loop.call_soon_threadsafe(functools.partial(call, *arguments, **fields))
 
 
 def _watch_stdin(loop: asyncio.AbstractEventLoop, shell: ServiceShell) -> None:

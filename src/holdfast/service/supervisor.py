@@ -30,8 +30,8 @@ import msgspec
 
 from holdfast.errors import ServiceProcessError
 from holdfast.runtime.events import EventSink
+from holdfast.runtime.process_ends import how_it_ended, restart_delay_s
 from holdfast.runtime.service_manager import ServiceManager
-from holdfast.runtime.signal_names import signal_name
 from holdfast.service.metrics import ServiceReport, summed
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ _STEADY_S = 10.0
 """A process that ends earlier than this has failed at its start; its restart is delayed."""
 
 _END_S = 0.5
-_FIRST_DELAY_S, _LAST_DELAY_S = 0.1, 30.0
+_FIRST_DELAY_S, _LAST_DELAY_S = 0.2, 30.0
 _KEPT_S = 1.0
 """With a longer delay, waiting connections are refused."""
 
@@ -380,11 +380,7 @@ class Supervisor:
             # The system closes a process's files a moment before its exit status is known.
             child.process.wait(_END_S)
         child.process.kill()
-        code = self._reap(index, child)
-        if code < 0:
-            reason = f"was ended by {signal_name(-code)}"
-        else:
-            reason = f"ended with exit code {code}"
+        reason = how_it_ended(self._reap(index, child))
         if not self._stopping:
             self._restart(index, child.failure or reason, monotonic() - child.started_at, child)
         self._changed()
@@ -406,7 +402,7 @@ class Supervisor:
             self._failure = reason
             return
         early = self._early_ends[index] = 0 if lived_s >= _STEADY_S else self._early_ends[index] + 1
-        delay_s = min(_FIRST_DELAY_S * 2 ** (early - 1), _LAST_DELAY_S) if early > 1 else 0.0
+        delay_s = restart_delay_s(early, _FIRST_DELAY_S, _LAST_DELAY_S)
         fields = {} if child is None else {"pid": child.process.pid}
         self._events.event("process_ended", reason=reason, **fields, again_in_s=delay_s)
         if delay_s > _KEPT_S:

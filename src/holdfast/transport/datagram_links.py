@@ -27,7 +27,14 @@ from typing import Any, Final
 
 from holdfast.errors import FrameError, KeysExhaustedError
 from holdfast.transport.datagram_cipher import AssociationKeys, DatagramCipher, require_cryptography
-from holdfast.transport.datagram_sockets import DATAGRAMS_AT_ONCE, LARGEST_DATAGRAM, DatagramSocket
+from holdfast.transport.datagram_sockets import (
+    DATAGRAMS_AT_ONCE,
+    LARGEST_DATAGRAM,
+    QUOTED_BYTES,
+    DatagramSocket,
+    connected_socket,
+    reported_errors,
+)
 from holdfast.transport.endpoints import Endpoint, Role
 from holdfast.transport.exchanges import (
     ECHO,
@@ -49,9 +56,8 @@ from holdfast.transport.frames import (
     FrameDecoder,
     encode_frame,
 )
-from holdfast.transport.link_defects import ends_link
 from holdfast.transport.link_settings import SLICE_S, LinkSettings
-from holdfast.transport.links import Link, LinkOwner
+from holdfast.transport.links import Link, LinkOwner, ends_link
 from holdfast.transport.redundancy import Paths
 from holdfast.transport.return_path import SECRET_BYTES, ReturnPath
 from holdfast.transport.schemes import Scheme
@@ -81,17 +87,6 @@ _BLOCKED_AFTER_S: Final = 3.0
 _VERIFYING_PROBES: Final = 5
 _PROBE_DISTANCE_S: Final = 0.003
 _PROBES_BEFORE_NEW_SOCKET: Final = 2
-
-_REPORTS_ERRORS: Final = {
-    socket.AF_INET: (socket.IPPROTO_IP, 11),
-    socket.AF_INET6: (socket.IPPROTO_IPV6, 25),
-}
-"""Linux's IP_RECVERR and IPV6_RECVERR: ICMP errors are queued with the datagram they quote."""
-
-_ERROR: Final = struct.Struct("=I")
-_ERROR_BYTES: Final = 512
-_QUOTED_BYTES: Final = 32
-"""Of a datagram: eight that can be guessed and 24 encrypted ones. None of ours is shorter."""
 
 _BROKEN: Final = "has broken the connection, and answers no datagram"
 _CLOSED: Final = "is gone: its port is closed"
@@ -334,18 +329,9 @@ class RobotDatagramLink(_DatagramLink):
     def _open_socket(self) -> None:
         """Open a socket, from the address that the robot has now."""
         self._close_socket()
-        family = socket.AF_INET6 if len(self._service_address) == 4 else socket.AF_INET
-        opened = socket.socket(family, socket.SOCK_DGRAM)
-        try:
-            opened.setblocking(False)
-            # A connected socket gets datagrams of this peer only, and its ICMP errors.
-            opened.connect(self._service_address)
-            opened.setsockopt(*_REPORTS_ERRORS[family], 1)
-        except OSError:
-            opened.close()
-            return  # the next probe tries again
-        self._socket = opened
-        self._loop.add_reader(opened, self._readable, opened)
+        self._socket = connected_socket(self._service_address)
+        if self._socket is not None:  # else the next probe tries again
+            self._loop.add_reader(self._socket, self._readable, self._socket)
 
     def _close_socket(self) -> None:
         if self._socket is not None:
@@ -354,7 +340,7 @@ class RobotDatagramLink(_DatagramLink):
             self._socket = None
 
     def _put(self, datagram: bytes) -> None:
-        self._sent.append(datagram[:_QUOTED_BYTES])
+        self._sent.append(datagram[:QUOTED_BYTES])
         for _ in range(2):
             if self._socket is None:
                 return
@@ -383,19 +369,12 @@ class RobotDatagramLink(_DatagramLink):
 
     def _failed(self, error: OSError) -> bool:
         """Handle a socket's error; return whether it is about an earlier datagram."""
+        if self._socket is None:
+            return False
         about_earlier = False
-        for _ in range(DATAGRAMS_AT_ONCE):
-            if self._socket is None:
-                return False
-            try:
-                quoted, errors, _, _ = self._socket.recvmsg(
-                    _QUOTED_BYTES, _ERROR_BYTES, socket.MSG_ERRQUEUE
-                )
-            except OSError:
-                break
+        for quoted, is_closed in reported_errors(self._socket):
             about_earlier = True
-            refused = any(_ERROR.unpack_from(each)[0] == errno.ECONNREFUSED for *_, each in errors)
-            if refused and quoted in self._sent and self._exchange.open:
+            if is_closed and quoted in self._sent and self._exchange.open:
                 self._loop.call_soon(self._verify_path, _CLOSED)
         if not about_earlier and error.errno in _ADDRESS_GONE:
             self._close_socket()

@@ -1,11 +1,14 @@
-"""A service's socket for datagrams, shared by the links of many robots."""
+"""Sockets for datagrams: a service's, which the links of many robots share, and a robot's own."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import os
 import socket
+import struct
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Final
 
 from holdfast.transport.datagram_cipher import AssociationKeys
@@ -13,7 +16,14 @@ from holdfast.transport.datagram_cipher import AssociationKeys
 if TYPE_CHECKING:
     from holdfast.transport.datagram_links import ServiceDatagramLink
 
-__all__ = ["DATAGRAMS_AT_ONCE", "LARGEST_DATAGRAM", "DatagramSocket"]
+__all__ = [
+    "DATAGRAMS_AT_ONCE",
+    "LARGEST_DATAGRAM",
+    "QUOTED_BYTES",
+    "DatagramSocket",
+    "connected_socket",
+    "reported_errors",
+]
 
 LARGEST_DATAGRAM: Final = 2048
 DATAGRAMS_AT_ONCE: Final = 64
@@ -21,6 +31,42 @@ DATAGRAMS_AT_ONCE: Final = 64
 
 _RECEIVE_BUFFER_BYTES: Final = 1 << 20
 """Asked of the system, so that a burst of one robot does not push out datagrams of others."""
+
+_REPORTS_ERRORS: Final = {
+    socket.AF_INET: (socket.IPPROTO_IP, 11),
+    socket.AF_INET6: (socket.IPPROTO_IPV6, 25),
+}
+"""Linux's IP_RECVERR and IPV6_RECVERR: ICMP errors are queued with the datagram they quote."""
+
+_ERROR: Final = struct.Struct("=I")
+_ERROR_BYTES: Final = 512
+
+QUOTED_BYTES: Final = 32
+"""Of a datagram: eight that can be guessed and 24 encrypted ones. None of ours is shorter."""
+
+
+def connected_socket(address: Any) -> socket.socket | None:
+    """Open a socket that gets datagrams of one peer only, and its ICMP errors; None if it fails."""
+    family = socket.AF_INET6 if len(address) == 4 else socket.AF_INET
+    opened = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        opened.setblocking(False)
+        opened.connect(address)
+        opened.setsockopt(*_REPORTS_ERRORS[family], 1)
+    except OSError:
+        opened.close()
+        return None
+    return opened
+
+
+def reported_errors(opened: socket.socket) -> Iterator[tuple[bytes, bool]]:
+    """Yield what each queued ICMP error quotes of a datagram, and whether its port is closed."""
+    for _ in range(DATAGRAMS_AT_ONCE):
+        try:
+            quoted, errors, _, _ = opened.recvmsg(QUOTED_BYTES, _ERROR_BYTES, socket.MSG_ERRQUEUE)
+        except OSError:
+            return
+        yield quoted, any(_ERROR.unpack_from(each)[0] == errno.ECONNREFUSED for *_, each in errors)
 
 
 class DatagramSocket:

@@ -136,7 +136,7 @@ class LinkSettings:
     pauses_for_readers : bool
         Whether reading pauses while the other end does not read.
     max_unsent_bytes : float
-        Of all links together: bytes that wait for the other ends to read.
+        Bound on the bytes of all links together that wait for the other ends to read.
     pause_s : float
         Of the :class:`FairScheduler`.
     """

@@ -4,7 +4,7 @@ A closed stream means a dead peer: the system closes the sockets of a process th
 falls silent is considered lost after its lease, so each end sends pings. A peer that does not read
 must not delay others: unsent bytes wait in a bounded buffer, nothing waits for them, and a peer
 that never empties it loses the link. Whatever exception a peer's bytes lead to ends its own link
-(:mod:`~holdfast.transport.link_defects`).
+(:func:`ends_link`).
 
 Each end opens with a hello. With TLS the robot speaks first, without it the end that dialled. The
 other end only answers, so a port scanner learns nothing.
@@ -14,12 +14,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import math
 import socket
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Concatenate, Final, ParamSpec, TypeVar
 
 from holdfast.errors import FrameError
 from holdfast.transport.endpoints import host_and_port
@@ -36,13 +38,15 @@ from holdfast.transport.frames import (
     encode_goodbye,
     read_goodbye,
 )
-from holdfast.transport.link_defects import ends_link
 from holdfast.transport.link_settings import SLICE_S, LinkSettings
 
 if TYPE_CHECKING:
     from holdfast.transport.tls import PeerCertificate, TlsStream
 
-__all__ = ["OPENING_TIMEOUT_S", "Link", "LinkOwner"]
+__all__ = ["OPENING_TIMEOUT_S", "Link", "LinkOwner", "ends_link"]
+
+_Arguments = ParamSpec("_Arguments")
+_AnyLink = TypeVar("_AnyLink", bound="Link")
 
 OPENING_TIMEOUT_S: Final = 5.0
 """For the handshake and the other end's hello."""
@@ -105,6 +109,24 @@ class LinkOwner(ABC):
         """Handle the end of the link: called once, and last."""
 
 
+def ends_link(
+    method: Callable[Concatenate[_AnyLink, _Arguments], None],
+) -> Callable[Concatenate[_AnyLink, _Arguments], None]:
+    """Have an exception of a method end its link, by :meth:`Link.fail`.
+
+    For the methods by which anything else enters a link: the event loop, the scheduler, the owner.
+    """
+
+    @functools.wraps(method)
+    def guarded(link: _AnyLink, /, *arguments: _Arguments.args, **named: _Arguments.kwargs) -> None:
+        try:
+            method(link, *arguments, **named)
+        except Exception as error:  # noqa: BLE001 - what a peer sends may raise anything
+            link.fail(error)
+
+    return guarded
+
+
 class Link(asyncio.BufferedProtocol):
     """One stream; a protocol for asyncio, to be connected by it.
 
@@ -134,7 +156,7 @@ class Link(asyncio.BufferedProtocol):
         self._peer_lease_s = 0.0
         self._progress_at = now
         self._said_hello = False
-        self._holds = self._has_unsent = False
+        self._holds = False
         # Received: undecoded bytes, the offset of the next one, and decoded frames.
         self._unread, self._unread_at = b"", 0
         self._frames: deque[Frame] = deque()
@@ -224,8 +246,7 @@ class Link(asyncio.BufferedProtocol):
         unsent_bytes = self.unsent_bytes
         if unsent_bytes > self._max_unsent_bytes:
             self.end("does not read what it is sent", abort=True)
-        elif unsent_bytes or self._has_unsent:
-            self._has_unsent = unsent_bytes > 0
+        else:
             self._settings.unsent.note(self, unsent_bytes)
 
     def send_message(self, kind: int, call: int, payload: bytes = b"") -> None:

@@ -2,11 +2,11 @@
 
 Anybody can write any source address on a datagram, a robot with a certificate as well. So a new
 address gets nothing but *probes* with a secret of eight bytes, and the answers go on to the old
-address until the secret has come back from the new one (as in QUIC: RFC 9000, section 8.2). There
-is at most one probe for each authentic datagram, and it is hardly longer, so nobody can use a
-service to multiply what he sends.
+address until the secret has come back from the new one (as in QUIC: RFC 9000, section 8.2). Each
+authentic datagram leads to at most one probe for each address, which is hardly longer, so a service
+cannot be used to amplify traffic.
 
-Somebody beside the path can copy a robot's datagram, send it on from an address of his own, and
+An attacker beside the path can copy a robot's datagram, send it from an address of its own, and
 carry the probe to the robot. So the old address is probed as well: a robot that is still reached
 there stays there (RFC 9000, section 9.3.3).
 

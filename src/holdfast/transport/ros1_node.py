@@ -64,11 +64,11 @@ _MAX_ANSWER_BYTES: Final = 256 << 10
 
 _MAX_UNREAD_BYTES: Final = 1 << 20
 _MAX_UNREAD_BYTES_OF_ALL: Final = 16 << 20
-"""Of messages that wait for one subscriber of a topic, and for all; further ones are dropped."""
+"""Bounds on what waits for one subscriber, and for all of a topic; further messages are dropped."""
 
 _TURNS_TO_BEGIN: Final = 4
-"""Of the loop, in which asyncio begins to serve a connection that it has accepted: until then
-nobody knows it, and it would stay open."""
+"""Turns of the loop until asyncio serves a connection that it has accepted. Before that it is in no
+list of ours, and would stay open."""
 
 _UNKNOWN: Final = -1
 _OK: Final = 1

@@ -54,7 +54,7 @@ MAX_LINKS: Final = 4096
 """Of robots, at the same time. Above it the owner of the most links loses one."""
 
 MAX_UNSENT_BYTES: Final = 32 << 20
-"""Of replies that wait until robots read, all together: the largest has 2 MiB."""
+"""Bound on all replies together that wait until robots read: the largest has 2 MiB."""
 
 _SAID_GOODBYE: Final = "said goodbye"
 _NO_GOODBYE: Final = "closed the connection without a goodbye, as one that is killed does"

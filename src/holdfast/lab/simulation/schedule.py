@@ -228,7 +228,7 @@ class Late(_Item, frozen=True, kw_only=True, tag="late", tag_field="item"):
     """The observation of a step comes so many task actions later; ``none`` for never.
 
     It comes with the move by which it is there, at the earliest with the next one; of a step that
-    has several such lines several times. Never is no reading, and is told at once.
+    has several such lines several times. ``none`` is no reading, and is reported at once.
     """
 
     step: Count

@@ -23,7 +23,7 @@ from holdfast.lab.testbed.proxy import Proxy
 from holdfast.lab.testbed.records import Decision, DecisionTable, LogEvent
 from holdfast.recording.run_directory import TIMINGS_NAME
 from holdfast.runtime.parent_death import parent_death_prefix
-from holdfast.runtime.signal_names import signal_name
+from holdfast.runtime.process_ends import signal_name
 
 __all__ = ["RobotCommand", "Script", "ServiceCommand", "Testbed", "after"]
 

@@ -504,7 +504,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
                 response.kind = _Decide.Response.SENSE
                 response.sensing_action = due.sensing_action
                 names = sensing_labels(read.configuration.problem)
-                response.sensing_action_name = str(names[due.sensing_action])
+                response.sensing_action_name = names[due.sensing_action]
         return response
 
     def _no_calls(self) -> str | None:

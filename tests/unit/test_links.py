@@ -6,8 +6,7 @@ from typing import cast
 
 import pytest
 
-from holdfast.transport.link_defects import ends_link
-from holdfast.transport.links import Link
+from holdfast.transport.links import Link, ends_link
 
 
 class Fragile:
