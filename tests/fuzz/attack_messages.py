@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, get_args
 import msgspec
 from msgspec import inspect
 from tests.fuzz import corpus
-from tests.fuzz.odd_values import OddValues, replaced
+from tests.fuzz.odd_values import STORMS, OddValues, replaced
 
 from holdfast.config.settings import Estimator, Method, PlanningSettings
 from holdfast.problems import registry
@@ -32,6 +32,8 @@ _CONFIGURATION, _SETTINGS = 9, 11
 
 _MODEL, _PLANNER, _PLANNING, _SEED = 1, 2, 3, 4
 """Places of a session configuration's."""
+
+_NO_DIGEST = b"s" * 16
 
 _BEYOND = (0, 1, -1, 2**31, 2**32, 2**63 - 1, 2**63, 2**64 - 1, 1e-320, 1e150, 1e308)
 
@@ -95,12 +97,17 @@ def _fields_of(array: object) -> list[bytes]:
     ]
 
 
-def _request(fields: list[bytes], configuration: bytes) -> bytes:
-    """Return a request with a packed session configuration, and the digest that it has here."""
+def _digest(configuration: bytes) -> bytes:
+    """Return the digest that a packed session configuration has here."""
     try:
-        settings = settings_digest(unpack_configuration(configuration))
+        return settings_digest(unpack_configuration(configuration))
     except Exception:  # noqa: BLE001 - a service will not come to the digest either
-        settings = b"s" * 16
+        return _NO_DIGEST
+
+
+def _request(fields: list[bytes], configuration: bytes, settings: bytes | None = None) -> bytes:
+    """Return a request with a packed session configuration, and its digest unless given."""
+    settings = settings or _digest(configuration)
     fields = replaced_fields(
         fields,
         {
@@ -137,6 +144,11 @@ def odd_requests(chance: random.Random) -> Iterator[bytes]:
         elif draw < 0.5:
             packed = replaced(opening, chance.randrange(len(opening)), odd.value())
             yield _request(fields, packed)
+        elif draw < 0.55:
+            # To decode it for its digest would cost the attacker what it costs the attacked.
+            section = b"\x81\xa1a" + chance.choice([*STORMS.values()])
+            packed = replaced(opening, chance.choice((_MODEL, _PLANNER)), section)
+            yield _request(fields, packed, _NO_DIGEST)
         elif draw < 0.95:
             # A section that is a mapping as it should be, and anything in it.
             items = [b"\xa1" + bytes([97 + k]) + odd.value() for k in range(chance.randrange(1, 4))]

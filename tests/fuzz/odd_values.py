@@ -6,11 +6,12 @@ times that no calendar has, extensions, keys of every type, lengths that lie, an
 
 from __future__ import annotations
 
+import itertools
 import random
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
-__all__ = ["OddValues", "replaced"]
+__all__ = ["STORMS", "OddValues", "replaced"]
 
 _EDGES = (0, 1, 15, 16, 31, 127, 128, 255, 256, 65_535, 65_536, 2**31 - 1, 2**31, 2**32 - 1)
 _FLOATS = (0.0, -0.0, 1e-320, 1e308, -1e308, float("inf"), float("-inf"), float("nan"))
@@ -160,3 +161,31 @@ def replaced(fields: Sequence[bytes], place: int, value: bytes) -> bytes:
     assert len(fields) < 16
     changed = [*fields[:place], value, *fields[place + 1 :]]
     return bytes([0x90 | len(fields)]) + b"".join(changed)
+
+
+def _mapping_of(keys: Iterable[bytes]) -> bytes:
+    items = [key + b"\xc0" for key in keys]
+    return b"\xdf" + struct.pack(">I", len(items)) + b"".join(items)
+
+
+def _same_hash(count: int, length: int) -> Iterator[bytes]:
+    """Yield arrays of the same hash: in CPython, -1 and -2 have the same."""
+    for numbers in itertools.islice(itertools.product(b"\xff\xfe", repeat=length), count):
+        yield bytes([0x90 | length, *numbers])
+
+
+STORMS = {
+    "array keys of one hash": _mapping_of(_same_hash(16_000, 14)),
+    "few array keys of one hash": _mapping_of(_same_hash(4_000, 12)),
+    "nested array keys of one hash": _mapping_of(
+        b"\x92" + one + other
+        for one, other in itertools.product(_same_hash(100, 7), _same_hash(100, 7))
+    ),
+    "array keys of one hash, deep": b"\x91" * 29 + _mapping_of(_same_hash(16_000, 14)),
+    "array keys of one hash in a key": b"\x81\x91" + _mapping_of(_same_hash(16_000, 14)) + b"\xc0",
+    "text keys": _mapping_of(b"\xa5%05d" % number for number in range(30_000)),
+    "integer keys": _mapping_of(b"\xce" + struct.pack(">I", k << 8) for k in range(30_000)),
+    "empty arrays": b"\xdd" + struct.pack(">I", 250_000) + b"\x90" * 250_000,
+    "towers": b"\xdd" + struct.pack(">I", 6_000) + (b"\x91" * 29 + b"\x90") * 6_000,
+}
+"""Values that are costly to make, each less than 250 kB."""

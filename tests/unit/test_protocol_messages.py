@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.fuzz.odd_values import OddValues, replaced
+from tests.fuzz.odd_values import STORMS, OddValues, replaced
 
 from holdfast.config import yaml_document
 from holdfast.config.settings import PlanningSettings
@@ -23,8 +23,6 @@ from holdfast.protocol.messages import (
     CHECKSUM_SIZE,
     DIGEST_SIZE,
     MAX_CONFIGURATION_BYTES,
-    MAX_CONFIGURATION_DEPTH,
-    MAX_CONFIGURATION_VALUES,
     MAX_INPUTS,
     MAX_TASK_ACTIONS,
     PROTOCOL_VERSION,
@@ -47,6 +45,7 @@ from holdfast.protocol.messages import (
     unpack_configuration,
     with_checksum,
 )
+from holdfast.protocol.plain_data import MAX_CONFIGURATION_DEPTH, MAX_CONFIGURATION_VALUES
 
 REQUEST = Request(
     PROTOCOL_VERSION,
@@ -290,19 +289,19 @@ _YEAR_10000 = b"\xc7\x0c\xff" + struct.pack(">Iq", 999_999_999, 253_402_300_799)
 @pytest.mark.parametrize(
     ("value", "what"),
     [
-        (_YEAR_10000, "year 10000"),
-        (b"\xd6\xff\x00\x00\x00\x01", "a value of type datetime"),
-        (b"\xd4\x05\x00", "a value of type Ext"),
-        (b"\xc4\x01\x00", "a value of type bytes"),
+        (_YEAR_10000, r"JSON lacks \(0xc7\)"),
+        (b"\xd6\xff\x00\x00\x00\x01", r"JSON lacks \(0xd6\)"),
+        (b"\xd4\x05\x00", r"JSON lacks \(0xd4\)"),
+        (b"\xc4\x01\x00", r"JSON lacks \(0xc4\)"),
         (b"\xcb" + struct.pack(">d", math.nan), "the number nan"),
         (b"\xca" + struct.pack(">f", -math.inf), "the number -inf"),
-        (b"\x81\x01\x01", "a key of type int"),
-        (b"\x91\x81\x91\x01\x01", "a key of type tuple"),
-        (b"\x81\xc4\x01\x00\x01", "a key of type bytes"),
-        (b"\x81" + _YEAR_10000 + b"\x01", "malformed|year 10000|hashable"),
+        (b"\x81\x01\x01", r"no text \(0x01\)"),
+        (b"\x91\x81\x91\x01\x01", r"no text \(0x91\)"),
+        (b"\x81\xc4\x01\x00\x01", r"no text \(0xc4\)"),
+        (b"\x81" + _YEAR_10000 + b"\x01", r"no text \(0xc7\)"),
         (b"\xa3\xed\xa0\x80", "utf-8"),
         (b"\x91" * MAX_CONFIGURATION_DEPTH + b"\x01", "more than 32 levels"),
-        (b"\x81\xa1a" * 900 + b"\x80", "more than 32 levels|recursion"),
+        (b"\x81\xa1a" * 900 + b"\x80", "more than 32 levels"),
         (b"\x91" * 100_000, "recursion"),
     ],
 )
@@ -311,6 +310,25 @@ def test_what_a_file_cannot_say_is_malformed_where_it_comes_in(value: bytes, wha
     with pytest.raises(MessageError, match=what) as raised:
         decode_request(_with_model(b"\x81\xa1a" + value))
     assert raised.value.code == "malformed"
+
+
+@pytest.mark.parametrize("storm", STORMS)
+@pytest.mark.parametrize("place", [1, 2], ids=["model", "state_space_planner"])
+def test_what_is_costly_to_make_is_refused_before_it_is_made(storm: str, place: int) -> None:
+    """Sixteen thousand keys of the same hash held up a process for seconds."""
+    opening = [*map(msgspec.msgpack.encode, msgspec.structs.astuple(_session_configuration({})))]
+    packed = replaced(opening, place, b"\x81\xa1a" + STORMS[storm])
+    assert len(packed) < MAX_CONFIGURATION_BYTES
+    fields = [*msgspec.structs.astuple(REQUEST)[:8], (), packed, None, b"s" * 16]
+    payload = with_checksum(msgspec.msgpack.encode(fields))
+    tracemalloc.start()
+    try:
+        with pytest.raises(MessageError, match=r"no text|more than"):
+            decode_request(payload)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 50_000 + 3 * len(payload)
 
 
 def test_as_many_levels_as_a_file_may_have_survive_the_wire() -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import struct
+import tracemalloc
 import xmlrpc.client
 from collections.abc import Awaitable, Callable
 from contextlib import asynccontextmanager
@@ -13,7 +15,7 @@ import pytest
 from tests.ports import free_port
 
 from holdfast.errors import CallError, GoneError, SilentError
-from holdfast.transport.ros1_calls import CALLER, Connection, call, offers_service
+from holdfast.transport.ros1_calls import CALLER, Connection, call, decoded, offers_service
 
 PATIENCE_S = 20.0
 SHORT_S = 0.05
@@ -190,6 +192,72 @@ class TestCalls:
             for value in (2**40, object()):
                 with pytest.raises(CallError):
                     await call(f"http://127.0.0.1:{port}/", "x", value, within_s=PATIENCE_S)
+
+
+def _bomb() -> str:
+    """Return nested entities: from 500 bytes come two million elements."""
+    entities = "".join(
+        f'<!ENTITY {name} "{20 * f"&{inner};"}">' for inner, name in itertools.pairwise("abcde")
+    )
+    return (
+        f'<?xml version="1.0"?><!DOCTYPE m [<!ENTITY a "<p/>">{entities}]>'
+        f"<methodResponse><params>{11 * '&e;'}</params></methodResponse>"
+    )
+
+
+def _answer(value: str) -> bytes:
+    return (f"<methodResponse><params><param>{value}</param></params></methodResponse>").encode()
+
+
+def _integer_names(prefix: str = "") -> bytes:
+    """Return integers of one hash as the names of members."""
+    members = "".join(f"<int>{k * (2**61 - 1)}</int><int>0</int>" for k in range(6000))
+    return _answer(f"<value><{prefix}struct>{members}</{prefix}struct></value>")
+
+
+class TestCostlyMessages:
+    @pytest.mark.parametrize(
+        ("content", "reason"),
+        [
+            *((_bomb().encode(encoding), "document type") for encoding in ("utf-8", "utf-16")),
+            (
+                b"<!DOCTYPE methodResponse>" + _answer("<value><int>1</int></value>"),
+                "document type",
+            ),
+            (_integer_names(), "name 0"),
+            (_integer_names("x:"), "name 0"),
+            (
+                _answer(500 * "<value><array><data>" + 500 * "</data></array></value>"),
+                "more than 100 levels",
+            ),
+        ],
+        ids=["entities", "in UTF-16", "no entity", "integer names", "of a namespace", "levels"],
+    )
+    def test_is_refused(self, content: bytes, reason: str) -> None:
+        with pytest.raises(xmlrpc.client.ResponseError, match=reason):
+            decoded(content)
+
+    def test_a_text_is_built_once_however_many_elements_end_after_it(self) -> None:
+        """Each element that ended after it had its own copy, gigabytes of an answer of 256 kB."""
+        text = 2000 * "text\n"
+        content = _answer(500 * "<name>" + text + 500 * "</name>")
+        tracemalloc.start()
+        try:
+            values, _ = decoded(content)
+            _, peak = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+        assert values[0] == text
+        assert peak < 100 * len(content)
+
+    @pytest.mark.parametrize(
+        "value", [[], {}, "", "é<&\n", [[1, -2.5, True], {"a": {"b": ["", "x"]}}]], ids=repr
+    )
+    def test_what_ros_sends_is_decoded_as_ever(self, value: Any) -> None:
+        content = xmlrpc.client.dumps((value, 5), "m").encode()
+        assert decoded(content) == xmlrpc.client.loads(content) == ((value, 5), "m")
+        with pytest.raises(xmlrpc.client.Fault, match="no"):
+            decoded(xmlrpc.client.dumps(xmlrpc.client.Fault(1, "no")).encode())
 
 
 def handshake(**fields: str) -> bytes:

@@ -280,6 +280,24 @@ async def test_calls_of_many_hold_up_nobody_else(
     await node.close()
 
 
+async def test_a_call_with_a_document_type_is_not_expanded(master: Master) -> None:
+    """A few hundred bytes of nested entities took a second of the loop's thread."""
+    node = RosNode("cloud", around(master))
+    await node.start(0.0)
+    reader, writer = await asyncio.open_connection(*place_of(node))
+    document = (
+        '<?xml version="1.0"?><!DOCTYPE m [<!ENTITY a "getPid">]>'
+        "<methodCall><methodName>&a;</methodName><params></params></methodCall>"
+    )
+    for encoding in ("utf-8", "utf-16"):
+        writer.write(post(document.encode(encoding)))
+        head = await asyncio.wait_for(HttpHead.read(reader), PATIENCE_S)
+        with pytest.raises(xmlrpc.client.Fault, match="document type"):
+            xmlrpc.client.loads(await reader.readexactly(head.size))
+    writer.close()
+    await node.close()
+
+
 async def test_a_call_larger_than_any_of_ros_is_not_read(master: Master) -> None:
     node = RosNode("cloud", around(master))
     await node.start(0.0)

@@ -18,7 +18,6 @@ about one damaged segment in ten thousand passes TCP's own check (Stone and Part
 from __future__ import annotations
 
 import hashlib
-import math
 import zlib
 from typing import Annotated, TypeAlias
 
@@ -31,14 +30,13 @@ from holdfast.arrays import FloatArray
 from holdfast.config.settings import PlanningSettings
 from holdfast.errors import MessageError
 from holdfast.printable import one_line
+from holdfast.protocol.plain_data import check_plain_data
 
 __all__ = [
     "CHECKSUM_SIZE",
     "DIGEST_SIZE",
     "MAX_ACTION_SIZE",
     "MAX_CONFIGURATION_BYTES",
-    "MAX_CONFIGURATION_DEPTH",
-    "MAX_CONFIGURATION_VALUES",
     "MAX_INPUTS",
     "MAX_TASK_ACTIONS",
     "MAX_TEXT",
@@ -92,12 +90,6 @@ MAX_INPUTS = 64
 
 MAX_CONFIGURATION_BYTES = 256 * 1024
 """Bound on a session configuration, encoded."""
-
-MAX_CONFIGURATION_VALUES = 10_000
-"""Bound on its values: the smallest take one byte each when encoded, and sixty in memory."""
-
-MAX_CONFIGURATION_DEPTH = 32
-"""Bound on levels of lists and mappings in each of its free sections, as in a YAML file."""
 
 DIGEST_SIZE = 16
 """Bytes sent of a state's digest: the first of :func:`holdfast.planning.digest`."""
@@ -164,6 +156,14 @@ class SessionConfiguration(msgspec.Struct, array_like=True, frozen=True):
     seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
     core_version: Annotated[str, msgspec.Meta(max_length=200)] = ""
     problem_digest: Annotated[str, msgspec.Meta(max_length=200)] = ""
+
+
+class _FreeSections(msgspec.Struct, array_like=True, frozen=True):
+    """The beginning of a packed session configuration, its free sections still packed."""
+
+    problem: Name
+    model: msgspec.Raw
+    state_space_planner: msgspec.Raw
 
 
 class Request(msgspec.Struct, array_like=True, frozen=True):
@@ -307,11 +307,9 @@ Reply: TypeAlias = TaskAnswer | SensingAnswer | Progress | NeedState | Busy | Re
 
 _ENCODER = msgspec.msgpack.Encoder()
 _REQUEST_DECODER = msgspec.msgpack.Decoder(_SentRequest)
+_FREE_SECTIONS_DECODER = msgspec.msgpack.Decoder(_FreeSections)
 _CONFIGURATION_DECODER = msgspec.msgpack.Decoder(SessionConfiguration)
 _REPLY_DECODER: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)
-
-_SCALARS = (type(None), bool, int, float, str)
-"""Values of a configuration that contain no others: those of JSON."""
 
 _ARRAY_HEADERS = {0xDC: 3, 0xDD: 5}
 """Sizes in bytes of the longer array headers of MessagePack, by their first byte."""
@@ -379,11 +377,10 @@ def decode_request(payload: bytes) -> Request:
     ------
     MessageError
         ``damaged``: the checksum is wrong. ``malformed``: not a request, or its session
-        configuration has values that JSON does not have, or more than
-        :data:`MAX_CONFIGURATION_DEPTH` levels. ``out_of_memory``: it may be sent again.
-        ``version``: another protocol version. ``too_large``: the session configuration has more
-        than :data:`MAX_CONFIGURATION_BYTES` or :data:`MAX_CONFIGURATION_VALUES`. ``other_code``:
-        its settings mean something else here than on the robot.
+        configuration has free sections that :func:`check_plain_data` refuses. ``out_of_memory``:
+        it may be sent again. ``version``: another protocol version. ``too_large``: the session
+        configuration has more than :data:`MAX_CONFIGURATION_BYTES`, or too many values.
+        ``other_code``: its settings mean something else here than on the robot.
     """
     content = _checked_content(payload)
     # Other versions may have other fields. A decoder would look at all of a large message first.
@@ -487,8 +484,13 @@ def _session_configuration_of(data: bytes, settings: bytes | None) -> SessionCon
             f"{len(data)} bytes of problem and settings, the sections model and "
             f"state_space_planner among them: at most {MAX_CONFIGURATION_BYTES} are allowed",
         )
+    free = _FREE_SECTIONS_DECODER.decode(data)
+    # What has passed can be encoded again, at any depth of the caller's stack.
+    check_plain_data(
+        (bytes(free.model), bytes(free.state_space_planner)),
+        f"problem {free.problem}: sections model and state_space_planner",
+    )
     session_configuration = _CONFIGURATION_DECODER.decode(data)
-    _check_sections(session_configuration)
     understood = settings_digest(session_configuration)
     if settings != understood:
         raise MessageError(
@@ -499,52 +501,3 @@ def _session_configuration_of(data: bytes, settings: bytes | None) -> SessionCon
             "they may decide differently, so deploy the same version on both",
         )
     return session_configuration
-
-
-def _check_sections(session_configuration: SessionConfiguration) -> None:
-    """Refuse what a YAML file cannot say in the problem's sections.
-
-    MessagePack has more than JSON: times, extensions, bytes, numbers that are not finite, keys of
-    any kind. What has passed here can be encoded again, at any depth of the caller's stack.
-    """
-    problem = session_configuration.problem
-    level: list[object] = [session_configuration.model, session_configuration.state_space_planner]
-    depth = count = 0
-    while level:
-        depth += 1
-        inside: list[object] = []
-        for container in level:
-            values: list[object]
-            if isinstance(container, dict):
-                values = list(container.values())
-                count += len(values)
-                # A key may itself be large: the tuple that msgspec makes of an array.
-                odd = next((key for key in container if not isinstance(key, str)), None)
-                if odd is not None:
-                    raise _no_plain_data(problem, f"a key of type {type(odd).__name__}")
-            else:
-                assert isinstance(container, list)
-                values = container
-            count += len(values)
-            if count > MAX_CONFIGURATION_VALUES:
-                raise MessageError(
-                    "too_large",
-                    f"problem {problem}: more than {MAX_CONFIGURATION_VALUES} values in the "
-                    "sections model and state_space_planner",
-                )
-            for value in values:
-                if isinstance(value, (dict, list)):
-                    inside.append(value)
-                elif not isinstance(value, _SCALARS):
-                    raise _no_plain_data(problem, f"a value of type {type(value).__name__}")
-                elif isinstance(value, float) and not math.isfinite(value):
-                    raise _no_plain_data(problem, f"the number {value}")
-        if inside and depth == MAX_CONFIGURATION_DEPTH:
-            raise _no_plain_data(problem, f"more than {MAX_CONFIGURATION_DEPTH} levels")
-        level = inside
-
-
-def _no_plain_data(problem: str, what: str) -> MessageError:
-    return MessageError(
-        "malformed", f"problem {problem}: {what} in the sections model and state_space_planner"
-    )

@@ -15,6 +15,7 @@ import xmlrpc.client
 from collections.abc import Iterable, Sequence
 from typing import Any, Final, NamedTuple, Self
 from urllib.parse import urlsplit
+from xml.parsers import expat
 
 from holdfast.errors import CallError, GoneError, SilentError, TransportError
 from holdfast.transport.endpoints import host_and_port
@@ -31,6 +32,7 @@ __all__ = [
     "Connection",
     "HttpHead",
     "call",
+    "decoded",
     "message",
     "offers_service",
 ]
@@ -39,6 +41,9 @@ CALLER: Final = "/holdfast"
 """Name of the caller where no node calls."""
 
 _MAX_RESPONSE_BYTES: Final = 256 * 1024 * 1024
+
+_MAX_LEVELS: Final = 100
+"""Bound on lists and mappings within each other in a message."""
 
 
 class HttpHead(NamedTuple):
@@ -74,6 +79,49 @@ async def message(reader: asyncio.StreamReader, max_bytes: int, begun: bytes = b
     if size > max_bytes:
         raise TransportError(f"sends {size} bytes; {max_bytes} are allowed")
     return await reader.readexactly(size)
+
+
+class _Unmarshaller(xmlrpc.client.Unmarshaller):
+    """The library's, but what it builds, and the time for it, are in proportion to what it reads.
+
+    The library repeats a text for each element that ends after it, takes any value for a name (a
+    peer can choose thousands of integers of one hash) and nests lists as deeply as it is told,
+    deeper than they can be printed.
+    """
+
+    def start(self, tag: str, attrs: dict[str, str]) -> None:
+        super().start(tag, attrs)
+        if len(self._marks) > _MAX_LEVELS:
+            raise xmlrpc.client.ResponseError(f"more than {_MAX_LEVELS} levels")
+
+    def end(self, tag: str) -> None:
+        if tag.split(":")[-1] == "struct":
+            for name in self._stack[self._marks[-1] :: 2]:
+                if not isinstance(name, str):
+                    raise xmlrpc.client.ResponseError(f"a member has the name {name!r:.100}")
+        super().end(tag)
+        self._data = []
+
+
+def _refuse_doctype(*_: object) -> None:
+    raise xmlrpc.client.ResponseError("a document type, which ROS never sends")
+
+
+def decoded(content: bytes) -> tuple[tuple[Any, ...], str | None]:
+    """Decode an XML-RPC message of a peer; return its values, and the method if it is a call.
+
+    A document type is refused: from a few hundred bytes of nested entities millions of elements
+    are made. Raises Fault if the message says so, and anything else if it is malformed.
+    """
+    unmarshaller = _Unmarshaller()
+    parser = expat.ParserCreate()
+    parser.StartDoctypeDeclHandler = _refuse_doctype
+    parser.StartElementHandler = unmarshaller.start
+    parser.EndElementHandler = unmarshaller.end
+    parser.CharacterDataHandler = unmarshaller.data
+    unmarshaller.xml("", None)  # what expat hands over is text already
+    parser.Parse(content, True)
+    return unmarshaller.close(), unmarshaller.getmethodname()
 
 
 async def _connect(uri: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
@@ -174,7 +222,7 @@ class Connection:
         content = await reader.readexactly(head.size)
         if head.ends:
             self.close()
-        values, _ = xmlrpc.client.loads(content)
+        values, _ = decoded(content)
         return values[0]
 
     def close(self) -> None:

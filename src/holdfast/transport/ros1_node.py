@@ -19,7 +19,7 @@ from typing import Any, Final, NamedTuple
 from holdfast.errors import DEFECT, CallError, TransportError, defect_fields
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
 from holdfast.transport.endpoints import host_and_port, why_not_bound
-from holdfast.transport.ros1_calls import Connection, HttpHead, message, offers_service
+from holdfast.transport.ros1_calls import Connection, HttpHead, decoded, message, offers_service
 from holdfast.transport.tcpros import (
     ANY_TYPE,
     MAX_HEADER_BYTES,
@@ -312,7 +312,7 @@ class RosNode:
             async with self._parsing:
                 await asyncio.sleep(0)  # one call in each turn of the loop, however many wait
                 try:
-                    arguments, method = xmlrpc.client.loads(content)
+                    arguments, method = decoded(content)
                     answer = (self._answer(str(method), arguments),)
                 except Exception as error:  # noqa: BLE001 - the parser may raise anything
                     reason = f"{type(error).__name__}: {error}"
