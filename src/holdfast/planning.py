@@ -411,6 +411,7 @@ class Planner:
         if self.moves_show:
             max_actions = min(max_actions, 1)
         while len(actions) < max_actions and not self.needs_sensing(state):
+            interruption.check()
             action, _ = self.choose_task_action(state)
             state = self.advance(state, action)
             actions.append(action)

@@ -11,11 +11,21 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple, get_args
 
 import msgspec
+import numpy as np
 from msgspec import inspect
 from tests.fuzz import corpus
 from tests.fuzz.odd_values import STORMS, OddValues, replaced
+from tests.questions import request_of
 
-from holdfast.config.settings import Estimator, Method, PlanningSettings
+from holdfast.belief import Belief
+from holdfast.config.settings import (
+    Estimator,
+    Method,
+    ParticleFilterSettings,
+    PlanningSettings,
+    SelectorSettings,
+)
+from holdfast.planning import PlanningState, encode_checkpoint
 from holdfast.problems import registry
 from holdfast.protocol.messages import (
     CHECKSUM_SIZE,
@@ -25,7 +35,14 @@ from holdfast.protocol.messages import (
     with_checksum,
 )
 
-__all__ = ["NumericKey", "hostile_settings", "numeric_keys", "odd_requests"]
+__all__ = [
+    "IN_AN_OBSTACLE",
+    "NumericKey",
+    "checkpoints_in_obstacles",
+    "hostile_settings",
+    "numeric_keys",
+    "odd_requests",
+]
 
 _CONFIGURATION, _SETTINGS = 9, 11
 """Places of a request's fields."""
@@ -34,6 +51,13 @@ _MODEL, _PLANNER, _PLANNING, _SEED = 1, 2, 3, 4
 """Places of a session configuration's."""
 
 _NO_DIGEST = b"s" * 16
+IN_AN_OBSTACLE: Mapping[str, tuple[float, ...]] = {
+    "peg_in_hole_2d": (20.0, -50.0, 0.0),
+    "peg_in_hole_3d": (20.0, 0.0, -50.0, 0.0, 0.0, 0.0),
+    "multitier_peg_in_hole_2d": (8.0, -0.5, 0.5),
+    "capsule_robot": (2.0, 2.0),
+}
+"""A state of each built-in problem with obstacles, as deep in one as noise cannot leave."""
 
 _BEYOND = (0, 1, -1, 2**31, 2**32, 2**63 - 1, 2**63, 2**64 - 1, 1e-320, 1e150, 1e308)
 
@@ -184,6 +208,33 @@ def hostile_settings(chance: random.Random) -> Iterator[bytes]:
                 changes[_SEED] = msgspec.msgpack.encode(chance.choice(_BEYOND))
             opening = replaced_fields(opening, changes)
             yield _request(fields, bytes([0x90 | len(opening)]) + b"".join(opening))
+
+
+def checkpoints_in_obstacles(chance: random.Random) -> Iterator[bytes]:
+    """Yield openings whose particles stand where none can: a move takes a thousand times as long."""
+    for name in itertools.cycle(IN_AN_OBSTACLE):
+        count = chance.choice((12, 300, 8000))
+        selector = SelectorSettings(method="random")
+        planning = msgspec.structs.replace(
+            corpus.PLANNING,
+            particle_filter=ParticleFilterSettings(num_particles=count),
+            selector=selector,
+            sensing_interval=chance.choice((0, 2)),
+        )
+        belief = Belief(np.tile(IN_AN_OBSTACLE[name], (count, 1)), np.full(count, 1.0 / count))
+        seed = chance.randrange(2**63)
+        state = PlanningState(seed, 0, 0, 0, True, belief)
+        yield encode(
+            request_of(
+                state,
+                chance.randbytes(16),
+                1,
+                session_configuration=corpus.session_configuration_of(
+                    name, seed, planning=planning
+                ),
+                checkpoint=encode_checkpoint(state),
+            )
+        )
 
 
 def _hostile_sections(chance: random.Random, name: str) -> Iterator[tuple[int, bytes]]:

@@ -33,7 +33,11 @@ from typing import Any, NamedTuple
 
 import msgspec
 from tests.fuzz import corpus
-from tests.fuzz.attack_messages import hostile_settings, odd_requests
+from tests.fuzz.attack_messages import (
+    checkpoints_in_obstacles,
+    hostile_settings,
+    odd_requests,
+)
 from tests.fuzz.hostile_client import HostileMessages
 from tests.fuzz.live import HonestRobots
 from tests.fuzz.measuring import held_by
@@ -115,6 +119,12 @@ def _odd_values(target: Target, chance: random.Random) -> None:
 def _hostile_settings(target: Target, chance: random.Random) -> None:
     """Every number of the settings and of the problems at its bound and beyond."""
     _converse(target, "hostile settings", ((each, True) for each in hostile_settings(chance)))
+
+
+def _checkpoints(target: Target, chance: random.Random) -> None:
+    """States that no robot can be in, in which every move takes a thousand times as long."""
+    payloads = ((each, True) for each in checkpoints_in_obstacles(chance))
+    _converse(target, "checkpoints in obstacles", payloads)
 
 
 def _messages(target: Target, chance: random.Random) -> None:
@@ -272,6 +282,7 @@ Way = Callable[[Target, random.Random], None]
 WAYS: dict[str, Way] = {
     "odd": _odd_values,
     "settings": _hostile_settings,
+    "checkpoints": _checkpoints,
     "messages": _messages,
     "cut": _cut_frames,
     "abandoned": _abandoned,

@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
+import random
 import subprocess
 import sys
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
-from tests.fuzz.attack_messages import numeric_keys
+from tests.fuzz.attack_messages import (
+    IN_AN_OBSTACLE,
+    checkpoints_in_obstacles,
+    numeric_keys,
+)
 from tests.fuzz.attacker import TRANSPORTS, attacked
 from tests.fuzz.hostile_client import HostileMessages
 from tests.fuzz.live import run_live
 from tests.fuzz.measuring import Held, flatness
 from tests.fuzz.soak import run_soak
 from tests.fuzz.targets import TARGETS
+from tests.unit.test_protocol_service import Bench
 
 from holdfast.config.settings import PlanningSettings
+from holdfast.problems import registry
+from holdfast.problems.registry import BUILT_IN
+from holdfast.protocol.messages import SensingAnswer, TaskAnswer, decode_request
 
 ROOT = Path(__file__).parents[2]
 RUNS = 20_000
@@ -62,7 +73,7 @@ def test_an_attacker_ends_no_process_and_changes_no_decision(
     assert report["decides_identically"]
     assert report["robot"]["decisions"] > 0
     # Each class of attack has come about.
-    assert len(report["attacks"]) == (10 if transport == "udp" else 7)
+    assert len(report["attacks"]) == (11 if transport == "udp" else 8)
     assert all(report["attacks"].values())
 
 
@@ -77,6 +88,21 @@ def test_every_number_of_the_settings_is_attacked() -> None:
         if isinstance(value, int | float | tuple | list) and not isinstance(value, bool)
     }
     assert numbers | {"sensing_interval", "selector.resolution"} == keys
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_each_built_in_problem_is_asked_about_states_in_an_obstacle(name: str) -> None:
+    assert (
+        registry.problem_class(name)
+        .from_settings({}, {})
+        .world.collides(np.array([IN_AN_OBSTACLE[name]]))
+        .all()
+    )
+    for payload in itertools.islice(checkpoints_in_obstacles(random.Random(1)), len(BUILT_IN)):
+        configuration = decode_request(payload).session_configuration
+        assert configuration is not None
+        if configuration.problem == name:
+            assert isinstance(Bench().ask(payload)[0], TaskAnswer | SensingAnswer)
 
 
 def test_the_same_seed_sends_the_same_messages() -> None:

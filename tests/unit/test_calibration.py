@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from holdfast.errors import InvalidValueError
 from holdfast.problems import registry
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.registry import BUILT_IN
@@ -96,6 +97,28 @@ def test_a_problem_that_fails_is_typical_from_there_on() -> None:
     found = measure_problem(Broken())
     assert found.move == TYPICAL_PROBLEM.move
     assert found.act != TYPICAL_PROBLEM.act
+
+
+def test_a_problem_without_an_initial_state_is_refused() -> None:
+    class Nowhere(CapsuleRobot):
+        def initial_states(self, stream: Any, count: int) -> Any:
+            raise InvalidValueError("model.init_mean: no place")
+
+    with pytest.raises(InvalidValueError, match="no place"):
+        measure_problem(Nowhere())
+
+
+def test_what_it_takes_to_try_counts_where_some_states_find_no_place(clock: Clock) -> None:
+    class Narrow(CapsuleRobot):
+        def initial_states(self, stream: Any, count: int) -> Any:
+            clock.now += 1e-4 * count
+            if count > 16:
+                raise InvalidValueError("model.init_mean: no place for some")
+            return super().initial_states(stream, count)
+
+    found = measure_problem(Narrow())
+    assert found.initial.state_s >= 1e-4
+    assert found.act == (0.0, 0.0), "the others are measured"
 
 
 def test_a_general_likelihood_is_measured(clock: Clock) -> None:

@@ -9,7 +9,7 @@ from tests.unit.test_protocol_service import Bench, Robot, content, planning_of,
 from holdfast.config.settings import PlanningSettings
 from holdfast.protocol.decision_cost import cost_of_sensing
 from holdfast.protocol.messages import Busy, Progress, Refused
-from holdfast.protocol.service_jobs import JobResult
+from holdfast.protocol.service_jobs import Job
 from holdfast.protocol.service_limits import ServiceLimits
 
 
@@ -117,7 +117,8 @@ class TestNobodyAwaitsIt:
         (job,) = bench.jobs
         bench.apply(bench.service.gone(first, bench.now))
         outcome = job.run()
-        assert outcome == JobResult(cancelled=True)
+        assert outcome.cancelled
+        assert outcome.problem is None, "left in the middle of something"
         bench.jobs.clear()
         bench.apply(bench.service.finished(job, outcome, bench.now))
         assert not bench.replies[first]
@@ -162,6 +163,106 @@ class TestNobodyAwaitsIt:
         bench.ask(robot.request())
         bench.apply(bench.service.gone(0, bench.now))
         assert content(bench.ask(robot.request())) == robot.right_answer()
+
+
+def held_up(bench: Bench) -> tuple[Robot, int, Robot, int, Job]:
+    """Have a brief decision run for far too long, while another robot waits for the worker."""
+    slow, other = Robot(key=1), Robot(key=2)
+    call = bench.send(slow.request())
+    (job,) = bench.jobs
+    waits = bench.send(other.request())
+    assert len(bench.jobs) == 1, "there is one worker"
+    limit_s = ServiceLimits().max_brief_s
+    bench.now += 4.0 * limit_s
+    bench.apply(bench.service.tick(bench.now))
+    assert not job.is_cancelled
+    bench.now += 2.0 * limit_s
+    due = bench.service.next_wakeup()
+    assert due is not None
+    assert due <= bench.now
+    bench.apply(bench.service.tick(bench.now))
+    return slow, call, other, waits, job
+
+
+class TestTheEstimateIsFarTooLow:
+    def test_what_holds_up_others_is_computed_as_a_long_one(self) -> None:
+        bench = Bench()
+        slow, call, other, waits, job = held_up(bench)
+        assert job.is_cancelled
+        due = bench.service.next_wakeup()
+        assert due is None or due > bench.now
+        again = bench.send(slow.request())
+        bench.run()
+        assert [each._most is None for each in bench.jobs] == [False, True]
+        bench.run_all()
+        assert content(bench.replies[waits]) == other.right_answer()
+        assert call in bench.ended, "superseded by the same robot's next request"
+        assert content(bench.replies[again]) == slow.right_answer()
+
+    def test_whoever_waits_for_it_gets_the_answer(self) -> None:
+        bench = Bench()
+        slow, call, other, waits, _ = held_up(bench)
+        bench.run_all()
+        assert content(bench.replies[call]) == slow.right_answer()
+        assert content(bench.replies[waits]) == other.right_answer()
+
+    def test_one_that_has_just_ended_is_answered_at_once(self) -> None:
+        bench, robot = Bench(), Robot()
+        call = bench.send(robot.request())
+        outcome = bench.jobs[0].run()
+        bench.send(Robot(key=2).request())
+        # The machine stood still meanwhile.
+        bench.now += 1.0
+        bench.apply(bench.service.tick(bench.now))
+        bench.apply(bench.service.finished(bench.jobs.popleft(), outcome, bench.now))
+        bench.run_all()
+        assert content(bench.replies[call]) == robot.right_answer()
+
+    def test_one_that_holds_up_nobody_goes_on(self) -> None:
+        bench, robot = Bench(), Robot()
+        call = bench.send(robot.request())
+        bench.now += 1.0
+        bench.apply(bench.service.tick(bench.now))
+        (job,) = bench.jobs
+        assert not job.is_cancelled
+        bench.send(Robot(key=2).request())
+        due = bench.service.next_wakeup()
+        assert due is not None
+        assert due <= bench.now, "now it does"
+        bench.run_all()
+        assert content(bench.replies[call]) == robot.right_answer()
+
+    def test_one_that_nobody_awaits_ends_at_its_lanes_limit(self) -> None:
+        for before in (0.0, 1.1):
+            bench, robot = Bench(), Robot()
+            call = bench.send(robot.request())
+            (job,) = bench.jobs
+            limit_s = ServiceLimits().max_brief_s
+            bench.now += before * limit_s
+            bench.apply(bench.service.gone(call, bench.now))
+            assert job.is_cancelled == (before > 1.0)
+            bench.now += 1.1 * limit_s
+            due = bench.service.next_wakeup()
+            assert job.is_cancelled or (due is not None and due <= bench.now)
+            bench.apply(bench.service.tick(bench.now))
+            assert job.is_cancelled
+            bench.run_all()
+            assert content(bench.ask(robot.request())) == robot.right_answer()
+
+    def test_a_medium_one_has_more_time(self) -> None:
+        bench, robot = Bench(), robot_of(medium_planning(), 1)
+        call = bench.send(robot.request())
+        bench.run()
+        (job,) = bench.jobs
+        bench.send(Robot(key=2).request())
+        bench.now += 0.4
+        bench.apply(bench.service.tick(bench.now))
+        assert not job.is_cancelled
+        bench.now += 0.2
+        bench.apply(bench.service.tick(bench.now))
+        assert job.is_cancelled
+        bench.run_all()
+        assert content(bench.replies[call]) == robot.right_answer()
 
 
 def test_what_takes_much_longer_than_estimated_is_refused_and_cancelled() -> None:

@@ -121,6 +121,7 @@ def test_the_earlier_works_settings_are_the_defaults(
         ({"sensing_cov": 0.0}, r"\$\.sensing_cov"),
         ({"sensing_cov": float("inf")}, r"\$\.sensing_cov"),
         ({"collision_tol": 1.0}, r"\$\.collision_tol"),
+        ({"collision_tol": 1e-13}, r">= 1e-12 .*\$\.collision_tol"),
         ({"state_size": 4}, r"\$\.state_size"),
         ({"peg_with": 1.0}, "peg_with"),
     ],

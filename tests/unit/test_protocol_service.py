@@ -1431,6 +1431,23 @@ def test_only_what_was_measured_of_a_robot_is_expected_to_be_brief() -> None:
     assert runs_of(service, 11, light.request(since=len(light.observed) - 3), 21.0)[0] == math.inf
 
 
+def test_nothing_is_expected_of_states_that_came_from_outside() -> None:
+    service, robot = Service(make_problem, 1), Robot()
+    for call in range(4):
+        request = robot.request(since=max(0, len(robot.observed) - 1))
+        found = runs_of(service, call, request, call)
+        robot.act_until_sensing()
+        robot.sense()
+    assert found[0] < math.inf
+    runs_of(service, 5, robot.restore(), 5.0)
+    robot.act_until_sensing()
+    robot.sense()
+    request = robot.request(since=len(robot.observed) - 1)
+    assert set(runs_of(service, 6, request, 6.0)) == {math.inf}
+    robot.begin(1)
+    assert runs_of(service, 7, robot.request(), 7.0)[0] < math.inf, "another trial is its own"
+
+
 def test_other_peoples_code_is_not_expected_to_be_brief() -> None:
     service, robot = Service(lambda _: CapsuleRobot(), 1), Robot()
     robot.session_configuration = msgspec.structs.replace(

@@ -7,7 +7,11 @@ from typing import Literal
 import pytest
 from tests.unit.test_protocol_service import Robot, make_problem
 
-from holdfast.protocol.messages import Request, pack_configuration
+from holdfast.errors import InterruptedComputationError, InvalidValueError
+from holdfast.interruption import check
+from holdfast.problems.problem import Problem
+from holdfast.protocol.decision_cost import TYPICAL_PROBLEM, Pricing, ProblemCost
+from holdfast.protocol.messages import Request, SessionConfiguration, pack_configuration
 from holdfast.protocol.service_jobs import Job, ProblemPool
 from holdfast.protocol.service_limits import ServiceLimits
 
@@ -66,6 +70,39 @@ def test_a_decision_has_a_bounded_size(limits: ServiceLimits, says: str | None) 
         assert failure is not None
         assert failure[0] == "invalid"
         assert says in failure[1]
+
+
+@pytest.mark.parametrize("during", ["building", "measuring"])
+def test_building_and_measuring_can_be_ended(during: str) -> None:
+    robot = Robot()
+
+    def build(session_configuration: SessionConfiguration) -> Problem:
+        if during == "building":
+            made.cancel()
+            check()
+            pytest.fail("it goes on")
+        return make_problem(session_configuration)
+
+    def measure(_: Problem) -> ProblemCost:
+        made.cancel()
+        # Whatever a problem raises while it is measured is suppressed.
+        with pytest.raises(InterruptedComputationError):
+            check()
+        return TYPICAL_PROBLEM
+
+    made = job(robot, robot.request())
+    made._make_problem, made._pricing = build, Pricing(measure=measure)
+    assert made.run().cancelled
+
+
+def test_a_problem_that_cannot_be_measured_is_refused() -> None:
+    def measure(_: Problem) -> ProblemCost:
+        raise InvalidValueError("model.init_mean: no place")
+
+    robot = Robot()
+    made = job(robot, robot.request())
+    made._pricing = Pricing(measure=measure)
+    assert made.run().failure == ("invalid", "model.init_mean: no place")
 
 
 def test_a_problem_is_lent_to_one_job_and_the_oldest_are_dropped() -> None:

@@ -467,6 +467,12 @@ def plain_settings(settings: SettingsT) -> SettingsT:
     What is out of bounds stays as it is, for :func:`check_settings` to name.
     """
     try:
+        msgspec.to_builtins(settings)
+    except TypeError:
+        pass  # It has something that is not plain.
+    else:
+        return settings
+    try:
         plain = msgspec.to_builtins(settings, enc_hook=_plain)
         return msgspec.convert(plain, type(settings))
     except (TypeError, msgspec.ValidationError):

@@ -53,7 +53,8 @@ CoordinatePair = tuple[Coordinate, Coordinate]
 Length = Annotated[float, msgspec.Meta(gt=0.0, le=1e5)]
 Variance = Annotated[float, msgspec.Meta(ge=0.0, le=1e10)]
 PositiveVariance = Annotated[float, msgspec.Meta(gt=0.0, le=1e10)]
-Tolerance = Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)]
+Tolerance = Annotated[float, msgspec.Meta(ge=1e-12, lt=1.0)]
+"""Finer ones change nothing that matters, and each halving costs time."""
 Seed = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
 StructT = TypeVar("StructT", bound=msgspec.Struct)

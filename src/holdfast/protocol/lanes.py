@@ -11,6 +11,10 @@ and the task moves to that of the *medium* ones or of the *long* ones:
 - Long ones have as many threads of their own, at least one, so that the system divides the cores
   between them and the others. They also share a bound on memory.
 
+An estimate can be wrong, or made wrong: a belief may hold states for which the problem's functions
+take a thousand times as long as for those that were measured. So a brief or medium task that runs
+for several times its lane's limit while others wait is cancelled, and computed as a long one.
+
 So no owner holds all threads, with one worker either (there brief and medium tasks share it). The
 lanes go by cost and not by owner, because without certificates all robots are one owner, and
 nothing tells them apart. Each lane is a :class:`~holdfast.protocol.request_queue.RequestQueue`.
@@ -39,6 +43,9 @@ __all__ = ["Lanes"]
 
 _OVERDUE = 4.0
 """So many times the longest decision a job may run; hardly any takes 3 times its estimate."""
+
+_OVERRUN = 5.0
+"""So many times its lane's limit a brief or medium task may run while others wait."""
 
 
 class Lanes:
@@ -151,8 +158,10 @@ class Lanes:
     def _running_in(self, job: Job) -> RequestQueue | None:
         return next((lane for lane in self._lanes if lane.runs(job)), None)
 
-    def postpone(self, task: PendingTask, cost: Cost, now: float) -> bool:
+    def postpone(self, task: PendingTask, cost: Cost | None, now: float) -> bool:
         """Queue a task again that costs more than its job was allowed, if a call waits for it.
+
+        None: the estimate was too low, and the job was ended because it held up others.
 
         Return whether there is room. (A prefetch has always room, at most one for each session.)
         """
@@ -160,6 +169,8 @@ class Lanes:
         session.is_brief = False
         if not task.calls:
             return True  # nobody awaits it
+        if cost is None:
+            cost = Cost(math.inf, max(task.num_bytes, float(limits.max_medium_bytes)))
         fits = cost.seconds <= limits.max_medium_s and cost.num_bytes <= limits.max_medium_bytes
         task.move_to(MEDIUM if fits else LONG, cost)
         if task.slot == REQUESTED and self._of(task).is_overloaded(
@@ -172,14 +183,15 @@ class Lanes:
 
     # -- what nobody awaits, or takes too long ---------------------------------------------------
 
-    def drop(self, task: PendingTask) -> bool:
+    def drop(self, task: PendingTask, now: float) -> bool:
         """Drop a task that nobody awaits; return whether it had not begun.
 
-        One that runs is cancelled if it is long. A short one ends soon, and its result may be asked
-        for again, over the robot's next link.
+        One that runs is cancelled if it is long, or once it has run for longer than its lane's
+        limit (:meth:`overdue`). A short one ends soon, and its result may be asked for again,
+        over the robot's next link.
         """
         if task.running:
-            if task.lane == LONG:
+            if task.lane == LONG or self._overdue_at(task) <= now:
                 self.cancel(task)
             return False
         task.session.remove_task(task)
@@ -207,17 +219,45 @@ class Lanes:
         )
 
     def overdue(self, now: float) -> list[PendingTask]:
-        """Return the running tasks that take much longer than any decision may."""
-        return [task for due_at, task in self._ends() if due_at <= now]
+        """Return the running tasks that take much longer than any decision may.
 
-    def overdue_at(self) -> float | None:
-        """Return when the next running task will be; None if none runs."""
-        return min((due_at for due_at, _ in self._ends()), default=None)
+        If nobody awaits one: longer than its lane's limit.
+        """
+        return [task for _, task in self._running() if self._overdue_at(task) <= now]
 
-    def _ends(self) -> list[tuple[float, PendingTask]]:
-        """Return by when each running task must have ended, but for those that are cancelled."""
+    def interrupt_overrunning(self, now: float) -> None:
+        """End the jobs of tasks that hold up others, for much longer than was expected.
+
+        The calls still wait for them: once such a job has ended, its task is queued with the long
+        ones (:meth:`postpone`).
+        """
+        if self._others_wait():
+            for job, task in self._running():
+                if self._overrun_at(task) <= now:
+                    job.cancel()
+
+    def next_end_at(self) -> float | None:
+        """Return when one of the running tasks is next to be ended; None if none runs."""
+        end_of = self._overrun_at if self._others_wait() else self._overdue_at
+        return min((end_of(task) for _, task in self._running()), default=None)
+
+    def _others_wait(self) -> bool:
+        """Return whether brief or medium tasks wait for a worker."""
+        return self._lanes[BRIEF].num_waiting + self._lanes[MEDIUM].num_waiting > 0
+
+    def _overdue_at(self, task: PendingTask) -> float:
+        most_s = self._overdue_s if task.calls else self.limits_s[task.lane]
+        return task.started_at + most_s
+
+    def _overrun_at(self, task: PendingTask) -> float:
+        if task.lane == LONG or not task.calls:
+            return self._overdue_at(task)
+        return task.started_at + _OVERRUN * self.limits_s[task.lane]
+
+    def _running(self) -> list[tuple[Job, PendingTask]]:
+        """Return the jobs that run and their tasks, but for those that are cancelled."""
         return [
-            (task.started_at + self._overdue_s, task)
+            (job, task)
             for lane in self._lanes
             for job, task in lane.running()
             if not job.is_cancelled

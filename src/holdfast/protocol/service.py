@@ -183,15 +183,13 @@ class Service:
             typical = session.built
             session.built = session.built or outcome.problem is not None
             session.price = outcome.price or session.price
-            if outcome.cancelled:
-                self._calls.end(task)
-            elif outcome.postponed is not None:
+            if outcome.cancelled or outcome.postponed is not None:
                 if is_awaited and not self._queue.postpone(task, outcome.postponed, now):
                     for record in self._calls.detach(task):
                         call, number, newcomer = record.call, record.number, task.newcomer
                         self._reject_busy(call, number, session.key, now, newcomer=newcomer)
             elif outcome.failure is not None or outcome.lacks_state:
-                self._failed(task, outcome)
+                self._failed(task, outcome, now)
             else:
                 if typical:
                     computed_s = now - task.started_at
@@ -208,7 +206,7 @@ class Service:
         """Handle the end of a call by itself: its link has ended, and nobody awaits replies."""
         task = self._calls.drop(call)
         if task is not None and not task.calls:
-            self._statistics.superseded += self._queue.drop(task)
+            self._statistics.superseded += self._queue.drop(task, now)
         self._dispatch(now)
         return self._effects.take()
 
@@ -219,14 +217,15 @@ class Service:
                 text = self._queue.overdue_in_words(task, now)
                 self._calls.send_refused(record.call, record.number, "invalid", text)
             self._queue.cancel(task)
+        self._queue.interrupt_overrunning(now)
         self._calls.send_progress(now)
         while (session := self._sessions.idle(now)) is not None:
-            self._forget(session, "idle")
+            self._forget(session, "idle", now)
         return self._effects.take()
 
     def next_wakeup(self) -> float | None:
         """Return when :meth:`tick` is due if nothing happens before; None if never."""
-        due = (self._calls.progress_at(), self._sessions.idle_at(), self._queue.overdue_at())
+        due = (self._calls.progress_at(), self._sessions.idle_at(), self._queue.next_end_at())
         return min((at for at in due if at is not None), default=None)
 
     # -- requests --------------------------------------------------------------------------------
@@ -250,7 +249,7 @@ class Service:
                     text = "this session was opened with another problem, settings or seed"
                     self._calls.send_refused(call, request.number, "invalid", text)
                     return
-                self._forget(session, "opened anew")
+                self._forget(session, "opened anew", now)
                 session = None
         if session is None:
             if configuration is None:
@@ -274,7 +273,7 @@ class Service:
             task = self._enqueue(session, call, request, size, now)
             if task is None:
                 return
-        self._supersede(session, task)
+        self._supersede(session, task, now)
 
     def _open_session(
         self,
@@ -317,7 +316,7 @@ class Service:
                     call, request.number, key, now, newcomer=newcomer, least_ms=least_ms
                 )
                 return None
-            self._forget(unused, "room needed")
+            self._forget(unused, "room needed", now)
         self._sessions.add(session)
         self._statistics.sessions_opened += 1
         named = {"problem": configuration.problem, "particles": count, "epoch": request.epoch}
@@ -331,7 +330,7 @@ class Service:
         # The next process numbers its requests anew.
         session.epoch, session.number = epoch, -1
         self._sessions.use(session, now)
-        self._supersede(session, None)
+        self._supersede(session, None, now)
 
     def _answer_from_cache(
         self, session: Session, call: int, request: Request, now: float, *, newest: bool
@@ -428,12 +427,12 @@ class Service:
         self._calls.attach(task, call, request.number, now)
         return task
 
-    def _supersede(self, session: Session, keep: PendingTask | None) -> None:
+    def _supersede(self, session: Session, keep: PendingTask | None, now: float) -> None:
         """Drop everything the robot waits for, except ``keep``."""
         for task in list(session.pending.values()):
             if task is not keep:
                 self._calls.end(task)
-                self._statistics.superseded += self._queue.drop(task)
+                self._statistics.superseded += self._queue.drop(task, now)
 
     # -- work ------------------------------------------------------------------------------------
 
@@ -489,7 +488,7 @@ class Service:
 
     # -- outcomes --------------------------------------------------------------------------------
 
-    def _failed(self, task: PendingTask, outcome: JobResult) -> None:
+    def _failed(self, task: PendingTask, outcome: JobResult, now: float) -> None:
         session, request = task.session, task.request
         if outcome.diverged and request is not None:
             self._statistics.states_diverged += 1
@@ -506,7 +505,7 @@ class Service:
                 self._calls.send_refused(record.call, record.number, *outcome.failure)
         if not session.built:
             # There is nothing to keep: whoever asks again sends all of it.
-            self._forget(session, "refused")
+            self._forget(session, "refused", now)
 
     def _succeeded(self, task: PendingTask, outcome: JobResult, now: float) -> None:
         session, statistics = task.session, self._statistics
@@ -520,6 +519,7 @@ class Service:
         if outcome.restored:
             statistics.restores += 1
             assert outcome.state is not None
+            session.restored_trial = outcome.state.trial
             self._note("restored", session, trial=outcome.state.trial, step=outcome.state.step)
         state = task.state if outcome.state is None else outcome.state
         assert state is not None
@@ -538,7 +538,7 @@ class Service:
             answer = CachedAnswer(*where, outcome.num_actions, outcome.actions, following)
             session.remember(task.digest, answer, most)
             self._send_task(task, answer, now)
-        self._limit_memory(session)
+        self._limit_memory(session, now)
 
     def _send_task(self, task: PendingTask, answer: CachedAnswer, now: float) -> None:
         """Send the task part, and let the calls wait for the sensing part that follows."""
@@ -573,7 +573,7 @@ class Service:
 
     # -- sessions --------------------------------------------------------------------------------
 
-    def _limit_memory(self, session: Session) -> None:
+    def _limit_memory(self, session: Session, now: float) -> None:
         """Count a session's memory; if all take too much, forget others, or its states."""
         sessions = self._sessions
         sessions.update_size(session)
@@ -581,13 +581,13 @@ class Service:
             unused = sessions.largest_evictable()
             if unused is None or unused is session:
                 break
-            self._forget(unused, "room needed")
+            self._forget(unused, "room needed", now)
         if sessions.over_budget:
             # The others are all in use: this robot sends its state each time.
             sessions.drop_states(session)
 
-    def _forget(self, session: Session, reason: str) -> None:
-        self._supersede(session, None)
+    def _forget(self, session: Session, reason: str, now: float) -> None:
+        self._supersede(session, None, now)
         self._sessions.forget(session)
         self._statistics.sessions_evicted += 1
         self._note("evicted", session, reason=reason)

@@ -26,7 +26,7 @@ from holdfast.errors import (
     OtherCodeError,
     UnknownProblemError,
 )
-from holdfast.interruption import Interruption, interruptible
+from holdfast.interruption import Interruption, check, interruptible
 from holdfast.planning import Planner, PlanningState
 from holdfast.problems.problem import Problem
 from holdfast.protocol.decision_cost import (
@@ -204,21 +204,23 @@ class Job:
         # Kept as it becomes known, for it is worth keeping if the rest fails.
         problem = self._problem
         try:
-            if problem is None:
-                problem = self._make_problem(unpack_configuration(self._configuration))
-            if self._price is None:
-                self._price = self._pricing.price_of(problem, self._planning)
-            cost = self._checked_cost(problem, self._price)
-            most = self._most
-            if most is not None and (
-                cost.seconds > most.seconds or cost.num_bytes > most.num_bytes
-            ):
-                return JobResult(problem=problem, price=self._price, postponed=cost)
+            # All of it: a model may take long to build, and to measure.
             with interruptible(self._interruption):
+                if problem is None:
+                    problem = self._make_problem(unpack_configuration(self._configuration))
+                if self._price is None:
+                    self._price = self._pricing.price_of(problem, self._planning)
+                check()
+                cost = self._checked_cost(problem, self._price)
+                most = self._most
+                if most is not None and (
+                    cost.seconds > most.seconds or cost.num_bytes > most.num_bytes
+                ):
+                    return JobResult(problem=problem, price=self._price, postponed=cost)
                 return self._computed(problem)._replace(price=self._price)
         except InterruptedComputationError:
-            # The problem was left in the middle of something.
-            return JobResult(cancelled=True)
+            # The problem was left in the middle of something. What it costs may be known.
+            return JobResult(cancelled=True, price=self._price)
         except _LacksStateError as lack:
             differs = lack.differs or self.state is not None
             return JobResult(
@@ -332,6 +334,7 @@ class Job:
             before = (given.step, isinstance(given, Moved))
             if before < (state.step, state.sensed):
                 continue  # part of the state already
+            check()
             state = self._rolled(planner, state, given.step, most)
             state = _with_input(planner, state, given)
         state = self._rolled(planner, state, request.step, most)
@@ -348,6 +351,7 @@ class Job:
         if not state.step <= step <= most:
             raise _LacksStateError
         while state.step < step:
+            check()
             if planner.needs_sensing(state):
                 raise _LacksStateError
             state = planner.advance(state, planner.choose_task_action(state)[0])

@@ -177,10 +177,13 @@ class PendingTask:
         """Return whether earlier times predict this task's, if it starts at ``state``.
 
         It must follow the previous observation, or start a trial, and span few steps, since a robot
-        may choose their number. Its problem must be built in: other code may take any time.
+        may choose their number. Its problem must be built in: other code may take any time. So may
+        states that came from outside: a particle in an obstacle takes a thousand times as long.
         """
         request = self.request
         if not (self.session.built_in and self.session.is_brief):
+            return False
+        if state is not None and state.trial == self.session.restored_trial:
             return False
         if request is None:
             return True
@@ -216,6 +219,8 @@ class Session:
         Whether the problem was built before, and whether it is part of holdfast.
     is_brief : bool
         Whether no decision was estimated to be too long for the lane of brief ones.
+    restored_trial : int or None
+        The last trial of which a state came from a checkpoint.
     price : Price or None
         What its decisions cost; None before the first.
     planning : PlanningSettings
@@ -259,6 +264,7 @@ class Session:
         )
         self.built = False
         self.is_brief = True
+        self.restored_trial: int | None = None
         self.price: Price | None = None
         self.built_in = configuration.problem in BUILT_IN
         # The number of threads changes no result, so the service may choose it.

@@ -18,6 +18,7 @@ import numpy as np
 
 from holdfast import _kernel, checked
 from holdfast.arrays import FloatArray, IntArray
+from holdfast.errors import HoldfastError
 from holdfast.estimators import KernelEstimator, NearestNeighbor, kernel_estimator, scaled
 from holdfast.problem_attributes import has_general_observations, has_own
 from holdfast.problems.problem import Problem
@@ -65,27 +66,45 @@ def measure_problem(problem: Problem) -> ProblemCost:
     """Return how long a problem's functions take; of one that fails, what is typical.
 
     A function that is slow is asked once, of few states: a robot chooses the problem's model.
+
+    Raises
+    ------
+    HoldfastError
+        If no initial state can be drawn. The decision that is asked for would fail as well, but
+        only after as many attempts for each of its particles.
     """
     own: dict[str, Any] = {}
-    # The decision that is asked for will raise the error again.
+    refused: HoldfastError | None = None
+    # The decision that is asked for will raise any other error again.
     with contextlib.suppress(Exception):
-        _measure(problem, own)
+        try:
+            one_s = _shortest(lambda: _drawn(problem, 1))
+        except HoldfastError as error:
+            refused = error
+        else:
+            _measure(problem, one_s, own)
+    if refused is not None:
+        raise refused
     return TYPICAL_PROBLEM._replace(**own)
 
 
-def _measure(problem: Any, own: dict[str, Any]) -> None:
+def _drawn(problem: Problem, count: int) -> FloatArray:
+    """Return some initial states, the same each time."""
+    return checked.initial_states(problem, stream(0, 0, 0, Purpose.INITIAL_BELIEF), count)
+
+
+def _measure(problem: Any, one_s: float, own: dict[str, Any]) -> None:
     random = stream(0, 0, 0, Purpose.INITIAL_BELIEF)
-
-    def draw(count: int) -> FloatArray:
-        return checked.initial_states(problem, random.anew(), count)
-
-    one_s = _shortest(lambda: draw(1))
+    few, many = (np.repeat(_drawn(problem, 1), count, axis=0) for count in (_FEW, _MANY))
     own["initial"] = CallCost(0.0, one_s)
     if one_s < _SLOW_S:
-        few, many = draw(_FEW), draw(_MANY)
-        own["initial"] = _measured(lambda states: draw(len(states)), few, many)
-    else:
-        few, many = (np.repeat(draw(1), count, axis=0) for count in (_FEW, _MANY))
+        began = thread_time()
+        try:
+            few, many = _drawn(problem, _FEW), _drawn(problem, _MANY)
+            own["initial"] = _measured(lambda states: _drawn(problem, len(states)), few, many)
+        except HoldfastError:
+            # Some found no place, where a belief of few may: what it took to try counts.
+            own["initial"] = CallCost(0.0, (thread_time() - began) / _FEW)
     own["act"] = _measured(lambda states: problem.execute(problem.policy(states, 0)), few, many)
     action = problem.execute(problem.policy(few[0], 0))
     own["move"] = _measured(lambda states: problem.move(states, action, random.anew()), few, many)
