@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import enum
 import math
-import operator
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeAlias, cast
 
@@ -21,7 +20,16 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel
-from holdfast.arrays import FloatArray, IntArray, in_brief
+from holdfast.arrays import (
+    FloatArray,
+    IntArray,
+    floats,
+    in_brief,
+    integer,
+    is_masked,
+    real_numbers,
+    whole,
+)
 from holdfast.errors import InvalidValueError, ProblemError
 
 __all__ = ["NOISE_FREE", "NoiseFreeStream", "Purpose", "Stream", "stream"]
@@ -166,11 +174,11 @@ class Stream:
             low, high = 0, low
         first = _whole("low", low)
         counts = np.asarray(_whole("high", high) - first + bool(endpoint))
-        if counts.size and not 1 <= counts.min() <= counts.max() <= _UNIFORMS:
+        shape = _shape(size) if size is not None else counts.shape
+        if counts.size and 0 not in shape and not 1 <= counts.min() <= counts.max() <= _UNIFORMS:
             raise InvalidValueError(
                 f"integers from {low!r:.40} to {high!r:.40}: a range must have 1 to 2**53 of them"
             )
-        shape = _shape(size) if size is not None else counts.shape
         least, many = (_fitted("low and high", each, shape).reshape(-1) for each in (first, counts))
         found = (least + self._below(many)).reshape(shape)
         return cast(IntArray, _unwrapped(found, size))
@@ -187,6 +195,8 @@ class Stream:
         ``p`` are their probabilities; without it all are alike. Without ``replace`` an entry is
         drawn at most once; it does not go with ``p``.
         """
+        if is_masked(a):
+            raise InvalidValueError(f"a {in_brief(a)}: must have no masked entry")
         entries = np.asarray(a)
         if entries.ndim == 0:
             entries = np.arange(int(_whole("a", a)))
@@ -216,8 +226,7 @@ class Stream:
         (:mod:`holdfast.geometry`) draws from substreams 0 to 999 of the stream that it is given: if
         you use substreams too, give it one of them.
         """
-        if not 0 <= index < _WORD:
-            raise InvalidValueError(f"substream index {index}: allowed are 0 to {_WORD - 1}")
+        index = whole("substream index", index, 0, _WORD - 1)
         self._require_open()
         return Stream(_kernel.substream(self.words, index))
 
@@ -367,13 +376,11 @@ def _shape(size: object) -> tuple[int, ...]:
     """Return a size as a shape: () for None."""
     if size is None:
         return ()
-    try:
-        extents: Iterable[Any] = size if isinstance(size, Iterable) else (size,)
-        shape = tuple(operator.index(extent) for extent in extents)
-    except TypeError:
-        raise InvalidValueError(
-            f"size {size!r:.40}: must be an integer or a tuple of integers"
-        ) from None
+    extents: Iterable[Any] = size if isinstance(size, Iterable) else (size,)
+    found = [integer(extent) for extent in extents]
+    shape = tuple(extent for extent in found if extent is not None)
+    if len(shape) < len(found):
+        raise InvalidValueError(f"size {size!r:.40}: must be an integer or a tuple of integers")
     if any(extent < 0 for extent in shape):
         raise InvalidValueError(f"shape {size}: no extent may be negative")
     return shape
@@ -421,21 +428,18 @@ def _fitted(what: str, values: Any, shape: tuple[int, ...]) -> Any:
 
 
 def _number(name: str, value: npt.ArrayLike | None, default: float) -> FloatArray:
-    try:
-        return np.asarray(default if value is None else value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InvalidValueError(f"{name} {value!r:.40}: must be numbers") from None
+    return floats(name, default if value is None else value)
 
 
 def _whole(name: str, value: npt.ArrayLike) -> IntArray:
-    array = np.asarray(value)
-    if array.size == 0:
-        return array.astype(np.int64)
-    if (
-        array.dtype.kind not in "iu"
-        or not -(2**62) <= int(array.min()) <= int(array.max()) <= 2**62
+    array = real_numbers(value)
+    if array is None or (
+        array.size > 0
+        and (
+            array.dtype.kind == "f" or not -(2**62) <= int(array.min()) <= int(array.max()) <= 2**62
+        )
     ):
-        raise InvalidValueError(f"{name} {in_brief(array)}: must be integers from -2**62 to 2**62")
+        raise InvalidValueError(f"{name} {in_brief(value)}: must be integers from -2**62 to 2**62")
     return array.astype(np.int64)
 
 
@@ -445,7 +449,12 @@ def _cumulated(p: npt.ArrayLike, count: int) -> FloatArray:
     # np.cumsum adds one by one, in order, unlike np.sum.
     sums = np.cumsum(shares)
     # Comparisons with NaN are false.
-    if shares.shape != (count,) or not (shares >= 0.0).all() or not abs(sums[-1] - 1.0) < 1e-6:
+    if (
+        not count
+        or shares.shape != (count,)
+        or not (shares >= 0.0).all()
+        or not abs(sums[-1] - 1.0) < 1e-6
+    ):
         raise InvalidValueError(
             f"p {in_brief(shares)}: must be {count} probabilities, not negative and of sum 1"
         )
