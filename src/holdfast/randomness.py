@@ -44,8 +44,6 @@ _WORD = 2**32
 _FURTHER_DRAWS = 2**30
 _FURTHER_MOTIONS = 2**29
 
-_ENDED = -1
-
 _UNIFORMS = 2**53
 """How many different numbers a uniform draw has."""
 
@@ -71,13 +69,25 @@ class Purpose(enum.IntEnum):
     WORLD_MOVE_OBSERVATION = 20
 
 
+class _Call:
+    """The call of a problem's function that a stream, and all that comes from it, is for."""
+
+    __slots__ = ("has_ended",)
+
+    def __init__(self) -> None:
+        self.has_ended = False
+
+    def __deepcopy__(self, memo: object) -> _Call:
+        return self
+
+
 class Stream:
     """A named, endless sequence of random numbers, with the methods of a NumPy ``Generator``.
 
     A stream goes on: each draw gives other numbers than the one before. Its first draw, and so each
     later one, is a function of its name. Every call of a problem's function gets a stream that
     begins anew, and that ends with the call: one that is kept and asked later raises ProblemError,
-    since what it gave would depend on what else had been computed.
+    since what it gave would depend on what else had been computed. So do its substreams and copies.
 
     Draws are exact to the last bit on every machine. ``size`` is None for one number, or a shape.
 
@@ -85,16 +95,19 @@ class Stream:
     ----------
     words : tuple of int
         Two key words and three counter words of 32 bits each: the name.
+    call : _Call, optional
+        Ends the stream; that of the one from which this one comes.
     """
 
     # Further draws have names of their own, as substreams do. So one draw has 2**33 numbers, none
     # shares a block with another, and normal deviates none with uniform ones.
-    __slots__ = ("_draws", "_motions", "words")
+    __slots__ = ("_call", "_draws", "_motions", "words")
 
     words: Words
 
-    def __init__(self, words: Words) -> None:
+    def __init__(self, words: Words, call: _Call | None = None) -> None:
         self.words = words
+        self._call = _Call() if call is None else call
         self._draws = self._motions = 0
 
     def standard_normal(self, size: Size | None = None) -> FloatArray:
@@ -228,10 +241,14 @@ class Stream:
         """
         index = whole("substream index", index, 0, _WORD - 1)
         self._require_open()
-        return Stream(_kernel.substream(self.words, index))
+        return Stream(_kernel.substream(self.words, index), self._call)
 
     def anew(self) -> Stream:
         """Return the stream from its beginning: who keeps one draws the same from it each time."""
+        return Stream(self.words, self._call)
+
+    def lent(self) -> Stream:
+        """Return the stream from its beginning, for one call of a problem's function."""
         return Stream(self.words)
 
     def for_motion(self) -> Words:
@@ -241,8 +258,8 @@ class Stream:
         return self._continued(_FURTHER_MOTIONS, number)
 
     def end(self) -> None:
-        """Refuse all further draws: the call that the stream was made for is over."""
-        self._draws = _ENDED
+        """Refuse all further draws, of what came from it too: the call that it is for is over."""
+        self._call.has_ended = True
 
     def _normals(self, count: int) -> FloatArray:
         return _kernel.normals(self._for_draw(), count)
@@ -276,7 +293,7 @@ class Stream:
         return _kernel.substream((key0, key1, purpose | marker, step, trial), number)
 
     def _require_open(self) -> None:
-        if self._draws == _ENDED:
+        if self._call.has_ended:
             raise ProblemError(
                 "a stream is for the one call of a problem's function that it was given to: one "
                 "that was kept from an earlier call cannot be drawn from"
@@ -336,6 +353,10 @@ class NoiseFreeStream(Stream):
         return self
 
     def anew(self) -> Stream:
+        """Return the stream itself."""
+        return self
+
+    def lent(self) -> Stream:
         """Return the stream itself."""
         return self
 

@@ -276,6 +276,19 @@ class TestGoingOn:
             with pytest.raises(ProblemError, match=r"for the one call .* kept from an earlier"):
                 draw()
 
+    def test_what_came_from_one_that_has_ended_gives_nothing(self) -> None:
+        own = named()
+        lent = own.lent()
+        derived = [lent.substream(3), lent.substream(3).substream(1), lent.anew()]
+        derived += [copy.copy(lent), copy.deepcopy(lent.substream(4))]
+        first = [each.normal() for each in derived]
+        lent.end()
+        for each in (*derived, lent.anew()):
+            with pytest.raises(ProblemError, match=r"for the one call .* kept from an earlier"):
+                each.normal()
+        # Whose it is goes on, and lends the same again.
+        assert own.normal() == own.lent().anew().normal() == first[2]
+
 
 class TestParameters:
     """NumPy's parameters, and nothing that means one thing there and another one here."""

@@ -77,7 +77,7 @@ def _measure(problem: Any, own: dict[str, Any]) -> None:
     random = stream(0, 0, 0, Purpose.INITIAL_BELIEF)
 
     def draw(count: int) -> FloatArray:
-        return checked.initial_states(problem, random.anew(), count)
+        return checked.initial_states(problem, random, count)
 
     one_s = _shortest(lambda: draw(1))
     own["initial"] = CallCost(0.0, one_s)
@@ -120,7 +120,7 @@ def _sensed(problem: Any, number: int, few: FloatArray, many: FloatArray) -> tup
     """Return what the predictions of a sensing action take, and the size of its observation."""
     random = stream(0, 0, 0, Purpose.HYPOTHESES)
     if has_general_observations(problem):
-        shown = checked.sample_observation(problem, few[0], number, random.anew())
+        shown = checked.sample_observation(problem, few[0], number, random)
 
         def sense(states: FloatArray) -> None:
             problem.sample_observation(states[0], number, random.anew())
