@@ -176,6 +176,9 @@ def check_sizes(problem: Any) -> None:
     A size of NumPy's is replaced by Python's own: it is read everywhere, and ``[0.0] * size`` is
     something else with NumPy's.
     """
+    if isinstance(problem, type):
+        called = problem.__name__
+        raise ProblemError(f"the problem {called} is a class; make one: {called}()")
     kind = type(problem).__name__
     name = getattr(problem, "name", "")
     if not isinstance(name, str) or not name:

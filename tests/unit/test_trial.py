@@ -11,6 +11,7 @@ import pytest
 
 from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration, load
+from holdfast.config.settings import LostSettings
 from holdfast.errors import EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import (
     DONE_VALUES,
@@ -21,6 +22,7 @@ from holdfast.outcome import (
     TrialResult,
 )
 from holdfast.planning import Planner
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.recording.recorder import Recorder
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import run_trial
@@ -246,3 +248,29 @@ class TestOneTrial:
     def test_a_damaged_log_is_refused(self, log: bytes) -> None:
         with pytest.raises(InvalidValueError, match="decision log"):
             list(Decisions(3, log))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (
+            {"lost": LostSettings(on_lost="reinitialize")},  # type: ignore[arg-type]
+            r"lost: on_lost is \"reinitialize\"; expected one of .*did you mean reinitialise\?",
+        ),
+        (
+            {"lost": LostSettings(false_alarm_rate=5)},
+            r"lost: false_alarm_rate is 5; expected a number >= 1e-12 and <= 0\.1",
+        ),
+        ({"lost": "hold"}, "lost is of type str; it must be a LostSettings"),
+        ({"lost": None}, "lost is of type NoneType; it must be a LostSettings"),
+        ({"lost": {"on_lost": "hold"}}, "lost is of type dict; it must be a LostSettings"),
+        (
+            {"max_missing_in_a_row": "x"},
+            r"environment: max_missing_in_a_row is \"x\"; expected a whole number >= 0",
+        ),
+        ({"max_missing_in_a_row": -1}, "max_missing_in_a_row is -1; expected a whole number >= 0"),
+    ],
+)
+def test_what_is_out_of_bounds_is_named(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(InvalidValueError, match=message):
+        run_trial(Planner(PegInHole2D(), method="random"), max_steps=1, **given)

@@ -23,6 +23,7 @@ from holdfast.config.settings import (
     LostSettings,
     OnLost,
     SimulatorSettings,
+    check_settings,
     plain_settings,
 )
 from holdfast.errors import EnvironmentFailedError, HeldError, InvalidValueError, ProblemError
@@ -172,8 +173,12 @@ def run_trial(
     if environment is None:
         environment = SimulatedEnvironment(planner.problem, seed, trial)
     require_methods(environment, type(environment).__name__)
-    track = Trial(planner, seed, trial, plain_settings(lost).false_alarm_rate)
-    missing = MissingReadings(max_missing_in_a_row)
+    lost = plain_settings(lost)
+    check_settings(lost, LostSettings, "lost")
+    missed = plain_settings(EnvironmentSettings(max_missing_in_a_row=max_missing_in_a_row))
+    check_settings(missed, EnvironmentSettings, "environment")
+    track = Trial(planner, seed, trial, lost.false_alarm_rate)
+    missing = MissingReadings(missed.max_missing_in_a_row)
     name = type(environment).__name__
     observer.trial_began(environment, track.state)
 
