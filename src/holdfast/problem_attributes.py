@@ -293,9 +293,18 @@ def sensing_action_of(problem: Any, given: object, *, optional: bool = False) ->
 
 
 def state_labels(problem: Any) -> tuple[str, ...]:
-    """Return a label for each coordinate of a state; empty if the problem has none."""
-    labels = getattr(problem, "state_labels", None)
-    return () if labels is None else tuple(map(str, labels))
+    """Return a label for each coordinate of a state; empty if the problem has none.
+
+    ProblemError if they are no sequence of labels: a text is one label.
+    """
+    given = getattr(problem, "state_labels", None)
+    labels = () if given is None else sequence_of(given)
+    if labels is None:
+        raise ProblemError(
+            f"state_labels of {name_of(problem)} is {given!r:.80}: must be a sequence of labels, "
+            "one for each coordinate of a state, or empty"
+        )
+    return tuple(map(str, labels))
 
 
 def circular_states(problem: Any) -> Sequence[int]:

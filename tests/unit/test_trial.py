@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,8 @@ from holdfast.outcome import (
 from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.recording.recorder import Recorder
-from holdfast.robot.environment import SimulatedEnvironment
+from holdfast.robot.environment import Environment, SimulatedEnvironment
+from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
 from holdfast.robot.trial import run_trial
 
 FAILING_PROBLEM = """
@@ -274,3 +276,25 @@ class TestOneTrial:
 def test_what_is_out_of_bounds_is_named(given: dict[str, Any], message: str) -> None:
     with pytest.raises(InvalidValueError, match=message):
         run_trial(Planner(PegInHole2D(), method="random"), max_steps=1, **given)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda problem: SimulatedEnvironment(problem, 0),
+        lambda _problem: GymnasiumEnvironment(
+            "MountainCarContinuous-v0",
+            [[0], [1]],
+            lambda _environment, action: action[:1].astype(np.float32),
+        ),
+    ],
+)
+def test_a_world_is_for_one_trial(make: Callable[[PegInHole2D], Environment]) -> None:
+    problem = PegInHole2D()
+    planner = Planner(problem, method="fixed")
+    environment = make(problem)
+    environment.perform(np.zeros(3))
+    with pytest.raises(
+        InvalidValueError, match=r"performed 1 task .*make a new one for each trial"
+    ):
+        run_trial(planner, max_steps=3, environment=environment)
