@@ -152,7 +152,7 @@ class TestHowItEnds:
                 "is_sucess",
                 {"is_success": True},
                 "failed",
-                "without success; info has no is_sucess; did you mean is_success?; it has is_success",
+                "; info has no is_sucess; did you mean is_success?; it has is_success",
             ),
             ("trunc", "succes", {"is_success": True}, "truncated", "; info has no succes; did you"),
             ("", "is_success", {"is_success": 1.0}, "succeeded", ""),
