@@ -19,6 +19,7 @@ from holdfast.errors import InvalidValueError
 from holdfast.printable import one_line
 
 __all__ = [
+    "NOTHING_ELSE",
     "BoolArray",
     "FloatArray",
     "IntArray",
@@ -37,6 +38,9 @@ __all__ = [
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
+
+NOTHING_ELSE = "(no text, truth value, date or masked entry)"
+"""What a message says after numbers, which the readers alone take for such."""
 
 _EDGE = 4
 """Entries of a long array that a message shows, at either end."""
@@ -130,8 +134,7 @@ def floats(what: str, value: object) -> FloatArray:
     numbers = real_numbers(value)
     if numbers is None:
         raise InvalidValueError(
-            f"{what} is {one_line(repr(value)):.80}: must be real numbers (no text, truth value, "
-            "date or masked entry)"
+            f"{what} is {one_line(repr(value)):.80}: must be real numbers {NOTHING_ELSE}"
         )
     return np.ascontiguousarray(numbers, dtype=np.float64).reshape(numbers.shape)
 

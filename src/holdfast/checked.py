@@ -375,8 +375,9 @@ def move_each(
     counts if the problem has a ``move_each``.
     """
     if has_own(problem, "move_each", ("move",)):
-        moved = _states(problem, "move_each", states.shape, states, actions, streams, threads)
-        for stream in streams:
+        lent = [stream.lent() for stream in streams]
+        moved = _states(problem, "move_each", states.shape, states, actions, lent, threads)
+        for stream in lent:
             stream.end()
         return moved
     together = np.empty(states.shape)
@@ -414,9 +415,10 @@ def is_goal(problem: Any, state: FloatArray) -> bool:
 
 
 def _ask(problem: Any, function: str, *arguments: object) -> Any:
-    """Call a function of the problem; streams among the arguments end with the call."""
-    found = as_caller(getattr(problem, function), *arguments)
-    for each in arguments:
+    """Call a function of the problem; streams among the arguments are lent to it for the call."""
+    lent = [each.lent() if isinstance(each, Stream) else each for each in arguments]
+    found = as_caller(getattr(problem, function), *lent)
+    for each in lent:
         if isinstance(each, Stream):
             each.end()
     return found

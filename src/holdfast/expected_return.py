@@ -304,8 +304,8 @@ class _Rollouts:
         _read_only(before, all_actions)
         moved = np.stack(
             [
-                # The same noise for each of the J: its stream begins anew.
-                checked.move(problem, states, own_actions, motion.anew())
+                # The same noise for each of the J: the stream is lent anew to each call.
+                checked.move(problem, states, own_actions, motion)
                 for states, own_actions in zip(before, all_actions, strict=True)
             ]
         )

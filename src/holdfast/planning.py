@@ -151,10 +151,11 @@ class Planner:
         check_sizes(problem)
         self.problem = problem
         self.settings = PlanningSettings() if settings is None else plain_settings(settings)
+        check_settings(self.settings)
         if particles is not None:
             self._replace_setting("particle_filter", "num_particles", plain(particles))
         if method is not None:
-            self._replace_setting("selector", "method", method)
+            self._replace_setting("selector", "method", plain(method))
         if particles is not None or method is not None:
             check_settings(self.settings)
 

@@ -176,6 +176,9 @@ def check_sizes(problem: Any) -> None:
     A size of NumPy's is replaced by Python's own: it is read everywhere, and ``[0.0] * size`` is
     something else with NumPy's.
     """
+    if isinstance(problem, type):
+        called = problem.__name__
+        raise ProblemError(f"the problem {called} is a class; make one: {called}()")
     kind = type(problem).__name__
     name = getattr(problem, "name", "")
     if not isinstance(name, str) or not name:
@@ -290,9 +293,18 @@ def sensing_action_of(problem: Any, given: object, *, optional: bool = False) ->
 
 
 def state_labels(problem: Any) -> tuple[str, ...]:
-    """Return a label for each coordinate of a state; empty if the problem has none."""
-    labels = getattr(problem, "state_labels", None)
-    return () if labels is None else tuple(map(str, labels))
+    """Return a label for each coordinate of a state; empty if the problem has none.
+
+    ProblemError if they are no sequence of labels: a text is one label.
+    """
+    given = getattr(problem, "state_labels", None)
+    labels = () if given is None else sequence_of(given)
+    if labels is None:
+        raise ProblemError(
+            f"state_labels of {name_of(problem)} is {given!r:.80}: must be a sequence of labels, "
+            "one for each coordinate of a state, or empty"
+        )
+    return tuple(map(str, labels))
 
 
 def circular_states(problem: Any) -> Sequence[int]:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import enum
 import math
-import operator
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeAlias, cast
 
@@ -21,7 +20,16 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel
-from holdfast.arrays import FloatArray, IntArray, in_brief
+from holdfast.arrays import (
+    FloatArray,
+    IntArray,
+    floats,
+    in_brief,
+    integer,
+    is_masked,
+    real_numbers,
+    whole,
+)
 from holdfast.errors import InvalidValueError, ProblemError
 
 __all__ = ["NOISE_FREE", "NoiseFreeStream", "Purpose", "Stream", "stream"]
@@ -35,8 +43,6 @@ _WORD = 2**32
 # Like the kernel's marker of substreams (2**31), above every purpose, in the same word of the name.
 _FURTHER_DRAWS = 2**30
 _FURTHER_MOTIONS = 2**29
-
-_ENDED = -1
 
 _UNIFORMS = 2**53
 """How many different numbers a uniform draw has."""
@@ -63,13 +69,25 @@ class Purpose(enum.IntEnum):
     WORLD_MOVE_OBSERVATION = 20
 
 
+class _Call:
+    """The call of a problem's function that a stream, and all that comes from it, is for."""
+
+    __slots__ = ("has_ended",)
+
+    def __init__(self) -> None:
+        self.has_ended = False
+
+    def __deepcopy__(self, memo: object) -> _Call:
+        return self
+
+
 class Stream:
     """A named, endless sequence of random numbers, with the methods of a NumPy ``Generator``.
 
     A stream goes on: each draw gives other numbers than the one before. Its first draw, and so each
     later one, is a function of its name. Every call of a problem's function gets a stream that
     begins anew, and that ends with the call: one that is kept and asked later raises ProblemError,
-    since what it gave would depend on what else had been computed.
+    since what it gave would depend on what else had been computed. So do its substreams and copies.
 
     Draws are exact to the last bit on every machine. ``size`` is None for one number, or a shape.
 
@@ -77,16 +95,19 @@ class Stream:
     ----------
     words : tuple of int
         Two key words and three counter words of 32 bits each: the name.
+    call : _Call, optional
+        Ends the stream; that of the one from which this one comes.
     """
 
     # Further draws have names of their own, as substreams do. So one draw has 2**33 numbers, none
     # shares a block with another, and normal deviates none with uniform ones.
-    __slots__ = ("_draws", "_motions", "words")
+    __slots__ = ("_call", "_draws", "_motions", "words")
 
     words: Words
 
-    def __init__(self, words: Words) -> None:
+    def __init__(self, words: Words, call: _Call | None = None) -> None:
         self.words = words
+        self._call = _Call() if call is None else call
         self._draws = self._motions = 0
 
     def standard_normal(self, size: Size | None = None) -> FloatArray:
@@ -166,11 +187,11 @@ class Stream:
             low, high = 0, low
         first = _whole("low", low)
         counts = np.asarray(_whole("high", high) - first + bool(endpoint))
-        if counts.size and not 1 <= counts.min() <= counts.max() <= _UNIFORMS:
+        shape = _shape(size) if size is not None else counts.shape
+        if counts.size and 0 not in shape and not 1 <= counts.min() <= counts.max() <= _UNIFORMS:
             raise InvalidValueError(
                 f"integers from {low!r:.40} to {high!r:.40}: a range must have 1 to 2**53 of them"
             )
-        shape = _shape(size) if size is not None else counts.shape
         least, many = (_fitted("low and high", each, shape).reshape(-1) for each in (first, counts))
         found = (least + self._below(many)).reshape(shape)
         return cast(IntArray, _unwrapped(found, size))
@@ -187,6 +208,8 @@ class Stream:
         ``p`` are their probabilities; without it all are alike. Without ``replace`` an entry is
         drawn at most once; it does not go with ``p``.
         """
+        if is_masked(a):
+            raise InvalidValueError(f"a {in_brief(a)}: must have no masked entry")
         entries = np.asarray(a)
         if entries.ndim == 0:
             entries = np.arange(int(_whole("a", a)))
@@ -216,13 +239,16 @@ class Stream:
         (:mod:`holdfast.geometry`) draws from substreams 0 to 999 of the stream that it is given: if
         you use substreams too, give it one of them.
         """
-        if not 0 <= index < _WORD:
-            raise InvalidValueError(f"substream index {index}: allowed are 0 to {_WORD - 1}")
+        index = whole("substream index", index, 0, _WORD - 1)
         self._require_open()
-        return Stream(_kernel.substream(self.words, index))
+        return Stream(_kernel.substream(self.words, index), self._call)
 
     def anew(self) -> Stream:
         """Return the stream from its beginning: who keeps one draws the same from it each time."""
+        return Stream(self.words, self._call)
+
+    def lent(self) -> Stream:
+        """Return the stream from its beginning, for one call of a problem's function."""
         return Stream(self.words)
 
     def for_motion(self) -> Words:
@@ -232,8 +258,8 @@ class Stream:
         return self._continued(_FURTHER_MOTIONS, number)
 
     def end(self) -> None:
-        """Refuse all further draws: the call that the stream was made for is over."""
-        self._draws = _ENDED
+        """Refuse all further draws, of what came from it too: the call that it is for is over."""
+        self._call.has_ended = True
 
     def _normals(self, count: int) -> FloatArray:
         return _kernel.normals(self._for_draw(), count)
@@ -267,7 +293,7 @@ class Stream:
         return _kernel.substream((key0, key1, purpose | marker, step, trial), number)
 
     def _require_open(self) -> None:
-        if self._draws == _ENDED:
+        if self._call.has_ended:
             raise ProblemError(
                 "a stream is for the one call of a problem's function that it was given to: one "
                 "that was kept from an earlier call cannot be drawn from"
@@ -330,6 +356,10 @@ class NoiseFreeStream(Stream):
         """Return the stream itself."""
         return self
 
+    def lent(self) -> Stream:
+        """Return the stream itself."""
+        return self
+
     def for_motion(self) -> Words:
         """Return the name, which a world does not draw from."""
         return self.words
@@ -367,13 +397,11 @@ def _shape(size: object) -> tuple[int, ...]:
     """Return a size as a shape: () for None."""
     if size is None:
         return ()
-    try:
-        extents: Iterable[Any] = size if isinstance(size, Iterable) else (size,)
-        shape = tuple(operator.index(extent) for extent in extents)
-    except TypeError:
-        raise InvalidValueError(
-            f"size {size!r:.40}: must be an integer or a tuple of integers"
-        ) from None
+    extents: Iterable[Any] = size if isinstance(size, Iterable) else (size,)
+    found = [integer(extent) for extent in extents]
+    shape = tuple(extent for extent in found if extent is not None)
+    if len(shape) < len(found):
+        raise InvalidValueError(f"size {size!r:.40}: must be an integer or a tuple of integers")
     if any(extent < 0 for extent in shape):
         raise InvalidValueError(f"shape {size}: no extent may be negative")
     return shape
@@ -421,21 +449,18 @@ def _fitted(what: str, values: Any, shape: tuple[int, ...]) -> Any:
 
 
 def _number(name: str, value: npt.ArrayLike | None, default: float) -> FloatArray:
-    try:
-        return np.asarray(default if value is None else value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InvalidValueError(f"{name} {value!r:.40}: must be numbers") from None
+    return floats(name, default if value is None else value)
 
 
 def _whole(name: str, value: npt.ArrayLike) -> IntArray:
-    array = np.asarray(value)
-    if array.size == 0:
-        return array.astype(np.int64)
-    if (
-        array.dtype.kind not in "iu"
-        or not -(2**62) <= int(array.min()) <= int(array.max()) <= 2**62
+    array = real_numbers(value)
+    if array is None or (
+        array.size > 0
+        and (
+            array.dtype.kind == "f" or not -(2**62) <= int(array.min()) <= int(array.max()) <= 2**62
+        )
     ):
-        raise InvalidValueError(f"{name} {in_brief(array)}: must be integers from -2**62 to 2**62")
+        raise InvalidValueError(f"{name} {in_brief(value)}: must be integers from -2**62 to 2**62")
     return array.astype(np.int64)
 
 
@@ -445,7 +470,12 @@ def _cumulated(p: npt.ArrayLike, count: int) -> FloatArray:
     # np.cumsum adds one by one, in order, unlike np.sum.
     sums = np.cumsum(shares)
     # Comparisons with NaN are false.
-    if shares.shape != (count,) or not (shares >= 0.0).all() or not abs(sums[-1] - 1.0) < 1e-6:
+    if (
+        not count
+        or shares.shape != (count,)
+        or not (shares >= 0.0).all()
+        or not abs(sums[-1] - 1.0) < 1e-6
+    ):
         raise InvalidValueError(
             f"p {in_brief(shares)}: must be {count} probabilities, not negative and of sum 1"
         )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -242,10 +244,19 @@ class TestStreams:
         assert moves
         assert moves[0::2] == moves[1::2]
 
-    def test_one_that_is_kept_is_refused(self) -> None:
+    @pytest.mark.parametrize(
+        "derive",
+        [
+            lambda stream: stream,
+            lambda stream: stream.substream(1),
+            lambda stream: stream.anew(),
+            copy.copy,
+        ],
+    )
+    def test_one_that_is_kept_is_refused(self, derive: Callable[[Stream], Stream]) -> None:
         class Keeping(Line):
             def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
-                self.kept = getattr(self, "kept", stream)
+                self.kept = getattr(self, "kept", derive(stream))
                 return states + actions + self.kept.normal(size=states.shape)
 
         environment = SimulatedEnvironment(Keeping(), 0, 0)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any, get_args
 
+import numpy as np
 import pytest
 
 from holdfast.config.settings import (
@@ -19,9 +22,10 @@ from holdfast.config.settings import (
     estimator_of,
     path_steps,
 )
-from holdfast.errors import InvalidValueError
+from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.robot.environment import SimulatedEnvironment
 
 
 @pytest.mark.parametrize(
@@ -40,13 +44,45 @@ from holdfast.problems.peg_in_hole_2d import PegInHole2D
             r"max_observation_samples is 40; .*num_observation_samples, which is 41",
         ),
         (PlanningSettings(selector=SelectorSettings(sensing_action=-1)), "sensing_action"),
+        (
+            PlanningSettings(selector={"metod": "random"}),  # type: ignore[arg-type]
+            r"selector\.metod is not a known key; did you mean method\?; allowed: method, ",
+        ),
+        (
+            PlanningSettings(active_sensing=ActiveSensingSettings(horizon=np.int64(0))),  # type: ignore[arg-type]
+            r"active_sensing\.horizon is 0; expected a whole number >= 1",
+        ),
+        (
+            SelectorSettings(method="random"),
+            r"settings is of type SelectorSettings; it must be a PlanningSettings, as in "
+            r"PlanningSettings\(selector=SelectorSettings\(\.\.\.\)\)",
+        ),
+        ({"selector": {}}, "settings is of type dict; it must be a PlanningSettings$"),
+        (300, "settings is of type int; it must be a PlanningSettings$"),
+        (PlanningSettings, "settings is the class PlanningSettings; it must be a Planning"),
+        (
+            SimpleNamespace(planning=PlanningSettings()),
+            "must be a PlanningSettings, as its attribute planning is",
+        ),
     ],
 )
-def test_settings_made_in_python_are_checked(settings: PlanningSettings, message: str) -> None:
+def test_settings_made_in_python_are_checked(settings: Any, message: str) -> None:
     with pytest.raises(InvalidValueError, match=message):
         check_settings(settings)
     with pytest.raises(InvalidValueError, match=message):
-        Planner(PegInHole2D(), settings).init(0, 0)
+        Planner(PegInHole2D(), settings)
+
+
+def test_a_method_may_be_a_text_of_numpys() -> None:
+    planner = Planner(PegInHole2D(), method=np.str_("random"))  # type: ignore[arg-type]
+    assert type(planner.settings.selector.method) is str
+
+
+@pytest.mark.parametrize("use", [Planner, lambda problem: SimulatedEnvironment(problem, 0)])
+def test_a_class_is_no_problem(use: Callable[[Any], object]) -> None:
+    message = r"PegInHole2D is a class; make one: PegInHole2D\(\)"
+    with pytest.raises(ProblemError, match=message):
+        use(PegInHole2D)
 
 
 @pytest.mark.parametrize(

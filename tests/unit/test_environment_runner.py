@@ -363,6 +363,13 @@ class TestFailures:
             ("perform_sensing", [0.5, 0.5], "returned [0.5, 0.5]; it must return an array of sha"),
             ("perform_sensing", [], "returned []; it must return an array of shape (1,)"),
             ("perform_sensing", ["0.5"], "returned ['0.5']; it must return an array of shape (1,)"),
+            (
+                "perform_sensing",
+                np.array(["4.0"]),
+                "it must return an array of shape (1,), of numbers (no text, truth value, date or "
+                "masked entry), or None",
+            ),
+            ("perform", MoveResult(0.0, np.array([True])), "numbers (no text, truth value, "),
             ("perform_sensing", [[1], [1, 2]], "it must return an array of shape (1,)"),
             ("perform_sensing", [1j], "returned [1j]; it must return an array of shape (1,)"),
             ("perform_sensing", np.zeros((1, 1)), "returned an array of shape (1, 1): array([[0.]"),
@@ -723,7 +730,7 @@ class TestShown:
         assert (acted.no_reading, [late.step for late in acted.late]) == ((0,), [1])
         robot.answers["perform_sensing"] = [np.nan, 1.0]
         runner.sense(1, 1)
-        assert "an array of shape (1,), or None" in bench.failure().text
+        assert "an array of shape (1,), of numbers" in bench.failure().text
 
     def test_too_many_in_a_row_stop_the_run(self, bench: Bench) -> None:
         """An observation, late or not, begins the count anew; what is still to come does not."""

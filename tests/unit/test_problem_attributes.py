@@ -31,6 +31,8 @@ from holdfast.problems.problem import (
         ("state_size", 0, "state_size of line is 0"),
         ("sensing_actions", "abcd", "sensing_actions of line is 'abcd'"),
         ("sensing_actions", (), "sensing_actions of line"),
+        ("state_labels", "xy", "state_labels of line is 'xy': must be a sequence of labels"),
+        ("sensing_actions", "xy", "sensing_actions of line is 'xy': must be a sequence of labels"),
         ("state_labels", ("x",), "state_labels of line has 1 labels: must have 2"),
         ("resolution", 0.0, "resolution of line is 0.0"),
         ("resolution", np.inf, "resolution of line is inf"),

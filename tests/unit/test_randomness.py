@@ -24,6 +24,7 @@ from holdfast.geometry import DiscWorld
 from holdfast.randomness import NOISE_FREE, NoiseFreeStream, Purpose, Stream, stream
 
 SAMPLE = 200_000
+MASKED = np.ma.array([1, 2], mask=[True, False])
 named = partial(stream, 12, 3, 4, Purpose.PREDICTION)  # anew at each call
 
 GOLDEN_UNIFORM = ["0x1.f5ffc4fe43eadp-1", "0x1.191f6d04e75b5p-1", "0x1.b5b448943e518p-4"]
@@ -275,6 +276,19 @@ class TestGoingOn:
             with pytest.raises(ProblemError, match=r"for the one call .* kept from an earlier"):
                 draw()
 
+    def test_what_came_from_one_that_has_ended_gives_nothing(self) -> None:
+        own = named()
+        lent = own.lent()
+        derived = [lent.substream(3), lent.substream(3).substream(1), lent.anew()]
+        derived += [copy.copy(lent), copy.deepcopy(lent.substream(4))]
+        first = [each.normal() for each in derived]
+        lent.end()
+        for each in (*derived, lent.anew()):
+            with pytest.raises(ProblemError, match=r"for the one call .* kept from an earlier"):
+                each.normal()
+        # Whose it is goes on, and lends the same again.
+        assert own.normal() == own.lent().anew().normal() == first[2]
+
 
 class TestParameters:
     """NumPy's parameters, and nothing that means one thing there and another one here."""
@@ -339,7 +353,22 @@ class TestParameters:
             (lambda own: own.normal(0.0, 1.0, scale=2.0), "loc, scale and size, each of them once"),
             (lambda own: own.normal(0.0, -1.0), r"scale is -1\., must be >= 0"),
             (lambda own: own.normal(0.0, np.nan), "scale is nan, must be >= 0"),
-            (lambda own: own.normal("a", size=2), "loc 'a': must be numbers"),
+            (lambda own: own.normal("a", size=2), "loc is 'a': must be real numbers"),
+            (lambda own: own.normal(loc="1"), "loc is '1': must be real numbers"),
+            (lambda own: own.normal(loc=True), "loc is True: must be real numbers"),
+            (lambda own: own.normal(loc=[0.0, True]), r"loc is \[0\.0, True\]: must be real"),
+            (lambda own: own.normal(loc=MASKED), "loc is masked_array.*: must be real numbers"),
+            (lambda own: own.uniform(high=np.datetime64("2026-01-01")), "high is .*must be real"),
+            (lambda own: own.normal(size=True), "size True: must be an integer"),
+            (lambda own: own.normal(size=(2, np.True_)), "size .*: must be an integer"),
+            (lambda own: own.random("34"), "size '34': must be an integer"),
+            (lambda own: own.integers(MASKED), "high .*: must be integers"),
+            (lambda own: own.integers([3, True]), "high .*: must be integers"),
+            (lambda own: own.integers(np.timedelta64(3, "s")), "high .*: must be integers"),
+            (lambda own: own.choice(MASKED), "must have no masked entry"),
+            (lambda own: own.choice(2, p=["0.5", "0.5"]), "p is .*: must be real numbers"),
+            (lambda own: own.choice([], 0, p=[]), "must be 0 probabilities"),
+            (lambda own: own.substream(True), "substream index True: allowed are whole numbers"),
             (
                 lambda own: own.normal(np.zeros(3), 1.0, 4),
                 r"size \(4,\) does not fit loc and scale",
@@ -378,6 +407,15 @@ class TestIntegersAndChoices:
         assert named().integers([1, 10], [2, 11]).tolist() == [1, 10]
         assert named().integers(5, 6).item() == 5
         assert named().integers(np.array([], dtype=np.int64), 5).shape == (0,)
+
+    def test_nothing_may_be_drawn_from_nothing(self) -> None:
+        for empty in (
+            named().integers(0, size=0),
+            named().integers(3, 3, (2, 0)),
+            named().choice([], size=0),
+            named().choice(0, 0, replace=False),
+        ):
+            assert empty.size == 0
 
     @pytest.mark.parametrize("count", [6, 10, 2**52 + 1, 3 * 2**51])
     def test_no_integer_is_favoured(self, count: int) -> None:

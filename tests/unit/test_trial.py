@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration, load
+from holdfast.config.settings import LostSettings
 from holdfast.errors import EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import (
     DONE_VALUES,
@@ -21,8 +23,10 @@ from holdfast.outcome import (
     TrialResult,
 )
 from holdfast.planning import Planner
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.recording.recorder import Recorder
-from holdfast.robot.environment import SimulatedEnvironment
+from holdfast.robot.environment import Environment, SimulatedEnvironment
+from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
 from holdfast.robot.trial import run_trial
 
 FAILING_PROBLEM = """
@@ -246,3 +250,51 @@ class TestOneTrial:
     def test_a_damaged_log_is_refused(self, log: bytes) -> None:
         with pytest.raises(InvalidValueError, match="decision log"):
             list(Decisions(3, log))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (
+            {"lost": LostSettings(on_lost="reinitialize")},  # type: ignore[arg-type]
+            r"lost: on_lost is \"reinitialize\"; expected one of .*did you mean reinitialise\?",
+        ),
+        (
+            {"lost": LostSettings(false_alarm_rate=5)},
+            r"lost: false_alarm_rate is 5; expected a number >= 1e-12 and <= 0\.1",
+        ),
+        ({"lost": "hold"}, "lost is of type str; it must be a LostSettings"),
+        ({"lost": None}, "lost is of type NoneType; it must be a LostSettings"),
+        ({"lost": {"on_lost": "hold"}}, "lost is of type dict; it must be a LostSettings"),
+        (
+            {"max_missing_in_a_row": "x"},
+            r"environment: max_missing_in_a_row is \"x\"; expected a whole number >= 0",
+        ),
+        ({"max_missing_in_a_row": -1}, "max_missing_in_a_row is -1; expected a whole number >= 0"),
+    ],
+)
+def test_what_is_out_of_bounds_is_named(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(InvalidValueError, match=message):
+        run_trial(Planner(PegInHole2D(), method="random"), max_steps=1, **given)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda problem: SimulatedEnvironment(problem, 0),
+        lambda _problem: GymnasiumEnvironment(
+            "MountainCarContinuous-v0",
+            [[0], [1]],
+            lambda _environment, action: action[:1].astype(np.float32),
+        ),
+    ],
+)
+def test_a_world_is_for_one_trial(make: Callable[[PegInHole2D], Environment]) -> None:
+    problem = PegInHole2D()
+    planner = Planner(problem, method="fixed")
+    environment = make(problem)
+    environment.perform(np.zeros(3))
+    with pytest.raises(
+        InvalidValueError, match=r"performed 1 task .*make a new one for each trial"
+    ):
+        run_trial(planner, max_steps=3, environment=environment)

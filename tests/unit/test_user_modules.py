@@ -97,6 +97,22 @@ class TestTwoDirectories:
         with pytest.raises(ConfigurationError, match=r"um_helper is .*second/um_helper\.py, and"):
             robot_of(second, "um_other:Robot")
 
+    def test_a_helper_in_a_folder_of_its_own(self, tmp_path: Path) -> None:
+        """Each module puts its ``lib`` on the import path, and so does one that has no helper."""
+        path = "import os, sys\nsys.path.insert(0, os.path.join(os.path.dirname(__file__), 'lib'))"
+        text = f"{path}\nfrom um_below import *"
+        first = written(tmp_path / "first", um_robot=text)
+        second = written(tmp_path / "second", um_other=text)
+        below = [written(each / "lib", um_below=ROBOT) / "um_below.py" for each in (first, second)]
+        assert robot_of(first).where == "lib"
+        with pytest.raises(ConfigurationError) as caught:
+            robot_of(second, "um_other:Robot")
+        for file in below:
+            assert str(file) in str(caught.value)
+        third = written(tmp_path / "third", um_third=text)  # which uses the first one's
+        assert robot_of(third, "um_third:Robot").where == "lib"
+        assert robot_of(first).where == "lib"
+
     def test_a_helper_that_is_imported_later(self, tmp_path: Path) -> None:
         later = (
             "    @property\n    def helper(self):\n        import um_helper\n"

@@ -487,33 +487,58 @@ def _plain(value: Any) -> Any:
     return found
 
 
-def check_settings(settings: PlanningSettings) -> None:
-    """Check the bounds of settings that were made in Python.
+def _plain_or_text(value: Any) -> Any:
+    from holdfast.arrays import plain
+
+    return repr(value) if (found := plain(value)) is value else found
+
+
+def check_settings(
+    settings: object, schema: type[_Section] = PlanningSettings, what: str = "settings"
+) -> None:
+    """Check the type and the bounds of settings that were made in Python.
 
     Raises
     ------
     InvalidValueError
-        If a value is not what its section allows; the message names section and key.
+        If a value is not what its section allows; the message names ``what``, section and key.
     """
+    if not isinstance(settings, schema):
+        raise InvalidValueError(f"{what} is {_mistaken(settings, schema)}")
     try:
-        plain = msgspec.to_builtins(settings)
+        plain = msgspec.to_builtins(settings, enc_hook=_plain_or_text)
     except TypeError as error:
-        raise InvalidValueError(f"settings: {error}") from error
+        raise InvalidValueError(f"{what}: {error}") from error
     try:
-        checked = msgspec.convert(plain, PlanningSettings)
+        checked = msgspec.convert(plain, schema)
     except msgspec.ValidationError as error:
         from holdfast.config.validation import dotted, find_mismatch
 
-        found = find_mismatch(plain, PlanningSettings)
+        found = find_mismatch(plain, schema)
         if found is None or not found.path:
-            raise InvalidValueError(f"settings: {error}") from error
-        raise InvalidValueError(f"settings: {dotted(found.path)} {found.in_words()}") from error
+            raise InvalidValueError(f"{what}: {error}") from error
+        raise InvalidValueError(f"{what}: {dotted(found.path)} {found.in_words()}") from error
+    if not isinstance(settings, PlanningSettings):
+        return
     for name in PlanningSettings.__struct_fields__:
         value, kind = getattr(settings, name), type(getattr(checked, name))
         if not isinstance(value, kind):
             raise InvalidValueError(
-                f"settings: {name} is of type {type(value).__name__}; it must be a {kind.__name__}"
+                f"{what}: {name} is of type {type(value).__name__}; it must be a {kind.__name__}"
             )
     if (unfit := unfit_for_the_method(settings)) is not None:
         (section, key), reason = unfit
-        raise InvalidValueError(f"settings: {section}.{key} {reason}")
+        raise InvalidValueError(f"{what}: {section}.{key} {reason}")
+
+
+def _mistaken(given: object, schema: type[_Section]) -> str:
+    """Return in words what was given in the place of settings, and what they must be."""
+    kind, name = type(given).__name__, schema.__name__
+    came = f"the class {given.__name__}" if isinstance(given, type) else f"of type {kind}"
+    hint = ""
+    if isinstance(getattr(given, "planning", None), schema):
+        hint = ", as its attribute planning is"
+    elif isinstance(given, _Section):
+        keys = [field.name for field in msgspec.structs.fields(schema) if field.type is type(given)]
+        hint = "".join(f", as in {name}({key}={kind}(...))" for key in keys)
+    return f"{came}; it must be a {name}{hint}"

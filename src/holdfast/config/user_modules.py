@@ -55,7 +55,11 @@ def find_in(directory: Path, module: str) -> None:
     _put_on_path(str(directory))
     package = module.partition(".")[0]
     spec = PathFinder.find_spec(package, [str(directory)])
-    needed = follow_imports([module], lambda name: _source(directory, name))
+    needed = follow_imports(
+        [module],
+        lambda name: _source(directory, name),
+        loaded=lambda name: _require_no_stand_in(name, directory),
+    )
     # A folder without __init__.py, of a clone perhaps, is a package only to what has files in it.
     if spec is None or (spec.origin is None and module not in needed):
         return
@@ -106,10 +110,32 @@ def _require_alone(name: str, directory: Path) -> None:
         )
     for other in (_place_of_module(sys.modules.get(name)), _place(_Finder.find_spec(name))):
         if here is not None and other not in (None, here):
-            raise ConfigurationError(
-                f"the module {name} is {here}, and this process has another one of that name, "
-                f"{other}; rename one of them, or use each in a process of its own"
-            )
+            raise _clash(name, here, other)
+
+
+def _require_no_stand_in(name: str, directory: Path) -> None:
+    """Raise ConfigurationError if a module would stand for one from a folder below a directory.
+
+    That folder gets onto the import path only while the directory's module is imported. Then the
+    name leads to what an earlier directory's module has loaded from a folder of its own.
+    """
+    from holdfast.config.user_code import is_users_file
+
+    there = _place_of_module(sys.modules.get(name))
+    others = {other for other, _ in _FOUND.values() if not directory.is_relative_to(other)}
+    if there is None or not any(map(there.is_relative_to, others)) or not is_users_file(str(there)):
+        return
+    below = f"*/{name.replace('.', '/')}"
+    for here in (*directory.glob(f"{below}.py"), *directory.glob(f"{below}/__init__.py")):
+        if here != there:
+            raise _clash(name, here, there)
+
+
+def _clash(name: str, here: Path, there: Path | None) -> ConfigurationError:
+    return ConfigurationError(
+        f"the module {name} is {here}, and this process has another one of that name, "
+        f"{there}; rename one of them, or use each in a process of its own"
+    )
 
 
 def _place(spec: ModuleSpec | None) -> Path | None:

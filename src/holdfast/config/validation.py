@@ -52,6 +52,9 @@ class Mismatch(NamedTuple):
         """Return what the value is and what is expected."""
         if self.missing:
             return "is missing; it has no default"
+        if self.unknown:
+            hint = close_match(str(self.path[-1]), self.allowed)
+            return f"is not a known key{hint}; allowed: {', '.join(self.allowed)}"
         value = self.value
         length = f" (a list of {len(value)})" if isinstance(value, list) else ""
         hint = close_match(value, self.allowed) if isinstance(value, str) else ""

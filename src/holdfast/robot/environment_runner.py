@@ -22,7 +22,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import FloatArray, real_numbers
+from holdfast.arrays import NOTHING_ELSE, FloatArray, real_numbers
 from holdfast.config.user_code import account_of_user_error
 from holdfast.errors import EnvironmentFailedError, HoldfastError, InvalidValueError
 from holdfast.outcome import Ending, MoveResult, ending_of
@@ -50,6 +50,8 @@ __all__ = ["EnvironmentRunner", "InlineRunner", "ThreadedRunner", "make_runner"]
 
 Deliver: TypeAlias = Callable[[EnvironmentEvent, float], None]
 """Takes an event and its time, in seconds; it must not block."""
+
+_NUMBERS = f"numbers {NOTHING_ELSE}"
 
 _SUSPENDED_S = 0.1
 """If a timer fires this much too late, the process was stopped, and with it the environment."""
@@ -262,7 +264,9 @@ class EnvironmentRunner(abc.ABC):
         size = self._sizes[sensing_action]
         array = real_numbers(value)
         if array is None or array.ndim != 1 or array.size < 1 or size not in (None, array.size):
-            raise self._unusable(value, f"an array of shape ({size or 'n'},), or None")
+            raise self._unusable(
+                value, f"an array of shape ({size or 'n'},), of {_NUMBERS}, or None"
+            )
         return self._finite(array, value)
 
     def _reward(self, value: object) -> float | None:
@@ -285,7 +289,7 @@ class EnvironmentRunner(abc.ABC):
             return None
         array = real_numbers(value)
         if array is None or array.ndim != 1 or not 1 <= array.size <= MAX_ACTION_SIZE:
-            need = f"a MoveResult whose {what} is an array of 1 to {MAX_ACTION_SIZE} numbers"
+            need = f"a MoveResult whose {what} is an array of 1 to {MAX_ACTION_SIZE} {_NUMBERS}"
             raise self._unusable(value, need)
         return self._finite(array, value)
 
@@ -309,7 +313,9 @@ class EnvironmentRunner(abc.ABC):
                 continue
             array = real_numbers(entry[1])
             if array is None or array.ndim != 1 or not 1 <= array.size <= MAX_ACTION_SIZE:
-                raise self._unusable(value, f"{need} with observations of shape (n,)")
+                raise self._unusable(
+                    value, f"{need} with observations of shape (n,), of {_NUMBERS}"
+                )
             late.append(LateObservation(step, self._finite(array, value)))
         return tuple(late), tuple(no_reading)
 

@@ -252,10 +252,23 @@ class GymnasiumEnvironment:
         if terminated:
             unsaid = self._success_key is None and self._success is None
             hint = "; success is not defined" if unsaid else ""
+            hint += self._missing_key()
             return Ending("failed", f"{self._name} terminated without success{hint}")
         if truncated:
-            return Ending("truncated", f"{self._name} truncated after {self._steps} steps")
+            hint = self._missing_key()
+            return Ending("truncated", f"{self._name} truncated after {self._steps} steps{hint}")
         return None
+
+    def _missing_key(self) -> str:
+        """Return in words that ``info`` has no such key as ``success``; empty if it has."""
+        key = self._success_key
+        if key in (None, _TERMINATED, *self.info):
+            return ""
+        from holdfast.config.validation import close_match
+
+        keys = [str(each) for each in self.info]
+        there = ", ".join(keys) or "nothing"
+        return f"; info has no {key}{close_match(str(key), keys)}; it has {there}"
 
     def _translated(self, task_action: FloatArray) -> Any:
         from gymnasium import spaces

@@ -17,12 +17,13 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import FloatArray, real_number, real_numbers, whole
+from holdfast.arrays import NOTHING_ELSE, FloatArray, real_number, real_numbers, whole
 from holdfast.config.settings import (
     EnvironmentSettings,
     LostSettings,
     OnLost,
     SimulatorSettings,
+    check_settings,
     plain_settings,
 )
 from holdfast.errors import EnvironmentFailedError, HeldError, InvalidValueError, ProblemError
@@ -171,9 +172,15 @@ def run_trial(
     max_steps = whole("max_steps", max_steps, 1)
     if environment is None:
         environment = SimulatedEnvironment(planner.problem, seed, trial)
+    else:
+        _require_new(environment)
     require_methods(environment, type(environment).__name__)
-    track = Trial(planner, seed, trial, plain_settings(lost).false_alarm_rate)
-    missing = MissingReadings(max_missing_in_a_row)
+    lost = plain_settings(lost)
+    check_settings(lost, LostSettings, "lost")
+    missed = plain_settings(EnvironmentSettings(max_missing_in_a_row=max_missing_in_a_row))
+    check_settings(missed, EnvironmentSettings, "environment")
+    track = Trial(planner, seed, trial, lost.false_alarm_rate)
+    missing = MissingReadings(missed.max_missing_in_a_row)
     name = type(environment).__name__
     observer.trial_began(environment, track.state)
 
@@ -230,6 +237,19 @@ def run_trial(
     return ended
 
 
+def _require_new(environment: Environment) -> None:
+    """Refuse a world that begins with an earlier trial's end."""
+    from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
+
+    if isinstance(environment, SimulatedEnvironment | GymnasiumEnvironment):
+        count = environment.steps_performed()
+        if count:
+            raise InvalidValueError(
+                f"environment is a {type(environment).__name__} that has performed {count} task "
+                "actions already: make a new one for each trial"
+            )
+
+
 def _sense(
     track: Trial, environment: Environment, observer: TrialObserver, missing: MissingReadings
 ) -> None:
@@ -278,7 +298,7 @@ def _reading(environment: Environment, method: str, shown: object) -> FloatArray
     if numbers is None:
         raise EnvironmentFailedError(
             f"{type(environment).__name__}: {method} returned {one_line(repr(shown)):.80}; "
-            "an observation must be an array of numbers"
+            f"an observation must be an array of numbers {NOTHING_ELSE}"
         )
     return np.array(numbers, dtype=np.float64)
 
@@ -291,7 +311,8 @@ def _numbers(environment: Environment, what: str, shown: npt.ArrayLike | None) -
     if array is None or array.ndim != 1 or not 1 <= array.size <= MAX_ACTION_SIZE:
         raise EnvironmentFailedError(
             f"{type(environment).__name__}: perform returned a MoveResult whose {what} is "
-            f"{one_line(repr(shown)):.80}; it must be an array of 1 to {MAX_ACTION_SIZE} numbers"
+            f"{one_line(repr(shown)):.80}; it must be an array of 1 to {MAX_ACTION_SIZE} "
+            f"numbers {NOTHING_ELSE}"
         )
     return np.array(array, dtype=np.float64)
 

@@ -95,7 +95,15 @@ def _drawn(problem: Problem, count: int) -> FloatArray:
 
 def _measure(problem: Any, one_s: float, own: dict[str, Any]) -> None:
     random = stream(0, 0, 0, Purpose.INITIAL_BELIEF)
+<<<<<<< HEAD
     few, many = (np.repeat(_drawn(problem, 1), count, axis=0) for count in (_FEW, _MANY))
+=======
+
+    def draw(count: int) -> FloatArray:
+        return checked.initial_states(problem, random, count)
+
+    one_s = _shortest(lambda: draw(1))
+>>>>>>> fix-c
     own["initial"] = CallCost(0.0, one_s)
     if one_s < _SLOW_S:
         began = thread_time()
@@ -139,7 +147,7 @@ def _sensed(problem: Any, number: int, few: FloatArray, many: FloatArray) -> tup
     """Return what the predictions of a sensing action take, and the size of its observation."""
     random = stream(0, 0, 0, Purpose.HYPOTHESES)
     if has_general_observations(problem):
-        shown = checked.sample_observation(problem, few[0], number, random.anew())
+        shown = checked.sample_observation(problem, few[0], number, random)
 
         def sense(states: FloatArray) -> None:
             problem.sample_observation(states[0], number, random.anew())
