@@ -95,15 +95,7 @@ def _drawn(problem: Problem, count: int) -> FloatArray:
 
 def _measure(problem: Any, one_s: float, own: dict[str, Any]) -> None:
     random = stream(0, 0, 0, Purpose.INITIAL_BELIEF)
-<<<<<<< HEAD
     few, many = (np.repeat(_drawn(problem, 1), count, axis=0) for count in (_FEW, _MANY))
-=======
-
-    def draw(count: int) -> FloatArray:
-        return checked.initial_states(problem, random, count)
-
-    one_s = _shortest(lambda: draw(1))
->>>>>>> fix-c
     own["initial"] = CallCost(0.0, one_s)
     if one_s < _SLOW_S:
         began = thread_time()
