@@ -5,7 +5,7 @@
 A real ``holdfast serve --processes 2`` is attacked while a real robot without local recovery
 decides. The report, as JSON, says whether the service's processes are the same as at the beginning,
 whether each decision of the robot is that of its own planner, and how long it waited at most. Exit
-code 0 if the service lives and no decision differs.
+code 0 if the service lives, no decision differs, and the service was attacked in all ways.
 
 With a certificate of its own (``tls``, ``udp``) the attacker is another robot of the same fleet.
 """
@@ -28,6 +28,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -144,7 +145,7 @@ def _cut_frames(target: Target, chance: random.Random) -> None:
             )
             stream = hello_of(incarnation="cut") * chance.choice((1, 1, 1, 2)) + calls
             for _ in range(chance.choice((0, 1, 3))):
-                start = chance.randrange(len(stream))
+                start = chance.randrange(len(stream) + 1)  # which may be cut to nothing
                 part = stream[start : start + chance.choice((1, 4, 9, 100))]
                 stream = chance.choice(
                     (
@@ -295,30 +296,42 @@ WAYS: dict[str, Way] = {
 _OVER_UDP = frozenset({"datagrams", "flood"})
 
 
+def _ways_over(transport: str) -> list[str]:
+    return [way for way in WAYS if transport == "udp" or way not in _OVER_UDP]
+
+
+def _known_ways(text: str) -> list[str]:
+    """Return the ways that an option names."""
+    ways = text.split(",")
+    for way in ways:
+        if way not in WAYS:
+            raise argparse.ArgumentTypeError(f"{way!r} is none of {','.join(WAYS)}")
+    return ways
+
+
 def _attack(endpoint: str, keys: Path | None, seconds: float, seed: int, ways: list[str]) -> None:
-    """Attack in all ways at once, and say how often, as a line of JSON."""
-    target = Target(endpoint, keys, threading.Event(), collections.Counter())
-    over_udp = endpoint.startswith("udp/")
+    """Attack in all ways at once, and say how often in each, as a line of JSON."""
+    until = threading.Event()
+    over = _ways_over(endpoint.partition("/")[0])
+    counts: dict[str, collections.Counter[str]] = {
+        way: collections.Counter() for way in ways if way in over
+    }
 
     def go_on(way: str) -> None:
+        target = Target(endpoint, keys, until, counts[way])
         chance = random.Random(f"{seed} {way}")
         while target.goes_on:
             # A service that is too busy for another link is no reason to give up.
             with contextlib.suppress(OSError, AssertionError):
                 WAYS[way](target, chance)
 
-    threads = [
-        threading.Thread(target=go_on, args=(way,))
-        for way in ways
-        if over_udp or way not in _OVER_UDP
-    ]
-    for thread in threads:
-        thread.start()
-    target.until.wait(seconds)
-    target.until.set()
-    for thread in threads:
-        thread.join()
-    print(json.dumps(dict(sorted(target.counts.items()))), flush=True)
+    with ThreadPoolExecutor(len(WAYS)) as pool:
+        attacks = [pool.submit(go_on, way) for way in counts]
+        until.wait(seconds)
+        until.set()
+    print(json.dumps(counts), flush=True)
+    for attack in attacks:
+        attack.result()  # raises what ended it
 
 
 # -- the attacked --------------------------------------------------------------------------------
@@ -362,6 +375,7 @@ def attacked(
 ) -> tuple[dict[str, Any], list[str]]:
     """Attack a service for so long; return the report, and what must not have happened."""
     findings: list[str] = []
+    ways = ways or _ways_over(transport)
     with Site(directory) as site:
         options: tuple[str, ...] = ()
         robot_options: tuple[str, ...] = ()
@@ -382,7 +396,7 @@ def attacked(
             sys.executable,
             *("-m", "tests.fuzz.attacker", "--attack", service.endpoint, *mallory),
             *("--minutes", str(seconds / 60.0), "--seed", str(seed)),
-            *(("--ways", ",".join(ways)) if ways else ()),
+            *("--ways", ",".join(ways)),
             variables={"PYTHONPATH": str(Path(__file__).parents[2])},
         )
         most_bytes = 0
@@ -410,6 +424,8 @@ def attacked(
         findings += robots.failures
         later_ms, first_ms = _longest_wait_ms(robots)
         sent = [line for line in attacker.output.splitlines() if line.startswith("{")]
+        attacks = json.loads(sent[-1]) if sent else {}
+        findings += [f"no attack: {way}" for way in ways if not any(attacks.get(way, {}).values())]
         report = {
             "transport": transport,
             "seconds": seconds,
@@ -421,29 +437,32 @@ def attacked(
             "most_memory_mb": round(most_bytes / 2**20, 1),
             "robot": compared,
             "robot_tells": robots.told(),
-            "attacks": json.loads(sent[-1]) if sent else {},
+            "attacks": attacks,
             "service_events": dict(events),
         }
     return report, findings
 
 
-def main() -> int:
+def main(arguments: list[str] | None = None) -> int:
     """Attack, and print the report."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--transport", choices=TRANSPORTS, default="tcp")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--ways", help=f"of {','.join(WAYS)}; all of them unless given")
+    parser.add_argument(
+        "--ways", type=_known_ways, help=f"of {','.join(WAYS)}; all of the transport unless given"
+    )
     parser.add_argument("--attack", metavar="ENDPOINT", help="a service that is there already")
     parser.add_argument("--tls", type=Path, help="credentials of the attacker, with --attack")
-    options = parser.parse_args()
-    ways = options.ways.split(",") if options.ways else list(WAYS)
+    options = parser.parse_args(arguments)
     seconds = 60.0 * options.minutes
     if options.attack:
-        _attack(options.attack, options.tls, seconds, options.seed, ways)
+        _attack(options.attack, options.tls, seconds, options.seed, options.ways or list(WAYS))
         return 0
     with tempfile.TemporaryDirectory(prefix="holdfast-attacker-") as directory:
-        report, findings = attacked(options.transport, seconds, options.seed, Path(directory), ways)
+        report, findings = attacked(
+            options.transport, seconds, options.seed, Path(directory), options.ways
+        )
     print(msgspec.json.format(msgspec.json.encode(report), indent=2).decode())
     for finding in findings:
         print(f"FOUND: {finding}")

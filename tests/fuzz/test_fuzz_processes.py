@@ -12,12 +12,17 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+<<<<<<< HEAD
 from tests.fuzz.attack_messages import (
     IN_AN_OBSTACLE,
     checkpoints_in_obstacles,
     numeric_keys,
 )
 from tests.fuzz.attacker import TRANSPORTS, attacked
+=======
+from tests.fuzz.attack_messages import numeric_keys
+from tests.fuzz.attacker import TRANSPORTS, attacked, main
+>>>>>>> fix-a
 from tests.fuzz.hostile_client import HostileMessages
 from tests.fuzz.live import run_live
 from tests.fuzz.measuring import Held, flatness
@@ -73,8 +78,30 @@ def test_an_attacker_ends_no_process_and_changes_no_decision(
     assert report["decides_identically"]
     assert report["robot"]["decisions"] > 0
     # Each class of attack has come about.
+<<<<<<< HEAD
     assert len(report["attacks"]) == (11 if transport == "udp" else 8)
     assert all(report["attacks"].values())
+=======
+    attacks = [each for way in report["attacks"].values() for each in way.values()]
+    assert len(attacks) == (10 if transport == "udp" else 7)
+    assert all(attacks)
+
+
+def test_an_attack_that_does_not_come_about_is_found(tmp_path: Path) -> None:
+    """Each way of attacking that was asked for is missed: one has no meaning over this link."""
+    report, findings = attacked("tcp", 1.0, 1, tmp_path, ["cut", "flood"])
+    assert report["attacks"]["cut"]
+    assert [finding for finding in findings if finding.startswith("no attack")] == [
+        "no attack: flood"
+    ]
+
+
+def test_an_unknown_way_of_attacking_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["--attack", "tcp/127.0.0.1:1", "--minutes", "0", "--ways", "cut,sideways"])
+    assert ended.value.code == 2
+    assert "'sideways' is none of odd,settings" in capsys.readouterr().err
+>>>>>>> fix-a
 
 
 def test_every_number_of_the_settings_is_attacked() -> None:
