@@ -12,17 +12,12 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-<<<<<<< HEAD
 from tests.fuzz.attack_messages import (
     IN_AN_OBSTACLE,
     checkpoints_in_obstacles,
     numeric_keys,
 )
-from tests.fuzz.attacker import TRANSPORTS, attacked
-=======
-from tests.fuzz.attack_messages import numeric_keys
 from tests.fuzz.attacker import TRANSPORTS, attacked, main
->>>>>>> fix-a
 from tests.fuzz.hostile_client import HostileMessages
 from tests.fuzz.live import run_live
 from tests.fuzz.measuring import Held, flatness
@@ -78,12 +73,8 @@ def test_an_attacker_ends_no_process_and_changes_no_decision(
     assert report["decides_identically"]
     assert report["robot"]["decisions"] > 0
     # Each class of attack has come about.
-<<<<<<< HEAD
-    assert len(report["attacks"]) == (11 if transport == "udp" else 8)
-    assert all(report["attacks"].values())
-=======
     attacks = [each for way in report["attacks"].values() for each in way.values()]
-    assert len(attacks) == (10 if transport == "udp" else 7)
+    assert len(attacks) == (11 if transport == "udp" else 8)
     assert all(attacks)
 
 
@@ -101,7 +92,6 @@ def test_an_unknown_way_of_attacking_is_refused(capsys: pytest.CaptureFixture[st
         main(["--attack", "tcp/127.0.0.1:1", "--minutes", "0", "--ways", "cut,sideways"])
     assert ended.value.code == 2
     assert "'sideways' is none of odd,settings" in capsys.readouterr().err
->>>>>>> fix-a
 
 
 def test_every_number_of_the_settings_is_attacked() -> None:
