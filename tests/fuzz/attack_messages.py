@@ -211,7 +211,7 @@ def hostile_settings(chance: random.Random) -> Iterator[bytes]:
 
 
 def checkpoints_in_obstacles(chance: random.Random) -> Iterator[bytes]:
-    """Yield openings whose particles stand where none can: moves take a thousand times as long."""
+    """Yield openings whose particles are where none can be: each move takes very long."""
     for name in itertools.cycle(IN_AN_OBSTACLE):
         count = chance.choice((12, 300, 8000))
         selector = SelectorSettings(method="random")
