@@ -150,8 +150,9 @@ class Planner:
             raise InvalidValueError(f"problem is the name {problem!r}: holdfast.make builds it")
         check_sizes(problem)
         self.problem = problem
-        self.settings = PlanningSettings() if settings is None else plain_settings(settings)
-        check_settings(self.settings)
+        settings = PlanningSettings() if settings is None else settings
+        check_settings(settings)
+        self.settings = plain_settings(settings)
         if particles is not None:
             self._replace_setting("particle_filter", "num_particles", plain(particles))
         if method is not None:

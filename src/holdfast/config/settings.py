@@ -518,15 +518,15 @@ def check_settings(
         if found is None or not found.path:
             raise InvalidValueError(f"{what}: {error}") from error
         raise InvalidValueError(f"{what}: {dotted(found.path)} {found.in_words()}") from error
-    if not isinstance(settings, PlanningSettings):
+    if not isinstance(checked, PlanningSettings):
         return
     for name in PlanningSettings.__struct_fields__:
         value, kind = getattr(settings, name), type(getattr(checked, name))
-        if not isinstance(value, kind):
+        if issubclass(kind, _Section) and not isinstance(value, kind):
             raise InvalidValueError(
                 f"{what}: {name} is of type {type(value).__name__}; it must be a {kind.__name__}"
             )
-    if (unfit := unfit_for_the_method(settings)) is not None:
+    if (unfit := unfit_for_the_method(checked)) is not None:
         (section, key), reason = unfit
         raise InvalidValueError(f"{what}: {section}.{key} {reason}")
 

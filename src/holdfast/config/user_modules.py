@@ -87,9 +87,13 @@ def _put_on_path(directory: str) -> None:
     libraries = (
         index
         for index, entry in enumerate(sys.path)
-        if index >= behind and not {"site-packages", "dist-packages"}.isdisjoint(Path(entry).parts)
+        if index >= behind and _is_library(Path(entry))
     )
     sys.path.insert(next(libraries, len(sys.path)), directory)
+
+
+def _is_library(path: Path) -> bool:
+    return not {"site-packages", "dist-packages"}.isdisjoint(path.parts)
 
 
 def _source(directory: Path, name: str) -> Path | None:
@@ -119,11 +123,9 @@ def _require_no_stand_in(name: str, directory: Path) -> None:
     That folder gets onto the import path only while the directory's module is imported. Then the
     name leads to what an earlier directory's module has loaded from a folder of its own.
     """
-    from holdfast.config.user_code import is_users_file
-
     there = _place_of_module(sys.modules.get(name))
     others = {other for other, _ in _FOUND.values() if not directory.is_relative_to(other)}
-    if there is None or not any(map(there.is_relative_to, others)) or not is_users_file(str(there)):
+    if there is None or _is_library(there) or not any(map(there.is_relative_to, others)):
         return
     below = f"*/{name.replace('.', '/')}"
     for here in (*directory.glob(f"{below}.py"), *directory.glob(f"{below}/__init__.py")):
