@@ -13,6 +13,7 @@
 #include <cstdint>
 #include <optional>
 #include <stdexcept>
+#include <utility>
 #include <vector>
 
 #include "bindings.hpp"
@@ -47,14 +48,23 @@ bool all_non_negative(const double* values, std::size_t count) {
     return non_negative;
 }
 
-// Lets other Python threads run while the work is long enough to be worth the switch.
-class ReleaseForLongWork {
+// Lets other Python threads run while the work is long enough to be worth the switch, or proves to
+// be.
+class ReleaseForLongWork final : public LongWork {
   public:
-    explicit ReleaseForLongWork(std::size_t count) {
-        if (count >= 1024) release_.emplace();
+    explicit ReleaseForLongWork(std::size_t count) : before_(std::exchange(long_work, this)) {
+        if (count >= 1024) begins();
+    }
+    ~ReleaseForLongWork() { long_work = before_; }
+    ReleaseForLongWork(const ReleaseForLongWork&) = delete;
+    ReleaseForLongWork& operator=(const ReleaseForLongWork&) = delete;
+
+    void begins() override {
+        if (!release_) release_.emplace();
     }
 
   private:
+    LongWork* before_;
     std::optional<WithoutInterpreter> release_;
 };
 

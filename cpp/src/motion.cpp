@@ -18,6 +18,9 @@ namespace {
 constexpr std::size_t block_size = 128;
 constexpr std::size_t way_block_size = 32;
 
+// Few particles that are not in an obstacle need more attempts to find a free place.
+constexpr std::size_t attempts_of_long_work = 16;
+
 // About what one particle takes; from it follows how many threads are worth their waking.
 constexpr double nanoseconds_of_a_move = 80.0;
 
@@ -63,6 +66,8 @@ std::size_t add_noise(const World& world, std::size_t first, std::size_t count,
         if (!place(states + i * d, noise.data() + i * d)) pending[num_pending++] = i;
     }
     for (std::size_t attempt = 1; attempt < max_noise_attempts && num_pending > 0; ++attempt) {
+        check_interruption();
+        if (attempt == attempts_of_long_work && long_work != nullptr) long_work->begins();
         const Stream draws = substream(stream, attempt);
         std::size_t still_pending = 0;
         for (std::size_t p = 0; p < num_pending; ++p) {

@@ -21,6 +21,15 @@ namespace holdfast {
 // Draws of the noise before the particle is left where it is without noise.
 inline constexpr std::size_t max_noise_attempts = 1000;
 
+/// Told once the calling thread's move or draw proves to take long.
+struct LongWork {
+    virtual void begins() = 0;
+
+  protected:
+    ~LongWork() = default;
+};
+inline thread_local LongWork* long_work = nullptr;
+
 // Below this number of particles one thread is faster than waking the others.
 inline constexpr std::size_t parallel_threshold = 4096;
 

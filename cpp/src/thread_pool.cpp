@@ -12,6 +12,7 @@
 #include <mutex>
 #include <system_error>
 #include <thread>
+#include <utility>
 #include <vector>
 
 #include "rounding.hpp"
@@ -28,7 +29,7 @@ constexpr int patience = 100;
 
 thread_local const std::uint8_t* interruption = nullptr;
 
-/// Raises Interrupted if a flag is set; a task that has begun is not cut short.
+/// Raises Interrupted if a flag is set.
 void require_awaited(const std::uint8_t* flag) {
     if (flag != nullptr && __atomic_load_n(flag, __ATOMIC_RELAXED) != 0) throw Interrupted();
 }
@@ -48,6 +49,7 @@ struct Job {
     /// Works until no task is left; tells whether there was any.
     bool work() {
         std::size_t mine = 0;
+        const std::uint8_t* const before = std::exchange(interruption, interrupted);
         for (std::size_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < tasks; ++mine) {
             if (failed.load(std::memory_order_relaxed)) continue;
             try {
@@ -57,6 +59,7 @@ struct Job {
                 if (!failed.exchange(true)) failure = std::current_exception();
             }
         }
+        interruption = before;
         if (mine != 0) {
             finished.fetch_add(mine, std::memory_order_release);
             finished.notify_one();
@@ -194,6 +197,10 @@ double use_threads_from(double nanoseconds) {
 
 void watch_interruption(const std::uint8_t* flag) {
     interruption = flag;
+}
+
+void check_interruption() {
+    require_awaited(interruption);
 }
 
 int threads_started() {

@@ -39,6 +39,9 @@ struct Interrupted : std::exception {
 /// thread may set it at any time. Null for none.
 void watch_interruption(const std::uint8_t* flag);
 
+/// Raises Interrupted if that flag is set; for tasks that may take long.
+void check_interruption();
+
 /// Calls `function(context, i)` for every i < tasks; passes on the first exception.
 void run_tasks(std::size_t tasks, int threads, void (*function)(void*, std::size_t), void* context);
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any, get_args
 
 import numpy as np
@@ -14,6 +15,7 @@ from holdfast.errors import InterruptedComputationError
 from holdfast.interruption import Interruption, check, interruptible
 from holdfast.planning import Planner
 from holdfast.problems.capsule_robot import CapsuleRobot
+from holdfast.randomness import Purpose, stream
 
 
 class Counting(CapsuleRobot):
@@ -105,3 +107,19 @@ def test_the_outer_interruption_is_watched_again_after_the_inner_one() -> None:
             outer.set()
             _kernel.all_finite(points)
         _kernel.entropies(points, rows, True, 0, 5, 1e-3, 0.0, 0.0, 1, (1.0,), np.empty(0))
+
+
+def test_one_block_of_particles_in_an_obstacle_leaves_the_interpreter_and_ends() -> None:
+    """With so many walls, each of a thousand attempts to place the noise takes long."""
+    around = {"end_0": [-1000.0, 0.0], "end_1": [-1000.0, 3.0], "thickness": 500.0}
+    elsewhere = {"end_0": [100.0, 100.0], "end_1": [100.0, 101.0]}
+    model = {"walls": [elsewhere] * 3000 + [around], "motion_cov": [1e-12, 1e-12]}
+    problem = CapsuleRobot.from_settings(model, {})
+    interruption = Interruption()
+    other = threading.Timer(0.02, interruption.set)
+    other.start()
+    with pytest.raises(InterruptedComputationError), interruptible(interruption):
+        problem.move(
+            np.tile([-1000.0, 1.0], (128, 1)), np.zeros(2), stream(0, 0, 0, Purpose.PREDICTION)
+        )
+    other.join()
