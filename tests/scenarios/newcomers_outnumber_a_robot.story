@@ -32,56 +32,66 @@ crowd service=cloud-1 at=0.2 robots=200
    0.2371  robot    hears of call 3: Progress
    0.2452  robot    performs task actions 16 to 17
    0.3004  robot    hears of call 3: Progress
-   0.3538  robot    hears of call 3: SensingAnswer
-   0.3538  robot    performs sensing action 0 of step 18
-   0.3538  robot    hears of call 3: its end
-   0.3548  robot    asks cloud-1, call 4
-   0.4201  robot    hears of call 4: Progress
-   0.4834  robot    hears of call 4: Progress
-   0.5459  robot    hears of call 4: Progress
-   0.6084  robot    hears of call 4: Progress
-   0.6709  robot    hears of call 4: Progress
-   0.7326  robot    hears of call 4: Progress
-   0.7738  robot    hears of call 4: TaskAnswer
-   0.7738  robot    performs task actions 18 to 23
-   0.8283  robot    hears of call 4: Progress
-   0.8350  robot    performs task actions 24 to 26
-   0.8901  robot    hears of call 4: Progress
-   0.9518  robot    hears of call 4: Progress
-   1.0127  robot    hears of call 4: Progress
-   1.0737  robot    hears of call 4: Progress
-   1.1338  robot    hears of call 4: SensingAnswer
-   1.1338  robot    performs sensing action 0 of step 27
-   1.1338  robot    hears of call 4: its end
-   1.1348  robot    asks cloud-1, call 5
-   1.1948  robot    hears of call 5: Progress
-   1.2557  robot    hears of call 5: Progress
-   1.3158  robot    hears of call 5: Progress
-   1.3760  robot    hears of call 5: Progress
-   1.4362  robot    hears of call 5: Progress
-   1.4955  robot    hears of call 5: Progress
-   1.5538  robot    hears of call 5: TaskAnswer
-   1.5538  robot    performs task actions 27 to 32
-   1.6132  robot    hears of call 5: Progress
-   1.6150  robot    performs task actions 33 to 35
-   1.6725  robot    hears of call 5: Progress
-   1.7319  robot    hears of call 5: Progress
-   1.7905  robot    hears of call 5: Progress
-   1.8491  robot    hears of call 5: Progress
-   1.9077  robot    hears of call 5: Progress
-   1.9138  robot    hears of call 5: SensingAnswer
-   1.9138  robot    performs sensing action 0 of step 36
-   1.9138  robot    hears of call 5: its end
-   1.9148  robot    asks cloud-1, call 6
-   1.9663  robot    hears of call 6: Progress
-   2.0249  robot    hears of call 6: Progress
-   2.0835  robot    hears of call 6: Progress
-   2.1413  robot    hears of call 6: Progress
-   2.1991  robot    hears of call 6: Progress
-   2.2569  robot    hears of call 6: Progress
-   2.3140  robot    hears of call 6: Progress
-   2.3338  robot    hears of call 6: TaskAnswer
-   2.3338  robot    performs task actions 36 to 39
-   2.3746  robot    ends trial 3 after 40 steps
+   0.3636  robot    hears of call 3: Progress
+   0.4269  robot    hears of call 3: Progress
+   0.4902  robot    hears of call 3: Progress
+   0.5338  robot    hears of call 3: SensingAnswer
+   0.5338  robot    performs sensing action 0 of step 18
+   0.5338  robot    hears of call 3: its end
+   0.5348  robot    asks cloud-1, call 4
+   0.6001  robot    hears of call 4: Progress
+   0.6634  robot    hears of call 4: Progress
+   0.7259  robot    hears of call 4: Progress
+   0.7884  robot    hears of call 4: Progress
+   0.8509  robot    hears of call 4: Progress
+   0.9126  robot    hears of call 4: Progress
+   0.9538  robot    hears of call 4: TaskAnswer
+   0.9538  robot    performs task actions 18 to 24
+   1.0155  robot    hears of call 4: Progress
+   1.0252  robot    performs task actions 25 to 26
+   1.0765  robot    hears of call 4: Progress
+   1.1374  robot    hears of call 4: Progress
+   1.1983  robot    hears of call 4: Progress
+   1.2593  robot    hears of call 4: Progress
+   1.3194  robot    hears of call 4: Progress
+   1.3796  robot    hears of call 4: Progress
+   1.4397  robot    hears of call 4: Progress
+   1.4938  robot    hears of call 4: SensingAnswer
+   1.4938  robot    performs sensing action 0 of step 27
+   1.4938  robot    hears of call 4: its end
+   1.4948  robot    asks cloud-1, call 5
+   1.5570  robot    hears of call 5: Progress
+   1.6171  robot    hears of call 5: Progress
+   1.6765  robot    hears of call 5: Progress
+   1.7359  robot    hears of call 5: Progress
+   1.7952  robot    hears of call 5: Progress
+   1.8538  robot    hears of call 5: Progress
+   1.9124  robot    hears of call 5: Progress
+   1.9138  robot    hears of call 5: TaskAnswer
+   1.9138  robot    performs task actions 27 to 32
+   1.9710  robot    hears of call 5: Progress
+   1.9750  robot    performs task actions 33 to 35
+   2.0296  robot    hears of call 5: Progress
+   2.0874  robot    hears of call 5: Progress
+   2.1452  robot    hears of call 5: Progress
+   2.2030  robot    hears of call 5: Progress
+   2.2609  robot    hears of call 5: Progress
+   2.3179  robot    hears of call 5: Progress
+   2.3749  robot    hears of call 5: Progress
+   2.4320  robot    hears of call 5: Progress
+   2.4538  robot    hears of call 5: SensingAnswer
+   2.4538  robot    performs sensing action 0 of step 36
+   2.4538  robot    hears of call 5: its end
+   2.4548  robot    asks cloud-1, call 6
+   2.5138  robot    hears of call 6: Progress
+   2.5709  robot    hears of call 6: Progress
+   2.6279  robot    hears of call 6: Progress
+   2.6841  robot    hears of call 6: Progress
+   2.7404  robot    hears of call 6: Progress
+   2.7966  robot    hears of call 6: Progress
+   2.8521  robot    hears of call 6: Progress
+   2.8738  robot    hears of call 6: TaskAnswer
+   2.8738  robot    performs task actions 36 to 39
+   2.9146  robot    ends trial 3 after 40 steps
 
 decided as without faults
