@@ -108,7 +108,6 @@ class TestOneCommandRepeated:
         killed, ended = -signal.SIGKILL, 128 + signal.SIGTERM
         codes = [command() for _ in range(6)]
         assert codes == [killed, killed, ended, killed, 0, 0], story.running.account()
-        # As it is called where the command was started.
         note = f"{story.running.out}: complete, with 2 trials"
         assert [event["reason"] for event in story.running.events] == [note]
         story.finish(story.running)
