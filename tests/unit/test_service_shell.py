@@ -155,7 +155,6 @@ class Joined:
         self.shell = ServiceShell(
             Service(make_problem, workers, ServiceLimits(**limits)),
             self.network.service("service", "boot"),
-            workers,
             self.log,
             on_decision=lambda *times: self.timed.append(times),
         )
@@ -505,7 +504,7 @@ class Call:
 
 def scripted(*jobs: tuple[str, float, Callable[[], object]]) -> tuple[Script, ServiceShell]:
     machine = Script(*(StartJob(cast(Job, Scripted(kind, run)), s) for kind, s, run in jobs))
-    return machine, ServiceShell(machine, InProcessNetwork().service("service", "boot"), 2, Log())
+    return machine, ServiceShell(machine, InProcessNetwork().service("service", "boot"), Log())
 
 
 @on_a_loop

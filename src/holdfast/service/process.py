@@ -267,7 +267,7 @@ class _ServiceProcess:
         service = Service(problems, workers, limits, _describe_error, pricing)
         self.events = EventLog(sys.stderr, format=options.log, component=options.name)
         self._times = DecisionTimes()
-        self._shell = ServiceShell(service, self._transport, workers, self.events, self._times.add)
+        self._shell = ServiceShell(service, self._transport, self.events, self._times.add)
         self._manager = ServiceManager()
 
     @property

@@ -21,6 +21,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
+from time import thread_time
 from typing import TYPE_CHECKING, Concatenate, Final, ParamSpec, TypeVar
 
 from holdfast.errors import FrameError
@@ -405,12 +406,12 @@ class Link(asyncio.BufferedProtocol):
         self._is_queued = False
         if self._ended or self._is_paused:
             return
-        owner, began = self.owner, self._loop.time()
+        owner, began = self.owner, thread_time()
         try:
             while self._handle_next():
                 if self.ended or self._is_paused:
                     break
-                if self._loop.time() >= began + SLICE_S and (self._frames or self._unread):
+                if thread_time() >= began + SLICE_S and (self._frames or self._unread):
                     self._enqueue()
                     break
             else:
@@ -421,7 +422,7 @@ class Link(asyncio.BufferedProtocol):
             self.end(
                 str(error), goodbye=str(error) if self.hello is not None else None, refused=True
             )
-        self._settings.scheduler.charge(owner, self._loop.time() - began)
+        self._settings.scheduler.charge(owner, thread_time() - began)
 
     def _handle_next(self) -> bool:
         """Handle one frame, or decode the next bytes; return whether there was anything."""
