@@ -645,7 +645,7 @@ async def test_a_machine_with_a_defect_forgets_everything_and_goes_on(
     method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Half-way through a change its tables may not agree any more; it holds nothing of worth."""
-    async with joined() as both:
+    async with joined(workers=3) as both:
         turns, other = Robot(key=1), Robot(key=2)
         patient, busy = Patient(both.network), Patient(both.network)
         await patient.run_turns(turns, 1)

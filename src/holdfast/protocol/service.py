@@ -194,7 +194,7 @@ class Service:
                 if is_awaited:
                     self._postpone(task, outcome.postponed, now)
             elif outcome.failure is not None or outcome.lacks_state:
-                self._failed(task, outcome, now)
+                self._failed(task, outcome)
             else:
                 computed_s = now - task.started_at
                 session.overran = session.overran and computed_s > self._queue.limits_s[MEDIUM]
@@ -499,7 +499,7 @@ class Service:
                 key = task.session.key
                 self._reject_busy(record.call, record.number, key, task.lane, now)
 
-    def _failed(self, task: PendingTask, outcome: JobResult, now: float) -> None:
+    def _failed(self, task: PendingTask, outcome: JobResult) -> None:
         session, request = task.session, task.request
         if outcome.diverged and request is not None:
             self._statistics.states_diverged += 1
