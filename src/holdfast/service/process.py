@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from holdfast.service.shell import ServiceShell
     from holdfast.service.supervisor import Supervised
 
-__all__ = ["Extension", "MakeExtensions", "main"]
+__all__ = ["Extension", "MakeExtension", "main"]
 
 _SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while another waits for it."""
@@ -42,15 +42,14 @@ _CHECK_INTERVAL_S = 0.01
 _STDIN = 0
 _ROS1 = "ros1"
 
-_OFFERED = ("health", "metrics", "ros2", "ros1")
+_OFFERED = ("health", "metrics", "ros1")
 """Keys of the ready line for what else is offered, and where."""
 
 
 class Extension(Protocol):
-    """Something else that runs in a service's process, on threads of its own: a service in ROS.
+    """Something else that runs in a service's process, on threads of its own: a service in ROS 1.
 
-    This package knows none. Who starts the service passes a function that makes those for which the
-    options ask.
+    This package knows none. Who starts the service passes a function that makes it.
     """
 
     @property
@@ -78,11 +77,11 @@ class Extension(Protocol):
         ...
 
 
-MakeExtensions: TypeAlias = "Callable[[ServeOptions], Sequence[Extension]]"
-"""Makes the extensions for some options; raises a HoldfastError if they cannot be used."""
+MakeExtension: TypeAlias = "Callable[[ServeOptions], Extension]"
+"""Makes the extension for some options; raises a HoldfastError if they cannot be used."""
 
 
-def main(arguments: Sequence[str], make_extensions: MakeExtensions | None = None) -> int:
+def main(arguments: Sequence[str], make_extension: MakeExtension | None = None) -> int:
     """Run ``holdfast serve`` until it has to stop.
 
     Returns
@@ -105,7 +104,7 @@ def main(arguments: Sequence[str], make_extensions: MakeExtensions | None = None
         return _serve_with_several(options)
     if options.supervised is not None:
         return _serve_supervised(options, *options.supervised)
-    return _serve(options, make_extensions=make_extensions)
+    return _serve(options, make_extension=make_extension)
 
 
 def _serve_with_several(options: ServeOptions) -> int:
@@ -174,7 +173,7 @@ def _serve_supervised(options: ServeOptions, parent: int, descriptor: int) -> in
 def _serve(
     options: ServeOptions,
     supervised: Supervised | None = None,
-    make_extensions: MakeExtensions | None = None,
+    make_extension: MakeExtension | None = None,
 ) -> int:
     if options.until_stdin_closes and sys.stdin is None:
         raise InvalidValueError("--until-stdin-closes: this process has no standard input")
@@ -184,8 +183,8 @@ def _serve(
 
     if credentials is None:
         _import_without_openssl()
-    extensions = make_extensions(options) if make_extensions and options.has_extensions else ()
-    process = _ServiceProcess(options, credentials, extensions, supervised)
+    extension = make_extension(options) if make_extension and options.ros1 else None
+    process = _ServiceProcess(options, credentials, extension, supervised)
 
     import asyncio
 
@@ -208,7 +207,7 @@ class _ServiceProcess:
         self,
         options: ServeOptions,
         credentials: ServiceCredentials | None,
-        extensions: Sequence[Extension],
+        extension: Extension | None,
         supervised: Supervised | None,
     ) -> None:
         # First the transport, which refuses options.
@@ -217,7 +216,7 @@ class _ServiceProcess:
 
         self._options = options
         self._credentials = credentials
-        self._extensions = extensions
+        self._extensions = () if extension is None else (extension,)
         self._supervised = supervised
         self._is_serving = False
         # Parts that ROS has asked to end; None: the links over ROS 1.
