@@ -208,7 +208,6 @@ def parse_options(arguments: Sequence[str]) -> ServeOptions:
         for name, given in (
             ("--connect", options.connect),
             ("--ros1", options.ros1),
-            ("--listen ros1/NAME", any(each.startswith("ros1/") for each in options.listen)),
             ("--until-stdin-closes", options.until_stdin_closes),
         ):
             if given:
@@ -255,12 +254,6 @@ def checked_endpoints(options: ServeOptions) -> list[Endpoint]:
             except TransportError as error:
                 raise TransportError(f"{name}: {error}") from None
             # Of an encrypted one without credentials the transport says that they are missing.
-            if endpoint.is_ros1 and not (endpoint.is_loopback or options.insecure):
-                raise TransportError(
-                    f"{name}: endpoint {endpoint}: other machines can reach it, and no peer "
-                    f"proves its identity; set ROS_HOSTNAME=127.0.0.1 to prevent that, or "
-                    f"say --insecure"
-                )
             if not (endpoint.is_loopback or options.insecure or endpoint.is_encrypted):
                 raise TransportError(
                     f"{name}: endpoint {endpoint}: other machines can reach it, and no peer "
