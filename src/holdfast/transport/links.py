@@ -211,10 +211,6 @@ class Link(asyncio.BufferedProtocol):
         """Whether short messages go beside the stream."""
         return False
 
-    def protocol(self) -> asyncio.BaseProtocol:
-        """Return the protocol for asyncio: the link itself, or an adapter around it."""
-        return self
-
     def begin(self, stream: socket.socket) -> None:
         """Take over a connection, from the next turn of the loop on."""
         self._connecting = self._loop.create_task(self.connect(stream))  # asyncio's are weak
@@ -222,7 +218,7 @@ class Link(asyncio.BufferedProtocol):
     async def connect(self, stream: socket.socket) -> None:
         """Take over a connection; never raises."""
         try:
-            await self._loop.create_connection(self.protocol, sock=stream)
+            await self._loop.create_connection(lambda: self, sock=stream)
         except OSError as error:
             stream.close()
             self.connection_lost(error)
