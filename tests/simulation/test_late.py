@@ -5,6 +5,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
+from tests.late_world import LateWorld
 
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import LostSettings
@@ -35,8 +36,6 @@ from holdfast.protocol.records import (
     Record,
 )
 from holdfast.randomness import Stream, stream
-from holdfast.robot.environment import SimulatedEnvironment
-from holdfast.robot.late_sensing import SenseLater
 from holdfast.robot.trial import run_trial
 
 MAX_STEPS = 40
@@ -58,7 +57,7 @@ def decisions(run: ReferenceRun) -> list[tuple[int | None, bytes]]:
     return [(step.sensing_action, step.action) for step in run.steps]
 
 
-class ShowsSometimes(SimulatedEnvironment):
+class ShowsSometimes(LateWorld):
     """Leaves out of what a move shows the same as the reference runs, and is carried away then."""
 
     kidnapped = False
@@ -90,14 +89,14 @@ class TestReferenceRuns:
         if reinitialises:
             lost = LostSettings(false_alarm_rate=1.0, on_lost="reinitialise")
         for trial in range(1, 3):
-            world = ShowsSometimes(planner.problem, seed, trial)
+            world = ShowsSometimes(planner.problem, seed, trial, moves)
             world.kidnapped = reinitialises
             result = run_trial(
                 planner,
                 seed,
                 trial,
                 max_steps=MAX_STEPS,
-                environment=SenseLater(world, moves) if moves else world,
+                environment=world,
                 lost=lost,
             )
             circumstances = Circumstances(
