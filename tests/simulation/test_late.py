@@ -12,7 +12,6 @@ from holdfast.config.settings import LostSettings
 from holdfast.lab.errors import Violation
 from holdfast.lab.simulation.checkers import WireChecker
 from holdfast.lab.simulation.environment_model import EnvironmentModel
-from holdfast.lab.simulation.memo_cache import MemoizingPlanner
 from holdfast.lab.simulation.peg_with_encoders import PegWithEncoders
 from holdfast.lab.simulation.reference_runs import (
     BEFORE_CHOOSING,
@@ -302,7 +301,7 @@ def test_a_service_that_diverges_is_found() -> None:
 
 
 def test_what_a_move_shows_is_folded_in_once() -> None:
-    planner = MemoizingPlanner(Setup(True, False).planner)
+    planner = Setup(True, False).planner
     state = planner.init(1, 0)
     one, other = (planner.observe_move(state, np.zeros(3), np.array([1.0])) for _ in range(2))
     assert one[0] is other[0]
