@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from tests.late_world import LateWorld
 
+from holdfast import tracking
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import LostSettings
 from holdfast.lab.errors import Violation
@@ -26,6 +27,7 @@ from holdfast.lab.simulation.reference_runs import (
 from holdfast.lab.simulation.schedule import RunSettings, SimulationSchedule, parse_schedule
 from holdfast.lab.simulation.schedule_draws import draw_schedule
 from holdfast.lab.simulation.world import Setup, Simulator
+from holdfast.lost import LostTest
 from holdfast.outcome import MoveResult
 from holdfast.protocol.records import (
     ActingRecord,
@@ -81,12 +83,13 @@ class TestReferenceRuns:
     @pytest.mark.parametrize("reinitialises", [False, True])
     @pytest.mark.parametrize("moves", [0, 1, 3, 9, 10, 25])
     def test_the_digest_is_the_one_of_a_trial_in_process(
-        self, setup: Setup, moves: int, reinitialises: bool
+        self, setup: Setup, moves: int, reinitialises: bool, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         planner, seed = setup.planner, Simulator().seed
         lost = LostSettings()
         if reinitialises:
-            lost = LostSettings(false_alarm_rate=1.0, on_lost="reinitialise")
+            lost = LostSettings(on_lost="reinitialise")
+            monkeypatch.setattr(tracking, "LostTest", lambda _rate: LostTest(1.0))
         for trial in range(1, 3):
             world = ShowsSometimes(planner.problem, seed, trial, moves)
             world.kidnapped = reinitialises
