@@ -18,6 +18,7 @@ from typing import Literal, NamedTuple, TypeAlias
 import msgspec
 
 from holdfast.errors import TransportError
+from holdfast.printable import did_you_mean
 
 __all__ = [
     "AUTHORITY_FILE",
@@ -192,10 +193,7 @@ def parse_endpoint(text: str) -> Endpoint:
     if protocol not in SCHEMES:
         instead = _RENAMED.get(protocol)
         if instead is None:
-            import difflib  # for a mistake alone
-
-            close = difflib.get_close_matches(protocol, SCHEMES, n=1)
-            instead = f"did you mean {close[0]}?" if close else None
+            instead = did_you_mean(protocol, SCHEMES).removeprefix("; ")
         raise TransportError(
             f"endpoint {text!r}: protocol {protocol} is not allowed"
             + (f" ({instead})" if instead else "")
