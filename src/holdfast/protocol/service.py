@@ -200,7 +200,7 @@ class Service:
                 session.overran = session.overran and computed_s > self._queue.limits_s[MEDIUM]
                 if typical:
                     if task.lane <= BRIEF:
-                        # What newcomers are expected to take.
+                        # What new robots are expected to take.
                         (self._sensing_time if task.sensing else self._task_time).learn(computed_s)
                     task.expected_time.learn(computed_s)
                 self._succeeded(task, outcome, now)
