@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from pathlib import Path
 
@@ -11,7 +10,6 @@ from tests.command_line import options_of
 
 from holdfast.cli import main
 from holdfast.cli.application import COMMANDS
-from holdfast.cli.run import RunOptions
 from holdfast.errors import OptionError
 from holdfast.runtime.command_line import (
     Options,
@@ -63,19 +61,6 @@ def test_words_with_a_dash_in_front_are_read_again() -> None:
     assert brew.words() == ["./-b", "anna"]
     serve = ServeOptions(name="-x", listen=("-y", "tcp/z:1"))
     assert vars(ServeOptions.parse("serve", serve.words())) == vars(serve)
-
-
-def test_the_command_that_goes_on_can_be_given() -> None:
-    run = RunOptions.parse("run", ["--out=-o", "--", "-x.yaml"])
-    words = shlex.split(run.resume_command(Path("-o")))[2:]
-    again = RunOptions.parse("run", words)
-    places = (Path("-x.yaml").absolute(), Path("-o").absolute())
-    assert (again.configuration, again.out, again.resume) == (*places, True)
-
-
-def test_a_bad_address_is_named_once() -> None:
-    with pytest.raises(OptionError, match=r"^--health is 'ten': port 'ten' is not a whole number"):
-        RunOptions.parse("run", ["x.yaml", "--health", "ten"])
 
 
 @pytest.mark.parametrize(

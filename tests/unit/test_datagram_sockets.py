@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from typing import Any, cast
+from typing import Any
 
 from holdfast.transport.datagram_cipher import DatagramCipher
-from holdfast.transport.datagram_links import ServiceDatagramLink
 from holdfast.transport.datagram_sockets import DatagramSocket
 
 
@@ -24,7 +23,7 @@ class Receiver:
 async def test_a_datagram_goes_to_the_link_whose_association_it_names() -> None:
     here = DatagramSocket(("127.0.0.1", 0))
     first, second = Receiver(), Receiver()
-    keys = [here.add(cast(ServiceDatagramLink, each)) for each in (first, second)]
+    keys = [here.add(each.take_datagram) for each in (first, second)]
     assert keys[0].association != keys[1].association
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as robot:
         robot.bind(("127.0.0.1", 0))

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from holdfast.cli.run import RunOptions
+    from holdfast.cli.run_options import RunOptions
     from holdfast.config.loader import Configuration
     from holdfast.outcome import TrialResult
     from holdfast.recording.run_directory import RunDirectory

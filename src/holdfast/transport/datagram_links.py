@@ -514,7 +514,7 @@ class ServiceDatagramLink(_DatagramLink):
         except OSError:
             return  # the system has no socket left; the stream carries all
         self._sockets[address] = self._socket
-        keys = self._socket.add(self)
+        keys = self._socket.add(self.take_datagram)
         self._cipher = DatagramCipher(keys, service=True)
         port = self._socket.port
         content = _KEYS.pack(*keys, 0 if port == address[1] else port)

@@ -8,13 +8,10 @@ import errno
 import os
 import socket
 import struct
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Callable, Iterator
+from typing import Any, Final
 
 from holdfast.transport.datagram_cipher import AssociationKeys
-
-if TYPE_CHECKING:
-    from holdfast.transport.datagram_links import ServiceDatagramLink
 
 __all__ = [
     "DATAGRAMS_AT_ONCE",
@@ -81,7 +78,7 @@ class DatagramSocket:
     def __init__(self, address: Any) -> None:
         self.address = address
         self._loop = asyncio.get_running_loop()
-        self._links: dict[int, ServiceDatagramLink] = {}
+        self._takers: dict[int, Callable[[bytes, Any], None]] = {}
         family = socket.AF_INET6 if len(address) == 4 else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         try:
@@ -97,22 +94,22 @@ class DatagramSocket:
         self.port: int = self._socket.getsockname()[1]
         self._loop.add_reader(self._socket, self._readable)
 
-    def add(self, link: ServiceDatagramLink) -> AssociationKeys:
-        """Draw keys for a link."""
+    def add(self, take: Callable[[bytes, Any], None]) -> AssociationKeys:
+        """Draw keys for a link, which takes its datagrams and where they come from."""
         # Random: an attacker that sees no datagram cannot guess one.
-        while (association := int.from_bytes(os.urandom(4))) in self._links:
+        while (association := int.from_bytes(os.urandom(4))) in self._takers:
             pass
-        self._links[association] = link
+        self._takers[association] = take
         return AssociationKeys.draw(association)
 
     def remove(self, association: int) -> None:
         """Take no more datagrams of an association."""
-        self._links.pop(association, None)
+        self._takers.pop(association, None)
 
     @property
     def is_idle(self) -> bool:
         """Whether no link uses it."""
-        return not self._links
+        return not self._takers
 
     def send(self, datagram: bytes, address: Any) -> None:
         """Send a datagram; it may be lost here as well as anywhere."""
@@ -133,6 +130,6 @@ class DatagramSocket:
                 return
             except OSError:
                 continue  # a robot is gone
-            link = self._links.get(int.from_bytes(datagram[:4]))  # the association
-            if link is not None:
-                link.take_datagram(datagram, address)
+            take = self._takers.get(int.from_bytes(datagram[:4]))  # by the association
+            if take is not None:
+                take(datagram, address)

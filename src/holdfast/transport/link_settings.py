@@ -7,12 +7,9 @@ import math
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from time import thread_time
-from typing import TYPE_CHECKING, Final
+from typing import Final, Protocol
 
 from holdfast.transport.frames import HEADER_BYTES
-
-if TYPE_CHECKING:
-    from holdfast.transport.links import Link
 
 __all__ = ["SLICE_S", "FairScheduler", "LinkSettings", "MemoryBudget"]
 
@@ -97,6 +94,21 @@ class FairScheduler:
             loop.call_soon(self._run_waiting)
 
 
+class _Holder(Protocol):
+    """A link, as far as a :class:`MemoryBudget` knows it."""
+
+    @property
+    def owner(self) -> object:
+        """Whose share it takes."""
+
+    @property
+    def unsent_bytes(self) -> int:
+        """What waits for the other end to read."""
+
+    def end(self, reason: str, *, abort: bool = False) -> None:
+        """End it."""
+
+
 class MemoryBudget:
     """Bounds the memory that all links together take for one purpose.
 
@@ -114,15 +126,15 @@ class MemoryBudget:
     """
 
     def __init__(
-        self, max_bytes: float, reason: str, measure: Callable[[Link], int] | None = None
+        self, max_bytes: float, reason: str, measure: Callable[[_Holder], int] | None = None
     ) -> None:
         self._max_bytes = max_bytes
         self._reason = reason
         self._measure = measure
-        self._sizes: dict[Link, int] = {}
+        self._sizes: dict[_Holder, int] = {}
         self._total = 0
 
-    def note(self, link: Link, size_bytes: int) -> None:
+    def note(self, link: _Holder, size_bytes: int) -> None:
         """Note how many bytes a link holds now."""
         self._set(link, size_bytes)
         if self._total > self._max_bytes and self._measure is not None:
@@ -137,7 +149,7 @@ class MemoryBudget:
             self._set(oldest, 0)
             oldest.end(self._reason, abort=self._measure is not None)
 
-    def _set(self, link: Link, size_bytes: int) -> None:
+    def _set(self, link: _Holder, size_bytes: int) -> None:
         before = self._sizes.get(link, 0)
         if size_bytes:
             self._sizes[link] = size_bytes

@@ -1,0 +1,220 @@
+"""The options of ``holdfast run``, and the configuration that they lead to."""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
+
+from holdfast.cli.overrides import Override, combined, parse_assignment
+from holdfast.errors import InvalidValueError
+from holdfast.files import shown_path
+from holdfast.recording.view_target import ViewTarget, viewer_url
+from holdfast.runtime.command_line import (
+    MAX_JOBS,
+    MAX_SEED,
+    MAX_TRIALS,
+    Options,
+    argument,
+    bad_value,
+    flag,
+    location,
+    number,
+    option,
+    whole_number,
+)
+from holdfast.runtime.log_lines import LogFormat
+from holdfast.runtime.logs import log_option
+from holdfast.service.options import http_address
+
+if TYPE_CHECKING:
+    from holdfast.config.loader import Configuration
+    from holdfast.service.health import HttpAddress
+
+__all__ = ["RunOptions", "Viewer", "viewer"]
+
+_MIN_RATE_HZ = 0.001
+_MAX_RATE_HZ = 10_000.0
+
+
+class Viewer(NamedTuple):
+    """The value of ``--view``, and the URL that it means; empty for a viewer of this machine."""
+
+    given: str
+    url: str
+
+    def __str__(self) -> str:
+        return self.given
+
+
+def viewer(text: str) -> Viewer:
+    """Read ``rerun`` or ``rerun=HOST:PORT``."""
+    name, equals, place = text.partition("=")
+    if name == "rerun":
+        with contextlib.suppress(InvalidValueError):
+            return Viewer(text, viewer_url(place) if equals else "")
+    raise bad_value(text, "rerun, or rerun=HOST:PORT of a viewer that runs elsewhere")
+
+
+class RunOptions(Options):
+    """Run the trials of CONFIG and write their results into a directory.
+
+    DIR gets trials.csv (a row for each trial), summary.json, config.yaml (with all defaults filled
+    in; it can be run again), journal.sqlite (every decision of every trial) and trial.png (a figure
+    of trial 0).
+
+    With --service, --environment, --rate or --view the trials are run one after another, as a robot
+    does: every step is in the journal before it is performed, and DIR gets events.jsonl (what
+    happened to the services) and timings.csv (how long each decision took) as well.
+
+    Ctrl-C or a crash loses no trial and no step: the same command with --resume goes on.
+    """
+
+    exit_codes: ClassVar = {3: None, 4: None, 5: None}
+    needs_arguments = True
+
+    configuration: Path = argument("CONFIG", "Configuration file (YAML) of the run.", location)
+    trials: int | None = option(
+        metavar="N",
+        read=whole_number(1, MAX_TRIALS),
+        key="simulator.num_trials",
+        help="Number of trials, instead of the file's.",
+    )
+    seed: int | None = option(
+        metavar="S",
+        read=whole_number(0, MAX_SEED),
+        key="simulator.seed",
+        help="Seed of all random draws, instead of the file's.",
+    )
+    problem: str | None = option(
+        metavar="NAME",
+        help="Problem to run, instead of the file's: a registered name or module:Class.",
+    )
+    assignments: tuple[str, ...] = option(
+        "--set",
+        metavar="SECTION.KEY=VALUE",
+        many=True,
+        help="A value instead of the file's, as YAML: selector.method=random.",
+    )
+    jobs: int | None = option(
+        "-j",
+        metavar="N",
+        read=whole_number(1, MAX_JOBS),
+        help="Largest number of processes (default: one for each core). Changes time only.",
+    )
+    out: Path | None = option(
+        "-o",
+        metavar="DIR",
+        read=location,
+        help="Directory for the results (default: runs/CONFIG-seedS, numbered if taken).",
+    )
+    resume: bool = flag(
+        help="Go on with the run in DIR (default: the latest) and run the missing trials; with a "
+        "larger --trials, more than it had.",
+    )
+    resume_if_begun: bool = flag(
+        help="Go on with the run in DIR if it has begun, otherwise begin it; needs --out. For a "
+        "unit or container that repeats one command.",
+    )
+    after_reboot: bool = flag(
+        help="Let the robot go on although the machine was rebooted since it last moved; without "
+        "this, a run that is resumed then ends with code 5.",
+    )
+    restart: bool = flag(
+        help="Start the run again when its process dies or fails, but not after the codes 0, 3 and "
+        "5 and a signal that ends it in order; needs --resume-if-begun. For a container, which the "
+        "engine must not restart.",
+    )
+    quiet: bool = flag(
+        "-q",
+        help="Show no progress and no summary: only errors. The files are the same.",
+    )
+    service: tuple[str, ...] = option(
+        "-s",
+        metavar="ENDPOINT",
+        many=True,
+        key="offload.services",
+        help="Let the service at ENDPOINT decide (tcp/10.0.0.7:7447); several are tried in this "
+        "order.",
+    )
+    recovery: str | None = option(
+        metavar="WHEN",
+        key="recovery.launch",
+        help="When to launch the local service: on_failure (the default), at_start or never.",
+    )
+    tls: Path | None = option(
+        metavar="DIR",
+        read=location,
+        key="offload.tls",
+        help="This robot's credentials, as holdfast keys makes them.",
+    )
+    environment: str | None = option(
+        "-e",
+        metavar="MODULE:CLASS",
+        key="environment.object",
+        help="Act on this environment instead of a simulated one.",
+    )
+    rate: float | None = option(
+        metavar="HZ",
+        read=number(_MIN_RATE_HZ, _MAX_RATE_HZ, "Hz"),
+        help="Task actions a second (default: as fast as possible).",
+    )
+    health: HttpAddress | None = option(
+        metavar="HOST:PORT",
+        read=http_address,
+        help="Answer http://HOST:PORT/livez, and /readyz while a service or the robot itself "
+        "decides; a PORT alone is one of 127.0.0.1.",
+    )
+    metrics: HttpAddress | None = option(
+        metavar="HOST:PORT",
+        read=http_address,
+        help="Offer this robot's metrics for Prometheus at http://HOST:PORT/metrics. The address "
+        "may be that of --health.",
+    )
+    view: Viewer | None = option(
+        metavar="rerun",
+        read=viewer,
+        help="Show the run in Rerun's viewer while it goes on (extra view); rerun=HOST:PORT is one "
+        "that runs elsewhere.",
+    )
+    view_file: Path | None = option(
+        metavar="FILE",
+        read=location,
+        help="Write what is shown to FILE (.rrd), with --view or without it.",
+    )
+    log: LogFormat = log_option("Format of the events shown: text or json.")
+
+    def view_target(self) -> ViewTarget | None:
+        """Return where to show the run while it goes on, if anywhere."""
+        if self.view is None and self.view_file is None:
+            return None
+        file = None if self.view_file is None else str(self.view_file)
+        return ViewTarget(None if self.view is None else self.view.url, file)
+
+    def resume_command(self, directory: Path) -> str:
+        """Return the command that goes on."""
+        words = self.words(
+            *("out", "resume", "resume_if_begun", "after_reboot", "restart", "quiet", "view_file")
+        )
+        out = self.table()["out"].words(directory)
+        return shlex.join(["holdfast", "run", *words, *out, "--resume"])
+
+    def overrides(self) -> list[Override]:
+        """Return the values that replace those of the file."""
+        given = []
+        for name, each in self.table().items():
+            value = getattr(self, name)
+            if each.key is not None and value != each.default:
+                plain = list(value) if each.many else value
+                if isinstance(value, Path):
+                    plain = shown_path(value)
+                given.append(Override(" ".join(each.words(value)), each.key, plain))
+        return [*map(parse_assignment, self.assignments), *given]
+
+    def load(self) -> Configuration:
+        """Read the configuration, with the values that replace those of the file."""
+        from holdfast.config.loader import load
+
+        path = shown_path(self.configuration)  # as messages name it
+        return load(path, problem=self.problem, overrides=combined(self.overrides()))
