@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import sys
 import threading
+
+import pytest
 
 from holdfast.runtime.pool import ThreadPool
 
@@ -35,6 +39,19 @@ async def test_an_error_is_handed_over_and_the_thread_goes_on() -> None:
     done: asyncio.Future[int] = loop.create_future()
     pool.submit(lambda: 7, done.set_result)
     assert await done == 7
+    pool.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere it is the whole process's")
+async def test_only_its_own_threads_are_nice() -> None:
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    found: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+    pool = ThreadPool(1, "nice", niceness=3)
+    pool.submit(
+        lambda: os.getpriority(os.PRIO_PROCESS, threading.get_native_id()), found.set_result
+    )
+    assert await found == min(19, before + 3)
+    assert os.getpriority(os.PRIO_PROCESS, 0) == before
     pool.close()
 
 

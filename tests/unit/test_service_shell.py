@@ -503,7 +503,7 @@ class Call:
 
 
 def scripted(*jobs: tuple[str, float, Callable[[], object]]) -> tuple[Script, ServiceShell]:
-    machine = Script(*(StartJob(cast(Job, Scripted(kind, run)), s) for kind, s, run in jobs))
+    machine = Script(*(StartJob(cast(Job, Scripted(kind, run)), s, True) for kind, s, run in jobs))
     return machine, ServiceShell(machine, InProcessNetwork().service("service", "boot"), Log())
 
 

@@ -481,7 +481,7 @@ class Service:
             self._queue.most_s(task),
         )
         self._queue.handed_out(task, job, now)
-        self._effects.append(StartJob(job, expected_s))
+        self._effects.append(StartJob(job, expected_s, task.lane == BRIEF))
 
     # -- outcomes --------------------------------------------------------------------------------
 

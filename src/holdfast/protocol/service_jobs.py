@@ -467,10 +467,14 @@ class StartJob(NamedTuple):
     expected_s : float
         Typical time of the robot's earlier jobs; infinite if that predicts nothing: the first job,
         a problem that is not built in, or an unusual request.
+    is_brief : bool
+        Whether it is one of a known robot's brief ones. All others may take any time, so their
+        threads have less weight (:class:`~holdfast.protocol.lanes.Lanes`).
     """
 
     job: Job
     expected_s: float
+    is_brief: bool
 
 
 class Computed(NamedTuple):

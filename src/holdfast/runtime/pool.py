@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
+import sys
 import threading
 from collections.abc import Callable
 from queue import SimpleQueue
@@ -22,8 +24,15 @@ _Task: TypeAlias = tuple[Callable[[], Any], Callable[[Any], None]]
 class ThreadPool:
     """Runs functions on threads, and hands their results to an event loop.
 
-    Its methods are called on the loop's thread, and ``failed``, too, with an exception of a
-    function; without it the loop's exception handler gets that. Threads start when they are needed.
+    Its methods are called on the loop's thread. Threads start when they are needed.
+
+    Parameters
+    ----------
+    failed : callable, optional
+        Called with an exception of a function; without it the loop's exception handler gets that.
+    niceness : int, optional
+        How much less of the processors the threads get while others want them; 5 is a third. Of
+        the process's threads, only Linux knows that of one.
 
     Attributes
     ----------
@@ -36,7 +45,9 @@ class ThreadPool:
         num_threads: int,
         name: str,
         failed: Callable[[BaseException], None] | None = None,
+        niceness: int = 0,
     ) -> None:
+        self._niceness = niceness
         self._num_threads = num_threads
         self._name = name
         self._failed = failed or _raise
@@ -71,6 +82,10 @@ class ThreadPool:
             each.join(timeout_s)
 
     def _work(self) -> None:
+        if self._niceness and sys.platform == "linux":
+            thread = threading.get_native_id()
+            now = os.getpriority(os.PRIO_PROCESS, thread)
+            os.setpriority(os.PRIO_PROCESS, thread, min(19, now + self._niceness))
         while (task := self._queue.get()) is not None:
             function, done = task
             try:

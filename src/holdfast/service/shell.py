@@ -54,6 +54,12 @@ DecisionHook: TypeAlias = Callable[[Literal["task", "sensing"], float, float], N
 _BRIEF_S = 0.001
 """Longer jobs run on threads, because a job blocks the loop."""
 
+_NICENESS = 5
+"""Of the threads for jobs that may take any time: a third of the processor time of the others.
+
+They also hold the interpreter for moments, which they must come to the end of.
+"""
+
 _LARGE_BYTES = 64 << 10
 """Requests that are larger are decoded on a thread."""
 
@@ -88,7 +94,8 @@ class ServiceShell:
     ) -> None:
         self._service = service
         self._transport = transport
-        self._jobs = ThreadPool(service.max_running, "holdfast-worker")
+        self._brief = ThreadPool(service.max_running, "holdfast-worker")
+        self._others = ThreadPool(service.max_running, "holdfast-other", niceness=_NICENESS)
         self._decoder = ThreadPool(1, "holdfast-decoder")
         self._events = events
         self._on_decision = on_decision
@@ -147,13 +154,15 @@ class ServiceShell:
         self._brief_jobs.clear()
         await self._transport.close(timeout_s)
         self._calls.clear()
-        self._jobs.close()
+        self._brief.close()
+        self._others.close()
         self._decoder.close()
 
     @property
     def is_computing(self) -> bool:
         """Whether a thread is still computing."""
-        return self._jobs.num_open + self._decoder.num_open > 0
+        pools = (self._brief, self._others, self._decoder)
+        return any(pool.num_open for pool in pools)
 
     def note(self, event: str, /, **fields: object) -> None:
         """Log an event, with a limited rate for each kind."""
@@ -323,7 +332,8 @@ class ServiceShell:
     def _run(self, run: StartJob) -> None:
         job = run.job
         if run.expected_s > _BRIEF_S:
-            self._jobs.submit(
+            pool = self._brief if run.is_brief else self._others
+            pool.submit(
                 functools.partial(self._computed, job),
                 lambda computed: self._guarded(self._finished, job, *computed),
             )

@@ -20,7 +20,7 @@ SLICE_S: Final = 0.001
 _WINDOW_S: Final = 0.005
 """An owner may use one slice per window without waiting."""
 
-_TURN_S: Final = 0.002
+_TURN_S: Final = 0.001
 """For so long waiting links run in one turn of the event loop."""
 
 
