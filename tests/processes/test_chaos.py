@@ -177,10 +177,6 @@ def test_every_kind_of_fault(tmp_path: Path, started: list[Chaos], wire: Wire) -
     assert chaos.others() == []
     assert sorted(path.name for path in chaos.out.iterdir()) == [
         "chaos.csv",
-        "failback.png",
-        "failback.svg",
-        "launch.png",
-        "launch.svg",
         "series.json",
         "summary.json",
         "table.txt",

@@ -1,4 +1,4 @@
-"""What is made of the outcomes of a series: rows, tables, figures; and its table on the disk."""
+"""What is made of the outcomes of a series: rows, tables; and its table on the disk."""
 
 from __future__ import annotations
 
@@ -126,35 +126,6 @@ def test_the_table_tells_behind_how_many_times_it_stands(tmp_path: Path) -> None
     assert "\nn: faults after which this was measured" in text
     assert "\n-: never measured" in text
     assert all(len(line) <= 142 for line in text.splitlines())
-
-
-@pytest.mark.slow
-def test_figures(tmp_path: Path) -> None:
-    from holdfast.lab.chaos.figure import draw_figures
-
-    names = draw_figures(tmp_path, summary(), outcomes())
-    assert names == ["launch.png", "launch.svg", "failback.png", "failback.svg"]
-    for name in names:
-        assert (tmp_path / name).stat().st_size > 5000
-
-
-@pytest.mark.slow
-def test_the_same_series_gives_the_same_figure(tmp_path: Path) -> None:
-    from holdfast.lab.chaos.figure import draw_figures
-
-    for name in ("one", "other"):
-        (tmp_path / name).mkdir()
-        draw_figures(tmp_path / name, summary(), outcomes())
-    one, other = ((tmp_path / name / "launch.svg").read_bytes() for name in ("one", "other"))
-    assert one == other
-
-
-@pytest.mark.slow
-def test_figures_of_nothing(tmp_path: Path) -> None:
-    from holdfast.lab.chaos.figure import draw_figures
-
-    nothing = summarise(PLAN, [], trials=1, jobs=1, left_out={})
-    assert len(draw_figures(tmp_path, nothing, [])) == 4
 
 
 class TestSeries:

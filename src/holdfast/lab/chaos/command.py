@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.cli.exit_codes import EXIT_DIFFERENT, ended_by_signals, interrupted_by
-from holdfast.config.user_code import in_words
 from holdfast.config.validation import close_match
 from holdfast.errors import HoldfastError, OptionError, RunError
 from holdfast.printable import printable
@@ -66,9 +65,8 @@ class ChaosOptions(Options):
     faults, and the world, which keeps a list of its own, must have been acted on exactly once and
     in order.
 
-    DIR gets table.txt, chaos.csv (a row for each fault), summary.json, trials.jsonl (a line for
-    each trial, as it ends) and two figures: how soon a loss is found and the local service
-    launched, and how soon the cloud is used again. The files of a trial that went wrong are kept.
+    DIR gets table.txt, chaos.csv (a row for each fault), summary.json and trials.jsonl (a line for
+    each trial, as it ends). The files of a trial that went wrong are kept.
 
     Ctrl-C ends all processes; the same command with --resume goes on.
     """
@@ -249,24 +247,8 @@ def _run(options: ChaosOptions) -> bool:
         raise
     except HoldfastError as error:
         raise RunError(error, again) from error
-    note = _draw(directory, summary, series.outcomes)
-    show.conclude(summary, directory, note)
+    show.conclude(summary, directory)
     return summary.identical == summary.finished
-
-
-def _draw(directory: Path, summary: ChaosSummary, outcomes: Sequence[TrialOutcome]) -> str | None:
-    """Draw the figures, and return a note if that is not possible."""
-    from holdfast.cli.run_figure import own_backend
-
-    try:
-        with own_backend():
-            from holdfast.lab.chaos.figure import draw_figures
-        draw_figures(directory, summary, outcomes)
-    except Exception as error:  # noqa: BLE001 - the series is finished, with figures or without
-        if isinstance(error, ImportError) and (error.name or "").split(".")[0] == "matplotlib":
-            return "no figures, because matplotlib is not installed: pip install matplotlib"
-        return f"no figures, because they cannot be drawn: {in_words(error)}"
-    return None
 
 
 class _Show:
@@ -338,7 +320,7 @@ class _Show:
         else:
             sys.stderr.write(printable(f"\n{text}\nGo on with: {command}\n"))
 
-    def conclude(self, summary: ChaosSummary, directory: Path, note: str | None) -> None:
+    def conclude(self, summary: ChaosSummary, directory: Path) -> None:
         if not self._as_json:
             self._print_table(summary)
             wrong = [outcome for outcome in self._series.outcomes if outcome.verdict != "identical"]
@@ -347,8 +329,6 @@ class _Show:
             names = sorted(path.name for path in directory.iterdir() if path.is_file())
             sys.stdout.write(f"\n{directory}/\n  {'  '.join(names)}\n")
             sys.stdout.flush()
-        if note is not None:
-            self._tell("note", f"note: {note}", reason=note)
 
     @staticmethod
     def _print_table(summary: ChaosSummary) -> None:
