@@ -331,21 +331,6 @@ def test_a_storm_of_signals_is_one(
     assert (chaos.out / "summary.json").exists()
 
 
-@pytest.mark.slow
-def test_events_instead_of_a_bar(tmp_path: Path, started: list[Chaos]) -> None:
-    chaos = Chaos(tmp_path, "--trials", "1", *only([FaultKind.CLOUD_KILLED]), "--log", "json")
-    started.append(chaos)
-    output, errors = chaos.end()
-    assert chaos.process.returncode == 0
-    (event,) = (json.loads(line) for line in errors.splitlines())
-    assert (event["component"], event["event"], event["verdict"]) == (
-        "chaos",
-        "chaos_trial",
-        "identical",
-    )
-    assert output == ""
-
-
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [

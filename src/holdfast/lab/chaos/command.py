@@ -23,8 +23,6 @@ from holdfast.runtime.command_line import (
     option,
     whole_number,
 )
-from holdfast.runtime.log_lines import LogFormat
-from holdfast.runtime.logs import log_option
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -121,7 +119,6 @@ class ChaosOptions(Options):
     )
     resume: bool = flag(help="Go on with the series in DIR.")
     keep: bool = flag(help="Keep the files of good trials as well.")
-    log: LogFormat = log_option("Show a bar (text), or events (json).")
     list: bool = flag(help="List the kinds of fault, and which can be done here.")
 
 
@@ -220,8 +217,7 @@ def _run(options: ChaosOptions) -> bool:
     if not options.resume or directory is None:
         directory = claim_directory(directory, _RUNS, "chaos")
     series = Series(directory, plan, resume=options.resume, keep=options.keep)
-    as_json = options.log == "json"
-    show = _Show(progress_line(trials, quiet=as_json), plan, series, trials, as_json=as_json)
+    show = _Show(progress_line(trials, quiet=False), plan, series, trials)
     show.start(directory, jobs, left_out)
     words = options.words("out", "resume")
     out = options.table()["out"].words(directory)
@@ -240,9 +236,9 @@ def _run(options: ChaosOptions) -> bool:
         how = interrupted_by(interruption)
         # Anew: a second signal may have come before the first summary was there.
         summary = summarise(plan, series.outcomes, trials=trials, jobs=jobs, left_out=left_out)
-        show.interrupted(
-            f"{how}; all processes are ended. {summary.finished} of {trials} trials are finished",
-            again,
+        sys.stderr.write(
+            f"\n{how}; all processes are ended. "
+            f"{summary.finished} of {trials} trials are finished\nGo on with: {printable(again)}\n"
         )
         raise
     except HoldfastError as error:
@@ -252,22 +248,13 @@ def _run(options: ChaosOptions) -> bool:
 
 
 class _Show:
-    """Shows a series, as text or as events."""
+    """Shows a series."""
 
-    def __init__(
-        self,
-        line: ProgressLine,
-        plan: SeriesPlan,
-        series: Series,
-        trials: int,
-        *,
-        as_json: bool,
-    ) -> None:
+    def __init__(self, line: ProgressLine, plan: SeriesPlan, series: Series, trials: int) -> None:
         self._line = line
         self._plan = plan
         self._series = series
         self._trials = trials
-        self._as_json = as_json
         self._going_on: dict[int, FaultKind] = {}
 
     def start(self, directory: Path, jobs: int, left_out: dict[FaultKind, str]) -> None:
@@ -282,7 +269,7 @@ class _Show:
         self._line.start(f"{title}; results in {directory}", finished, self._note())
         for reason in dict.fromkeys(left_out.values()):
             kinds = ", ".join(kind.value for kind, why in left_out.items() if why == reason)
-            self._tell("left_out", f"left out: {kinds}: {reason}", kinds=kinds, reason=reason)
+            self._line.say(f"left out: {kinds}: {reason}")
 
     def started(self, trial: int, kind: FaultKind) -> None:
         self._going_on[trial] = kind
@@ -291,44 +278,20 @@ class _Show:
     def ended(self, outcome: TrialOutcome) -> None:
         self._going_on.pop(outcome.trial, None)
         self._line.show(len(self._series.outcomes), self._note())
-        wrong = outcome.verdict != "identical"
-        if self._as_json:
-            where = {
-                "reason": outcome.reason,
-                "directory": str(self._series.directory_of(outcome.trial)),
-                "again": self._command_of(outcome),
-            }
-            self._event(
-                "chaos_trial",
-                trial=outcome.trial,
-                kind=outcome.kind.value,
-                wire=outcome.wire,
-                verdict=outcome.verdict,
-                faults=len(outcome.faults),
-                took_s=outcome.took_s,
-                **(where if wrong else {}),
-            )
-        elif wrong:
+        if outcome.verdict != "identical":
             self._line.say(self._account(outcome))
 
     def stop(self) -> None:
         self._line.stop()
 
-    def interrupted(self, text: str, command: str) -> None:
-        if self._as_json:
-            self._event("interrupted", reason=text, resume_command=command)
-        else:
-            sys.stderr.write(printable(f"\n{text}\nGo on with: {command}\n"))
-
     def conclude(self, summary: ChaosSummary, directory: Path) -> None:
-        if not self._as_json:
-            self._print_table(summary)
-            wrong = [outcome for outcome in self._series.outcomes if outcome.verdict != "identical"]
-            for outcome in sorted(wrong, key=lambda outcome: outcome.trial):
-                sys.stdout.write(printable(f"\n{self._account(outcome)}\n"))
-            names = sorted(path.name for path in directory.iterdir() if path.is_file())
-            sys.stdout.write(f"\n{directory}/\n  {'  '.join(names)}\n")
-            sys.stdout.flush()
+        self._print_table(summary)
+        wrong = [outcome for outcome in self._series.outcomes if outcome.verdict != "identical"]
+        for outcome in sorted(wrong, key=lambda outcome: outcome.trial):
+            sys.stdout.write(printable(f"\n{self._account(outcome)}\n"))
+        names = sorted(path.name for path in directory.iterdir() if path.is_file())
+        sys.stdout.write(f"\n{directory}/\n  {'  '.join(names)}\n")
+        sys.stdout.flush()
 
     @staticmethod
     def _print_table(summary: ChaosSummary) -> None:
@@ -353,26 +316,9 @@ class _Show:
             f"trial {outcome.trial} ({outcome.kind.value} over {outcome.wire}): "
             f"{outcome.verdict}: {outcome.reason}\n"
             f"  its files: {self._series.directory_of(outcome.trial)}\n"
-            f"  again: {self._command_of(outcome)}"
-        )
-
-    def _command_of(self, outcome: TrialOutcome) -> str:
-        return (
-            f"holdfast chaos --trials 1 --first {outcome.trial} --seed {self._plan.seed} "
+            f"  again: holdfast chaos --trials 1 --first {outcome.trial} --seed {self._plan.seed} "
             f"--only {outcome.kind.value} --wire {outcome.wire} --keep"
         )
-
-    def _tell(self, event: str, text: str, **fields: object) -> None:
-        if self._as_json:
-            self._event(event, **fields)
-        else:
-            self._line.say(text)
-
-    @staticmethod
-    def _event(name: str, **fields: object) -> None:
-        from holdfast.runtime.logs import write_event
-
-        write_event("chaos", name, **fields)
 
 
 def _write_table(summary: ChaosSummary, path: Path) -> None:
