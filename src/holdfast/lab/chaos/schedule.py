@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 import msgspec
 
 from holdfast.lab.testbed.faults import NEEDS_NAMESPACE, NEEDS_PROXY, Fault, FaultKind
-from holdfast.lab.testbed.proxy import Direction
+from holdfast.lab.testbed.line import Direction
 
 __all__ = [
     "WIRES",
