@@ -11,10 +11,7 @@ import statistics
 from collections.abc import Callable
 from typing import NamedTuple
 
-import msgspec
-
 from holdfast.cli.terminal import counted
-from holdfast.files import write_atomically
 from holdfast.lab.demo.narrator import DemoState, Narrator, Observer
 from holdfast.lab.errors import NoProgressError
 from holdfast.lab.testbed.driver import Testbed
@@ -31,12 +28,10 @@ __all__ = [
     "REFERENCE_RUN_NAME",
     "Demo",
     "Findings",
-    "Outage",
     "Plan",
 ]
 
 CONFIGURATION_NAME = "demo.yaml"
-FINDINGS_NAME = "findings.json"
 KILLED_RUN_NAME = "killed"
 REFERENCE_RUN_NAME = "undisturbed"
 
@@ -65,60 +60,30 @@ _AROUND_S = 3.0
 """Of the demo, before and after the robot's run."""
 
 
-class Outage(msgspec.Struct, frozen=True, kw_only=True):
-    """One kill of the cloud service and its return, in ms; None where nothing was measured.
+class Findings(NamedTuple):
+    """What the demo comes to.
 
     Attributes
     ----------
-    found_ms : float or None
-        From the kill until the robot logs the loss.
-    first_local_decision_ms : float or None
-        From then until the robot carries out a decision of the local service. Until then it uses
-        the actions that it has.
-    longest_wait_ms : float or None
-        Longest time that the robot stood still for a decision while the cloud was away.
-    launched_ms : float or None
-        From the start of the local service until the robot sees it; None if it ran already.
-    listening_ms : float
-        From the start of the new cloud service until it listens.
-    used_again_ms : float or None
-        From then until the robot carries out a decision of it.
-    """
-
-    found_ms: float | None
-    first_local_decision_ms: float | None
-    longest_wait_ms: float | None
-    launched_ms: float | None
-    listening_ms: float
-    used_again_ms: float | None
-
-
-class Findings(msgspec.Struct, frozen=True, kw_only=True):
-    """The content of ``findings.json``.
-
-    Attributes
-    ----------
-    rate_hz : float
-        Task actions per second.
-    robot_acting_again_ms : float or None
-        From the kill of the robot's own process until a new one carries out its first decision.
+    outages : tuple of FaultTimes
+        Of the two kills of the cloud service.
+    listening_ms : tuple of float
+        From the start of each cloud service that followed until it listened.
+    robot_kill : FaultTimes
+        Of the kill of the robot's own process.
     usual_wait_ms : float
         Median time that the robot waits for the cloud's task actions: one round trip.
-    statuses : tuple of tuple of str
+    statuses : tuple of list of str
         Of each process that the robot had.
     comparison : Comparison
         Of the reference run and the run with the kills.
     """
 
-    problem: str
-    seed: int
-    trials: int
-    steps: int
-    rate_hz: float
-    outages: tuple[Outage, ...]
-    robot_acting_again_ms: float | None
+    outages: tuple[FaultTimes, ...]
+    listening_ms: tuple[float, ...]
+    robot_kill: FaultTimes
     usual_wait_ms: float
-    statuses: tuple[tuple[str, ...], ...]
+    statuses: tuple[list[str], ...]
     comparison: Comparison
 
 
@@ -152,7 +117,7 @@ class Demo:
         testbed.on_turn = self._narrator.update
 
     def run(self) -> Findings:
-        """Run it; the findings are also written to ``findings.json``.
+        """Run it.
 
         Raises
         ------
@@ -178,10 +143,10 @@ class Demo:
         )
         self._narrator.started_robot(robot.process)
         self._wait(lambda: bool(robot.decisions), "the robot's first decision")
-        listening_s = [
+        listening_ms = (
             self._kill_cloud(_FIRST_KILL, _FIRST_RESTART),
             self._kill_cloud(_SECOND_KILL, _SECOND_RESTART),
-        ]
+        )
         self._kill_robot()
         self._wait(lambda: robot.is_done, "the end of the robot's run", steps / rate_hz)
         robot.table.read()
@@ -192,22 +157,15 @@ class Demo:
             and row.service == self._cloud.endpoint
             and row.status != Status.LOCAL_RECOVERY.value
         ]
-        *kills, robot_kill = times_of_faults(testbed.faults, robot.events, robot.decisions)
-        findings = Findings(
-            problem="peg_in_hole_2d",
-            seed=self._seed,
-            trials=len(reference.steps_of_trials),
-            steps=steps,
-            rate_hz=rate_hz,
-            outages=tuple(map(_outage, kills, listening_s)),
-            robot_acting_again_ms=robot_kill.recovery_ms,
+        *outages, robot_kill = times_of_faults(testbed.faults, robot.events, robot.decisions)
+        return Findings(
+            outages=tuple(outages),
+            listening_ms=listening_ms,
+            robot_kill=robot_kill,
             usual_wait_ms=statistics.median(waits) if waits else 0.0,
-            statuses=tuple(map(tuple, self._narrator.statuses)),
+            statuses=tuple(self._narrator.statuses),
             comparison=compare_runs(directory / REFERENCE_RUN_NAME, robot.out),
         )
-        text = msgspec.json.format(msgspec.json.encode(findings), indent=2)
-        write_atomically(directory / FINDINGS_NAME, text + b"\n")
-        return findings
 
     def _make_reference_run(self) -> ReferenceRun:
         directory = self._testbed.directory
@@ -235,7 +193,7 @@ class Demo:
     def _kill_cloud(self, kill_at: float, restart_at: float) -> float:
         """Kill the cloud, let the robot do without it for a while, and start it again.
 
-        Returns how long the new service took until it listened, in s.
+        Returns how long the new service took until it listened, in ms.
         """
         testbed, cloud, narrator = self._testbed, self._cloud, self._narrator
         decisions = testbed.robot.decisions
@@ -259,7 +217,7 @@ class Demo:
             lambda row: row.service == cloud.endpoint and row.at >= ready_at,
             "the cloud being used again",
         )
-        return start_s
+        return 1e3 * start_s
 
     def _kill_robot(self) -> None:
         """Kill the robot's own process in mid-step, resume its run and wait until it acts."""
@@ -303,17 +261,3 @@ class Demo:
             raise NoProgressError(
                 f"the robot's run was over before {what}; the logs are in {self._testbed.directory}"
             )
-
-
-def _outage(times: FaultTimes, listening_s: float) -> Outage:
-    decided_ms = None
-    if times.recovery_ms is not None and times.detection_ms is not None:
-        decided_ms = max(0.0, times.recovery_ms - times.detection_ms)
-    return Outage(
-        found_ms=times.detection_ms,
-        first_local_decision_ms=decided_ms,
-        longest_wait_ms=times.longest_wait_ms,
-        launched_ms=times.launch_ms,
-        listening_ms=1e3 * listening_s,
-        used_again_ms=times.failback_ms,
-    )
