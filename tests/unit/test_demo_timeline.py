@@ -101,14 +101,14 @@ def test_no_kill_and_no_start_is_lost(expected_s: float) -> None:
 
 def test_characters_say_as_much_as_colours() -> None:
     for characters in (UNICODE, ASCII):
-        shown = [*characters.cells.values(), characters.start, characters.kill]
+        shown = [*characters.values()]
         assert len(set(shown)) == len(shown)
         assert all(len(text) == 1 for text in shown)
         said = legend(characters).plain
         assert len(said) <= 79
         activities: tuple[Activity, ...] = ("deciding", "ready", "by_cloud", "by_local", "held")
         for activity in activities:
-            assert characters.cells[activity] in said
+            assert characters[activity] in said
     assert legend(ASCII).plain.isascii()
 
 

@@ -88,7 +88,7 @@ def _run(out: Path | None, seed: int, *, quick: bool) -> Findings:
         with Testbed(directory, orderly_end_s=_ORDERLY_END_S) as testbed:
             show.start(state)
             try:
-                findings = Demo(testbed, seed, plan, state, show).run()
+                findings = Demo(testbed, seed, plan, state, show.say).run()
             finally:
                 # The terminal comes first; after SIGHUP there is none.
                 with contextlib.suppress(OSError):

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from holdfast.cli.terminal import counted
-from holdfast.lab.demo.narrator import DemoState, Narrator, Observer
+from holdfast.lab.demo.narrator import DemoState, Line, Narrator
 from holdfast.lab.errors import NoProgressError
 from holdfast.lab.testbed.driver import Testbed
 from holdfast.lab.testbed.fault_times import ROBOT, FaultTimes, times_of_faults
@@ -106,14 +106,19 @@ class Demo:
     """The demo in a testbed's directory."""
 
     def __init__(
-        self, testbed: Testbed, seed: int, plan: Plan, state: DemoState, observer: Observer
+        self,
+        testbed: Testbed,
+        seed: int,
+        plan: Plan,
+        state: DemoState,
+        show: Callable[[Line], object],
     ) -> None:
         self._testbed = testbed
         self._seed = seed
         self._plan = plan
         self._state = state
         self._cloud = testbed.add_service(f"tcp/127.0.0.1:{free_port()}")
-        self._narrator = Narrator(testbed, self._cloud, state, observer)
+        self._narrator = Narrator(testbed, self._cloud, state, show)
         testbed.on_turn = self._narrator.update
 
     def run(self) -> Findings:
@@ -141,7 +146,7 @@ class Demo:
             rate_hz,
             *("--service", self._cloud.endpoint),
         )
-        self._narrator.started_robot(robot.process)
+        self._narrator.started_robot()
         self._wait(lambda: bool(robot.decisions), "the robot's first decision")
         listening_ms = (
             self._kill_cloud(_FIRST_KILL, _FIRST_RESTART),
@@ -203,7 +208,7 @@ class Demo:
             "the use of the cloud service",
         )
         fault = testbed.note_fault("cloud_killed", cloud.endpoint, cloud.process.kill())
-        narrator.killed_cloud(cloud.process, fault.injected_at)
+        narrator.killed("cloud", cloud.process, "the cloud service")
         self._wait(lambda: not narrator.cloud_decides, "the loss being noticed")
         local = self._wait_for_decision(
             lambda row: row.service == RECOVERY_SERVICE and row.at >= fault.injected_at,
@@ -224,15 +229,16 @@ class Demo:
         self._wait_for_progress(_ROBOT_KILL)
         robot = self._testbed.robot
         fault = self._testbed.note_fault("robot_killed", ROBOT, robot.process.kill())
-        self._narrator.killed_robot(robot.process, fault.injected_at)
+        self._narrator.killed("robot", robot.process, "the robot's own process")
         robot.resume()
-        self._narrator.started_robot(robot.process, "--resume")
+        self._narrator.started_robot("--resume")
         fault.usable_at = resumed_at = robot.process.spawned_at
         self._wait_for_decision(lambda row: row.at >= resumed_at, "the robot acting again")
 
     def _start_cloud(self) -> float:
         """Start the cloud service and wait until it listens; return how long it took in s."""
-        self._narrator.started_cloud(self._cloud.start().process)
+        self._cloud.start()
+        self._narrator.started_cloud()
         self._wait(lambda: self._cloud.ready_at is not None, "the cloud service listening")
         return self._cloud.start_s
 
