@@ -48,18 +48,15 @@ class KindRow(msgspec.Struct, frozen=True, kw_only=True):
         Injected faults.
     wrong : int
         Trials that are not identical with their reference runs.
-    detection, recovery, launch, failback : Spread or None
-        None where nothing was measured; always for combinations.
+    times : dict of str to Spread
+        ``detection``, ``recovery``, ``launch`` and ``failback``, where they were measured.
     """
 
     kind: FaultKind
     trials: int
     faults: int
     wrong: int
-    detection: Spread | None
-    recovery: Spread | None
-    launch: Spread | None
-    failback: Spread | None
+    times: dict[str, Spread]
 
 
 class ChaosSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -106,21 +103,18 @@ def kind_rows(outcomes: Sequence[TrialOutcome]) -> tuple[KindRow, ...]:
 
 def _row(kind: FaultKind, outcomes: Sequence[TrialOutcome]) -> KindRow:
     faults = [fault for outcome in outcomes for fault in outcome.faults]
-    measured = [] if kind is FaultKind.COMBINATION else faults
-
-    def spread(name: str) -> Spread | None:
-        times = [getattr(fault, f"{name}_ms") for fault in measured]
-        return spread_of([time for time in times if time is not None])
-
+    times: dict[str, Spread] = {}
+    for name in _TIMES if kind is not FaultKind.COMBINATION else ():
+        measured = [getattr(fault, f"{name}_ms") for fault in faults]
+        spread = spread_of([time for time in measured if time is not None])
+        if spread is not None:
+            times[name] = spread
     return KindRow(
         kind=kind,
         trials=len(outcomes),
         faults=len(faults),
         wrong=sum(outcome.verdict != "identical" for outcome in outcomes),
-        detection=spread("detection"),
-        recovery=spread("recovery"),
-        launch=spread("launch"),
-        failback=spread("failback"),
+        times=times,
     )
 
 
@@ -180,7 +174,7 @@ def text_of(summary: ChaosSummary, width: int) -> str:
     ]
     for row in summary.kinds:
         numbers = "".join(f" {getattr(row, name):>{len(name)}}" for name in counts)
-        spreads = (_cell(getattr(row, name), wide=wide) for name in _TIMES)
+        spreads = (_cell(row.times.get(name), wide=wide) for name in _TIMES)
         cells = "".join(f" {text:>{len(cell)}}" for text in spreads)
         lines.append(f"{row.kind.value:<{name_width}}{numbers}{cells}")
     bad = summary.finished - summary.identical
