@@ -20,7 +20,7 @@ from tests.processes.faults import (
     sensing_steps,
 )
 
-from holdfast.lab.testbed.line import Impairment
+from holdfast.lab.testbed.bad_line import Impairment
 from holdfast.lab.testbed.proxy import Proxy
 from holdfast.protocol.events import CallEnded, ServiceVanished
 from holdfast.transport.credentials import load_credentials

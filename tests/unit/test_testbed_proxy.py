@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from holdfast.lab.errors import CannotStartError
-from holdfast.lab.testbed.line import Impairment
+from holdfast.lab.testbed.bad_line import Impairment
 from holdfast.lab.testbed.processes import free_port
 from holdfast.lab.testbed.proxy import Proxy
 

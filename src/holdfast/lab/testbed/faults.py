@@ -15,9 +15,9 @@ from enum import StrEnum
 
 import msgspec
 
+from holdfast.lab.testbed.bad_line import Direction, Impairment
 from holdfast.lab.testbed.driver import Script, Testbed, after
 from holdfast.lab.testbed.fault_times import ROBOT
-from holdfast.lab.testbed.line import Direction, Impairment
 from holdfast.lab.testbed.processes import Process, local_services_of
 from holdfast.robot.links import RECOVERY_SERVICE
 

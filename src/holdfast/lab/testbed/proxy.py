@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from holdfast.lab.errors import CannotStartError
-from holdfast.lab.testbed.line import CARRIERS, Carrier, Direction, Impairment, Line
+from holdfast.lab.testbed.bad_line import CARRIERS, BadLine, Carrier, Direction, Impairment
 
 __all__ = ["Place", "Proxy", "endpoint_at"]
 
@@ -47,7 +47,7 @@ def endpoint_at(transport: str, place: Place) -> str:
     return f"{transport}/{place}" if isinstance(place, Path) else f"{transport}/127.0.0.1:{place}"
 
 
-class Proxy(Line):
+class Proxy(BadLine):
     """A line to a service on this machine; to be used in a ``with`` statement.
 
     Parameters

@@ -2,7 +2,7 @@
 
 Where the machine permits it, each gets a network namespace with a tunnel device. This process reads
 the packets of each device and writes them to the other half a round trip later, or drops them
-(:mod:`~holdfast.lab.testbed.line`). Both
+(:mod:`~holdfast.lab.testbed.bad_line`). Both
 ends are the system's own TCP and UDP, so they treat late and lost packets as on a real line.
 (``tc netem`` does the same, but not every kernel has it.)
 
@@ -24,7 +24,7 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 
 from holdfast.errors import InvalidValueError
 from holdfast.lab.errors import CannotStartError
-from holdfast.lab.testbed.line import Direction, Impairment, Line
+from holdfast.lab.testbed.bad_line import BadLine, Direction, Impairment
 from holdfast.lab.testbed.namespace import NetworkNamespace, why_no_namespace
 from holdfast.lab.testbed.processes import free_port
 from holdfast.lab.testbed.proxy import Proxy
@@ -144,7 +144,7 @@ def why_no_wide_area() -> str | None:
         return str(error).partition("\n")[0]
 
 
-class _PacketLine(Line):
+class _PacketLine(BadLine):
     """A line between the tunnel devices of two networks."""
 
     def __init__(self, robot_end: _Device, service_end: _Device, seed: str) -> None:

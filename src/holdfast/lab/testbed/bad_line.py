@@ -20,7 +20,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, Literal, Self, TypeAlias, get_args
 
-__all__ = ["CARRIERS", "Carrier", "Direction", "Impairment", "Line"]
+__all__ = ["CARRIERS", "BadLine", "Carrier", "Direction", "Impairment"]
 
 Direction: TypeAlias = Literal["both", "to_service", "to_robot"]
 
@@ -61,7 +61,7 @@ class Impairment:
     carriers: tuple[Carrier, ...] = CARRIERS
 
 
-class Line:
+class BadLine:
     """A line without ends; to be used in a ``with`` statement.
 
     Parameters

@@ -6,13 +6,13 @@ import queue
 
 import pytest
 
-from holdfast.lab.testbed import line as line_module
-from holdfast.lab.testbed.line import Impairment, Line
+from holdfast.lab.testbed import bad_line
+from holdfast.lab.testbed.bad_line import BadLine, Impairment
 
 PATIENCE_S = 20.0
 
 
-def carry(line: Line, contents: range, arrived: queue.Queue[bytes]) -> None:
+def carry(line: BadLine, contents: range, arrived: queue.Queue[bytes]) -> None:
     """Put datagrams on the line, all in one turn of its loop."""
 
     async def put() -> None:
@@ -24,7 +24,7 @@ def carry(line: Line, contents: range, arrived: queue.Queue[bytes]) -> None:
 
 def test_a_share_is_lost_and_the_seed_says_which() -> None:
     def lost(seed: str) -> list[int]:
-        with Line("line", seed) as line:
+        with BadLine("line", seed) as line:
             line.impair(Impairment(loss=0.2))
             return [n for n in range(10_000) if line._fate("datagrams", "to_robot")[1]]
 
@@ -38,7 +38,7 @@ def test_a_share_is_lost_and_the_seed_says_which() -> None:
 
 def test_all_or_nothing() -> None:
     arrived: queue.Queue[bytes] = queue.Queue()
-    with Line("line", "seed") as line:
+    with BadLine("line", "seed") as line:
         heal = line.impair(Impairment(loss=1.0))
         carry(line, range(50), arrived)
         heal()
@@ -48,9 +48,9 @@ def test_all_or_nothing() -> None:
 
 
 def test_a_full_line_loses_what_comes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(line_module, "_CAPACITY", 3)
+    monkeypatch.setattr(bad_line, "_CAPACITY", 3)
     arrived: queue.Queue[bytes] = queue.Queue()
-    with Line("line", "seed") as line:
+    with BadLine("line", "seed") as line:
         line.impair(Impairment(latency_s=0.02))
         carry(line, range(5), arrived)
         assert [arrived.get(timeout=PATIENCE_S)[0] for _ in range(3)] == [0, 1, 2]
