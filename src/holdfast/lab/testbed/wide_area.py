@@ -2,9 +2,8 @@
 
 Where the machine permits it, each gets a network namespace with a tunnel device. This process reads
 the packets of each device and writes them to the other half a round trip later, or drops them
-(:mod:`~holdfast.lab.testbed.bad_line`). Both
-ends are the system's own TCP and UDP, so they treat late and lost packets as on a real line.
-(``tc netem`` does the same, but not every kernel has it.)
+(:mod:`~holdfast.lab.testbed.bad_line`). Both ends are the system's own TCP and UDP, so they treat
+late and lost packets as on a real line. (``tc netem`` does the same, but not every kernel has it.)
 
 Where the machine does not permit it, a proxy stands between them. It delays and drops datagrams as
 well, but TCP ends at a proxy: it cannot drop TCP's packets, only deliver a piece later by the time
