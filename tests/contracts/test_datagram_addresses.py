@@ -23,7 +23,8 @@ from tests.contracts.test_datagram_links import (
 from tests.contracts.wires import Inbox, StreamWire, echo, until
 from tests.ports import free_port
 
-from holdfast.lab.testbed.proxy import Impairment, Proxy
+from holdfast.lab.testbed.bad_line import Impairment
+from holdfast.lab.testbed.proxy import Proxy
 from holdfast.protocol.events import ServiceAppeared, ServiceVanished
 from holdfast.transport.datagram_links import DatagramScheme, RobotDatagramLink
 from holdfast.transport.endpoints import TlsFiles

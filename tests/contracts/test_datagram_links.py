@@ -18,7 +18,8 @@ from tests.contracts.wires import LEASE_MS, Inbox, Received, StreamWire, echo, u
 from tests.ports import free_port
 
 from holdfast.errors import TransportError
-from holdfast.lab.testbed.proxy import Carrier, Direction, Impairment, Proxy
+from holdfast.lab.testbed.bad_line import Carrier, Direction, Impairment
+from holdfast.lab.testbed.proxy import Proxy
 from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared, ServiceVanished
 from holdfast.transport import datagram_cipher
 from holdfast.transport import datagram_links as datagram_links

@@ -5,7 +5,6 @@ What it makes of two runs: unit/test_chaos_trial.py.
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import re
@@ -18,6 +17,7 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import msgspec
 import pytest
 from tests.process_states import state_of
 
@@ -176,12 +176,6 @@ def test_every_kind_of_fault(tmp_path: Path, started: list[Chaos], wire: Wire) -
     assert chaos.process.returncode == 0, output + errors
     assert chaos.others() == []
     assert sorted(path.name for path in chaos.out.iterdir()) == [
-        "chaos.csv",
-        "failback.png",
-        "failback.svg",
-        "launch.png",
-        "launch.svg",
-        "series.json",
         "summary.json",
         "table.txt",
         "trials.jsonl",
@@ -194,13 +188,13 @@ def test_every_kind_of_fault(tmp_path: Path, started: list[Chaos], wire: Wire) -
     assert summary["wires"] == {wire: len(possible)}
     for kind in left_out:
         assert kind in errors  # and why
-    with (chaos.out / "chaos.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    struck = {row["kind"] for row in rows}
+    lines = (chaos.out / "trials.jsonl").read_bytes().splitlines()
+    outcomes = [msgspec.json.decode(line, type=TrialOutcome) for line in lines]
+    struck = {fault.kind for outcome in outcomes for fault in outcome.faults}
     assert struck >= possible - left_out - {"combination"}
-    for row in rows:
-        if row["kind"] in ("cloud_killed", "link_cut") and row["trial_kind"] == row["kind"]:
-            assert float(row["detection_ms"]) > 0.0
+    for outcome in outcomes:
+        if outcome.kind in (FaultKind.CLOUD_KILLED, FaultKind.LINK_CUT):
+            assert all((fault.detection_ms or 0.0) > 0.0 for fault in outcome.faults)
     assert "no divergence" in output
     assert re.search(r"^cloud_killed +\d", output, re.MULTILINE)
     assert (chaos.out / "table.txt").read_text() in output
@@ -264,16 +258,21 @@ def test_an_interruption_ends_all_processes_and_the_series_goes_on(
     again = re.search(r"Go on with: (holdfast chaos .*)", errors)
     assert again is not None
     assert not list(chaos.out.glob("trial-*"))
-    assert (chaos.out / "chaos.csv").exists()
+    assert json.loads((chaos.out / "summary.json").read_text())["finished"] == 1
 
     words = shlex.split(again[1])[2:]
+    assert words == ["--trials", "2", *options[2:], "--first", "1"]
+    others = tmp_path / "others"
     done = subprocess.run(
-        [*COMMAND, *words], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S
+        [*COMMAND, *words, "--out", str(others)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
     )
     assert done.returncode == 0, done.stderr
-    assert "1 finished before" in done.stderr
-    finished = [json.loads(line)["trial"] for line in lines.read_text().splitlines()]
-    assert finished == [0, 1, 2]
+    text = lines.read_text() + (others / "trials.jsonl").read_text()
+    assert [json.loads(line)["trial"] for line in text.splitlines()] == [0, 1, 2]
 
 
 @pytest.mark.slow
@@ -333,21 +332,6 @@ def test_a_storm_of_signals_is_one(
     assert re.search(r"Go on with: (holdfast chaos .*)", errors)
     assert not list(chaos.out.glob("trial-*"))
     assert (chaos.out / "summary.json").exists()
-
-
-@pytest.mark.slow
-def test_events_instead_of_a_bar(tmp_path: Path, started: list[Chaos]) -> None:
-    chaos = Chaos(tmp_path, "--trials", "1", *only([FaultKind.CLOUD_KILLED]), "--log", "json")
-    started.append(chaos)
-    output, errors = chaos.end()
-    assert chaos.process.returncode == 0
-    (event,) = (json.loads(line) for line in errors.splitlines())
-    assert (event["component"], event["event"], event["verdict"]) == (
-        "chaos",
-        "chaos_trial",
-        "identical",
-    )
-    assert output == ""
 
 
 @pytest.mark.parametrize(

@@ -20,10 +20,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Self
 
-import msgspec
 import pytest
 
-from holdfast.lab.demo.scenario import Findings
 from holdfast.lab.testbed.processes import marked_processes
 from holdfast.recording.compare import compare_runs
 
@@ -126,14 +124,15 @@ class Standstill:
             before = now
 
 
-STATUSES = (
-    ("standard", "local_recovery", "keep_alive", "local_recovery", "keep_alive"),
-    ("standard",),
-)
+STATUSES = """
+Statuses that the robot passed
+  standard -> local_recovery -> keep_alive -> local_recovery -> keep_alive
+  after its restart: standard
+"""
 
 
-def told(directory: Path) -> tuple[Demo, Findings, str, str]:
-    """Return a demo that has ended well, what it found, and what it wrote."""
+def told(directory: Path) -> tuple[Demo, str, str]:
+    """Return a demo that has ended well, and what it wrote."""
     for attempt in range(ATTEMPTS):
         place = directory / str(attempt)
         place.mkdir()
@@ -145,39 +144,33 @@ def told(directory: Path) -> tuple[Demo, Findings, str, str]:
                 demo.wait_until_all_are_gone()
             finally:
                 demo.close()
-        found = msgspec.json.decode((demo.out / "findings.json").read_bytes(), type=Findings)
         # With the usual timeouts a machine that stands still is taken for a dead service.
-        if found.statuses == STATUSES or standstill.longest_s < STANDSTILL_S:
+        if STATUSES in output or standstill.longest_s < STANDSTILL_S:
             break
-    return demo, found, output, story
+    return demo, output, story
 
 
 @pytest.mark.slow
 def test_the_whole_story(directory: Path) -> None:
-    demo, found, output, story = told(directory)
-    assert found.statuses == STATUSES
-    assert found.comparison.identical
-    assert found.comparison.task_actions == found.steps >= 240
-    cold, warm = found.outages
-    assert cold.launched_ms is not None
-    assert warm.launched_ms is None
-    for outage in found.outages:
-        assert (outage.found_ms or 0.0) > 0.0
-        assert (outage.first_local_decision_ms or 0.0) > 0.0
-        assert (outage.longest_wait_ms or 0.0) > 0.0
-        assert (outage.used_again_ms or 0.0) > 0.0
-        assert outage.listening_ms > 0.0
-    assert (found.robot_acting_again_ms or 0.0) > 0.0
+    demo, output, story = told(directory)
+    assert STATUSES in output
+    rows = dict(re.findall(r"^  (\S.*?)   +(\S.*)$", output, re.MULTILINE))
+    assert len(rows) == 7
+    for label, times in rows.items():
+        if "spawned -> up" in label:  # the second time it runs already
+            assert re.fullmatch(r"\d+ ms +-", times)
+        else:
+            assert re.fullmatch(r"\d+ ms( +\d+ ms)?", times), label
 
     # What it says is what the runs say.
     again = compare_runs(demo.out / "undisturbed", demo.out / "killed")
     assert again.identical
+    assert again.task_actions >= 240
     verdict = f"The decisions are those of the run without kills:\n{again.describe()}\n"
     assert verdict in output
     journal_of_robot = (demo.out / "killed" / "events.jsonl").read_text()
-    assert re.findall(r'"event":"status".*?"to":"(\w+)"', journal_of_robot) == list(
-        found.statuses[0][1:]
-    )
+    changes = re.findall(r'"event":"status".*?"to":"(\w+)"', journal_of_robot)
+    assert " -> ".join(["standard", *changes]) in STATUSES
     assert journal_of_robot.count('"event":"resumed_trial"') == 1
 
     # A line for each thing that happened, with the time, and the bars in plain characters.

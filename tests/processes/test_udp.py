@@ -20,7 +20,8 @@ from tests.processes.faults import (
     sensing_steps,
 )
 
-from holdfast.lab.testbed.proxy import Impairment, Proxy
+from holdfast.lab.testbed.bad_line import Impairment
+from holdfast.lab.testbed.proxy import Proxy
 from holdfast.protocol.events import CallEnded, ServiceVanished
 from holdfast.transport.credentials import load_credentials
 from holdfast.transport.datagram_links import RobotDatagramLink

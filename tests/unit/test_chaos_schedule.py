@@ -103,7 +103,7 @@ class TestCombination:
 
 
 def test_all_wires_have_as_many_trials_and_all_their_kinds() -> None:
-    plan = SeriesPlan(seed=0, first=0, wires=WIRES, kinds=ALL, possible=ALL, commit="")
+    plan = SeriesPlan(seed=0, wires=WIRES, kinds=ALL, possible=ALL)
     drawn = [plan.of(trial) for trial in range(len(WIRES) * len(ALL))]
     assert Counter(wire for wire, _ in drawn) == dict.fromkeys(WIRES, len(ALL))
     for wire in WIRES:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -13,8 +14,9 @@ from holdfast.errors import OutputError
 from holdfast.files import claim_directory
 from holdfast.lab.demo.command import account
 from holdfast.lab.demo.narrator import Activity, Change, DemoState, Line, Mark
-from holdfast.lab.demo.scenario import Findings, Outage
+from holdfast.lab.demo.scenario import Findings
 from holdfast.lab.demo.timeline import ASCII, UNICODE, legend, plain_line, timeline
+from holdfast.lab.testbed.fault_times import FaultTimes
 from holdfast.recording.compare import Comparison, Difference
 
 
@@ -99,14 +101,14 @@ def test_no_kill_and_no_start_is_lost(expected_s: float) -> None:
 
 def test_characters_say_as_much_as_colours() -> None:
     for characters in (UNICODE, ASCII):
-        shown = [*characters.cells.values(), characters.start, characters.kill]
+        shown = [*characters.values()]
         assert len(set(shown)) == len(shown)
         assert all(len(text) == 1 for text in shown)
         said = legend(characters).plain
         assert len(said) <= 79
         activities: tuple[Activity, ...] = ("deciding", "ready", "by_cloud", "by_local", "held")
         for activity in activities:
-            assert characters.cells[activity] in said
+            assert characters[activity] in said
     assert legend(ASCII).plain.isascii()
 
 
@@ -115,34 +117,30 @@ def test_lines_are_aligned() -> None:
     assert lines == ["  0.00 s  demo   |", "123.40 s  robot  |"]
 
 
+def times(kind: str, **measured: float) -> FaultTimes:
+    fields: dict[str, Any] = dict.fromkeys(FaultTimes.__struct_fields__)
+    return FaultTimes(**{**fields, "kind": kind, "target": "", "in_use": True, **measured})
+
+
 def findings(*, identical: bool) -> Findings:
-    outage = Outage(
-        found_ms=8.4,
-        first_local_decision_ms=321.0,
+    cold = times(
+        "cloud_killed",
+        detection_ms=8.4,
+        recovery_ms=329.4,
         longest_wait_ms=234.5,
-        launched_ms=254.4,
-        listening_ms=190.0,
-        used_again_ms=62.0,
+        launch_ms=254.4,
+        failback_ms=62.0,
     )
-    warm = Outage(
-        found_ms=9.0,
-        first_local_decision_ms=14.0,
-        longest_wait_ms=12.0,
-        launched_ms=None,
-        listening_ms=195.0,
-        used_again_ms=70.0,
+    warm = times(
+        "cloud_killed", detection_ms=9.0, recovery_ms=23.0, longest_wait_ms=12.0, failback_ms=70.0
     )
     difference = Difference(what="sensing action", trial=1, step=9, first="0", second="2")
     return Findings(
-        problem="peg_in_hole_2d",
-        seed=0,
-        trials=5,
-        steps=438,
-        rate_hz=27.0,
-        outages=(outage, warm),
-        robot_acting_again_ms=417.0,
+        outages=(cold, warm),
+        listening_ms=(190.0, 195.0),
+        robot_kill=times("robot_killed", recovery_ms=417.0),
         usual_wait_ms=2.34,
-        statuses=(("standard", "local_recovery", "keep_alive"), ("standard",)),
+        statuses=(["standard", "local_recovery", "keep_alive"], ["standard"]),
         comparison=Comparison(
             identical=identical,
             first_run="a",
@@ -160,7 +158,11 @@ def test_account() -> None:
     text = account(findings(identical=True), Path("out"))
     words = [" ".join(line.split()) for line in text.splitlines()]
     assert "cloud killed -> found 8 ms 9 ms" in words
+    assert "found -> first local decision 321 ms 14 ms" in words
+    assert "longest wait for a decision 234 ms 12 ms" in words
     assert "local service: spawned -> up 254 ms -" in words
+    assert "cloud: spawned -> listening 190 ms 195 ms" in words
+    assert "cloud: listening -> used again 62 ms 70 ms" in words
     assert "robot killed -> acting again 417 ms" in words
     assert "  standard -> local_recovery -> keep_alive\n  after its restart: standard\n" in text
     assert (

@@ -14,8 +14,9 @@ from typing import Any
 import pytest
 
 from holdfast.lab.errors import CannotStartError
+from holdfast.lab.testbed.bad_line import Impairment
 from holdfast.lab.testbed.processes import free_port
-from holdfast.lab.testbed.proxy import Impairment, Proxy
+from holdfast.lab.testbed.proxy import Proxy
 
 PATIENCE_S = 20.0
 BRIEFLY_S = 0.15

@@ -61,7 +61,8 @@ def test_where_no_networks_can_be_had_there_is_a_proxy(transport: Any, way: str)
     ("transport", "round_trip_ms", "loss", "message"),
     [
         ("quic", 20.0, 0.0, "transport 'quic': there are tcp, tls, udp"),
-        ("tcp", -20.0, 0.0, "must be from 0 to 60"),
+        ("tcp", -20.0, 0.0, "round_trip_ms -20.0: must be from 0 to 120000"),
+        ("tcp", float("nan"), 0.0, "round_trip_ms nan: must be"),
         ("udp", 20.0, 1.01, r"loss 1.01: must be from 0 to 1"),
     ],
 )

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import shlex
+import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.cli.exit_codes import EXIT_DIFFERENT, ended_by_signals, interrupted_by
-from holdfast.config.user_code import in_words
 from holdfast.config.validation import close_match
-from holdfast.errors import HoldfastError, OptionError, RunError
+from holdfast.errors import OptionError
 from holdfast.printable import printable
 from holdfast.runtime.command_line import (
     MAX_SEED,
@@ -24,18 +23,12 @@ from holdfast.runtime.command_line import (
     option,
     whole_number,
 )
-from holdfast.runtime.log_lines import LogFormat
-from holdfast.runtime.logs import log_option
 
 if TYPE_CHECKING:
-    from rich.console import Console
+    from collections.abc import Iterable
 
-    from holdfast.cli.terminal import ProgressLine
-    from holdfast.lab.chaos.report import ChaosSummary
-    from holdfast.lab.chaos.schedule import Wire
     from holdfast.lab.chaos.series import Series, SeriesPlan
     from holdfast.lab.chaos.trial import TrialOutcome
-    from holdfast.lab.testbed.fault_times import Spread
     from holdfast.lab.testbed.faults import FaultKind
 
 __all__ = ["main"]
@@ -44,18 +37,6 @@ _RUNS = Path("runs")
 _MAX_TRIALS = 100_000
 _DEFAULT_TRIALS = 20
 _MAX_JOBS = 64
-_TABLE_NAME = "table.txt"
-_WIDE = 142
-"""Characters that the whole table needs; on a narrower terminal a part of it is left out."""
-
-_N_EXPLAINED = (
-    "n: faults after which this was measured. After the others it did not come to it: the robot "
-    "did not need what was struck, or its run was over."
-)
-_DASH_EXPLAINED = (
-    "-: never measured. A robot cannot report its own death, and no robot returns to a local "
-    "service; times of faults that overlap (combination) belong to none of them."
-)
 
 
 class ChaosOptions(Options):
@@ -66,11 +47,10 @@ class ChaosOptions(Options):
     faults, and the world, which keeps a list of its own, must have been acted on exactly once and
     in order.
 
-    DIR gets table.txt, chaos.csv (a row for each fault), summary.json, trials.jsonl (a line for
-    each trial, as it ends) and two figures: how soon a loss is found and the local service
-    launched, and how soon the cloud is used again. The files of a trial that went wrong are kept.
+    DIR gets table.txt, summary.json and trials.jsonl (a line for each trial, as it ends, with the
+    times of its faults). The files of a trial that went wrong are kept.
 
-    Ctrl-C ends all processes; the same command with --resume goes on.
+    Ctrl-C ends all processes, and says how to go on (--first).
     """
 
     exit_codes: ClassVar = {
@@ -121,9 +101,7 @@ class ChaosOptions(Options):
         default=0,
         help="Number of the first trial.",
     )
-    resume: bool = flag(help="Go on with the series in DIR.")
     keep: bool = flag(help="Keep the files of good trials as well.")
-    log: LogFormat = log_option("Show a bar (text), or events (json).")
     list: bool = flag(help="List the kinds of fault, and which can be done here.")
 
 
@@ -152,311 +130,101 @@ def _impossible_kinds() -> dict[FaultKind, str]:
     from holdfast.lab.testbed.faults import NEEDS_NAMESPACE, FaultKind
     from holdfast.lab.testbed.namespace import why_no_namespace
 
-    impossible = {}
     reason = why_no_namespace()
-    if reason is not None:
-        impossible = {kind: reason for kind in FaultKind if kind in NEEDS_NAMESPACE}
-    if not Path("/proc/self/stat").exists():
-        impossible[FaultKind.LOCAL_KILLED] = "the local service's process is found in /proc"
-    return impossible
+    return {kind: reason for kind in FaultKind if reason is not None and kind in NEEDS_NAMESPACE}
 
 
-def _chosen_kinds(
-    only: Sequence[str], impossible: dict[FaultKind, str]
-) -> tuple[tuple[FaultKind, ...], dict[FaultKind, str]]:
-    """Return the kinds of a series, and those of the wanted ones that are left out."""
+def _chosen(option: str, names: Sequence[str], known: Iterable[str]) -> list[str]:
+    """Return those that were named, or all."""
+    known = list(known)
+    for name in names:
+        if name not in known:
+            hint = close_match(name.replace("-", "_"), known)
+            raise OptionError(f"{option} is {name!r}; allowed are {', '.join(known)}{hint}")
+    return [each for each in known if not names or each in names]
+
+
+def _plan_of(options: ChaosOptions) -> tuple[SeriesPlan, dict[FaultKind, str]]:
+    """Return the plan of a series, and which of the wanted kinds are left out, and why."""
+    from holdfast.lab.chaos.schedule import WIRES, kinds_over
+    from holdfast.lab.chaos.series import SeriesPlan
     from holdfast.lab.testbed.faults import FaultKind
 
-    for name in only:
-        if name not in list(FaultKind):
-            hint = close_match(name.replace("-", "_"), list(FaultKind))
-            raise OptionError(f"--only is {name!r}; allowed are {', '.join(FaultKind)}{hint}")
-    wanted = [kind for kind in FaultKind if kind in only] if only else list(FaultKind)
+    impossible = _impossible_kinds()
+    wanted = [FaultKind(name) for name in _chosen("--only", options.only, FaultKind)]
     kinds = tuple(kind for kind in wanted if kind not in impossible)
     if not kinds:
-        kind = wanted[0]
-        raise OptionError(f"--only {kind.value} cannot be done here: {impossible[kind]}")
-    return kinds, {kind: impossible[kind] for kind in wanted if kind in impossible}
-
-
-def _chosen_wires(names: Sequence[str]) -> tuple[Wire, ...]:
-    from holdfast.lab.chaos.schedule import WIRES
-
-    for name in names:
-        if name not in WIRES:
-            hint = close_match(name, WIRES)
-            raise OptionError(f"--wire is {name!r}; allowed are {', '.join(WIRES)}{hint}")
-    return tuple(wire for wire in WIRES if not names or wire in names)
+        raise OptionError(f"--only {wanted[0]} cannot be done here: {impossible[wanted[0]]}")
+    chosen = _chosen("--wire", options.wire, WIRES)
+    wires = tuple(wire for wire in WIRES if wire in chosen and kinds_over(wire, kinds))
+    if not wires:
+        raise OptionError(
+            f"--only {kinds[0]} cannot be done over {chosen[0]}: choose another --wire"
+        )
+    possible = tuple(kind for kind in FaultKind if kind not in impossible)
+    plan = SeriesPlan(options.seed, wires, kinds, possible)
+    return plan, {kind: impossible[kind] for kind in wanted if kind in impossible}
 
 
 def _run(options: ChaosOptions) -> bool:
-    from holdfast.cli.terminal import progress_line
+    from holdfast.cli.terminal import counted, progress_line
     from holdfast.files import claim_directory
-    from holdfast.lab.chaos.report import summarise, write_tables
-    from holdfast.lab.chaos.schedule import kinds_over
-    from holdfast.lab.chaos.series import Series, SeriesPlan
-    from holdfast.lab.testbed.faults import FaultKind
-    from holdfast.recording.machine import commit
+    from holdfast.lab.chaos.report import WIDE, summarise, text_of, write_report
+    from holdfast.lab.chaos.series import Series
 
-    impossible = _impossible_kinds()
-    kinds, left_out = _chosen_kinds(options.only, impossible)
-    wires = _chosen_wires(options.wire)
-    trials, jobs = options.trials, options.jobs
-    over = tuple(wire for wire in wires if kinds_over(wire, kinds))
-    if not over:
-        raise OptionError(
-            f"--only {kinds[0].value} cannot be done over {wires[0]}: choose another --wire"
-        )
-    if options.resume and options.out is None:
-        raise OptionError("--resume needs --out: which series is to go on")
-    possible = tuple(kind for kind in FaultKind if kind not in impossible)
-    plan = SeriesPlan(
-        seed=options.seed,
-        first=options.first,
-        wires=over,
-        kinds=kinds,
-        possible=possible,
-        commit=commit().removeprefix("commit "),
-    )
-    directory = options.out
-    if not options.resume or directory is None:
-        directory = claim_directory(directory, _RUNS, "chaos")
-    series = Series(directory, plan, resume=options.resume, keep=options.keep)
-    as_json = options.log == "json"
-    show = _Show(progress_line(trials, quiet=as_json), plan, series, trials, as_json=as_json)
-    show.start(directory, jobs, left_out)
-    words = options.words("out", "resume")
-    out = options.table()["out"].words(directory)
-    again = shlex.join(["holdfast", "chaos", *words, *out, "--resume"])
+    plan, left_out = _plan_of(options)
+    trials = range(options.first, options.first + options.trials)
+    directory = claim_directory(options.out, _RUNS, "chaos")
+    series = Series(directory, plan, keep=options.keep)
+    line = progress_line(options.trials, quiet=False)
+
+    def show(outcome: TrialOutcome) -> None:
+        line.show(len(series.outcomes), f"{len(series.wrong)} wrong")
+        if outcome in series.wrong:
+            line.say(_account(series, outcome))
+
+    title = f"chaos, {counted(options.trials, 'trial')}, seed {options.seed}"
+    if options.jobs > 1:
+        title += f", {options.jobs} at a time"
+    line.start(f"{title}; results in {directory}", 0, "0 wrong")
+    if left_out:
+        line.say(f"left out: {', '.join(left_out)}: {next(iter(left_out.values()))}")
     try:
         try:
-            series.run(trials, jobs, show.started, show.ended)
+            series.run(trials, options.jobs, show)
         finally:
             # First of all the terminal; after SIGHUP there is none to write to.
             with contextlib.suppress(OSError):
-                show.stop()
-            summary = summarise(plan, series.outcomes, trials=trials, jobs=jobs, left_out=left_out)
-            write_tables(directory, summary, series.outcomes)
-            _write_table(summary, directory / _TABLE_NAME)
+                line.stop()
+            summary = summarise(series.outcomes, trials, plan.seed, options.jobs, left_out)
+            write_report(directory, summary)
     except KeyboardInterrupt as interruption:
-        how = interrupted_by(interruption)
-        # Anew: a second signal may have come before the first summary was there.
-        summary = summarise(plan, series.outcomes, trials=trials, jobs=jobs, left_out=left_out)
-        show.interrupted(
-            f"{how}; all processes are ended. {summary.finished} of {trials} trials are finished",
-            again,
+        finished = {outcome.trial for outcome in series.outcomes}
+        first = min(set(trials) - finished, default=trials.stop)
+        words = [*options.words("out", "trials", "first"), "--first", str(first)]
+        again = shlex.join(["holdfast", "chaos", "--trials", str(trials.stop - first), *words])
+        sys.stderr.write(
+            f"\n{interrupted_by(interruption)}; all processes are ended. "
+            f"{len(finished)} of {options.trials} trials are finished\n"
+            f"Go on with: {printable(again)}\n"
         )
         raise
-    except HoldfastError as error:
-        raise RunError(error, again) from error
-    note = _draw(directory, summary, series.outcomes)
-    show.conclude(summary, directory, note)
-    return summary.identical == summary.finished
+
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else WIDE
+    accounts = "".join(f"\n{_account(series, outcome)}\n" for outcome in series.wrong)
+    names = sorted(path.name for path in directory.iterdir() if path.is_file())
+    files = f"{directory}/\n  {'  '.join(names)}\n"
+    sys.stdout.write(f"\n{text_of(summary, width)}{printable(accounts)}\n{files}")
+    sys.stdout.flush()
+    return not series.wrong
 
 
-def _draw(directory: Path, summary: ChaosSummary, outcomes: Sequence[TrialOutcome]) -> str | None:
-    """Draw the figures, and return a note if that is not possible."""
-    from holdfast.cli.run_figure import own_backend
-
-    try:
-        with own_backend():
-            from holdfast.lab.chaos.figure import draw_figures
-        draw_figures(directory, summary, outcomes)
-    except Exception as error:  # noqa: BLE001 - the series is finished, with figures or without
-        if isinstance(error, ImportError) and (error.name or "").split(".")[0] == "matplotlib":
-            return "no figures, because matplotlib is not installed: pip install matplotlib"
-        return f"no figures, because they cannot be drawn: {in_words(error)}"
-    return None
-
-
-class _Show:
-    """Shows a series, as text or as events."""
-
-    def __init__(
-        self,
-        line: ProgressLine,
-        plan: SeriesPlan,
-        series: Series,
-        trials: int,
-        *,
-        as_json: bool,
-    ) -> None:
-        self._line = line
-        self._plan = plan
-        self._series = series
-        self._trials = trials
-        self._as_json = as_json
-        self._going_on: dict[int, FaultKind] = {}
-
-    def start(self, directory: Path, jobs: int, left_out: dict[FaultKind, str]) -> None:
-        from holdfast.cli.terminal import counted
-
-        finished = len(self._series.outcomes)
-        title = f"chaos, {counted(self._trials, 'trial')}, seed {self._plan.seed}"
-        if jobs > 1:
-            title += f", {jobs} at a time"
-        if finished:
-            title += f", {finished} finished before"
-        self._line.start(f"{title}; results in {directory}", finished, self._note())
-        for reason in dict.fromkeys(left_out.values()):
-            kinds = ", ".join(kind.value for kind, why in left_out.items() if why == reason)
-            self._tell("left_out", f"left out: {kinds}: {reason}", kinds=kinds, reason=reason)
-
-    def started(self, trial: int, kind: FaultKind) -> None:
-        self._going_on[trial] = kind
-        self._line.show(len(self._series.outcomes), self._note())
-
-    def ended(self, outcome: TrialOutcome) -> None:
-        self._going_on.pop(outcome.trial, None)
-        self._line.show(len(self._series.outcomes), self._note())
-        wrong = outcome.verdict != "identical"
-        if self._as_json:
-            where = {
-                "reason": outcome.reason,
-                "directory": str(self._series.directory_of(outcome.trial)),
-                "again": self._command_of(outcome),
-            }
-            self._event(
-                "chaos_trial",
-                trial=outcome.trial,
-                kind=outcome.kind.value,
-                wire=outcome.wire,
-                verdict=outcome.verdict,
-                faults=len(outcome.faults),
-                took_s=outcome.took_s,
-                **(where if wrong else {}),
-            )
-        elif wrong:
-            self._line.say(self._account(outcome))
-
-    def stop(self) -> None:
-        self._line.stop()
-
-    def interrupted(self, text: str, command: str) -> None:
-        if self._as_json:
-            self._event("interrupted", reason=text, resume_command=command)
-        else:
-            sys.stderr.write(printable(f"\n{text}\nGo on with: {command}\n"))
-
-    def conclude(self, summary: ChaosSummary, directory: Path, note: str | None) -> None:
-        if not self._as_json:
-            self._print_table(summary)
-            wrong = [outcome for outcome in self._series.outcomes if outcome.verdict != "identical"]
-            for outcome in sorted(wrong, key=lambda outcome: outcome.trial):
-                sys.stdout.write(printable(f"\n{self._account(outcome)}\n"))
-            names = sorted(path.name for path in directory.iterdir() if path.is_file())
-            sys.stdout.write(f"\n{directory}/\n  {'  '.join(names)}\n")
-            sys.stdout.flush()
-        if note is not None:
-            self._tell("note", f"note: {note}", reason=note)
-
-    @staticmethod
-    def _print_table(summary: ChaosSummary) -> None:
-        from rich.console import Console
-
-        console = Console(highlight=False)
-        if not console.is_terminal:
-            console = Console(highlight=False, width=_WIDE)
-        console.print()
-        _print_table(summary, console)
-
-    def _note(self) -> str:
-        wrong = sum(outcome.verdict != "identical" for outcome in self._series.outcomes)
-        note = f"{wrong} wrong"
-        if self._going_on:
-            note += f", now {', '.join(kind.value for kind in self._going_on.values())}"
-        return note
-
-    def _account(self, outcome: TrialOutcome) -> str:
-        """Say what went wrong, where its files are, and how to do it again."""
-        return (
-            f"trial {outcome.trial} ({outcome.kind.value} over {outcome.wire}): "
-            f"{outcome.verdict}: {outcome.reason}\n"
-            f"  its files: {self._series.directory_of(outcome.trial)}\n"
-            f"  again: {self._command_of(outcome)}"
-        )
-
-    def _command_of(self, outcome: TrialOutcome) -> str:
-        return (
-            f"holdfast chaos --trials 1 --first {outcome.trial} --seed {self._plan.seed} "
-            f"--only {outcome.kind.value} --wire {outcome.wire} --keep"
-        )
-
-    def _tell(self, event: str, text: str, **fields: object) -> None:
-        if self._as_json:
-            self._event(event, **fields)
-        else:
-            self._line.say(text)
-
-    @staticmethod
-    def _event(name: str, **fields: object) -> None:
-        from holdfast.runtime.logs import write_event
-
-        write_event("chaos", name, **fields)
-
-
-def _write_table(summary: ChaosSummary, path: Path) -> None:
-    """Write the table as it is printed where there is room for it."""
-    from rich.console import Console
-
-    from holdfast.files import write_atomically
-
-    console = Console(file=io.StringIO(), width=_WIDE, highlight=False, color_system=None)
-    with console.capture() as capture:
-        _print_table(summary, console)
-    write_atomically(path, capture.get())
-
-
-def _print_table(summary: ChaosSummary, console: Console) -> None:
-    from rich.table import Table
-    from rich.text import Text
-
-    from holdfast.cli.terminal import counted
-
-    wide = console.width >= _WIDE
-    table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column("kind of trial", no_wrap=True)
-    for name in ("trials", "faults", "wrong") if wide else ("trials", "wrong"):
-        table.add_column(name, justify="right")
-    for name in ("detection", "recovery", "launch", "failback"):
-        head = f"{name}, ms\n   n median   p95   max" if wide else f"{name}\nmedian max"
-        table.add_column(head, justify="right", no_wrap=True)
-    for row in summary.kinds:
-        wrong = Text(str(row.wrong), style="bold red" if row.wrong else "")
-        counts = [str(row.trials), str(row.faults)] if wide else [str(row.trials)]
-        spreads = (row.detection, row.recovery, row.launch, row.failback)
-        cells = (_cell(spread, wide=wide) for spread in spreads)
-        table.add_row(row.kind.value, *counts, wrong, *cells)
-    console.print(table)
-    console.print()
-    if wide:
-        console.print(_N_EXPLAINED)
-    console.print(_DASH_EXPLAINED)
-    bad = summary.finished - summary.identical
-    if bad:
-        verdict = (
-            f"{bad} of {counted(summary.finished, 'trial')} went wrong ({summary.diverged} "
-            f"diverged, {summary.failed} failed, {summary.timed_out} timed out)"
-        )
-    else:
-        trials = counted(summary.identical, "trial")
-        verdict = f"no divergence: {trials} with {counted(summary.faults, 'fault')}"
-    units = "" if wide else "Times in milliseconds. "
-    console.print(
-        f"\n{units}{verdict}, over {_counted_wires(summary.wires)}; {summary.steps:,} task actions "
-        f"and {summary.sensing_actions:,} sensing actions are those of the runs without faults",
-        style="bold red" if bad else "",
+def _account(series: Series, outcome: TrialOutcome) -> str:
+    """Say what went wrong, where its files are, and how to do it again."""
+    return (
+        f"trial {outcome.trial} ({outcome.kind.value} over {outcome.wire}): "
+        f"{outcome.verdict}: {outcome.reason}\n"
+        f"  its files: {series.directory_of(outcome.trial)}\n"
+        f"  again: holdfast chaos --trials 1 --first {outcome.trial} --seed {series.plan.seed} "
+        f"--only {outcome.kind.value} --wire {outcome.wire} --keep"
     )
-
-
-def _counted_wires(wires: dict[str, int]) -> str:
-    return ", ".join(f"{wire} ({number})" for wire, number in sorted(wires.items())) or "no wire"
-
-
-def _cell(spread: Spread | None, *, wide: bool) -> str:
-    if spread is None:
-        return "-"
-    if wide:
-        times = f"{spread.median_ms:6.0f} {spread.p95_ms:5.0f} {spread.max_ms:5.0f}"
-        return f"{spread.count:4} {times}"
-    return f"{spread.median_ms:.0f} {spread.max_ms:5.0f}"

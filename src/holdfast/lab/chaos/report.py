@@ -1,40 +1,42 @@
-"""The results of a series: a row for each kind of fault, a row for each fault, and a summary.
+"""What a series comes to: its verdict and a row for each kind of fault, as numbers and as text.
 
-Times of overlapping faults belong to none of them, so those of combinations are in the table of all
-faults alone; combinations are there for the comparison with the reference run.
+Times of overlapping faults belong to none of them, so a combination has none; combinations are
+there for the comparison with the reference run.
 """
 
 from __future__ import annotations
 
-import csv
-import io
+import textwrap
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import msgspec
 
+from holdfast.cli.terminal import counted
 from holdfast.files import write_atomically
-from holdfast.lab.chaos.series import SeriesPlan
 from holdfast.lab.chaos.trial import TrialOutcome
-from holdfast.lab.testbed.fault_times import FaultTimes, Spread, spread_of
+from holdfast.lab.testbed.fault_times import Spread, spread_of
 from holdfast.lab.testbed.faults import FaultKind
 from holdfast.recording.machine import describe
 
-__all__ = [
-    "FAULTS_NAME",
-    "SUMMARY_NAME",
-    "ChaosSummary",
-    "KindRow",
-    "kind_rows",
-    "summarise",
-    "write_tables",
-]
+__all__ = ["WIDE", "ChaosSummary", "KindRow", "kind_rows", "summarise", "text_of", "write_report"]
 
-FAULTS_NAME = "chaos.csv"
-SUMMARY_NAME = "summary.json"
+WIDE = 142
+"""Characters that the whole table needs; on a narrower terminal a part of it is left out."""
 
-_TRIAL_COLUMNS = ("trial", "trial_kind", "wire", "verdict", "launch", "fault")
+_SUMMARY_NAME = "summary.json"
+_TABLE_NAME = "table.txt"
+_TIMES = ("detection", "recovery", "launch", "failback")
+
+_N_EXPLAINED = (
+    "n: faults after which this was measured. After the others it did not come to it: the robot "
+    "did not need what was struck, or its run was over."
+)
+_DASH_EXPLAINED = (
+    "-: never measured. A robot cannot report its own death, and no robot returns to a local "
+    "service; times of faults that overlap (combination) belong to none of them."
+)
 
 
 class KindRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -44,26 +46,17 @@ class KindRow(msgspec.Struct, frozen=True, kw_only=True):
     ----------
     faults : int
         Injected faults.
-    unnoticed : int
-        Faults after which the robot neither lost nor awaited anything.
     wrong : int
         Trials that are not identical with their reference runs.
-    detection, recovery, launch, failback : Spread or None
-        None where nothing was measured; always for combinations.
-    longest_wait_ms : float or None
-        Longest time that a robot stood still for a decision.
+    times : dict of str to Spread
+        ``detection``, ``recovery``, ``launch`` and ``failback``, where they were measured.
     """
 
     kind: FaultKind
     trials: int
     faults: int
-    unnoticed: int
     wrong: int
-    detection: Spread | None
-    recovery: Spread | None
-    launch: Spread | None
-    failback: Spread | None
-    longest_wait_ms: float | None
+    times: dict[str, Spread]
 
 
 class ChaosSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -73,16 +66,12 @@ class ChaosSummary(msgspec.Struct, frozen=True, kw_only=True):
     ----------
     identical, diverged, failed, timed_out : int
         Trials by their verdicts.
-    faults, robot_processes : int
+    faults : int
         In all of them.
     steps, sensing_actions : int
         Compared with those of the reference runs and found the same.
     left_out : dict of str to str
         Kinds that this machine cannot inject, and why.
-    holdfast_version, commit : str
-        As they were when the series began.
-    trials_took_s : float
-        The sum over all trials.
     """
 
     seed: int
@@ -94,17 +83,13 @@ class ChaosSummary(msgspec.Struct, frozen=True, kw_only=True):
     failed: int
     timed_out: int
     faults: int
-    robot_processes: int
     steps: int
     sensing_actions: int
     jobs: int
     kinds: tuple[KindRow, ...]
     wires: dict[str, int]
     left_out: dict[str, str]
-    holdfast_version: str
-    commit: str
     machine: dict[str, str]
-    trials_took_s: float
 
 
 def kind_rows(outcomes: Sequence[TrialOutcome]) -> tuple[KindRow, ...]:
@@ -118,92 +103,105 @@ def kind_rows(outcomes: Sequence[TrialOutcome]) -> tuple[KindRow, ...]:
 
 def _row(kind: FaultKind, outcomes: Sequence[TrialOutcome]) -> KindRow:
     faults = [fault for outcome in outcomes for fault in outcome.faults]
-    measured = [] if kind is FaultKind.COMBINATION else faults
-
-    def spread(name: str) -> Spread | None:
-        times = [getattr(fault, name) for fault in measured]
-        return spread_of([time for time in times if time is not None])
-
-    waits = [fault.longest_wait_ms for fault in faults if fault.longest_wait_ms is not None]
+    times: dict[str, Spread] = {}
+    for name in _TIMES if kind is not FaultKind.COMBINATION else ():
+        measured = [getattr(fault, f"{name}_ms") for fault in faults]
+        spread = spread_of([time for time in measured if time is not None])
+        if spread is not None:
+            times[name] = spread
     return KindRow(
         kind=kind,
         trials=len(outcomes),
         faults=len(faults),
-        unnoticed=sum(
-            fault.detection_ms is None and fault.recovery_ms is None for fault in measured
-        ),
         wrong=sum(outcome.verdict != "identical" for outcome in outcomes),
-        detection=spread("detection_ms"),
-        recovery=spread("recovery_ms"),
-        launch=spread("launch_ms"),
-        failback=spread("failback_ms"),
-        longest_wait_ms=max(waits, default=None),
+        times=times,
     )
 
 
 def summarise(
-    plan: SeriesPlan,
     outcomes: Sequence[TrialOutcome],
-    *,
-    trials: int,
+    trials: range,
+    seed: int,
     jobs: int,
     left_out: Mapping[FaultKind, str],
 ) -> ChaosSummary:
     """Return the summary of a series."""
     verdicts = [outcome.verdict for outcome in outcomes]
     return ChaosSummary(
-        seed=plan.seed,
-        first=plan.first,
-        trials=trials,
+        seed=seed,
+        first=trials.start,
+        trials=len(trials),
         finished=len(outcomes),
         identical=verdicts.count("identical"),
         diverged=verdicts.count("diverged"),
         failed=verdicts.count("failed"),
         timed_out=verdicts.count("timed_out"),
         faults=sum(len(outcome.faults) for outcome in outcomes),
-        robot_processes=sum(outcome.robots for outcome in outcomes),
         steps=sum(outcome.steps for outcome in outcomes),
         sensing_actions=sum(outcome.sensing_actions for outcome in outcomes),
         jobs=jobs,
         kinds=kind_rows(outcomes),
         wires=dict(Counter(outcome.wire for outcome in outcomes)),
         left_out={kind.value: reason for kind, reason in left_out.items()},
-        holdfast_version=plan.holdfast_version,
-        commit=plan.commit,
         machine=describe(),
-        trials_took_s=round(sum(outcome.took_s for outcome in outcomes), 1),
     )
 
 
-def write_tables(directory: Path, summary: ChaosSummary, outcomes: Sequence[TrialOutcome]) -> None:
-    """Write ``chaos.csv`` and ``summary.json``.
+def write_report(directory: Path, summary: ChaosSummary) -> None:
+    """Write ``summary.json`` and ``table.txt``.
 
     Raises
     ------
     OutputError
         If they cannot be written.
     """
-    write_atomically(directory / FAULTS_NAME, _fault_table(outcomes))
     text = msgspec.json.format(msgspec.json.encode(summary), indent=2)
-    write_atomically(directory / SUMMARY_NAME, text + b"\n")
+    write_atomically(directory / _SUMMARY_NAME, text + b"\n")
+    write_atomically(directory / _TABLE_NAME, text_of(summary, WIDE))
 
 
-def _fault_table(outcomes: Sequence[TrialOutcome]) -> str:
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    columns = FaultTimes.__struct_fields__
-    writer.writerow((*_TRIAL_COLUMNS, *columns))
-    for outcome in sorted(outcomes, key=lambda outcome: outcome.trial):
-        head = (
-            outcome.trial,
-            outcome.kind.value,
-            outcome.wire,
-            outcome.verdict,
-            outcome.launch,
+def text_of(summary: ChaosSummary, width: int) -> str:
+    """Return the table and the verdict, whole or for a narrow terminal."""
+    wide = width >= WIDE
+    counts = ("trials", "faults", "wrong") if wide else ("trials", "wrong")
+    cell = "   n median   p95   max" if wide else "median max"
+    above = [f"{name}, ms" if wide else name for name in _TIMES]
+    name_width = max(map(len, FaultKind))
+    heads = "".join(f" {name}" for name in counts)
+    lines = [
+        " " * (name_width + len(heads)) + "".join(f" {name:>{len(cell)}}" for name in above),
+        f"{'kind of trial':<{name_width}}{heads}" + f" {cell}" * len(above),
+    ]
+    for row in summary.kinds:
+        numbers = "".join(f" {getattr(row, name):>{len(name)}}" for name in counts)
+        spreads = (_cell(row.times.get(name), wide=wide) for name in _TIMES)
+        cells = "".join(f" {text:>{len(cell)}}" for text in spreads)
+        lines.append(f"{row.kind.value:<{name_width}}{numbers}{cells}")
+    bad = summary.finished - summary.identical
+    if bad:
+        verdict = (
+            f"{bad} of {counted(summary.finished, 'trial')} went wrong ({summary.diverged} "
+            f"diverged, {summary.failed} failed, {summary.timed_out} timed out)"
         )
-        for number, fault in enumerate(outcome.faults):
-            values = (getattr(fault, column) for column in columns)
-            writer.writerow(
-                (*head, number, *(int(v) if isinstance(v, bool) else v for v in values))
-            )
-    return text.getvalue()
+    else:
+        trials = counted(summary.identical, "trial")
+        verdict = f"no divergence: {trials} with {counted(summary.faults, 'fault')}"
+    wires = ", ".join(f"{wire} ({count})" for wire, count in sorted(summary.wires.items()))
+    verdict += (
+        f", over {wires or 'no wire'}; {summary.steps:,} task actions and "
+        f"{summary.sensing_actions:,} sensing actions are those of the runs without faults"
+    )
+    explained = [_N_EXPLAINED, _DASH_EXPLAINED] if wide else [_DASH_EXPLAINED]
+    units = "" if wide else "Times in milliseconds. "
+    lines += ["", *(textwrap.fill(text, width) for text in explained)]
+    lines += ["", textwrap.fill(f"{units}{verdict}", width)]
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _cell(spread: Spread | None, *, wide: bool) -> str:
+    if spread is None:
+        return "-"
+    if wide:
+        times = f"{spread.median_ms:6.0f} {spread.p95_ms:5.0f} {spread.max_ms:5.0f}"
+        return f"{spread.count:4} {times}"
+    return f"{spread.median_ms:.0f} {spread.max_ms:3.0f}"

@@ -13,8 +13,8 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import msgspec
 
+from holdfast.lab.testbed.bad_line import Direction
 from holdfast.lab.testbed.faults import NEEDS_NAMESPACE, NEEDS_PROXY, Fault, FaultKind
-from holdfast.lab.testbed.proxy import Direction
 
 __all__ = [
     "WIRES",

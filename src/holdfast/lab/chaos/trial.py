@@ -83,8 +83,6 @@ class TrialOutcome(msgspec.Struct, frozen=True, kw_only=True):
         Of the robot's run, all of them compared.
     robots : int
         Processes that the robot had.
-    statuses : int
-        Changes of the robot's status.
     """
 
     trial: int
@@ -93,12 +91,10 @@ class TrialOutcome(msgspec.Struct, frozen=True, kw_only=True):
     verdict: Verdict
     reason: str
     launch: str
-    faults_planned: int
     faults: tuple[FaultTimes, ...]
     steps: int
     sensing_actions: int
     robots: int
-    statuses: int
     took_s: float
 
 
@@ -154,12 +150,10 @@ def run_chaos_trial(
         verdict=verdict,
         reason=reason,
         launch=schedule.launch,
-        faults_planned=len(schedule.faults),
         faults=tuple(times_of_faults(testbed.faults, events, decisions)),
         steps=0 if comparison is None else comparison.task_actions,
         sensing_actions=0 if comparison is None else comparison.sensing_actions,
         robots=0 if robot is None else len(robot.processes),
-        statuses=sum(event.name == "status" for event in events),
         took_s=round(time.monotonic() - began, 3),
     )
 

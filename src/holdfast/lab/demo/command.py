@@ -88,7 +88,7 @@ def _run(out: Path | None, seed: int, *, quick: bool) -> Findings:
         with Testbed(directory, orderly_end_s=_ORDERLY_END_S) as testbed:
             show.start(state)
             try:
-                findings = Demo(testbed, seed, plan, state, show).run()
+                findings = Demo(testbed, seed, plan, state, show.say).run()
             finally:
                 # The terminal comes first; after SIGHUP there is none.
                 with contextlib.suppress(OSError):
@@ -115,6 +115,12 @@ def account(findings: Findings, directory: Path) -> str:
         return f"  {label:<42}" + "".join(f"{text:>12}" for text in texts)
 
     outages = findings.outages
+    local_ms = [
+        None
+        if each.recovery_ms is None or each.detection_ms is None
+        else max(0.0, each.recovery_ms - each.detection_ms)
+        for each in outages
+    ]
     passed = [" -> ".join(each) for each in findings.statuses]
     comparison = findings.comparison
     runs = [directory / name for name in (REFERENCE_RUN_NAME, KILLED_RUN_NAME)]
@@ -125,13 +131,13 @@ def account(findings: Findings, directory: Path) -> str:
     lines = [
         "",
         f"{'What the kills cost':<44}{'1st kill':>12}{'2nd kill':>12}",
-        row("cloud killed -> found", *(each.found_ms for each in outages)),
-        row("found -> first local decision", *(each.first_local_decision_ms for each in outages)),
+        row("cloud killed -> found", *(each.detection_ms for each in outages)),
+        row("found -> first local decision", *local_ms),
         row("longest wait for a decision", *(each.longest_wait_ms for each in outages)),
-        row("local service: spawned -> up", *(each.launched_ms for each in outages)),
-        row("cloud: spawned -> listening", *(each.listening_ms for each in outages)),
-        row("cloud: listening -> used again", *(each.used_again_ms for each in outages)),
-        row("robot killed -> acting again", findings.robot_acting_again_ms),
+        row("local service: spawned -> up", *(each.launch_ms for each in outages)),
+        row("cloud: spawned -> listening", *findings.listening_ms),
+        row("cloud: listening -> used again", *(each.failback_ms for each in outages)),
+        row("robot killed -> acting again", findings.robot_kill.recovery_ms),
         "After a kill the robot first uses up the actions that it has; the wait is how",
         f"long it stood still. Without a kill that is {findings.usual_wait_ms:.1f} ms (median).",
         "",

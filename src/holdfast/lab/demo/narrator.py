@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, Protocol, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 from holdfast.lab.testbed.driver import ServiceCommand, Testbed
 from holdfast.lab.testbed.processes import Process
@@ -12,7 +13,7 @@ from holdfast.lab.testbed.records import LogEvent
 from holdfast.protocol.status import Status
 from holdfast.robot.links import RECOVERY_SERVICE
 
-__all__ = ["Activity", "Change", "DemoState", "Line", "Mark", "Narrator", "Observer", "Row"]
+__all__ = ["Activity", "Change", "DemoState", "Line", "Mark", "Narrator", "Row"]
 
 _SENTENCES = {
     "service_appeared": "sees {who}",
@@ -92,26 +93,21 @@ class DemoState:
         return time.time() - self.began_at
 
 
-class Observer(Protocol):
-    """Shows a demo while it runs."""
-
-    def say(self, line: Line) -> None:
-        """Show the next line; the state has it already."""
-        ...
-
-
 class Narrator:
     """Follows a testbed with one cloud service and one robot."""
 
     def __init__(
-        self, testbed: Testbed, cloud: ServiceCommand, state: DemoState, observer: Observer
+        self,
+        testbed: Testbed,
+        cloud: ServiceCommand,
+        state: DemoState,
+        show: Callable[[Line], object],
     ) -> None:
         self._testbed = testbed
         self._cloud = cloud
         self._state = state
-        self._observer = observer
+        self._show = show
         self._ready_process: Process | None = None
-        self._killed_at: float | None = None
         self._num_events = 0
         self._local: Activity = "off"
         self._is_up = self._is_held = self._has_done_all = self._has_finished = False
@@ -124,39 +120,32 @@ class Narrator:
 
     # -- what the demo does --------------------------------------------------------------------
 
-    def started_cloud(self, process: Process) -> None:
+    def started_cloud(self) -> None:
         """Note a start of the cloud service."""
-        self._mark("cloud", "start", process.spawned_at)
         command = f"holdfast serve --listen {self._cloud.endpoint}"
-        self.say("demo", f"starts the cloud: {command}", process.spawned_at)
+        self._mark("cloud", "start", self._cloud.process.spawned_at, f"starts the cloud: {command}")
 
-    def killed_cloud(self, process: Process, killed_at: float) -> None:
-        """Note a kill of the cloud service."""
-        self._killed_at = killed_at
-        self._mark("cloud", "kill", killed_at)
-        self.say("demo", f"kill -9 {process.pid}: the cloud service", killed_at)
-
-    def started_robot(self, process: Process, *options: str) -> None:
+    def started_robot(self, *options: str) -> None:
         """Note a start of the robot."""
         self.statuses.append([Status.STANDARD.value])
         self._state.status = Status.STANDARD
         self._is_held = False
-        self._mark("robot", "start", process.spawned_at)
         command = " ".join(["holdfast run CONFIG --service ...", *options])
-        self.say("demo", f"starts the robot: {command}", process.spawned_at)
+        started_at = self._testbed.robot.process.spawned_at
+        self._mark("robot", "start", started_at, f"starts the robot: {command}")
 
-    def killed_robot(self, process: Process, killed_at: float) -> None:
-        """Note a kill of the robot, with which its local service ends."""
-        self._is_up = False
-        self._local = "off"
-        self._mark("robot", "kill", killed_at)
-        self.say("demo", f"kill -9 {process.pid}: the robot's own process", killed_at)
+    def killed(self, row: Row, process: Process, what: str) -> None:
+        """Note a kill of the cloud service, or of the robot, with which its local service ends."""
+        if row == "robot":
+            self._is_up = False
+            self._local = "off"
+        self._mark(row, "kill", process.killed_at or 0.0, f"kill -9 {process.pid}: {what}")
 
     def say(self, who: str, text: str, at: float | None = None) -> None:
         """Add a line."""
         line = Line((time.time() if at is None else at) - self._state.began_at, who, text)
         self._state.lines.append(line)
-        self._observer.say(line)
+        self._show(line)
 
     # -- what the testbed shows ----------------------------------------------------------------
 
@@ -218,8 +207,9 @@ class Narrator:
         if name == "status" and self.cloud_decides:
             return f"status {event['to']}: the cloud decides again"
         if name == "status":
-            ms = "" if self._killed_at is None else f"{1e3 * (event.at - self._killed_at):.0f} ms"
-            return f"status {event['to']}, {ms} after the kill" if ms else f"status {event['to']}"
+            killed_at = self._cloud.process.killed_at
+            after = killed_at and f", {1e3 * (event.at - killed_at):.0f} ms after the kill"
+            return f"status {event['to']}{after or ''}"
         if name == "trial":
             how = "the peg is in" if event["success"] else "the peg is not in"
             return f"trial {event['trial']} ends after {event['steps']} steps: {how}"
@@ -232,9 +222,10 @@ class Narrator:
 
     # -- activities ----------------------------------------------------------------------------
 
-    def _mark(self, row: Row, kind: Literal["start", "kill"], at: float) -> None:
+    def _mark(self, row: Row, kind: Literal["start", "kill"], at: float, text: str) -> None:
         self._state.marks.append(Mark(at - self._state.began_at, row, kind))
         self._note_changes(at)
+        self.say("demo", text, at)
 
     def _note_changes(self, at: float) -> None:
         """Note the activity of each row where it has changed."""

@@ -11,11 +11,8 @@ import statistics
 from collections.abc import Callable
 from typing import NamedTuple
 
-import msgspec
-
 from holdfast.cli.terminal import counted
-from holdfast.files import write_atomically
-from holdfast.lab.demo.narrator import DemoState, Narrator, Observer
+from holdfast.lab.demo.narrator import DemoState, Line, Narrator
 from holdfast.lab.errors import NoProgressError
 from holdfast.lab.testbed.driver import Testbed
 from holdfast.lab.testbed.fault_times import ROBOT, FaultTimes, times_of_faults
@@ -31,12 +28,10 @@ __all__ = [
     "REFERENCE_RUN_NAME",
     "Demo",
     "Findings",
-    "Outage",
     "Plan",
 ]
 
 CONFIGURATION_NAME = "demo.yaml"
-FINDINGS_NAME = "findings.json"
 KILLED_RUN_NAME = "killed"
 REFERENCE_RUN_NAME = "undisturbed"
 
@@ -65,60 +60,30 @@ _AROUND_S = 3.0
 """Of the demo, before and after the robot's run."""
 
 
-class Outage(msgspec.Struct, frozen=True, kw_only=True):
-    """One kill of the cloud service and its return, in ms; None where nothing was measured.
+class Findings(NamedTuple):
+    """What the demo comes to.
 
     Attributes
     ----------
-    found_ms : float or None
-        From the kill until the robot logs the loss.
-    first_local_decision_ms : float or None
-        From then until the robot carries out a decision of the local service. Until then it uses
-        the actions that it has.
-    longest_wait_ms : float or None
-        Longest time that the robot stood still for a decision while the cloud was away.
-    launched_ms : float or None
-        From the start of the local service until the robot sees it; None if it ran already.
-    listening_ms : float
-        From the start of the new cloud service until it listens.
-    used_again_ms : float or None
-        From then until the robot carries out a decision of it.
-    """
-
-    found_ms: float | None
-    first_local_decision_ms: float | None
-    longest_wait_ms: float | None
-    launched_ms: float | None
-    listening_ms: float
-    used_again_ms: float | None
-
-
-class Findings(msgspec.Struct, frozen=True, kw_only=True):
-    """The content of ``findings.json``.
-
-    Attributes
-    ----------
-    rate_hz : float
-        Task actions per second.
-    robot_acting_again_ms : float or None
-        From the kill of the robot's own process until a new one carries out its first decision.
+    outages : tuple of FaultTimes
+        Of the two kills of the cloud service.
+    listening_ms : tuple of float
+        From the start of each cloud service that followed until it listened.
+    robot_kill : FaultTimes
+        Of the kill of the robot's own process.
     usual_wait_ms : float
         Median time that the robot waits for the cloud's task actions: one round trip.
-    statuses : tuple of tuple of str
+    statuses : tuple of list of str
         Of each process that the robot had.
     comparison : Comparison
         Of the reference run and the run with the kills.
     """
 
-    problem: str
-    seed: int
-    trials: int
-    steps: int
-    rate_hz: float
-    outages: tuple[Outage, ...]
-    robot_acting_again_ms: float | None
+    outages: tuple[FaultTimes, ...]
+    listening_ms: tuple[float, ...]
+    robot_kill: FaultTimes
     usual_wait_ms: float
-    statuses: tuple[tuple[str, ...], ...]
+    statuses: tuple[list[str], ...]
     comparison: Comparison
 
 
@@ -141,18 +106,23 @@ class Demo:
     """The demo in a testbed's directory."""
 
     def __init__(
-        self, testbed: Testbed, seed: int, plan: Plan, state: DemoState, observer: Observer
+        self,
+        testbed: Testbed,
+        seed: int,
+        plan: Plan,
+        state: DemoState,
+        show: Callable[[Line], object],
     ) -> None:
         self._testbed = testbed
         self._seed = seed
         self._plan = plan
         self._state = state
         self._cloud = testbed.add_service(f"tcp/127.0.0.1:{free_port()}")
-        self._narrator = Narrator(testbed, self._cloud, state, observer)
+        self._narrator = Narrator(testbed, self._cloud, state, show)
         testbed.on_turn = self._narrator.update
 
     def run(self) -> Findings:
-        """Run it; the findings are also written to ``findings.json``.
+        """Run it.
 
         Raises
         ------
@@ -176,12 +146,12 @@ class Demo:
             rate_hz,
             *("--service", self._cloud.endpoint),
         )
-        self._narrator.started_robot(robot.process)
+        self._narrator.started_robot()
         self._wait(lambda: bool(robot.decisions), "the robot's first decision")
-        listening_s = [
+        listening_ms = (
             self._kill_cloud(_FIRST_KILL, _FIRST_RESTART),
             self._kill_cloud(_SECOND_KILL, _SECOND_RESTART),
-        ]
+        )
         self._kill_robot()
         self._wait(lambda: robot.is_done, "the end of the robot's run", steps / rate_hz)
         robot.table.read()
@@ -192,22 +162,15 @@ class Demo:
             and row.service == self._cloud.endpoint
             and row.status != Status.LOCAL_RECOVERY.value
         ]
-        *kills, robot_kill = times_of_faults(testbed.faults, robot.events, robot.decisions)
-        findings = Findings(
-            problem="peg_in_hole_2d",
-            seed=self._seed,
-            trials=len(reference.steps_of_trials),
-            steps=steps,
-            rate_hz=rate_hz,
-            outages=tuple(map(_outage, kills, listening_s)),
-            robot_acting_again_ms=robot_kill.recovery_ms,
+        *outages, robot_kill = times_of_faults(testbed.faults, robot.events, robot.decisions)
+        return Findings(
+            outages=tuple(outages),
+            listening_ms=listening_ms,
+            robot_kill=robot_kill,
             usual_wait_ms=statistics.median(waits) if waits else 0.0,
-            statuses=tuple(map(tuple, self._narrator.statuses)),
+            statuses=tuple(self._narrator.statuses),
             comparison=compare_runs(directory / REFERENCE_RUN_NAME, robot.out),
         )
-        text = msgspec.json.format(msgspec.json.encode(findings), indent=2)
-        write_atomically(directory / FINDINGS_NAME, text + b"\n")
-        return findings
 
     def _make_reference_run(self) -> ReferenceRun:
         directory = self._testbed.directory
@@ -235,7 +198,7 @@ class Demo:
     def _kill_cloud(self, kill_at: float, restart_at: float) -> float:
         """Kill the cloud, let the robot do without it for a while, and start it again.
 
-        Returns how long the new service took until it listened, in s.
+        Returns how long the new service took until it listened, in ms.
         """
         testbed, cloud, narrator = self._testbed, self._cloud, self._narrator
         decisions = testbed.robot.decisions
@@ -245,7 +208,7 @@ class Demo:
             "the use of the cloud service",
         )
         fault = testbed.note_fault("cloud_killed", cloud.endpoint, cloud.process.kill())
-        narrator.killed_cloud(cloud.process, fault.injected_at)
+        narrator.killed("cloud", cloud.process, "the cloud service")
         self._wait(lambda: not narrator.cloud_decides, "the loss being noticed")
         local = self._wait_for_decision(
             lambda row: row.service == RECOVERY_SERVICE and row.at >= fault.injected_at,
@@ -259,22 +222,23 @@ class Demo:
             lambda row: row.service == cloud.endpoint and row.at >= ready_at,
             "the cloud being used again",
         )
-        return start_s
+        return 1e3 * start_s
 
     def _kill_robot(self) -> None:
         """Kill the robot's own process in mid-step, resume its run and wait until it acts."""
         self._wait_for_progress(_ROBOT_KILL)
         robot = self._testbed.robot
         fault = self._testbed.note_fault("robot_killed", ROBOT, robot.process.kill())
-        self._narrator.killed_robot(robot.process, fault.injected_at)
+        self._narrator.killed("robot", robot.process, "the robot's own process")
         robot.resume()
-        self._narrator.started_robot(robot.process, "--resume")
+        self._narrator.started_robot("--resume")
         fault.usable_at = resumed_at = robot.process.spawned_at
         self._wait_for_decision(lambda row: row.at >= resumed_at, "the robot acting again")
 
     def _start_cloud(self) -> float:
         """Start the cloud service and wait until it listens; return how long it took in s."""
-        self._narrator.started_cloud(self._cloud.start().process)
+        self._cloud.start()
+        self._narrator.started_cloud()
         self._wait(lambda: self._cloud.ready_at is not None, "the cloud service listening")
         return self._cloud.start_s
 
@@ -303,17 +267,3 @@ class Demo:
             raise NoProgressError(
                 f"the robot's run was over before {what}; the logs are in {self._testbed.directory}"
             )
-
-
-def _outage(times: FaultTimes, listening_s: float) -> Outage:
-    decided_ms = None
-    if times.recovery_ms is not None and times.detection_ms is not None:
-        decided_ms = max(0.0, times.recovery_ms - times.detection_ms)
-    return Outage(
-        found_ms=times.detection_ms,
-        first_local_decision_ms=decided_ms,
-        longest_wait_ms=times.longest_wait_ms,
-        launched_ms=times.launch_ms,
-        listening_ms=1e3 * listening_s,
-        used_again_ms=times.failback_ms,
-    )

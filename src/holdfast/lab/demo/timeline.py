@@ -8,9 +8,10 @@ characters say.
 from __future__ import annotations
 
 import io
+import itertools
 import sys
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Literal, TypeAlias
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -21,8 +22,7 @@ from holdfast.lab.demo.narrator import Activity, DemoState, Line, Row
 from holdfast.printable import printable
 from holdfast.protocol.status import MEANINGS
 
-__all__ = ["ASCII", "UNICODE", "Characters", "LiveShow", "PlainShow", "legend", "make_show"]
-__all__ += ["plain_line", "timeline"]
+__all__ = ["ASCII", "UNICODE", "legend", "make_show", "plain_line", "timeline"]
 
 _FRAMES_HZ = 12
 _LABEL_WIDTH = 8
@@ -34,15 +34,9 @@ _INTERVALS_S = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600)
 _MIN_TICK_CELLS = 8
 
 
-class Characters(NamedTuple):
-    """The characters of a timeline."""
+Shown: TypeAlias = Activity | Literal["start", "kill"]
 
-    start: str
-    kill: str
-    cells: Mapping[Activity, str]
-
-
-_CELLS: Mapping[Activity, str] = {
+ASCII: Mapping[Shown, str] = {
     "off": " ",
     "starting": ".",
     "ready": "-",
@@ -50,11 +44,12 @@ _CELLS: Mapping[Activity, str] = {
     "by_cloud": "C",
     "by_local": "L",
     "held": "!",
+    "start": "^",
+    "kill": "X",
 }
-ASCII = Characters("^", "X", _CELLS)
-UNICODE = Characters("▲", "X", {**_CELLS, "ready": "░", "deciding": "█"})
+UNICODE: Mapping[Shown, str] = {**ASCII, "ready": "░", "deciding": "█", "start": "▲"}
 
-_STYLES: Mapping[Activity, str] = {
+_STYLES: Mapping[Shown, str] = {
     "off": "",
     "starting": "dim",
     "ready": "dim",
@@ -62,13 +57,22 @@ _STYLES: Mapping[Activity, str] = {
     "by_cloud": "black on green",
     "by_local": "black on yellow",
     "held": "black on red",
+    "start": "bold cyan",
+    "kill": "bold white on red",
 }
-_START_STYLE, _KILL_STYLE = "bold cyan", "bold white on red"
-_ROW_STYLES: Mapping[Row, str] = {"cloud": "green", "local": "yellow", "robot": ""}
-_LINE_STYLES = {"demo": "bold", "cloud": "green", "local": "yellow"}
+_LEGEND: Mapping[Shown, str] = {
+    "deciding": " decides  ",
+    "ready": " ready  ",
+    "start": " started  ",
+    "kill": " killed   ",
+    "by_cloud": " cloud decides  ",
+    "by_local": " local  ",
+    "held": " none",
+}
+_ROW_STYLES: Mapping[str, str] = {"demo": "bold", "cloud": "green", "local": "yellow"}
 
 
-def timeline(state: DemoState, now_s: float, width: int, characters: Characters) -> Table:
+def timeline(state: DemoState, now_s: float, width: int, characters: Mapping[Shown, str]) -> Table:
     """Return a table of the axis and the three bars."""
     num_cells = max(_MIN_WIDTH, width) - _LABEL_WIDTH - 1
     # The bars never fill the width while the demo runs.
@@ -100,7 +104,7 @@ def _bar(
     now_s: float,
     num_cells: int,
     cell_s: float,
-    characters: Characters,
+    characters: Mapping[Shown, str],
 ) -> Text:
     cells: list[tuple[str, str]] = []
     changes = state.changes[row]
@@ -114,8 +118,8 @@ def _bar(
             held = held or activity == "held"
             following += 1
         shown: Activity = "held" if held else activity
-        style = _ROW_STYLES[row] if shown == "deciding" else _STYLES[shown]
-        cells.append((characters.cells[shown], style))
+        style = _ROW_STYLES.get(row, "") if shown == "deciding" else _STYLES[shown]
+        cells.append((characters[shown], style))
     taken: set[int] = set()
     for mark in sorted(state.marks):
         if mark.row != row or mark.at_s > now_s:
@@ -125,30 +129,17 @@ def _bar(
             index += 1
         taken.add(index)
         cells += [(" ", "")] * (index + 1 - len(cells))
-        is_kill = mark.kind == "kill"
-        cells[index] = (
-            (characters.kill, _KILL_STYLE) if is_kill else (characters.start, _START_STYLE)
-        )
+        cells[index] = (characters[mark.kind], _STYLES[mark.kind])
     return Text.assemble(*cells[:num_cells], no_wrap=True)
 
 
-def legend(characters: Characters) -> Text:
+def legend(characters: Mapping[Shown, str]) -> Text:
     """Return the line that says what the characters mean."""
-    cells = characters.cells
-    return Text.assemble(
-        (f"{cells['deciding']} decides  {cells['ready']} ready  ", "dim"),
-        (characters.start, _START_STYLE),
-        (" started  ", "dim"),
-        (characters.kill, _KILL_STYLE),
-        (" killed   ", "dim"),
-        ("C", _STYLES["by_cloud"]),
-        (" cloud decides  ", "dim"),
-        ("L", _STYLES["by_local"]),
-        (" local  ", "dim"),
-        ("!", _STYLES["held"]),
-        (" none", "dim"),
-        no_wrap=True,
-    )
+    said = [
+        ((characters[shown], _STYLES[shown] or "dim"), (text, "dim"))
+        for shown, text in _LEGEND.items()
+    ]
+    return Text.assemble(*itertools.chain.from_iterable(said), no_wrap=True)
 
 
 def plain_line(line: Line) -> str:
@@ -190,7 +181,7 @@ class PlainShow:
         sys.stderr.flush()
 
 
-class LiveShow:
+class LiveShow(PlainShow):
     """A live timeline on a terminal."""
 
     def __init__(self, console: Console) -> None:
@@ -248,7 +239,7 @@ class LiveShow:
 
 
 def _styled(line: Line) -> Text:
-    return Text(plain_line(line), style=_LINE_STYLES.get(line.who, ""), no_wrap=True)
+    return Text(plain_line(line), style=_ROW_STYLES.get(line.who, ""), no_wrap=True)
 
 
 def _in_order(state: DemoState) -> list[Line]:

@@ -15,10 +15,10 @@ from enum import StrEnum
 
 import msgspec
 
+from holdfast.lab.testbed.bad_line import Direction, Impairment
 from holdfast.lab.testbed.driver import Script, Testbed, after
 from holdfast.lab.testbed.fault_times import ROBOT
 from holdfast.lab.testbed.processes import Process, local_services_of
-from holdfast.lab.testbed.proxy import Direction, Impairment
 from holdfast.robot.links import RECOVERY_SERVICE
 
 __all__ = ["DESCRIPTIONS", "NEEDS_NAMESPACE", "NEEDS_PROXY", "Fault", "FaultKind", "inject"]

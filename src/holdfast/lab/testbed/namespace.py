@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from typing import Self
 
 from holdfast.lab.errors import CannotStartError
-from holdfast.lab.testbed.proxy import Direction
+from holdfast.lab.testbed.bad_line import Direction
 
 __all__ = ["NetworkNamespace", "why_no_namespace"]
 

@@ -1,45 +1,37 @@
-"""A bad line on demand: a proxy that delays, loses, falls silent and cuts.
+"""A bad line through a proxy, which stands between one robot and one service.
 
-It stands between one robot and one service. Like TCP, it never changes, reorders or drops a byte of
-an open stream. On a real line a lost packet is sent again after a timeout, and everything behind it
-waits; so here loss makes a piece late. On a silent line all pieces, and the ends of connections,
-are late until it is healed. Only a cut breaks connections: it resets both ends and refuses new
-ones.
+Like TCP, it never changes, reorders or drops a byte of an open stream. On a real line a lost packet
+is sent again after a timeout, and everything behind it waits; so here loss makes a piece late. On a
+silent line all pieces, and the ends of connections, are late until it is healed. Only a cut breaks
+connections: it resets both ends and refuses new ones.
 
 It may carry datagrams beside streams, at the same port. Loss and silence drop datagrams, jitter
 reorders them, and they may come twice, again later, or from another address.
 
-Several impairments may be active at the same time; a piece suffers from all of them. The queue of
-pieces is bounded: when it is full, the proxy stops reading, as with a full TCP window.
+The queue of pieces is bounded: when it is full, the proxy stops reading, as with a full TCP window.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import random
 import socket
 import struct
-import threading
 from collections import deque
-from collections.abc import Callable, Coroutine, Iterator
-from concurrent.futures import Future
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, Self, TypeAlias, get_args
+from typing import Any, TypeAlias
 
 from holdfast.lab.errors import CannotStartError
+from holdfast.lab.testbed.bad_line import CARRIERS, BadLine, Carrier, Direction, Impairment
 
-__all__ = ["Carrier", "Direction", "Impairment", "Place", "Proxy", "endpoint_at"]
-
-Direction: TypeAlias = Literal["both", "to_service", "to_robot"]
+__all__ = ["Place", "Proxy", "endpoint_at"]
 
 Place: TypeAlias = int | Path
 """A port of 127.0.0.1, or the path of a local socket."""
 
 _PIECE_BYTES = 65_536
 _PIECES_WAITING = 64
-_START_TIMEOUT_S = 10.0
 _RETRANSMISSION_S = 0.2
 """Linux sends a lost packet again after this time or longer, on a line that is short."""
 
@@ -49,45 +41,13 @@ _LARGEST_DATAGRAM = 65_536
 _MOST_CLIENTS = 64
 _KEPT_DATAGRAMS = 50
 
-Carrier: TypeAlias = Literal["streams", "datagrams"]
-_CARRIERS: tuple[Carrier, ...] = get_args(Carrier)
-
 
 def endpoint_at(transport: str, place: Place) -> str:
     """Return the endpoint of a service at a place of this machine."""
     return f"{transport}/{place}" if isinstance(place, Path) else f"{transport}/127.0.0.1:{place}"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Impairment:
-    """An impairment of the line.
-
-    Attributes
-    ----------
-    direction : {"both", "to_service", "to_robot"}
-        Which pieces it affects. A cut has no direction.
-    latency_s, jitter_s : float
-        Each piece is late by the latency and up to the jitter.
-    loss : float
-        Share of pieces that are late by TCP's retransmission timeout, and of datagrams that are
-        dropped.
-    doubled : bool
-        Whether datagrams come twice.
-    carriers : tuple of {"streams", "datagrams"}
-        What it affects.
-    """
-
-    direction: Direction = "both"
-    latency_s: float = 0.0
-    jitter_s: float = 0.0
-    loss: float = 0.0
-    silent: bool = False
-    cut: bool = False
-    doubled: bool = False
-    carriers: tuple[Carrier, ...] = _CARRIERS
-
-
-class Proxy:
+class Proxy(BadLine):
     """A line to a service on this machine; to be used in a ``with`` statement.
 
     Parameters
@@ -115,10 +75,7 @@ class Proxy:
         overhear: Callable[[Carrier, Direction, bytes], object] = lambda *_: None,
     ) -> None:
         self.place = place
-        self._overhear = overhear
         self._target = target
-        self._chance = random.Random(seed)
-        self._impairments: dict[object, Impairment] = {}
         self._listener: socket.socket | None = None
         self._datagrams: socket.socket | None = None
         self._carries_datagrams = datagrams
@@ -126,10 +83,8 @@ class Proxy:
         self._kept: deque[bytes] = deque(maxlen=_KEPT_DATAGRAMS)
         self._connections: set[asyncio.Task[None]] = set()
         self._sockets: set[socket.socket] = set()
-        self._loop = asyncio.new_event_loop()
         self._changed = asyncio.Event()
-        self._thread = threading.Thread(target=self._run, name=f"proxy-{place}", daemon=True)
-        self._thread.start()
+        super().__init__(f"proxy-{place}", seed, overhear)
         try:
             self._call(self._open())
         except OSError as error:
@@ -139,18 +94,6 @@ class Proxy:
                 f"the proxy cannot listen on {named}: {error.strerror}"
             ) from error
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def impair(self, impairment: Impairment) -> Callable[[], None]:
-        """Put an impairment on the line; return what takes it away, which may be repeated."""
-        key = object()
-        self._call(self._change(key, impairment))
-        return lambda: self._call(self._change(key, None))
-
     def change_address(self) -> None:
         """Let datagrams come to the service from other ports, as after a change of networks."""
         self._call(self._change_address())
@@ -159,30 +102,10 @@ class Proxy:
         """Send the last datagrams to the service again, from an address that nobody has had."""
         self._call(self._replay())
 
-    def close(self) -> None:
-        """Reset all connections, and listen no more; may be repeated."""
-        if not self._thread.is_alive():
-            return
-        self._call(self._end())
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
-        self._loop.close()
-
     # -- on the thread of the loop -------------------------------------------------------------
 
-    def _run(self) -> None:
-        asyncio.set_event_loop(self._loop)
-        self._loop.run_forever()
-
-    def _call(self, coroutine: Coroutine[Any, Any, None]) -> None:
-        if self._loop.is_closed():
-            coroutine.close()
-            return
-        future: Future[None] = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
-        future.result(_START_TIMEOUT_S)
-
     async def _open(self) -> None:
-        for carrier in _CARRIERS:
+        for carrier in CARRIERS:
             await self._set_up(carrier)
 
     async def _set_up(self, carrier: Carrier) -> None:
@@ -223,18 +146,15 @@ class Proxy:
 
     async def _change(self, key: object, impairment: Impairment | None) -> None:
         """Put an impairment on the line, or take it away."""
-        were_cut = [self._is_cut(carrier) for carrier in _CARRIERS]
-        if impairment is None:
-            self._impairments.pop(key, None)
-        else:
-            self._impairments[key] = impairment
+        were_cut = [self._is_cut(carrier) for carrier in CARRIERS]
+        await super()._change(key, impairment)
         self._tell()
-        for carrier, was_cut in zip(_CARRIERS, were_cut, strict=True):
+        for carrier, was_cut in zip(CARRIERS, were_cut, strict=True):
             if self._is_cut(carrier) != was_cut:
                 await self._set_up(carrier)
 
     async def _end(self) -> None:
-        self._impairments.clear()
+        await super()._end()
         self._tell()
         await self._hang_up()
         self._close_datagrams()
@@ -258,27 +178,6 @@ class Proxy:
         """Wake the tasks that wait for a change of the line."""
         self._changed.set()
         self._changed = asyncio.Event()
-
-    def _active(self, carrier: Carrier, direction: Direction = "both") -> Iterator[Impairment]:
-        for each in self._impairments.values():
-            if carrier in each.carriers and (
-                direction == each.direction or "both" in (direction, each.direction)
-            ):
-                yield each
-
-    def _is_cut(self, carrier: Carrier) -> bool:
-        return any(each.cut for each in self._active(carrier))
-
-    def _is_silent(self, carrier: Carrier, direction: Direction) -> bool:
-        return any(each.silent for each in self._active(carrier, direction))
-
-    def _fate(self, carrier: Carrier, direction: Direction) -> tuple[float, int]:
-        """Return by how much something comes later, and how often it is lost."""
-        delay_s, losses = 0.0, 0
-        for each in self._active(carrier, direction):
-            delay_s += each.latency_s + each.jitter_s * self._chance.random()
-            losses += each.loss > 0.0 and self._chance.random() < each.loss
-        return delay_s, losses
 
     async def _until_heard(self, direction: Direction) -> None:
         while self._is_silent("streams", direction):
@@ -376,7 +275,8 @@ class Proxy:
                 content, address = listener.recvfrom(_LARGEST_DATAGRAM)
                 client = self._clients.pop(address, None) or self._new_client(address)
                 self._clients[address] = client  # now the last of all
-                self._carry_datagram(content, "to_service", client, None)
+                self._kept.append(content)
+                self._carry_datagram(content, "to_service", client.send)
 
     def _new_client(self, address: Any) -> socket.socket:
         """Give a client a socket of its own, so that the service's answers find it."""
@@ -391,11 +291,14 @@ class Proxy:
         return client
 
     def _answers_come(self, client: socket.socket, address: Any) -> None:
+        listener = self._datagrams
+        assert listener is not None  # its clients are closed with it
         with contextlib.suppress(OSError):
             while True:
                 content = client.recv(_LARGEST_DATAGRAM)
-                if self._datagrams is not None:
-                    self._carry_datagram(content, "to_robot", self._datagrams, address)
+                self._carry_datagram(
+                    content, "to_robot", lambda answer: listener.sendto(answer, address)
+                )
 
     async def _change_address(self) -> None:
         for address, client in list(self._clients.items()):
@@ -407,27 +310,8 @@ class Proxy:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
             stranger.connect(_address(self._target))
             for content in self._kept:
-                self._send_datagram(content, stranger, None)
-
-    def _carry_datagram(
-        self, content: bytes, direction: Direction, sender: socket.socket, address: Any
-    ) -> None:
-        if direction == "to_service":
-            self._kept.append(content)
-        delay_s, losses = self._fate("datagrams", direction)
-        if losses or self._is_silent("datagrams", direction):
-            return
-        self._overhear("datagrams", direction, content)
-        for _ in range(1 + any(each.doubled for each in self._active("datagrams", direction))):
-            self._loop.call_later(delay_s, self._send_datagram, content, sender, address)
-
-    @staticmethod
-    def _send_datagram(content: bytes, sender: socket.socket, address: Any) -> None:
-        with contextlib.suppress(OSError):  # no room, no receiver, or a cut line
-            if address is None:
-                sender.send(content)
-            else:
-                sender.sendto(content, address)
+                with contextlib.suppress(OSError):  # nobody listens
+                    stranger.send(content)
 
 
 def _family(place: Place) -> socket.AddressFamily:

@@ -1,9 +1,9 @@
 """A robot and a service far from each other, emulated on one machine.
 
 Where the machine permits it, each gets a network namespace with a tunnel device. This process reads
-the packets of each device and writes them to the other half a round trip later, or drops them. Both
-ends are the system's own TCP and UDP, so they treat late and lost packets as on a real line.
-(``tc netem`` does the same, but not every kernel has it.)
+the packets of each device and writes them to the other half a round trip later, or drops them
+(:mod:`~holdfast.lab.testbed.bad_line`). Both ends are the system's own TCP and UDP, so they treat
+late and lost packets as on a real line. (``tc netem`` does the same, but not every kernel has it.)
 
 Where the machine does not permit it, a proxy stands between them. It delays and drops datagrams as
 well, but TCP ends at a proxy: it cannot drop TCP's packets, only deliver a piece later by the time
@@ -14,25 +14,21 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import math
 import os
-import random
-import select
+import selectors
 import socket
 import sys
-import threading
-import time
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar, get_args
+from collections.abc import Callable, Iterator
+from typing import Literal, NamedTuple, TypeAlias, get_args
 
 from holdfast.errors import InvalidValueError
 from holdfast.lab.errors import CannotStartError
+from holdfast.lab.testbed.bad_line import BadLine, Direction, Impairment
 from holdfast.lab.testbed.namespace import NetworkNamespace, why_no_namespace
 from holdfast.lab.testbed.processes import free_port
-from holdfast.lab.testbed.proxy import Impairment, Proxy
+from holdfast.lab.testbed.proxy import Proxy
 
-__all__ = ["DelayLine", "Emulation", "Route", "Transport", "lay_route", "why_no_wide_area"]
+__all__ = ["Emulation", "Route", "Transport", "lay_route", "why_no_wide_area"]
 
 Transport: TypeAlias = Literal["tcp", "tls", "udp"]
 
@@ -46,12 +42,8 @@ _DEVICE = "wan"
 _NO_DEVICE = "no tunnel device can be made"
 _LARGEST = 65_536
 _PATIENCE_S = 10.0
-_CAPACITY = 4096
-"""Packets on the way in one direction: 6 MB of the usual size, as a router may hold."""
-
-_LONGEST_DELAY_S = 60.0
-
-Item = TypeVar("Item")
+_PACKETS_A_TURN = 4096
+_LONGEST_ROUND_TRIP_MS = 120_000.0
 
 # Run in a namespace: makes its tunnel device and hands over the descriptor.
 _OPEN = f"""
@@ -60,56 +52,6 @@ device = os.open("/dev/net/tun", os.O_RDWR)
 fcntl.ioctl(device, 0x400454CA, struct.pack("16sH", b"{_DEVICE}", 0x0001 | 0x1000))
 socket.send_fds(socket.socket(fileno=int(sys.argv[1])), [b"."], [device])
 """
-
-
-class DelayLine(Generic[Item]):
-    """One direction of a line: items come out later, in order, or never.
-
-    Parameters
-    ----------
-    delay_s : float
-        From 0 to 60.
-    loss : float
-        Share of lost items, from 0 to 1.
-    capacity : int
-        Items put into a full line are lost, as in a router.
-
-    Raises
-    ------
-    InvalidValueError
-        If a number is out of bounds.
-    """
-
-    def __init__(self, delay_s: float, loss: float, seed: str, capacity: int = _CAPACITY) -> None:
-        if not 0.0 <= delay_s <= _LONGEST_DELAY_S:
-            raise InvalidValueError(f"delay_s {delay_s}: must be from 0 to {_LONGEST_DELAY_S:g}")
-        if not 0.0 <= loss <= 1.0:
-            raise InvalidValueError(f"loss {loss}: must be from 0 to 1")
-        self._delay_s = delay_s
-        self._loss = loss
-        self._chance = random.Random(seed)
-        self._capacity = capacity
-        self._waiting: deque[tuple[float, Item]] = deque()
-        self.lost = 0
-
-    def put(self, item: Item, now: float) -> None:
-        """Send an item; ``now``, in seconds, never goes back."""
-        if len(self._waiting) >= self._capacity or self._chance.random() < self._loss:
-            self.lost += 1
-            return
-        self._waiting.append((now + self._delay_s, item))
-
-    def take(self, now: float) -> list[Item]:
-        """Return the items that have arrived, in the order in which they were sent."""
-        arrived = []
-        while self._waiting and self._waiting[0][0] <= now:
-            arrived.append(self._waiting.popleft()[1])
-        return arrived
-
-    @property
-    def due(self) -> float:
-        """When the next item arrives; infinite if there is none."""
-        return self._waiting[0][0] if self._waiting else math.inf
 
 
 class Route(NamedTuple):
@@ -161,25 +103,29 @@ def lay_route(
         raise InvalidValueError(
             f"transport {transport!r}: there are {', '.join(get_args(Transport))}"
         )
+    if not 0.0 <= round_trip_ms <= _LONGEST_ROUND_TRIP_MS:
+        raise InvalidValueError(
+            f"round_trip_ms {round_trip_ms}: must be from 0 to {_LONGEST_ROUND_TRIP_MS:g}"
+        )
+    if not 0.0 <= loss <= 1.0:
+        raise InvalidValueError(f"loss {loss}: must be from 0 to 1")
     port = free_port()
     near = f"{transport}/127.0.0.1:{port}"
     if round_trip_ms == 0.0 and loss == 0.0:
         yield Route((), (), near, near, "127.0.0.1", "nothing")
         return
-    # Also checks the numbers.
-    lines = [
-        DelayLine[bytes](0.5e-3 * round_trip_ms, loss, f"{seed} {way}") for way in ("up", "down")
-    ]
+    impairment = Impairment(latency_s=0.5e-3 * round_trip_ms, loss=loss)
     if packets and why_no_wide_area() is None:
-        with _two_networks(lines[0], lines[1]) as (robot, service, carried_bytes):
+        with _two_networks(seed) as (line, robot, service):
+            line.impair(impairment)
             far = f"{transport}/{_SERVICE}:{port}"
-            yield Route(robot, service, far, far, _SERVICE, "packets", carried_bytes)
+            carried = lambda: line.carried_bytes  # noqa: E731
+            yield Route(robot.prefix, service.prefix, far, far, _SERVICE, "packets", carried)
         return
     entry = free_port()
     through = f"{transport}/127.0.0.1:{entry}"
-    round_trip_s = 1e-3 * round_trip_ms
     with Proxy(entry, port, seed, datagrams=transport == "udp") as proxy:
-        proxy.impair(Impairment(latency_s=0.5 * round_trip_s, loss=loss))
+        proxy.impair(impairment)
         way: Emulation = "datagram proxy" if transport == "udp" else "tcp proxy"
         yield Route((), (), near, through, "127.0.0.1", way)
 
@@ -191,87 +137,60 @@ def why_no_wide_area() -> str | None:
     if reason is not None:
         return reason
     try:
-        with _two_networks(DelayLine(0.0, 0.0, ""), DelayLine(0.0, 0.0, "")):
+        with _two_networks(""):
             return None
     except CannotStartError as error:
         return str(error).partition("\n")[0]
 
 
-class _Way(NamedTuple):
-    """From a readable descriptor, over a line, to a function that sends."""
+class _PacketLine(BadLine):
+    """A line between the tunnel devices of two networks."""
 
-    receive: Callable[[], Any]
-    line: DelayLine[Any]
-    send: Callable[[Any], object]
+    def __init__(self, robot_end: _Device, service_end: _Device, seed: str) -> None:
+        super().__init__("wide-area", seed, selector=selectors.SelectSelector())
+        self._ends = (robot_end, service_end)
+        self.carried_bytes = 0
+        self._call(self._open())
 
+    async def _open(self) -> None:
+        robot_end, service_end = self._ends
+        self._loop.add_reader(
+            robot_end.descriptor, self._receive, robot_end, service_end, "to_service"
+        )
+        self._loop.add_reader(
+            service_end.descriptor, self._receive, service_end, robot_end, "to_robot"
+        )
 
-@contextlib.contextmanager
-def _carried(ways: Mapping[int, _Way]) -> Iterator[None]:
-    """Move packets from descriptors over lines, in a thread; what cannot be sent is lost."""
-    ended, end = os.pipe()
-    thread = threading.Thread(target=_carry, args=(ways, ended), name="wide-area", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        os.close(end)
-        thread.join()
-        os.close(ended)
+    async def _end(self) -> None:
+        await super()._end()
+        for each in self._ends:
+            self._loop.remove_reader(each.descriptor)
 
-
-def _carry(ways: Mapping[int, _Way], ended: int) -> None:
-    while True:
-        due = min(way.line.due for way in ways.values())
-        wait_s = None if due == math.inf else max(0.0, due - time.monotonic())
-        # poll has whole milliseconds, which would falsify short delays.
-        ready, _, _ = select.select([ended, *ways], [], [], wait_s)
-        if ended in ready:
-            return
-        for descriptor in ready:
-            _receive(ways[descriptor])
-        for way in ways.values():
-            for packet in way.line.take(time.monotonic()):
-                with contextlib.suppress(OSError):
-                    way.send(packet)
-
-
-def _receive(way: _Way) -> None:
-    # Bounded, because other descriptors have packets too.
-    for _ in range(_CAPACITY):
-        try:
-            packet = way.receive()
-        except OSError:
-            return  # there is no more, or the last one was refused
-        way.line.put(packet, time.monotonic())
+    def _receive(self, source: _Device, sink: _Device, direction: Direction) -> None:
+        # Bounded, because the other device has packets too.
+        with contextlib.suppress(OSError):  # there is no more
+            for _ in range(_PACKETS_A_TURN):
+                packet = os.read(source.descriptor, _LARGEST)
+                self.carried_bytes += len(packet)
+                self._carry_datagram(packet, direction, sink.send)
 
 
 @contextlib.contextmanager
-def _two_networks(
-    up: DelayLine[bytes], down: DelayLine[bytes]
-) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Callable[[], int]]]:
-    """Yield the two commands that enter the namespaces, and a counter of all sent bytes."""
+def _two_networks(seed: str) -> Iterator[tuple[_PacketLine, NetworkNamespace, NetworkNamespace]]:
+    """Yield a line and the namespaces of the robot and the service at its ends."""
     with contextlib.ExitStack() as stack:
         robot = stack.enter_context(NetworkNamespace())
         service = stack.enter_context(NetworkNamespace())
         robot_end = stack.enter_context(_Device(robot, _ROBOT, _SERVICE))
         service_end = stack.enter_context(_Device(service, _SERVICE, _ROBOT))
-        ways = {
-            robot_end.descriptor: _Way(robot_end.receive, up, service_end.send),
-            service_end.descriptor: _Way(service_end.receive, down, robot_end.send),
-        }
-        stack.enter_context(_carried(ways))
-        yield (
-            robot.prefix,
-            service.prefix,
-            lambda: robot_end.received_bytes + service_end.received_bytes,
-        )
+        line = stack.enter_context(_PacketLine(robot_end, service_end, seed))
+        yield line, robot, service
 
 
 class _Device:
     """The tunnel device of one namespace, read and written by this process."""
 
     def __init__(self, network: NetworkNamespace, own: str, other: str) -> None:
-        self.received_bytes = 0
         here, there = socket.socketpair()
         with here, there:
             here.settimeout(_PATIENCE_S)
@@ -298,11 +217,6 @@ class _Device:
 
     def __exit__(self, *_: object) -> None:
         os.close(self.descriptor)
-
-    def receive(self) -> bytes:
-        packet = os.read(self.descriptor, _LARGEST)
-        self.received_bytes += len(packet)
-        return packet
 
     def send(self, packet: bytes) -> None:
         os.write(self.descriptor, packet)
