@@ -415,7 +415,8 @@ class TestCertificates:
         context.load_cert_chain(home / service / "certificate.pem", home / service / "key.pem")
 
         def answer(taken: socket.socket) -> None:
-            context.wrap_socket(taken, server_side=True).recv(1000)
+            with context.wrap_socket(taken, server_side=True) as tls:
+                tls.recv(1000)
 
         with answering(answer) as port:
             seen = look(site, f"tls/127.0.0.1:{port}", "--tls", home / "anna")

@@ -42,9 +42,7 @@ from holdfast.protocol.messages import (
 from holdfast.robot.probe import (
     CLOSES_AT_TLS,
     AddressPath,
-    WatchedTls,
     account_of,
-    certificate_at,
     in_thread,
     interface_of,
 )
@@ -105,6 +103,7 @@ _IP_MTU: Final = {
 _LEASE_MS: Final = 30_000.0
 """The robot may be silent for so long; it never is."""
 
+_BAD_CERTIFICATE: Final = "has a certificate that "
 _NO_TLS: Final = "is it at tcp/..., another program, or a process that is stopped?"
 _NO_HOLDFAST: Final = "is it another program, at tls/... or udp/..., or a process that is stopped?"
 _DISTRUST: Final = "do not use it before you know why (docs/trust.md)"
@@ -257,7 +256,7 @@ class _Examination:
         if self._endpoint.is_local_socket:
             if Path(host).is_socket():
                 self._tell(OK, "a socket of this machine")
-                return [AddressPath(socket.AF_UNIX, host, host)]
+                return [AddressPath(self._endpoint, self._settings, socket.AF_UNIX, host)]
             seen = "is no socket" if Path(host).exists() else "is not there"
             self._tell(FAILS, f"{host} {seen}", "start the service that listens there")
             return []
@@ -269,7 +268,7 @@ class _Examination:
             advice = "is it spelled right, and the name server reached? /etc/hosts may name it too"
             self._tell(FAILS, f"{host} is not found: {why}", advice)
             return []
-        paths = [AddressPath(entry[0], entry[4], str(entry[4][0])) for entry in found]
+        paths = [AddressPath(self._endpoint, self._settings, entry[0], entry[4]) for entry in found]
         listed = ", ".join(path.text for path in paths)
         self._tell(OK, f"{host} is {'an address' if listed == host else listed}")
         return paths
@@ -293,11 +292,9 @@ class _Examination:
     async def _port(self, path: AddressPath) -> _Seen:
         endpoint = self._endpoint
         what = "the socket" if endpoint.is_local_socket else f"TCP port {endpoint.port}"
-        path.stream = stream = socket.socket(path.family, socket.SOCK_STREAM)
-        stream.setblocking(False)
         try:
             async with asyncio.timeout(_CONNECT_S):
-                await asyncio.get_running_loop().sock_connect(stream, path.address)
+                await path.connect()
         except TimeoutError:
             advice = f"is the machine on, and the port right? {_OPEN_IT}"
             return _fails(f"{what}: nothing answers within {_CONNECT_S:g} s", advice)
@@ -328,34 +325,26 @@ class _Examination:
 
     async def _tls(self, path: AddressPath) -> _Seen:
         endpoint = self._endpoint
-        tls = None
-        if endpoint.is_encrypted:
-            if self._context is None:
-                _, why_not = await certificate_at(path)
-                if why_not:
-                    return _fails(why_not, _NO_TLS)
-                return _Seen("TLS 1.3")
-            tls = path.tls = WatchedTls(self._context, endpoint.host)
-        await path.greet(self._settings, endpoint, tls)
-        if tls is None:
+        await path.greet(self._context)
+        if path.tls is None:
             none = f"none, as {endpoint.protocol}/... has: "
             if endpoint.is_loopback:
                 return _Seen(f"{none}only this machine can connect")
             advice = "use tls/... or udp/... with credentials ('holdfast keys DIR' makes them)"
             return _Seen(f"{none}whoever is on the way can read along, and answer", advice)
-        if not tls.established and not isinstance(tls.error, ssl.SSLCertVerificationError):
+        if not path.tls.established and not path.why_not.startswith(_BAD_CERTIFICATE):
             return _fails(path.why_not or CLOSES_AT_TLS, _NO_TLS)
         return _Seen("TLS 1.3")
 
     async def _certificate(self, path: AddressPath) -> _Seen:
         ours = f"ours: {self._ours}"
         tls, link = path.tls, path.link
-        if tls is None or link is None:
+        assert tls is not None and link is not None
+        if self._context is None:
             return _fails(ours, self._ours_advice)
         if not tls.established:
-            shown, _ = await certificate_at(path)
-            fault = path.why_not.removeprefix("has a certificate that ")
-            return _fails(f"theirs: {fault}", account_of(shown))
+            fault = path.why_not.removeprefix(_BAD_CERTIFICATE)
+            return _fails(f"theirs: {fault}", account_of(await path.certificate()))
         if link.hello is None and "certificate" in path.why_not:
             return _fails(f"{ours}: {path.why_not}")
         if link.peer is None:
@@ -373,7 +362,8 @@ class _Examination:
             reason = path.why_not or "closes the connection without a hello"
             return _fails(reason, "" if "install" in reason or "--tls" in reason else _NO_HOLDFAST)
         try:
-            replies = await path.ask(self._echo(), _REPLY_S)
+            async with asyncio.timeout(_REPLY_S):
+                replies = await path.ask(self._echo())
         except TimeoutError:
             advice = "its process stands still, or has far too much to do"
             return _fails(f"has not answered within {_REPLY_S:g} s", advice)
@@ -466,7 +456,7 @@ class _Examination:
                 turn.observations,
                 session_configuration,
             )
-            replies = await path.ask(request, _DECISION_S)
+            replies = await path.ask(request)
             busy = next((reply for reply in replies if isinstance(reply, Busy)), None)
             if busy is None:
                 return replies
@@ -479,7 +469,7 @@ class _Examination:
             async with asyncio.timeout(_REPLY_S):
                 while len(took_ms) < _ECHOES:
                     began = time.perf_counter()
-                    await path.ask(self._echo(), _REPLY_S)
+                    await path.ask(self._echo())
                     took_ms.append(1e3 * (time.perf_counter() - began))
         if not took_ms:
             return _fails(f"no echo within {_REPLY_S:g} s", "its process stands still")

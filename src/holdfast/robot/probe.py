@@ -19,7 +19,7 @@ from typing import Any, Final, TypeVar
 from holdfast.errors import TransportError
 from holdfast.protocol.messages import Progress, Reply, Request, decode_reply, encode
 from holdfast.transport.credentials import date_text
-from holdfast.transport.endpoints import Endpoint, system_words
+from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.frames import CALL, END, LAST, REPLY, Frame, Hello
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
@@ -29,9 +29,7 @@ from holdfast.transport.tls import TlsStream
 __all__ = [
     "CLOSES_AT_TLS",
     "AddressPath",
-    "WatchedTls",
     "account_of",
-    "certificate_at",
     "in_thread",
     "interface_of",
 ]
@@ -47,55 +45,73 @@ _SAYS_NOTHING: Final = f"takes connections and says nothing for {GREETING_S:g} s
 _T = TypeVar("_T")
 
 
-class WatchedTls(TlsStream):
-    """A handshake of which it is remembered how it failed."""
+class ShownTls(TlsStream):
+    """A handshake that tells what the other end's certificate says.
 
-    error: OSError | None = None
+    Without a context any certificate will do, and the link ends with the handshake.
+    """
 
-    def describe_error(self, error: OSError) -> str:
-        """Return what an error means, and remember it."""
-        self.error = error
-        return super().describe_error(error)
+    def __init__(self, context: ssl.SSLContext | None, host: str | None) -> None:
+        if context is None:
+            host, context = None, ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+            context.minimum_version = ssl.TLSVersion.TLSv1_3
+            context.check_hostname = False
+            context.verify_mode = ssl.CERT_NONE
+        super().__init__(context, host)
+
+    def certificate(self) -> bytes:
+        """Return the other end's certificate, once established."""
+        return self._tls.getpeercert(binary_form=True) or b""
 
     def hosts(self) -> str:
-        """Return the hosts that the other end's certificate names."""
+        """Return the hosts that it names."""
         named: Any = (self._tls.getpeercert() or {}).get("subjectAltName", ())
         return ", ".join(
             str(ipaddress.ip_address(host)) if kind == "IP Address" else str(host)
             for kind, host in named
         )
 
-    def shown(self) -> bytes:
-        """Return the other end's certificate."""
-        return self._tls.getpeercert(binary_form=True) or b""
-
 
 class AddressPath(LinkOwner):
-    """One address, as far as it was followed: the owner of its link."""
+    """One address of a service, as far as it was followed: the owner of its link."""
 
-    def __init__(self, family: socket.AddressFamily, address: Any, text: str) -> None:
+    def __init__(
+        self, endpoint: Endpoint, settings: LinkSettings, family: socket.AddressFamily, address: Any
+    ) -> None:
+        self._endpoint = endpoint
+        self._settings = settings
         self.family = family
         self.address = address
-        self.text = text
-        self.stream: socket.socket | None = None
-        self.tls: WatchedTls | None = None
+        self.text = address if endpoint.is_local_socket else str(address[0])
+        self._stream: socket.socket | None = None
+        self.tls: ShownTls | None = None
         self.link: Link | None = None
         self.clock_ahead_s: float | None = None
-        self._settled: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._calls: dict[int, asyncio.Queue[bytes | None]] = {}
+        self._settled = asyncio.Event()
+        self._frames: asyncio.Queue[Frame | None] = asyncio.Queue()
 
-    async def greet(
-        self, settings: LinkSettings, endpoint: Endpoint, tls: WatchedTls | None
-    ) -> None:
-        """Make a link, and wait until the service has said who it is, or the link has ended."""
-        assert self.stream is not None
-        self.tls = tls
-        scheme = load_scheme(endpoint.protocol)
-        self.link = scheme.make_link(self, settings, endpoint, tls, role="robot", dialled=True)
-        await self.link.connect(self.stream)
+    async def connect(self) -> None:
+        """Connect; raise OSError if that fails."""
+        self._stream = stream = socket.socket(self.family, socket.SOCK_STREAM)
+        stream.setblocking(False)
+        await asyncio.get_running_loop().sock_connect(stream, self.address)
+
+    async def greet(self, context: ssl.SSLContext | None) -> None:
+        """Make a link, and wait until the service has said who it is, or the link has ended.
+
+        Where links are encrypted and there is no context, it ends with the service's certificate.
+        """
+        assert self._stream is not None
+        endpoint = self._endpoint
+        if endpoint.is_encrypted:
+            self.tls = ShownTls(context, endpoint.host)
+        self.link = load_scheme(endpoint.protocol).make_link(
+            self, self._settings, endpoint, self.tls, role="robot", dialled=True
+        )
+        await self.link.connect(self._stream)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(GREETING_S):
-                await asyncio.shield(self._settled)
+                await self._settled.wait()
 
     @property
     def is_greeted(self) -> bool:
@@ -106,39 +122,48 @@ class AddressPath(LinkOwner):
     def why_not(self) -> str:
         """Why no hello has come, as the rest of a sentence about the service."""
         assert self.link is not None
-        if not self.link.ended:
-            return _SAYS_NOTHING
-        return self.link.reason
+        return self.link.reason if self.link.ended else _SAYS_NOTHING
 
-    async def ask(self, request: Request, limit_s: float) -> list[Reply]:
+    async def ask(self, request: Request) -> list[Reply]:
         """Return all replies but progress reports.
 
         Raises
         ------
-        TimeoutError
         HoldfastError
             If the link ends, or what comes is no reply.
         """
         assert self.link is not None
-        queue: asyncio.Queue[bytes | None] = asyncio.Queue()
-        self._calls[request.number] = queue
         replies: list[Reply] = []
-        async with asyncio.timeout(limit_s):
-            self.link.send_message(CALL, request.number, encode(request))
-            while not self.link.ended and (payload := await queue.get()) is not None:
-                reply = decode_reply(payload)
-                if not isinstance(reply, Progress):
-                    replies.append(reply)
-        if self.link.ended:
-            raise TransportError(f"the link has ended: {self.link.reason or 'closed'}")
-        return replies
+        self.link.send_message(CALL, request.number, encode(request))
+        while not self.link.ended and (frame := await self._frames.get()) is not None:
+            if frame.call != request.number:
+                continue  # of one that was given up
+            if frame.kind in (REPLY, LAST):
+                replies.append(decode_reply(frame.payload))
+            if frame.kind in (END, LAST):
+                return [reply for reply in replies if not isinstance(reply, Progress)]
+        raise TransportError(f"the link has ended: {self.link.reason or 'closed'}")
+
+    async def certificate(self) -> bytes:
+        """Return whatever certificate is shown here, believed or not; empty if there is none."""
+        other = AddressPath(self._endpoint, self._settings, self.family, self.address)
+        try:
+            async with asyncio.timeout(GREETING_S):
+                await other.connect()
+                await other.greet(None)
+        except OSError:
+            pass
+        finally:
+            other.close()
+        tls = other.tls
+        return b"" if tls is None or not tls.established else tls.certificate()
 
     def close(self) -> None:
         """Say goodbye."""
         if self.link is not None:
             self.link.end("", goodbye="")
-        elif self.stream is not None:
-            self.stream.close()
+        elif self._stream is not None:
+            self._stream.close()
 
     # -- events of the link -----------------------------------------------------------------------
 
@@ -152,61 +177,18 @@ class AddressPath(LinkOwner):
         del link
         if hello.clock_s > 0.0:
             self.clock_ahead_s = time.time() - hello.clock_s
-        self._settle()
+        self._settled.set()
 
     def on_frame(self, link: Link, frame: Frame) -> None:
         """Take a reply."""
         del link
-        queue = self._calls.get(frame.call)
-        if queue is not None:
-            if frame.kind in (REPLY, LAST):
-                queue.put_nowait(frame.payload)
-            if frame.kind in (END, LAST):
-                queue.put_nowait(None)
+        self._frames.put_nowait(frame)
 
     def on_ended(self, link: Link) -> None:
-        """End all calls."""
+        """Wake up what waits."""
         del link
-        self._settle()
-        for queue in self._calls.values():
-            queue.put_nowait(None)
-
-    def _settle(self) -> None:
-        if not self._settled.done():
-            self._settled.set_result(None)
-
-
-async def certificate_at(path: AddressPath) -> tuple[bytes, str]:
-    """Return whatever certificate is shown at an address, believed or not, or why there is none.
-
-    The handshake is not finished, so it leaves no line in a service's log.
-    """
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.minimum_version = ssl.TLSVersion.TLSv1_3
-    context.check_hostname = False
-    context.verify_mode = ssl.CERT_NONE
-    tls = WatchedTls(context)
-    loop = asyncio.get_running_loop()
-    reason = CLOSES_AT_TLS
-    with socket.socket(path.family, socket.SOCK_STREAM) as stream:
-        stream.setblocking(False)
-        try:
-            async with asyncio.timeout(GREETING_S):
-                await loop.sock_connect(stream, path.address)
-                tls.begin()
-                while not tls.established:
-                    # It may ask for a key of another kind before it shows anything.
-                    await loop.sock_sendall(stream, tls.take())
-                    if not (data := await loop.sock_recv(stream, 65536)):
-                        break
-                    tls.receive(data)
-        except TimeoutError:
-            reason = _SAYS_NOTHING
-        except ssl.SSLError as error:
-            reason = tls.describe_error(error)
-        except OSError as error:
-            reason = system_words(error.errno)
-    return (tls.shown(), "") if tls.established else (b"", reason)
+        self._settled.set()
+        self._frames.put_nowait(None)
 
 
 def account_of(der: bytes) -> str:
