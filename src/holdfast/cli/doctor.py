@@ -68,7 +68,7 @@ def main(arguments: Sequence[str]) -> int:
     from holdfast.config.settings import OffloadSettings
     from holdfast.robot.doctor import RobotSetup, check, examine
     from holdfast.robot.probe import in_thread
-    from holdfast.robot.reference_decisions import ReferenceDecisions
+    from holdfast.robot.reference_decisions import reference_decisions
 
     configuration = None if options.configuration is None else load(options.configuration)
     tls = options.tls
@@ -80,7 +80,7 @@ def main(arguments: Sequence[str]) -> int:
         raise HoldfastError("no service is named: give --service ENDPOINT, or CONFIG one")
     decisions = None
     if configuration is not None:
-        decisions = in_thread(functools.partial(ReferenceDecisions.of, configuration))
+        decisions = in_thread(functools.partial(reference_decisions, configuration))
     robot = RobotSetup(offload.name or ("" if tls else "doctor"), tls, offload, decisions)
     fails = False
     for endpoint in endpoints:

@@ -25,9 +25,10 @@ from itertools import count
 from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
+import msgspec
+
 from holdfast.config.settings import OffloadSettings
 from holdfast.errors import HoldfastError
-from holdfast.planning import digest
 from holdfast.printable import printable
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
@@ -37,7 +38,6 @@ from holdfast.protocol.messages import (
     Refused,
     Reply,
     Request,
-    SessionConfiguration,
 )
 from holdfast.robot.probe import (
     CLOSES_AT_TLS,
@@ -46,7 +46,7 @@ from holdfast.robot.probe import (
     in_thread,
     interface_of,
 )
-from holdfast.robot.reference_decisions import ReferenceDecisions, ReferenceTurn
+from holdfast.robot.reference_decisions import ReferenceDecision, answer_in
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
 from holdfast.transport.credentials import (
     EXPIRES_SOON_DAYS,
@@ -132,7 +132,7 @@ class RobotSetup(NamedTuple):
     """Directory of its credentials."""
     offload: OffloadSettings
     """The robot's limits on time."""
-    decisions: Future[ReferenceDecisions] | None
+    decisions: Future[list[ReferenceDecision]] | None
     """What the service's answers are compared with; None asks for none."""
 
 
@@ -414,49 +414,33 @@ class _Examination:
             return _Seen(seen, state=NOT_REACHED)
         except HoldfastError as error:
             return _fails(f"this robot's own planner fails: {error}", goes_on=True)
-        session, took_s = os.urandom(16), 0.0
-        for turn in own.turns:
-            session_configuration = None if turn.observations else own.session_configuration
+        session = os.urandom(16)
+        for decision in own:
             began = time.perf_counter()
             try:
                 async with asyncio.timeout(_DECISION_S):
-                    replies = await self._decided(path, session, turn, session_configuration)
+                    replies = await self._decided(path, decision.request, session)
             except TimeoutError:
                 advice = "it is too slow for this problem, or has too much to do"
                 seen = f"no decision within {_DECISION_S:g} s"
                 return _fails(seen, advice, goes_on=True)
             except HoldfastError as error:
                 return _fails(str(error), goes_on=True)
-            took_s = time.perf_counter() - began
-            if (fault := _fault_of(replies, turn)) is not None:
+            self._decision_s = time.perf_counter() - began, decision.took_s
+            if (fault := _fault_of(replies, decision)) is not None:
+                self._decision_s = None
                 return fault
-        self._decision_s = took_s, own.turns[-1].took_s
-        problem = own.session_configuration.problem
-        seen = f"{problem}: the same code and settings; {len(own.turns)} decisions are"
+        described = own[0].request.session_configuration
+        assert described is not None
+        seen = f"{described.problem}: the same code and settings; {len(own)} decisions are"
         return _Seen(f"{seen} the robot's own, bit for bit")
 
-    async def _decided(
-        self,
-        path: AddressPath,
-        session: bytes,
-        turn: ReferenceTurn,
-        session_configuration: SessionConfiguration | None,
-    ) -> list[Reply]:
+    async def _decided(self, path: AddressPath, request: Request, session: bytes) -> list[Reply]:
         while True:
-            state = turn.state
-            request = Request(
-                PROTOCOL_VERSION,
-                session,
-                1,
-                next(self._numbers),
-                state.trial,
-                state.step,
-                state.sensed,
-                digest(state)[:DIGEST_SIZE],
-                turn.observations,
-                session_configuration,
+            number = next(self._numbers)
+            replies = await path.ask(
+                msgspec.structs.replace(request, session=session, number=number)
             )
-            replies = await path.ask(request)
             busy = next((reply for reply in replies if isinstance(reply, Busy)), None)
             if busy is None:
                 return replies
@@ -498,7 +482,7 @@ class _Examination:
         return Request(PROTOCOL_VERSION, unknown, 1, number, 0, 0, False, bytes(DIGEST_SIZE))
 
 
-def _fault_of(replies: list[Reply], own: ReferenceTurn) -> _Seen | None:
+def _fault_of(replies: list[Reply], own: ReferenceDecision) -> _Seen | None:
     """Return what is wrong with answers; None if they are the robot's own, bit for bit."""
     for reply in replies:
         if isinstance(reply, Refused):
@@ -507,7 +491,7 @@ def _fault_of(replies: list[Reply], own: ReferenceTurn) -> _Seen | None:
         if isinstance(reply, NeedState):
             seen = "the service comes to another state than this robot, with the same code"
             return _fails(seen, _DISTRUST, goes_on=True)
-    if not own.agrees_with(replies):
+    if answer_in(replies) != own.answer:
         seen = "the service answers otherwise than this robot's own planner, with the same code"
         return _fails(seen, _DISTRUST, goes_on=True)
     return None
