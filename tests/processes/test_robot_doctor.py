@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from tests.ports import free_port
@@ -25,10 +25,12 @@ from tests.processes import lying_problem, test_other_code
 from tests.processes.faults import HERE, PATIENCE_S, PATIENT, Process, Service, Site, document_of
 from tests.wire import CALL, LAST, frame_of, hello_of
 
+from holdfast.cli.doctor import _as_text
 from holdfast.config.settings import OffloadSettings
 from holdfast.lab.testbed.namespace import NetworkNamespace, why_no_namespace
 from holdfast.protocol.messages import NeedState, Refused, Reply, decode_request, encode
-from holdfast.robot.doctor import LayerFinding, RobotSetup, check, examine
+from holdfast.robot.doctor import Examination, LayerFinding, State
+from holdfast.transport.endpoints import parse_endpoint
 from holdfast.transport.frames import FrameDecoder
 from holdfast.transport.key_ring import make_credentials, revoke_credentials
 
@@ -245,6 +247,15 @@ def own_network() -> Iterator[NetworkNamespace]:
         yield network
 
 
+@pytest.mark.parametrize("state", get_args(State))
+def test_each_state_on_a_terminal(state: State, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    text = _as_text(LayerFinding("clock", state, "it is late", "sleep", "::1"))
+    first, second = text.splitlines()
+    assert f"m {state:<6} \x1b[0m::1: it is late" in first
+    assert second.strip() == "-> sleep"
+
+
 def test_a_host_with_two_addresses(home: Path, site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     """One of them is a way to the service, and that is enough."""
     cloud = service_of(site, "tls", home / "cloud")
@@ -252,9 +263,10 @@ def test_a_host_with_two_addresses(home: Path, site: Site, monkeypatch: pytest.M
     tcp = (socket.AF_INET, socket.SOCK_STREAM, 6, "")
     found = [(*tcp, (address, port)) for address in ("127.0.0.2", "127.0.0.1")]
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
-    robot = RobotSetup("", home / "anna", OffloadSettings(detection_timeout_ms=30_000.0), None)
+    offload = OffloadSettings(detection_timeout_ms=30_000.0, tls=str(home / "anna"))
     seen: list[LayerFinding] = []
-    asyncio.run(examine(check(f"tls/localhost:{port}", robot.tls), robot, seen.append))
+    endpoint = parse_endpoint(f"tls/localhost:{port}")
+    asyncio.run(Examination(endpoint, offload, None, seen.append).run())
     states = {(each.layer, each.address): each.state for each in seen}
     assert seen[0].seen == "localhost is 127.0.0.2, 127.0.0.1"
     assert states["port", "127.0.0.1"] == "ok"

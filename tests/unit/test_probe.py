@@ -17,15 +17,13 @@ from holdfast.robot.probe import (
     interface_of,
 )
 from holdfast.transport.endpoints import Endpoint
-from holdfast.transport.link_settings import LinkSettings
 
 
 def test_without_a_service_there_is_no_certificate() -> None:
     async def look() -> bytes:
         endpoint = Endpoint("tls", "127.0.0.1", free_port())
-        settings = LinkSettings(bytes, 1000.0, 1000, pauses_for_readers=False)
         address = (endpoint.host, endpoint.port)
-        return await AddressPath(endpoint, settings, socket.AF_INET, address).certificate()
+        return await AddressPath(endpoint, "anna", socket.AF_INET, address).certificate()
 
     assert asyncio.run(look()) == b""
 

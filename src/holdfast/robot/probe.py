@@ -6,41 +6,43 @@ import asyncio
 import contextlib
 import fcntl
 import ipaddress
+import os
 import socket
 import ssl
 import struct
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+import msgspec
+
 from holdfast.errors import TransportError
 from holdfast.protocol.messages import Progress, Reply, Request, decode_reply, encode
+from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
 from holdfast.transport.credentials import date_text
 from holdfast.transport.endpoints import Endpoint
-from holdfast.transport.frames import CALL, END, LAST, REPLY, Frame, Hello
+from holdfast.transport.frames import CALL, END, LAST, REPLY, Frame, Hello, encode_hello
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.schemes import load_scheme
 from holdfast.transport.tls import TlsStream
 
-__all__ = [
-    "CLOSES_AT_TLS",
-    "AddressPath",
-    "account_of",
-    "in_thread",
-    "interface_of",
-]
+__all__ = ["AddressPath", "account_of", "in_thread", "interface_of"]
 
-GREETING_S: Final = 3.0
+_GREETING_S: Final = 3.0
 """For the handshake and the other end's hello."""
+
+_LEASE_MS: Final = 30_000.0
+"""The robot may be silent for so long; it never is."""
 
 _SIOCGIFADDR: Final = 0x8915
 
-CLOSES_AT_TLS: Final = "closes connections at the first bytes of TLS"
-_SAYS_NOTHING: Final = f"takes connections and says nothing for {GREETING_S:g} s"
+_SAYS_NOTHING: Final = f"takes connections and says nothing for {_GREETING_S:g} s"
 
 _T = TypeVar("_T")
 
@@ -76,19 +78,20 @@ class AddressPath(LinkOwner):
     """One address of a service, as far as it was followed: the owner of its link."""
 
     def __init__(
-        self, endpoint: Endpoint, settings: LinkSettings, family: socket.AddressFamily, address: Any
+        self, endpoint: Endpoint, robot: str, family: socket.AddressFamily, address: Any
     ) -> None:
         self._endpoint = endpoint
-        self._settings = settings
+        self._robot = robot
         self.family = family
         self.address = address
         self.text = address if endpoint.is_local_socket else str(address[0])
         self._stream: socket.socket | None = None
         self.tls: ShownTls | None = None
-        self.link: Link | None = None
+        self._link: Link | None = None
+        self._numbers = count(1)
         self.clock_ahead_s: float | None = None
-        self._settled = asyncio.Event()
-        self._frames: asyncio.Queue[Frame | None] = asyncio.Queue()
+        # Frames of calls; None for the hello and for the end of the link.
+        self._arrived: asyncio.Queue[Frame | None] = asyncio.Queue()
 
     async def connect(self) -> None:
         """Connect; raise OSError if that fails."""
@@ -105,38 +108,46 @@ class AddressPath(LinkOwner):
         endpoint = self._endpoint
         if endpoint.is_encrypted:
             self.tls = ShownTls(context, endpoint.host)
-        self.link = load_scheme(endpoint.protocol).make_link(
-            self, self._settings, endpoint, self.tls, role="robot", dialled=True
+        settings = LinkSettings(
+            partial(encode_hello, "robot", self._robot, os.urandom(8).hex(), _LEASE_MS),
+            _LEASE_MS,
+            DEFAULT_MAX_MESSAGE_BYTES,
+            pauses_for_readers=False,
         )
-        await self.link.connect(self._stream)
+        self._link = load_scheme(endpoint.protocol).make_link(
+            self, settings, endpoint, self.tls, role="robot", dialled=True
+        )
+        await self._link.connect(self._stream)
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(GREETING_S):
-                await self._settled.wait()
+            async with asyncio.timeout(_GREETING_S):
+                await self._arrived.get()
 
     @property
-    def is_greeted(self) -> bool:
-        """Whether the service has said who it is, and the link stands."""
-        return self.link is not None and self.link.hello is not None and not self.link.ended
+    def link(self) -> Link:
+        """The link, once it is made."""
+        assert self._link is not None
+        return self._link
 
     @property
     def why_not(self) -> str:
         """Why no hello has come, as the rest of a sentence about the service."""
-        assert self.link is not None
         return self.link.reason if self.link.ended else _SAYS_NOTHING
 
     async def ask(self, request: Request) -> list[Reply]:
-        """Return all replies but progress reports.
+        """Send a request under a number of its own; return all replies but progress reports.
 
         Raises
         ------
         HoldfastError
             If the link ends, or what comes is no reply.
         """
-        assert self.link is not None
         replies: list[Reply] = []
-        self.link.send_message(CALL, request.number, encode(request))
-        while not self.link.ended and (frame := await self._frames.get()) is not None:
-            if frame.call != request.number:
+        number = next(self._numbers)
+        message = encode(msgspec.structs.replace(request, number=number))
+        self.link.send_message(CALL, number, message)
+        while not self.link.ended:
+            frame = await self._arrived.get()
+            if frame is None or frame.call != number:
                 continue  # of one that was given up
             if frame.kind in (REPLY, LAST):
                 replies.append(decode_reply(frame.payload))
@@ -146,9 +157,9 @@ class AddressPath(LinkOwner):
 
     async def certificate(self) -> bytes:
         """Return whatever certificate is shown here, believed or not; empty if there is none."""
-        other = AddressPath(self._endpoint, self._settings, self.family, self.address)
+        other = AddressPath(self._endpoint, self._robot, self.family, self.address)
         try:
-            async with asyncio.timeout(GREETING_S):
+            async with asyncio.timeout(_GREETING_S):
                 await other.connect()
                 await other.greet(None)
         except OSError:
@@ -160,8 +171,8 @@ class AddressPath(LinkOwner):
 
     def close(self) -> None:
         """Say goodbye."""
-        if self.link is not None:
-            self.link.end("", goodbye="")
+        if self._link is not None:
+            self._link.end("", goodbye="")
         elif self._stream is not None:
             self._stream.close()
 
@@ -174,32 +185,26 @@ class AddressPath(LinkOwner):
 
     def on_hello(self, link: Link, hello: Hello) -> None:
         """Take the service's hello."""
-        del link
         if hello.clock_s > 0.0:
             self.clock_ahead_s = time.time() - hello.clock_s
-        self._settled.set()
+        self.on_ended(link)
 
     def on_frame(self, link: Link, frame: Frame) -> None:
         """Take a reply."""
         del link
-        self._frames.put_nowait(frame)
+        self._arrived.put_nowait(frame)
 
     def on_ended(self, link: Link) -> None:
         """Wake up what waits."""
         del link
-        self._settled.set()
-        self._frames.put_nowait(None)
+        self._arrived.put_nowait(None)
 
 
 def account_of(der: bytes) -> str:
     """Say what a certificate that is not believed says of itself, if there is what reads it."""
     try:
         from cryptography import x509
-    except ImportError:
-        return ""
-    if not der:
-        return ""
-    try:
+
         read = x509.load_der_x509_certificate(der)
         begins, ends = read.not_valid_before_utc, read.not_valid_after_utc
         names = [str(name.value) for name in read.subject] or ["nobody"]
@@ -207,7 +212,7 @@ def account_of(der: bytes) -> str:
         with contextlib.suppress(x509.ExtensionNotFound):
             hosts = read.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
             names.append(f"for {', '.join(str(host.value) for host in hosts)}")
-    except ValueError:
+    except (ImportError, ValueError):
         return ""
     return (
         f"shown is {' '.join(names)}, of the authority {' '.join(issuer)}, valid from "
@@ -217,21 +222,20 @@ def account_of(der: bytes) -> str:
 
 def interface_of(local: str) -> str:
     """Return the name of the interface that has an address and a comma; else nothing."""
-    wanted = ipaddress.ip_address(local.partition("%")[0])
-    if wanted.version == 6:
-        with contextlib.suppress(OSError):
-            for line in Path("/proc/net/if_inet6").read_text().splitlines():
-                fields = line.split()
-                if bytes.fromhex(fields[0]) == wanted.packed:
-                    return f"{fields[-1]}, "
-        return ""
+    wanted = ipaddress.ip_address(local.partition("%")[0]).packed
+    return next((f"{name}, " for name, packed in _interface_addresses() if packed == wanted), "")
+
+
+def _interface_addresses() -> Iterator[tuple[str, bytes]]:
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/net/if_inet6").read_text().splitlines():
+            packed, *_, name = line.split()
+            yield name, bytes.fromhex(packed)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         for _, name in socket.if_nameindex():
             with contextlib.suppress(OSError):
                 asked = struct.pack("256s", name.encode())
-                if fcntl.ioctl(probe, _SIOCGIFADDR, asked)[20:24] == wanted.packed:
-                    return f"{name}, "
-    return ""
+                yield name, fcntl.ioctl(probe, _SIOCGIFADDR, asked)[20:24]
 
 
 def in_thread(function: Callable[[], _T]) -> Future[_T]:
