@@ -276,13 +276,17 @@ def test_a_host_with_two_addresses(home: Path, site: Site, monkeypatch: pytest.M
 
 
 class TestTlsAndProtocol:
-    @pytest.mark.parametrize("protocol", ["tcp", "tls"])
-    def test_another_program(self, protocol: str, home: Path, site: Site) -> None:
+    @pytest.mark.parametrize(
+        ("protocol", "robot"), [("tcp", None), ("tls", "anna"), ("tls", None)]
+    )
+    def test_another_program(
+        self, protocol: str, robot: str | None, home: Path, site: Site
+    ) -> None:
         def answer(taken: socket.socket) -> None:
             taken.recv(1000)
             taken.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
 
-        options = ("--tls", home / "anna") if protocol == "tls" else ()
+        options = () if robot is None else ("--tls", home / robot)
         with answering(answer) as port:
             seen = look(site, f"{protocol}/127.0.0.1:{port}", *options)
         if protocol == "tcp":

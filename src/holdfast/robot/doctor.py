@@ -299,10 +299,9 @@ class Examination:
         slow = "its process stands still, or has far too much to do"
         async with _within(_REPLY_S, "has not answered", slow):
             replies = await path.ask(_ECHO)
-        for reply in replies:
-            if isinstance(reply, Refused):
-                advice = "install the same release at both ends"
-                raise _LayerError(f"{reply.code}: {reply.text}", advice)
+        if refused := _of_kind(Refused, replies):
+            advice = "install the same release at both ends"
+            raise _LayerError(f"{refused.code}: {refused.text}", advice)
         seen = f"{hello.name}, holdfast {hello.release}, messages of version {PROTOCOL_VERSION}"
         return _Seen(seen)
 

@@ -14,7 +14,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -23,12 +22,11 @@ import msgspec
 
 from holdfast.errors import TransportError
 from holdfast.protocol.messages import Progress, Reply, Request, decode_reply, encode
-from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
 from holdfast.transport.credentials import date_text
 from holdfast.transport.endpoints import Endpoint
-from holdfast.transport.frames import CALL, END, LAST, REPLY, Frame, Hello, encode_hello
-from holdfast.transport.link_settings import LinkSettings
+from holdfast.transport.frames import CALL, END, LAST, REPLY, Frame, Hello
 from holdfast.transport.links import Link, LinkOwner
+from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.schemes import load_scheme
 from holdfast.transport.tls import TlsStream
 
@@ -108,14 +106,11 @@ class AddressPath(LinkOwner):
         endpoint = self._endpoint
         if endpoint.is_encrypted:
             self.tls = ShownTls(context, endpoint.host)
-        settings = LinkSettings(
-            partial(encode_hello, "robot", self._robot, os.urandom(8).hex(), _LEASE_MS),
-            _LEASE_MS,
-            DEFAULT_MAX_MESSAGE_BYTES,
-            pauses_for_readers=False,
+        robot = StreamRobotTransport(
+            {}, name=self._robot, incarnation=os.urandom(8).hex(), lease_ms=_LEASE_MS
         )
         self._link = load_scheme(endpoint.protocol).make_link(
-            self, settings, endpoint, self.tls, role="robot", dialled=True
+            self, robot.settings, endpoint, self.tls, role="robot", dialled=True
         )
         await self._link.connect(self._stream)
         with contextlib.suppress(TimeoutError):
