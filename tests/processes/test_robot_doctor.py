@@ -276,9 +276,7 @@ def test_a_host_with_two_addresses(home: Path, site: Site, monkeypatch: pytest.M
 
 
 class TestTlsAndProtocol:
-    @pytest.mark.parametrize(
-        ("protocol", "robot"), [("tcp", None), ("tls", "anna"), ("tls", None)]
-    )
+    @pytest.mark.parametrize(("protocol", "robot"), [("tcp", None), ("tls", "anna"), ("tls", None)])
     def test_another_program(
         self, protocol: str, robot: str | None, home: Path, site: Site
     ) -> None:
