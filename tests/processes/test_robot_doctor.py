@@ -23,6 +23,7 @@ import pytest
 from tests.ports import free_port
 from tests.processes import lying_problem, test_other_code
 from tests.processes.faults import HERE, PATIENCE_S, PATIENT, Process, Service, Site, document_of
+from tests.unit.test_transport_credentials import sign_with_names
 from tests.wire import CALL, LAST, frame_of, hello_of
 
 from holdfast.cli.doctor import _as_text
@@ -97,6 +98,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
         moment = now - timedelta(days=days)
         make_credentials(home, robots=[name], services=[f"{name}-cloud"], days=2, now=moment)
     make_credentials(home, robots=["soon"], services=["soon-cloud"], days=5)
+    sign_with_names(home, "cloud", "two-names", ["two-names", "two"])
     make_credentials(home, robots=["thief"], services=["thief-cloud"])
     for name in ("thief", "thief-cloud"):
         shutil.copytree(home / name, home.with_name(name))
@@ -420,9 +422,10 @@ class TestCertificates:
         [
             ("old-cloud", "has expired; 'holdfast keys DIR --renew --service NAME' makes another"),
             ("early-cloud", "is not valid yet; is a clock wrong?"),
+            ("two-names", "theirs: has 2 common names, and must have one"),
         ],
     )
-    def test_a_service_whose_time_is_not_now(
+    def test_a_service_with_a_faulty_certificate(
         self, service: str, what: str, home: Path, site: Site
     ) -> None:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -434,7 +437,7 @@ class TestCertificates:
 
         with answering(answer) as port:
             seen = look(site, f"tls/127.0.0.1:{port}", "--tls", home / "anna")
-        assert_fails(seen, "certificate", what, f"shown is {service} for ")
+        assert_fails(seen, "certificate", what, f"shown is {service} ")
         assert "; it is 20" in seen["clock"]["seen"]
 
     @pytest.mark.parametrize(

@@ -200,13 +200,14 @@ def account_of(der: bytes) -> str:
     try:
         from cryptography import x509
 
+        from holdfast.transport.authority import hosts_of
+
         read = x509.load_der_x509_certificate(der)
         begins, ends = read.not_valid_before_utc, read.not_valid_after_utc
         names = [str(name.value) for name in read.subject] or ["nobody"]
         issuer = [str(name.value) for name in read.issuer] or ["nobody"]
-        with contextlib.suppress(x509.ExtensionNotFound):
-            hosts = read.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-            names.append(f"for {', '.join(str(host.value) for host in hosts)}")
+        if hosts := hosts_of(read):
+            names.append(f"for {', '.join(hosts)}")
     except (ImportError, ValueError):
         return ""
     return (
