@@ -17,18 +17,21 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from tests.ports import free_port
 from tests.processes import lying_problem, test_other_code
 from tests.processes.faults import HERE, PATIENCE_S, PATIENT, Process, Service, Site, document_of
+from tests.unit.test_transport_credentials import sign_with_names
 from tests.wire import CALL, LAST, frame_of, hello_of
 
+from holdfast.cli.doctor import _as_text
 from holdfast.config.settings import OffloadSettings
 from holdfast.lab.testbed.namespace import NetworkNamespace, why_no_namespace
 from holdfast.protocol.messages import NeedState, Refused, Reply, decode_request, encode
-from holdfast.robot.doctor import LayerFinding, RobotSetup, check, examine
+from holdfast.robot.doctor import Examination, LayerFinding, State
+from holdfast.transport.endpoints import parse_endpoint
 from holdfast.transport.frames import FrameDecoder
 from holdfast.transport.key_ring import make_credentials, revoke_credentials
 
@@ -95,6 +98,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
         moment = now - timedelta(days=days)
         make_credentials(home, robots=[name], services=[f"{name}-cloud"], days=2, now=moment)
     make_credentials(home, robots=["soon"], services=["soon-cloud"], days=5)
+    sign_with_names(home, "cloud", "two-names", ["two-names", "two"])
     make_credentials(home, robots=["thief"], services=["thief-cloud"])
     for name in ("thief", "thief-cloud"):
         shutil.copytree(home / name, home.with_name(name))
@@ -245,6 +249,15 @@ def own_network() -> Iterator[NetworkNamespace]:
         yield network
 
 
+@pytest.mark.parametrize("state", get_args(State))
+def test_each_state_on_a_terminal(state: State, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    text = _as_text(LayerFinding("clock", state, "it is late", "sleep", "::1"))
+    first, second = text.splitlines()
+    assert f"m {state:<6} \x1b[0m::1: it is late" in first
+    assert second.strip() == "-> sleep"
+
+
 def test_a_host_with_two_addresses(home: Path, site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     """One of them is a way to the service, and that is enough."""
     cloud = service_of(site, "tls", home / "cloud")
@@ -252,9 +265,10 @@ def test_a_host_with_two_addresses(home: Path, site: Site, monkeypatch: pytest.M
     tcp = (socket.AF_INET, socket.SOCK_STREAM, 6, "")
     found = [(*tcp, (address, port)) for address in ("127.0.0.2", "127.0.0.1")]
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
-    robot = RobotSetup("", home / "anna", OffloadSettings(detection_timeout_ms=30_000.0), None)
+    offload = OffloadSettings(detection_timeout_ms=30_000.0, tls=str(home / "anna"))
     seen: list[LayerFinding] = []
-    asyncio.run(examine(check(f"tls/localhost:{port}", robot.tls), robot, seen.append))
+    endpoint = parse_endpoint(f"tls/localhost:{port}")
+    asyncio.run(Examination(endpoint, offload, None, seen.append).run())
     states = {(each.layer, each.address): each.state for each in seen}
     assert seen[0].seen == "localhost is 127.0.0.2, 127.0.0.1"
     assert states["port", "127.0.0.1"] == "ok"
@@ -264,13 +278,15 @@ def test_a_host_with_two_addresses(home: Path, site: Site, monkeypatch: pytest.M
 
 
 class TestTlsAndProtocol:
-    @pytest.mark.parametrize("protocol", ["tcp", "tls"])
-    def test_another_program(self, protocol: str, home: Path, site: Site) -> None:
+    @pytest.mark.parametrize(("protocol", "robot"), [("tcp", None), ("tls", "anna"), ("tls", None)])
+    def test_another_program(
+        self, protocol: str, robot: str | None, home: Path, site: Site
+    ) -> None:
         def answer(taken: socket.socket) -> None:
             taken.recv(1000)
             taken.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
 
-        options = ("--tls", home / "anna") if protocol == "tls" else ()
+        options = () if robot is None else ("--tls", home / robot)
         with answering(answer) as port:
             seen = look(site, f"{protocol}/127.0.0.1:{port}", *options)
         if protocol == "tcp":
@@ -406,20 +422,22 @@ class TestCertificates:
         [
             ("old-cloud", "has expired; 'holdfast keys DIR --renew --service NAME' makes another"),
             ("early-cloud", "is not valid yet; is a clock wrong?"),
+            ("two-names", "theirs: has 2 common names, and must have one"),
         ],
     )
-    def test_a_service_whose_time_is_not_now(
+    def test_a_service_with_a_faulty_certificate(
         self, service: str, what: str, home: Path, site: Site
     ) -> None:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.load_cert_chain(home / service / "certificate.pem", home / service / "key.pem")
 
         def answer(taken: socket.socket) -> None:
-            context.wrap_socket(taken, server_side=True).recv(1000)
+            with context.wrap_socket(taken, server_side=True) as tls:
+                tls.recv(1000)
 
         with answering(answer) as port:
             seen = look(site, f"tls/127.0.0.1:{port}", "--tls", home / "anna")
-        assert_fails(seen, "certificate", what, f"shown is {service} for ")
+        assert_fails(seen, "certificate", what, f"shown is {service} ")
         assert "; it is 20" in seen["clock"]["seen"]
 
     @pytest.mark.parametrize(

@@ -8,28 +8,29 @@ import pytest
 
 from holdfast.config.loader import load
 from holdfast.errors import HoldfastError
-from holdfast.planning import digest
-from holdfast.protocol.messages import DIGEST_SIZE, Reply, SensingAnswer, TaskAnswer, encode_floats
-from holdfast.robot.reference_decisions import ReferenceDecisions
+from holdfast.protocol.messages import Progress, Reply, SensingAnswer, TaskAnswer
+from holdfast.robot.reference_decisions import answer_in, reference_decisions
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
 
 
 def test_an_answer_agrees_only_if_every_bit_does() -> None:
     configuration = load(EXAMPLE, overrides={"particle_filter.num_particles": 50})
-    decisions = ReferenceDecisions.of(configuration)
-    assert decisions.session_configuration.problem == "peg_in_hole_2d"
-    first, second = decisions.turns
-    assert (first.observations, len(second.observations)) == ((), 1)
-    actions, sensing_action, ahead = second.decision
-    assert sensing_action is not None
+    first, second = reference_decisions(configuration)
+    assert first.request.session_configuration is not None
+    assert first.request.session_configuration.problem == "peg_in_hole_2d"
+    assert (first.request.inputs, len(second.request.inputs)) == ((), 1)
+    actions = next(each for each in second.answer if isinstance(each, bytes))
+    sensing_action, arrives = next(each for each in second.answer if isinstance(each, tuple))
     replies: list[Reply] = [
-        TaskAnswer(1, len(actions), b"".join(map(encode_floats, actions)), 0),
-        SensingAnswer(1, ahead.step, sensing_action, digest(ahead)[:DIGEST_SIZE], 0),
+        Progress(1, True),
+        TaskAnswer(1, 1, actions, 0),
+        SensingAnswer(1, 9, sensing_action, arrives, 0),
     ]
-    assert second.agrees_with(replies)
-    assert not second.agrees_with(replies[:1])
-    assert not first.agrees_with(replies)
+    assert answer_in(replies) == second.answer != first.answer
+    assert answer_in(replies[:2]) != second.answer
+    other = bytes([actions[0] ^ 1, *actions[1:]])
+    assert answer_in([TaskAnswer(1, 1, other, 0), replies[2]]) != second.answer
 
 
 def test_a_problem_that_fails_is_named(tmp_path: Path) -> None:
@@ -42,4 +43,4 @@ def test_a_problem_that_fails_is_named(tmp_path: Path) -> None:
     path = tmp_path / "failing.yaml"
     path.write_text("problem: reference_failing:Failing\n")
     with pytest.raises(HoldfastError, match="ZeroDivisionError: a defect"):
-        ReferenceDecisions.of(load(path))
+        reference_decisions(load(path))

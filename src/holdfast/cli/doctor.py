@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 __all__ = ["main"]
 
 _COLORS = {"ok": 32, "warns": 33, "fails": 31}
-"""Of a terminal: green, yellow, red."""
+"""Of a terminal: green, yellow, red; else its own."""
 
-_INDENT = 22
 _WIDEST = 110
+_ADVICE = f"{' ' * 19}-> "
 
 
 class DoctorOptions(Options):
@@ -66,22 +66,25 @@ def main(arguments: Sequence[str]) -> int:
 
     from holdfast.config.loader import load
     from holdfast.config.settings import OffloadSettings
-    from holdfast.robot.doctor import RobotSetup, check, examine
+    from holdfast.robot.doctor import Examination
     from holdfast.robot.probe import in_thread
-    from holdfast.robot.reference_decisions import ReferenceDecisions
+    from holdfast.robot.reference_decisions import reference_decisions
+    from holdfast.transport.endpoints import TlsFiles, check_credentials, check_endpoint
 
     configuration = None if options.configuration is None else load(options.configuration)
-    tls = options.tls
     offload = OffloadSettings() if configuration is None else configuration.offload
-    if tls is None and offload.tls is not None:
-        tls = Path(offload.tls)
-    endpoints = [check(each, tls) for each in options.service or offload.services]
+    if options.tls is not None:
+        offload = msgspec.structs.replace(offload, tls=str(options.tls))
+    services = options.service or offload.services
+    endpoints = [check_endpoint(service, "robot", listens=False) for service in services]
+    if offload.tls is not None:
+        for endpoint in endpoints:
+            check_credentials(endpoint, TlsFiles.of(Path(offload.tls)))
     if not endpoints:
         raise HoldfastError("no service is named: give --service ENDPOINT, or CONFIG one")
     decisions = None
     if configuration is not None:
-        decisions = in_thread(functools.partial(ReferenceDecisions.of, configuration))
-    robot = RobotSetup(offload.name or ("" if tls else "doctor"), tls, offload, decisions)
+        decisions = in_thread(functools.partial(reference_decisions, configuration))
     fails = False
     for endpoint in endpoints:
 
@@ -97,27 +100,22 @@ def main(arguments: Sequence[str]) -> int:
 
         if not options.json:
             sys.stdout.write(f"{endpoint}\n")
-        asyncio.run(examine(endpoint, robot, show))
+        asyncio.run(Examination(endpoint, offload, decisions, show).run())
     return EXIT_DIFFERENT if fails else 0
 
 
 def _as_text(finding: LayerFinding) -> str:
     """Return the lines of a finding."""
     width = min(shutil.get_terminal_size().columns, _WIDEST)
-    begins = f"  {finding.layer:<12} {finding.state:<6} "
     where = f"{finding.address}: " if finding.address else ""
-    lines = textwrap.wrap(
-        f"{where}{finding.seen}", width, initial_indent=begins, subsequent_indent=" " * _INDENT
-    )
-    if finding.advice:
+    begins = f"  {finding.layer:<12} {finding.state:<6} "
+    lines = []
+    for text, indent in ((f"{where}{finding.seen}", begins), (finding.advice, _ADVICE)):
         lines += textwrap.wrap(
-            finding.advice,
-            width,
-            initial_indent=f"{' ' * (_INDENT - 3)}-> ",
-            subsequent_indent=" " * _INDENT,
+            text, width, initial_indent=indent, subsequent_indent=" " * len(begins)
         )
     if sys.stdout.isatty():
         state = f" {finding.state:<6} "
-        colored = f"\x1b[{_COLORS[finding.state]}m{state}\x1b[0m"
+        colored = f"\x1b[{_COLORS.get(finding.state, 0)}m{state}\x1b[0m"
         lines[0] = lines[0].replace(state, colored, 1)
     return "\n".join(lines)

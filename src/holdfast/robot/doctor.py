@@ -18,16 +18,16 @@ import socket
 import ssl
 import statistics
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import Future
 from functools import partial
-from itertools import count
 from pathlib import Path
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, Literal, NamedTuple, TypeAlias, TypeVar
+
+import msgspec
 
 from holdfast.config.settings import OffloadSettings
 from holdfast.errors import HoldfastError
-from holdfast.planning import digest
 from holdfast.printable import printable
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
@@ -37,52 +37,15 @@ from holdfast.protocol.messages import (
     Refused,
     Reply,
     Request,
-    SessionConfiguration,
 )
-from holdfast.robot.probe import (
-    CLOSES_AT_TLS,
-    AddressPath,
-    WatchedTls,
-    account_of,
-    certificate_at,
-    in_thread,
-    interface_of,
-)
-from holdfast.robot.reference_decisions import ReferenceDecisions, ReferenceTurn
-from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
-from holdfast.transport.credentials import (
-    EXPIRES_SOON_DAYS,
-    date_text,
-    load_credentials,
-)
-from holdfast.transport.datagram_cipher import require_cryptography
-from holdfast.transport.endpoints import (
-    Endpoint,
-    TlsFiles,
-    check_credentials,
-    check_endpoint,
-    system_words,
-)
+from holdfast.robot.probe import AddressPath, account_of, in_thread, interface_of
+from holdfast.robot.reference_decisions import ReferenceDecision, answer_in
+from holdfast.transport.credentials import EXPIRES_SOON_DAYS, date_text, load_credentials
+from holdfast.transport.endpoints import Endpoint, system_words
 from holdfast.transport.exchanges import MAX_DATAGRAM_BYTES
-from holdfast.transport.frames import encode_hello
-from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.tls import client_context
 
-__all__ = [
-    "FAILS",
-    "NOT_REACHED",
-    "OK",
-    "WARNS",
-    "LayerFinding",
-    "RobotSetup",
-    "check",
-    "examine",
-]
-
-OK: Final = "ok"
-WARNS: Final = "warns"
-FAILS: Final = "fails"
-NOT_REACHED: Final = "-"
+__all__ = ["Examination", "LayerFinding", "State"]
 
 _NAME_S: Final = 3.0
 _CONNECT_S: Final = 2.0
@@ -102,21 +65,30 @@ _IP_MTU: Final = {
 }
 """Linux's options that tell the MTU of a connected socket's route."""
 
-_LEASE_MS: Final = 30_000.0
-"""The robot may be silent for so long; it never is."""
-
+_BAD_CERTIFICATE: Final = "has a certificate that "
+_CLOSES_AT_TLS: Final = "closes connections at the first bytes of TLS"
 _NO_TLS: Final = "is it at tcp/..., another program, or a process that is stopped?"
 _NO_HOLDFAST: Final = "is it another program, at tls/... or udp/..., or a process that is stopped?"
 _DISTRUST: Final = "do not use it before you know why (docs/trust.md)"
 _OPEN_IT: Final = "let it through the firewalls on the way, or mend the VPN"
+
+_Kind = TypeVar("_Kind")
+_Look: TypeAlias = Callable[..., Awaitable["_Seen | None"]]
+State: TypeAlias = Literal["ok", "warns", "fails", "-"]
+
+_ECHO: Final = Request(PROTOCOL_VERSION, os.urandom(16), 1, 0, 0, 0, False, bytes(DIGEST_SIZE))
+"""Of an unknown session, so it is answered at once."""
+
+_OTHERS_WORK_WITHOUT: Final = {"datagrams", "problem"}
+"""Layers that those above do not need."""
 
 
 class LayerFinding(NamedTuple):
     """The result of one layer, at one address or at all of them."""
 
     layer: str
-    state: str
-    """:data:`OK`, :data:`WARNS` (works, with a problem), :data:`FAILS` or :data:`NOT_REACHED`."""
+    state: State
+    """``warns`` works, with a problem; ``-`` was not reached."""
     seen: str
     advice: str = ""
     """What to do, if anything."""
@@ -124,165 +96,135 @@ class LayerFinding(NamedTuple):
     """If the host has several."""
 
 
-class RobotSetup(NamedTuple):
-    """The robot whose link to a service is checked."""
-
-    name: str
-    """May be empty."""
-    tls: Path | None
-    """Directory of its credentials."""
-    offload: OffloadSettings
-    """The robot's limits on time."""
-    decisions: Future[ReferenceDecisions] | None
-    """What the service's answers are compared with; None asks for none."""
-
-
-def check(service: str, tls: Path | None) -> Endpoint:
-    """Read an endpoint of a service.
-
-    Raises
-    ------
-    TransportError
-        If it is none, or credentials are given that it does not use.
-    """
-    endpoint = check_endpoint(service, "robot", listens=False)
-    if not endpoint.is_encrypted and tls is not None:
-        check_credentials(endpoint, TlsFiles.of(tls))
-    if endpoint.protocol == "udp":
-        require_cryptography()
-    return endpoint
-
-
-async def examine(
-    endpoint: Endpoint, robot: RobotSetup, tell: Callable[[LayerFinding], None]
-) -> None:
-    """Check all layers between this robot and a service; ``tell`` gets each finding at once."""
-    await _Examination(endpoint, robot, tell).run()
-
-
 class _Seen(NamedTuple):
-    """What the check of a layer at one address has found."""
+    """What the check of a layer has found; with advice it is a warning."""
 
     text: str
     advice: str = ""
-    state: str = ""
-    """If empty: :data:`OK`, or :data:`WARNS` if there is advice."""
-    goes_on: bool = False
-    """Whether the layers above a failed one are checked nevertheless."""
+    state: State = "ok"
 
 
-_Look: TypeAlias = Callable[[AddressPath], Awaitable[_Seen | None]]
-"""Checks a layer; None if another path did."""
+class _LayerError(HoldfastError):
+    """A layer does not work."""
+
+    def __init__(self, text: str, advice: str = "") -> None:
+        super().__init__(text)
+        self.advice = advice
 
 
-def _fails(text: str, advice: str = "", *, goes_on: bool = False) -> _Seen:
-    return _Seen(text, advice, FAILS, goes_on)
+@contextlib.asynccontextmanager
+async def _within(limit_s: float, text: str, advice: str = "") -> AsyncIterator[None]:
+    try:
+        async with asyncio.timeout(limit_s):
+            yield
+    except TimeoutError:
+        raise _LayerError(f"{text} within {limit_s:g} s", advice) from None
 
 
-class _Examination:
+class Examination:
+    """The check of all layers between a robot and a service; ``report`` gets each finding at once.
+
+    The robot's name, credentials and limits on time are in ``offload``. Without ``decisions`` the
+    service is asked for none.
+    """
+
     def __init__(
-        self, endpoint: Endpoint, robot: RobotSetup, tell: Callable[[LayerFinding], None]
+        self,
+        endpoint: Endpoint,
+        offload: OffloadSettings,
+        decisions: Future[list[ReferenceDecision]] | None,
+        report: Callable[[LayerFinding], None],
     ) -> None:
         self._endpoint = endpoint
-        self._robot = robot
-        self._report = tell
+        self._offload = offload
+        self._decisions = decisions
+        self._report = report
         self._layer = "name"
         self._paths: list[AddressPath] = []
-        self._numbers = count(1)
+        self._going_on: list[AddressPath] = []
         self._context: ssl.SSLContext | None = None
-        self._ours = self._ours_advice = ""
         self._decision_s: tuple[float, float] | None = None
-        self._settings = LinkSettings(
-            partial(encode_hello, "robot", robot.name, os.urandom(8).hex(), _LEASE_MS),
-            _LEASE_MS,
-            DEFAULT_MAX_MESSAGE_BYTES,
-            pauses_for_readers=False,
-        )
 
     async def run(self) -> None:
-        layers: dict[str, _Look] = {
-            "route": self._route,
+        """Check them from below."""
+        endpoint = self._endpoint
+        layers: dict[str, _Look | Literal[False]] = {
+            "route": not endpoint.is_local_socket and self._route,
             "port": self._port,
             "tls": self._tls,
-            "certificate": self._certificate,
+            "certificate": endpoint.is_encrypted and self._certificate,
             "protocol": self._protocol,
-            "datagrams": self._datagrams,
+            "datagrams": endpoint.protocol == "udp" and self._datagrams,
             "clock": self._clock,
             "problem": self._problem,
             "round trip": self._round_trip,
         }
-        if self._endpoint.is_local_socket:
-            del layers["route"]
-        if self._endpoint.is_encrypted:
-            self._read_own()
-        else:
-            del layers["certificate"]
-        if self._endpoint.protocol != "udp":
-            del layers["datagrams"]
+        self._ours = self._own_credentials()
         try:
-            async with asyncio.timeout(_ALL_S):
-                self._paths = going_on = await self._name()
+            async with _within(_ALL_S, "all together was not finished"):
+                await self._check(self._name)
+                self._going_on = self._paths
                 for self._layer, look in layers.items():
-                    if going_on:
-                        follow = (self._follow(each, look) for each in going_on)
-                        went = await asyncio.gather(*follow)
-                        going_on = [each for each, on in zip(going_on, went, strict=True) if on]
-                    else:
-                        now = f"; it is {date_text(time.time())} here"
-                        seen = f"not reached{now if self._layer == 'clock' else ''}"
-                        self._tell(NOT_REACHED, seen)
-        except TimeoutError:
-            self._tell(FAILS, f"all together was not finished within {_ALL_S:g} s")
+                    if look and self._going_on:
+                        checks = (self._check(look, path) for path in self._going_on)
+                        went = zip(self._going_on, await asyncio.gather(*checks), strict=True)
+                        self._going_on = [path for path, goes_on in went if goes_on]
+                    elif look:
+                        now = f"; it is {_now()} here" if self._layer == "clock" else ""
+                        self._tell(_Seen(f"not reached{now}", state="-"))
+        except _LayerError as error:
+            self._tell(_Seen(str(error), state="fails"))
         finally:
             for path in self._paths:
                 path.close()
 
-    async def _follow(self, path: AddressPath, look: _Look) -> bool:
-        """Check one layer at one address; return whether to check those above."""
-        address = path.text if len(self._paths) > 1 else ""
-        seen = await look(path)
-        if seen is None:
-            return True
-        state = seen.state or (WARNS if seen.advice else OK)
-        self._tell(state, seen.text, seen.advice, address)
-        return seen.goes_on or state != FAILS
+    async def _check(self, look: _Look, *path: AddressPath) -> bool:
+        """Check one layer, at one address; return whether to check those above."""
+        try:
+            seen = await look(*path)
+        except HoldfastError as error:
+            seen = _Seen(str(error), getattr(error, "advice", ""), "fails")
+        if seen is not None:
+            self._tell(seen, "".join(each.text for each in path if len(self._paths) > 1))
+        return seen is None or seen.state != "fails" or self._layer in _OTHERS_WORK_WITHOUT
 
-    def _tell(self, state: str, seen: str, advice: str = "", address: str = "") -> None:
-        self._report(LayerFinding(self._layer, state, printable(seen), printable(advice), address))
+    def _tell(self, seen: _Seen, address: str = "") -> None:
+        text, advice, state = seen
+        state = "warns" if advice and state == "ok" else state
+        self._report(LayerFinding(self._layer, state, printable(text), printable(advice), address))
 
     # -- the layers, from below ------------------------------------------------------------------
 
-    async def _name(self) -> list[AddressPath]:
+    async def _name(self) -> _Seen:
         host, port = self._endpoint.host, self._endpoint.port
+        name = self._offload.name or ("" if self._offload.tls else "doctor")
+        make_path = partial(AddressPath, self._endpoint, name)
         if self._endpoint.is_local_socket:
-            if Path(host).is_socket():
-                self._tell(OK, "a socket of this machine")
-                return [AddressPath(socket.AF_UNIX, host, host)]
-            seen = "is no socket" if Path(host).exists() else "is not there"
-            self._tell(FAILS, f"{host} {seen}", "start the service that listens there")
-            return []
+            if not Path(host).is_socket():
+                fault = "is no socket" if Path(host).exists() else "is not there"
+                raise _LayerError(f"{host} {fault}", "start the service that listens there")
+            self._paths = [make_path(socket.AF_UNIX, host)]
+            return _Seen("a socket of this machine")
         look_up = partial(socket.getaddrinfo, host, port, type=socket.SOCK_STREAM)
         try:
             found = await asyncio.wait_for(asyncio.wrap_future(in_thread(look_up)), _NAME_S)
         except (OSError, UnicodeError) as error:
             why = getattr(error, "strerror", None) or f"no answer within {_NAME_S:g} s"
             advice = "is it spelled right, and the name server reached? /etc/hosts may name it too"
-            self._tell(FAILS, f"{host} is not found: {why}", advice)
-            return []
-        paths = [AddressPath(entry[0], entry[4], str(entry[4][0])) for entry in found]
-        listed = ", ".join(path.text for path in paths)
-        self._tell(OK, f"{host} is {'an address' if listed == host else listed}")
-        return paths
+            raise _LayerError(f"{host} is not found: {why}", advice) from error
+        self._paths = [make_path(family, address) for family, _, _, _, address in found]
+        listed = ", ".join(path.text for path in self._paths)
+        return _Seen(f"{host} is {'an address' if listed == host else listed}")
 
     async def _route(self, path: AddressPath) -> _Seen:
         with socket.socket(path.family, socket.SOCK_DGRAM) as probe:
             try:
                 probe.connect(path.address)
             except OSError as error:
-                return _fails(
+                raise _LayerError(
                     f"no way there: {system_words(error.errno)}",
                     "is the network up, and the VPN? 'ip route' lists what there is",
-                )
+                ) from error
             local = str(probe.getsockname()[0])
             mtu = probe.getsockopt(*_IP_MTU[path.family])
         least = MAX_DATAGRAM_BYTES + _DATAGRAM_HEADERS_BYTES
@@ -293,74 +235,55 @@ class _Examination:
     async def _port(self, path: AddressPath) -> _Seen:
         endpoint = self._endpoint
         what = "the socket" if endpoint.is_local_socket else f"TCP port {endpoint.port}"
-        path.stream = stream = socket.socket(path.family, socket.SOCK_STREAM)
-        stream.setblocking(False)
+        advice = f"is the machine on, and the port right? {_OPEN_IT}"
         try:
-            async with asyncio.timeout(_CONNECT_S):
-                await asyncio.get_running_loop().sock_connect(stream, path.address)
-        except TimeoutError:
-            advice = f"is the machine on, and the port right? {_OPEN_IT}"
-            return _fails(f"{what}: nothing answers within {_CONNECT_S:g} s", advice)
-        except ConnectionRefusedError:
+            async with _within(_CONNECT_S, f"{what}: nothing answers", advice):
+                await path.connect()
+        except ConnectionRefusedError as error:
             own = endpoint.is_local_socket or endpoint.is_loopback
             at = endpoint if own else f"{endpoint.protocol}/0.0.0.0:{endpoint.port}"
             advice = f"start the service there: holdfast serve --listen {at}"
-            return _fails(f"{what}: refused, nothing listens there", advice)
+            raise _LayerError(f"{what}: refused, nothing listens there", advice) from error
         except OSError as error:
-            return _fails(f"{what}: {system_words(error.errno)}", _OPEN_IT)
+            raise _LayerError(f"{what}: {system_words(error.errno)}", _OPEN_IT) from error
         return _Seen(f"{what} is open")
 
-    def _read_own(self) -> None:
-        robot = self._robot
-        if robot.tls is None:
-            self._ours = "none was given"
-            self._ours_advice = "'holdfast keys DIR' makes them; give this robot's with --tls DIR"
-            return
+    def _own_credentials(self) -> _Seen:
+        if self._offload.tls is None:
+            advice = "'holdfast keys DIR' makes them; give this robot's with --tls DIR"
+            return _Seen("none was given", advice)
         warnings: list[str] = []
         try:
-            own = load_credentials(robot.tls, "robot", warn=warnings.append)
+            own = load_credentials(Path(self._offload.tls), "robot", warn=warnings.append)
             self._context = client_context(own.files)
         except HoldfastError as error:
-            self._ours = str(error)
-            return
-        self._ours = f"{own.name}, {_until(own.expires_s)}"
-        self._ours_advice = "; ".join(warnings)
+            return _Seen(str(error))
+        return _Seen(f"{own.name}, {_until(own.expires_s)}", "; ".join(warnings))
 
     async def _tls(self, path: AddressPath) -> _Seen:
         endpoint = self._endpoint
-        tls = None
-        if endpoint.is_encrypted:
-            if self._context is None:
-                _, why_not = await certificate_at(path)
-                if why_not:
-                    return _fails(why_not, _NO_TLS)
-                return _Seen("TLS 1.3")
-            tls = path.tls = WatchedTls(self._context, endpoint.host)
-        await path.greet(self._settings, endpoint, tls)
-        if tls is None:
+        await path.greet(self._context)
+        if path.tls is None:
             none = f"none, as {endpoint.protocol}/... has: "
             if endpoint.is_loopback:
                 return _Seen(f"{none}only this machine can connect")
             advice = "use tls/... or udp/... with credentials ('holdfast keys DIR' makes them)"
             return _Seen(f"{none}whoever is on the way can read along, and answer", advice)
-        if not tls.established and not isinstance(tls.error, ssl.SSLCertVerificationError):
-            return _fails(path.why_not or CLOSES_AT_TLS, _NO_TLS)
+        if not path.tls.established and not path.why_not.startswith(_BAD_CERTIFICATE):
+            raise _LayerError(path.why_not or _CLOSES_AT_TLS, _NO_TLS)
         return _Seen("TLS 1.3")
 
     async def _certificate(self, path: AddressPath) -> _Seen:
-        ours = f"ours: {self._ours}"
-        tls, link = path.tls, path.link
-        if tls is None or link is None:
-            return _fails(ours, self._ours_advice)
-        if not tls.established:
-            shown, _ = await certificate_at(path)
-            fault = path.why_not.removeprefix("has a certificate that ")
-            return _fails(f"theirs: {fault}", account_of(shown))
-        if link.hello is None and "certificate" in path.why_not:
-            return _fails(f"{ours}: {path.why_not}")
+        tls, link, ours = path.tls, path.link, f"ours: {self._ours.text}"
+        assert tls is not None
+        if self._context is None:
+            raise _LayerError(ours, self._ours.advice)
         if link.peer is None:
-            return _fails(f"theirs: {path.why_not}")
-        ends, advice = link.peer.expires_at, [self._ours_advice] * bool(self._ours_advice)
+            fault = path.why_not.removeprefix(_BAD_CERTIFICATE)
+            raise _LayerError(f"theirs: {fault}", account_of(await path.certificate()))
+        if link.hello is None and "certificate" in path.why_not:
+            raise _LayerError(f"{ours}: {path.why_not}")
+        ends, advice = link.peer.expires_at, [self._ours.advice] * bool(self._ours.advice)
         if ends < time.time() + 86_400.0 * EXPIRES_SOON_DAYS:
             renew = f"'holdfast keys DIR --renew --service {link.peer.name}'"
             advice.append(f"the service's ends soon: {renew} makes another")
@@ -368,41 +291,34 @@ class _Examination:
         return _Seen(f"{ours}; {theirs}", "; ".join(advice))
 
     async def _protocol(self, path: AddressPath) -> _Seen:
-        hello = None if path.link is None else path.link.hello
+        hello = path.link.hello
         if hello is None:
             reason = path.why_not or "closes the connection without a hello"
-            return _fails(reason, "" if "install" in reason or "--tls" in reason else _NO_HOLDFAST)
-        try:
-            replies = await path.ask(self._echo(), _REPLY_S)
-        except TimeoutError:
-            advice = "its process stands still, or has far too much to do"
-            return _fails(f"has not answered within {_REPLY_S:g} s", advice)
-        except HoldfastError as error:
-            return _fails(str(error))
-        for reply in replies:
-            if isinstance(reply, Refused):
-                advice = "install the same release at both ends"
-                return _fails(f"{reply.code}: {reply.text}", advice)
+            known = "install" in reason or "--tls" in reason
+            raise _LayerError(reason, "" if known else _NO_HOLDFAST)
+        slow = "its process stands still, or has far too much to do"
+        async with _within(_REPLY_S, "has not answered", slow):
+            replies = await path.ask(_ECHO)
+        if refused := _of_kind(Refused, replies):
+            advice = "install the same release at both ends"
+            raise _LayerError(f"{refused.code}: {refused.text}", advice)
         seen = f"{hello.name}, holdfast {hello.release}, messages of version {PROTOCOL_VERSION}"
         return _Seen(seen)
 
     async def _datagrams(self, path: AddressPath) -> _Seen:
-        assert path.link is not None
         try:
             async with asyncio.timeout(_DATAGRAMS_S):
                 while not path.link.sends_datagrams:
                     await asyncio.sleep(0.005)
         except TimeoutError:
             seen = f"none gets through within {_DATAGRAMS_S:g} s, so everything goes on TLS"
-            advice = f"UDP port {self._endpoint.port}: {_OPEN_IT}"
-            return _fails(seen, advice, goes_on=True)
+            raise _LayerError(seen, f"UDP port {self._endpoint.port}: {_OPEN_IT}") from None
         return _Seen("get through in both directions")
 
     async def _clock(self, path: AddressPath) -> _Seen:
-        ahead_s = path.clock_ahead_s
-        now = f"it is {date_text(time.time())} here"
+        ahead_s, now = path.clock_ahead_s, f"it is {_now()} here"
         if ahead_s is None:
-            return _Seen(f"the service does not tell its own; {now}", state=NOT_REACHED)
+            return _Seen(f"the service does not tell its own; {now}", state="-")
         size = f"{abs(ahead_s):.0f} s" if abs(ahead_s) >= 1.0 else "less than a second"
         if abs(ahead_s) < _CLOCKS_APART_S:
             return _Seen(f"{size} from the service's")
@@ -411,89 +327,61 @@ class _Examination:
         return _Seen(f"{size} {where} the service's; {now}", advice)
 
     async def _problem(self, path: AddressPath) -> _Seen | None:
-        if path is not next((each for each in self._paths if each.is_greeted), path):
+        if path is not self._going_on[0]:
             return None
-        decisions = self._robot.decisions
-        if decisions is None:
-            seen = "not asked: with CONFIG, decisions are compared"
-            return _Seen(seen, state=NOT_REACHED)
+        if self._decisions is None:
+            return _Seen("not asked: with CONFIG, decisions are compared", state="-")
         try:
-            own = await asyncio.wait_for(asyncio.wrap_future(decisions), _DECISION_S)
+            own = await asyncio.wait_for(asyncio.wrap_future(self._decisions), _DECISION_S)
         except TimeoutError:
             seen = f"not asked: two decisions take longer than {_DECISION_S:g} s here"
-            return _Seen(seen, state=NOT_REACHED)
+            return _Seen(seen, state="-")
         except HoldfastError as error:
-            return _fails(f"this robot's own planner fails: {error}", goes_on=True)
-        session, took_s = os.urandom(16), 0.0
-        for turn in own.turns:
-            session_configuration = None if turn.observations else own.session_configuration
+            raise _LayerError(f"this robot's own planner fails: {error}") from error
+        session, slow = os.urandom(16), "it is too slow for this problem, or has too much to do"
+        for decision in own:
+            request = msgspec.structs.replace(decision.request, session=session)
             began = time.perf_counter()
-            try:
-                async with asyncio.timeout(_DECISION_S):
-                    replies = await self._decided(path, session, turn, session_configuration)
-            except TimeoutError:
-                advice = "it is too slow for this problem, or has too much to do"
-                seen = f"no decision within {_DECISION_S:g} s"
-                return _fails(seen, advice, goes_on=True)
-            except HoldfastError as error:
-                return _fails(str(error), goes_on=True)
+            async with _within(_DECISION_S, "no decision", slow):
+                while busy := _of_kind(Busy, replies := await path.ask(request)):
+                    await asyncio.sleep(1e-3 * busy.retry_after_ms)
             took_s = time.perf_counter() - began
-            if (fault := _fault_of(replies, turn)) is not None:
-                return fault
-        self._decision_s = took_s, own.turns[-1].took_s
-        problem = own.session_configuration.problem
-        seen = f"{problem}: the same code and settings; {len(own.turns)} decisions are"
+            if refused := _of_kind(Refused, replies):
+                advice = "deploy the same holdfast and problem at both ends"
+                raise _LayerError(f"{refused.code}: {refused.text}", advice)
+            if _of_kind(NeedState, replies):
+                other = "comes to another state than this robot"
+                raise _LayerError(f"the service {other}, with the same code", _DISTRUST)
+            if answer_in(replies) != decision.answer:
+                other = "answers otherwise than this robot's own planner"
+                raise _LayerError(f"the service {other}, with the same code", _DISTRUST)
+        self._decision_s = took_s, decision.took_s
+        described = own[0].request.session_configuration
+        assert described is not None
+        seen = f"{described.problem}: the same code and settings; {len(own)} decisions are"
         return _Seen(f"{seen} the robot's own, bit for bit")
 
-    async def _decided(
-        self,
-        path: AddressPath,
-        session: bytes,
-        turn: ReferenceTurn,
-        session_configuration: SessionConfiguration | None,
-    ) -> list[Reply]:
-        while True:
-            state = turn.state
-            request = Request(
-                PROTOCOL_VERSION,
-                session,
-                1,
-                next(self._numbers),
-                state.trial,
-                state.step,
-                state.sensed,
-                digest(state)[:DIGEST_SIZE],
-                turn.observations,
-                session_configuration,
-            )
-            replies = await path.ask(request, _DECISION_S)
-            busy = next((reply for reply in replies if isinstance(reply, Busy)), None)
-            if busy is None:
-                return replies
-            await asyncio.sleep(1e-3 * busy.retry_after_ms)
-
     async def _round_trip(self, path: AddressPath) -> _Seen:
-        assert path.link is not None and path.link.hello is not None
+        assert path.link.hello is not None
         took_ms: list[float] = []
         with contextlib.suppress(TimeoutError, HoldfastError):
             async with asyncio.timeout(_REPLY_S):
                 while len(took_ms) < _ECHOES:
                     began = time.perf_counter()
-                    await path.ask(self._echo(), _REPLY_S)
+                    await path.ask(_ECHO)
                     took_ms.append(1e3 * (time.perf_counter() - began))
         if not took_ms:
-            return _fails(f"no echo within {_REPLY_S:g} s", "its process stands still")
+            raise _LayerError(f"no echo within {_REPLY_S:g} s", "its process stands still")
         worst_ms = max(took_ms)
         seen = f"{len(took_ms)} echoes: median {statistics.median(took_ms):.1f} ms, "
         seen += f"worst {worst_ms:.1f} ms"
         if self._decision_s is not None:
             there_s, here_s = self._decision_s
             seen += f"; a decision {1e3 * there_s:.1f} ms, here {1e3 * here_s:.1f} ms"
-        offload = self._robot.offload
         limits_ms = {
             "--lease-ms of the service": path.link.hello.lease_ms,
-            "offload.lease_ms": offload.lease_ms,
-            "offload.detection_timeout_ms": offload.detection_timeout_ms,
+            "offload.lease_ms": self._offload.lease_ms,
+            "offload.detection_timeout_ms": self._offload.detection_timeout_ms,
         }
         advice = [
             f"{key}, {limit_ms:g}, is short for this way: take {100 * (4 * worst_ms // 100 + 1):g}"
@@ -502,25 +390,13 @@ class _Examination:
         ]
         return _Seen(seen, "; ".join(advice))
 
-    def _echo(self) -> Request:
-        """Return a request of an unknown session, which is answered at once."""
-        unknown, number = os.urandom(16), next(self._numbers)
-        return Request(PROTOCOL_VERSION, unknown, 1, number, 0, 0, False, bytes(DIGEST_SIZE))
+
+def _of_kind(kind: type[_Kind], replies: list[Reply]) -> _Kind | None:
+    return next((reply for reply in replies if isinstance(reply, kind)), None)
 
 
-def _fault_of(replies: list[Reply], own: ReferenceTurn) -> _Seen | None:
-    """Return what is wrong with answers; None if they are the robot's own, bit for bit."""
-    for reply in replies:
-        if isinstance(reply, Refused):
-            advice = "deploy the same holdfast and problem at both ends"
-            return _fails(f"{reply.code}: {reply.text}", advice, goes_on=True)
-        if isinstance(reply, NeedState):
-            seen = "the service comes to another state than this robot, with the same code"
-            return _fails(seen, _DISTRUST, goes_on=True)
-    if not own.agrees_with(replies):
-        seen = "the service answers otherwise than this robot's own planner, with the same code"
-        return _fails(seen, _DISTRUST, goes_on=True)
-    return None
+def _now() -> str:
+    return date_text(time.time())
 
 
 def _until(expires_s: float) -> str:

@@ -6,139 +6,170 @@ import asyncio
 import contextlib
 import fcntl
 import ipaddress
+import os
 import socket
 import ssl
 import struct
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from itertools import count
 from pathlib import Path
 from typing import Any, Final, TypeVar
+
+import msgspec
 
 from holdfast.errors import TransportError
 from holdfast.protocol.messages import Progress, Reply, Request, decode_reply, encode
 from holdfast.transport.credentials import date_text
-from holdfast.transport.endpoints import Endpoint, system_words
+from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.frames import CALL, END, LAST, REPLY, Frame, Hello
-from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
+from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.schemes import load_scheme
 from holdfast.transport.tls import TlsStream
 
-__all__ = [
-    "CLOSES_AT_TLS",
-    "AddressPath",
-    "WatchedTls",
-    "account_of",
-    "certificate_at",
-    "in_thread",
-    "interface_of",
-]
+__all__ = ["AddressPath", "account_of", "in_thread", "interface_of"]
 
-GREETING_S: Final = 3.0
+_GREETING_S: Final = 3.0
 """For the handshake and the other end's hello."""
+
+_LEASE_MS: Final = 30_000.0
+"""The robot may be silent for so long; it never is."""
 
 _SIOCGIFADDR: Final = 0x8915
 
-CLOSES_AT_TLS: Final = "closes connections at the first bytes of TLS"
-_SAYS_NOTHING: Final = f"takes connections and says nothing for {GREETING_S:g} s"
+_SAYS_NOTHING: Final = f"takes connections and says nothing for {_GREETING_S:g} s"
 
 _T = TypeVar("_T")
 
 
-class WatchedTls(TlsStream):
-    """A handshake of which it is remembered how it failed."""
+class ShownTls(TlsStream):
+    """A handshake that tells what the other end's certificate says.
 
-    error: OSError | None = None
+    Without a context any certificate will do, and the link ends with the handshake.
+    """
 
-    def describe_error(self, error: OSError) -> str:
-        """Return what an error means, and remember it."""
-        self.error = error
-        return super().describe_error(error)
+    def __init__(self, context: ssl.SSLContext | None, host: str | None) -> None:
+        if context is None:
+            host, context = None, ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+            context.minimum_version = ssl.TLSVersion.TLSv1_3
+            context.check_hostname = False
+            context.verify_mode = ssl.CERT_NONE
+        super().__init__(context, host)
+
+    def certificate(self) -> bytes:
+        """Return the other end's certificate, once established."""
+        return self._tls.getpeercert(binary_form=True) or b""
 
     def hosts(self) -> str:
-        """Return the hosts that the other end's certificate names."""
+        """Return the hosts that it names."""
         named: Any = (self._tls.getpeercert() or {}).get("subjectAltName", ())
         return ", ".join(
             str(ipaddress.ip_address(host)) if kind == "IP Address" else str(host)
             for kind, host in named
         )
 
-    def shown(self) -> bytes:
-        """Return the other end's certificate."""
-        return self._tls.getpeercert(binary_form=True) or b""
-
 
 class AddressPath(LinkOwner):
-    """One address, as far as it was followed: the owner of its link."""
+    """One address of a service, as far as it was followed: the owner of its link."""
 
-    def __init__(self, family: socket.AddressFamily, address: Any, text: str) -> None:
+    def __init__(
+        self, endpoint: Endpoint, robot: str, family: socket.AddressFamily, address: Any
+    ) -> None:
+        self._endpoint = endpoint
+        self._robot = robot
         self.family = family
         self.address = address
-        self.text = text
-        self.stream: socket.socket | None = None
-        self.tls: WatchedTls | None = None
-        self.link: Link | None = None
+        self.text = address if endpoint.is_local_socket else str(address[0])
+        self._stream: socket.socket | None = None
+        self.tls: ShownTls | None = None
+        self._link: Link | None = None
+        self._numbers = count(1)
         self.clock_ahead_s: float | None = None
-        self._settled: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._calls: dict[int, asyncio.Queue[bytes | None]] = {}
+        # Frames of calls; None for the hello and for the end of the link.
+        self._arrived: asyncio.Queue[Frame | None] = asyncio.Queue()
 
-    async def greet(
-        self, settings: LinkSettings, endpoint: Endpoint, tls: WatchedTls | None
-    ) -> None:
-        """Make a link, and wait until the service has said who it is, or the link has ended."""
-        assert self.stream is not None
-        self.tls = tls
-        scheme = load_scheme(endpoint.protocol)
-        self.link = scheme.make_link(self, settings, endpoint, tls, role="robot", dialled=True)
-        await self.link.connect(self.stream)
+    async def connect(self) -> None:
+        """Connect; raise OSError if that fails."""
+        self._stream = stream = socket.socket(self.family, socket.SOCK_STREAM)
+        stream.setblocking(False)
+        await asyncio.get_running_loop().sock_connect(stream, self.address)
+
+    async def greet(self, context: ssl.SSLContext | None) -> None:
+        """Make a link, and wait until the service has said who it is, or the link has ended.
+
+        Where links are encrypted and there is no context, it ends with the service's certificate.
+        """
+        assert self._stream is not None
+        endpoint = self._endpoint
+        if endpoint.is_encrypted:
+            self.tls = ShownTls(context, endpoint.host)
+        robot = StreamRobotTransport(
+            {}, name=self._robot, incarnation=os.urandom(8).hex(), lease_ms=_LEASE_MS
+        )
+        self._link = load_scheme(endpoint.protocol).make_link(
+            self, robot.settings, endpoint, self.tls, role="robot", dialled=True
+        )
+        await self._link.connect(self._stream)
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(GREETING_S):
-                await asyncio.shield(self._settled)
+            async with asyncio.timeout(_GREETING_S):
+                await self._arrived.get()
 
     @property
-    def is_greeted(self) -> bool:
-        """Whether the service has said who it is, and the link stands."""
-        return self.link is not None and self.link.hello is not None and not self.link.ended
+    def link(self) -> Link:
+        """The link, once it is made."""
+        assert self._link is not None
+        return self._link
 
     @property
     def why_not(self) -> str:
         """Why no hello has come, as the rest of a sentence about the service."""
-        assert self.link is not None
-        if not self.link.ended:
-            return _SAYS_NOTHING
-        return self.link.reason
+        return self.link.reason if self.link.ended else _SAYS_NOTHING
 
-    async def ask(self, request: Request, limit_s: float) -> list[Reply]:
-        """Return all replies but progress reports.
+    async def ask(self, request: Request) -> list[Reply]:
+        """Send a request under a number of its own; return all replies but progress reports.
 
         Raises
         ------
-        TimeoutError
         HoldfastError
             If the link ends, or what comes is no reply.
         """
-        assert self.link is not None
-        queue: asyncio.Queue[bytes | None] = asyncio.Queue()
-        self._calls[request.number] = queue
         replies: list[Reply] = []
-        async with asyncio.timeout(limit_s):
-            self.link.send_message(CALL, request.number, encode(request))
-            while not self.link.ended and (payload := await queue.get()) is not None:
-                reply = decode_reply(payload)
-                if not isinstance(reply, Progress):
-                    replies.append(reply)
-        if self.link.ended:
-            raise TransportError(f"the link has ended: {self.link.reason or 'closed'}")
-        return replies
+        number = next(self._numbers)
+        message = encode(msgspec.structs.replace(request, number=number))
+        self.link.send_message(CALL, number, message)
+        while not self.link.ended:
+            frame = await self._arrived.get()
+            if frame is None or frame.call != number:
+                continue  # of one that was given up
+            if frame.kind in (REPLY, LAST):
+                replies.append(decode_reply(frame.payload))
+            if frame.kind in (END, LAST):
+                return [reply for reply in replies if not isinstance(reply, Progress)]
+        raise TransportError(f"the link has ended: {self.link.reason or 'closed'}")
+
+    async def certificate(self) -> bytes:
+        """Return whatever certificate is shown here, believed or not; empty if there is none."""
+        other = AddressPath(self._endpoint, self._robot, self.family, self.address)
+        try:
+            async with asyncio.timeout(_GREETING_S):
+                await other.connect()
+                await other.greet(None)
+        except OSError:
+            pass
+        finally:
+            other.close()
+        tls = other.tls
+        return b"" if tls is None or not tls.established else tls.certificate()
 
     def close(self) -> None:
         """Say goodbye."""
-        if self.link is not None:
-            self.link.end("", goodbye="")
-        elif self.stream is not None:
-            self.stream.close()
+        if self._link is not None:
+            self._link.end("", goodbye="")
+        elif self._stream is not None:
+            self._stream.close()
 
     # -- events of the link -----------------------------------------------------------------------
 
@@ -149,83 +180,35 @@ class AddressPath(LinkOwner):
 
     def on_hello(self, link: Link, hello: Hello) -> None:
         """Take the service's hello."""
-        del link
         if hello.clock_s > 0.0:
             self.clock_ahead_s = time.time() - hello.clock_s
-        self._settle()
+        self.on_ended(link)
 
     def on_frame(self, link: Link, frame: Frame) -> None:
         """Take a reply."""
         del link
-        queue = self._calls.get(frame.call)
-        if queue is not None:
-            if frame.kind in (REPLY, LAST):
-                queue.put_nowait(frame.payload)
-            if frame.kind in (END, LAST):
-                queue.put_nowait(None)
+        self._arrived.put_nowait(frame)
 
     def on_ended(self, link: Link) -> None:
-        """End all calls."""
+        """Wake up what waits."""
         del link
-        self._settle()
-        for queue in self._calls.values():
-            queue.put_nowait(None)
-
-    def _settle(self) -> None:
-        if not self._settled.done():
-            self._settled.set_result(None)
-
-
-async def certificate_at(path: AddressPath) -> tuple[bytes, str]:
-    """Return whatever certificate is shown at an address, believed or not, or why there is none.
-
-    The handshake is not finished, so it leaves no line in a service's log.
-    """
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.minimum_version = ssl.TLSVersion.TLSv1_3
-    context.check_hostname = False
-    context.verify_mode = ssl.CERT_NONE
-    tls = WatchedTls(context)
-    loop = asyncio.get_running_loop()
-    reason = CLOSES_AT_TLS
-    with socket.socket(path.family, socket.SOCK_STREAM) as stream:
-        stream.setblocking(False)
-        try:
-            async with asyncio.timeout(GREETING_S):
-                await loop.sock_connect(stream, path.address)
-                tls.begin()
-                while not tls.established:
-                    # It may ask for a key of another kind before it shows anything.
-                    await loop.sock_sendall(stream, tls.take())
-                    if not (data := await loop.sock_recv(stream, 65536)):
-                        break
-                    tls.receive(data)
-        except TimeoutError:
-            reason = _SAYS_NOTHING
-        except ssl.SSLError as error:
-            reason = tls.describe_error(error)
-        except OSError as error:
-            reason = system_words(error.errno)
-    return (tls.shown(), "") if tls.established else (b"", reason)
+        self._arrived.put_nowait(None)
 
 
 def account_of(der: bytes) -> str:
     """Say what a certificate that is not believed says of itself, if there is what reads it."""
     try:
         from cryptography import x509
-    except ImportError:
-        return ""
-    if not der:
-        return ""
-    try:
+
+        from holdfast.transport.authority import hosts_of
+
         read = x509.load_der_x509_certificate(der)
         begins, ends = read.not_valid_before_utc, read.not_valid_after_utc
         names = [str(name.value) for name in read.subject] or ["nobody"]
         issuer = [str(name.value) for name in read.issuer] or ["nobody"]
-        with contextlib.suppress(x509.ExtensionNotFound):
-            hosts = read.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-            names.append(f"for {', '.join(str(host.value) for host in hosts)}")
-    except ValueError:
+        if hosts := hosts_of(read):
+            names.append(f"for {', '.join(hosts)}")
+    except (ImportError, ValueError):
         return ""
     return (
         f"shown is {' '.join(names)}, of the authority {' '.join(issuer)}, valid from "
@@ -235,21 +218,20 @@ def account_of(der: bytes) -> str:
 
 def interface_of(local: str) -> str:
     """Return the name of the interface that has an address and a comma; else nothing."""
-    wanted = ipaddress.ip_address(local.partition("%")[0])
-    if wanted.version == 6:
-        with contextlib.suppress(OSError):
-            for line in Path("/proc/net/if_inet6").read_text().splitlines():
-                fields = line.split()
-                if bytes.fromhex(fields[0]) == wanted.packed:
-                    return f"{fields[-1]}, "
-        return ""
+    wanted = ipaddress.ip_address(local.partition("%")[0]).packed
+    return next((f"{name}, " for name, packed in _interface_addresses() if packed == wanted), "")
+
+
+def _interface_addresses() -> Iterator[tuple[str, bytes]]:
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/net/if_inet6").read_text().splitlines():
+            packed, *_, name = line.split()
+            yield name, bytes.fromhex(packed)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         for _, name in socket.if_nameindex():
             with contextlib.suppress(OSError):
                 asked = struct.pack("256s", name.encode())
-                if fcntl.ioctl(probe, _SIOCGIFADDR, asked)[20:24] == wanted.packed:
-                    return f"{name}, "
-    return ""
+                yield name, fcntl.ioctl(probe, _SIOCGIFADDR, asked)[20:24]
 
 
 def in_thread(function: Callable[[], _T]) -> Future[_T]:
