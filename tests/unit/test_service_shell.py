@@ -208,7 +208,7 @@ async def test_first_jobs_and_other_peoples_code_run_on_threads() -> None:
         both.held.let_go.set()
         await Patient(both.network).run_turns(held_robot(1), 12)
         names = {thread.name for thread in both.held.threads}
-        assert names <= {"holdfast-worker-0", "holdfast-worker-1"}
+        assert names <= {"holdfast-worker-0", "holdfast-worker-1", "holdfast-other-0"}
 
 
 @pytest.mark.parametrize(
