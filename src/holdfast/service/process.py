@@ -227,7 +227,7 @@ class _ServiceProcess:
             incarnation=self._incarnation,
             listen=options.listen,
             connect=options.connect,
-            listening=[socket.socket(fileno=each) for each in options.sockets],
+            shared=[socket.socket(fileno=each) for each in options.sockets],
             lease_ms=options.lease_ms,
             # Otherwise robots with many links would leave no descriptor for a new one.
             max_links=min(MAX_LINKS, max(allowed // 4, allowed - reserved)),

@@ -4,10 +4,8 @@ One interpreter computes on one core. So N processes serve, each an ordinary ``h
 They share nothing but the address: a robot that reaches another process than before sends its
 state, as after any lost link. The system chooses the process of a connection.
 
-The supervisor binds the addresses. It gives every process a listening socket, and keeps that socket
-for the next process when one dies: connections wait there, and are refused only if the process
-cannot be restarted at once. Processes are spawned, not forked, and end when the supervisor does. It
-serves no robot itself, so little in it can fail.
+The supervisor binds the addresses, and each process listens there by itself. Processes are spawned,
+not forked, and end when the supervisor does. It serves no robot itself, so little in it can fail.
 
 Supervisor and process talk over a pair of SEQPACKET sockets. A process reports its counters every
 second and on request; each report is a heartbeat, too.
@@ -52,8 +50,6 @@ _STEADY_S = 10.0
 
 _END_S = 0.5
 _FIRST_DELAY_S, _LAST_DELAY_S = 0.2, 30.0
-_KEPT_S = 1.0
-"""With a longer delay, waiting connections are refused."""
 
 _MAX_MESSAGE_BYTES = 65_536
 _MAX_TEXT = 4000
@@ -274,7 +270,7 @@ class Supervisor:
         self._stopping = True
         for timer in self._delayed.values():
             timer.cancel()
-        # An open listening socket would go on accepting connections.
+        # An open local socket would go on accepting connections.
         self._listening.close()
         for child in self._living():
             child.process.send_signal(number)
@@ -330,7 +326,7 @@ class Supervisor:
         ours.setblocking(False)
         with theirs:
             try:
-                descriptors = [each.fileno() for each in self._listening.of(index)]
+                descriptors = self._listening.descriptors
                 process = subprocess.Popen(
                     [
                         *self._command,
@@ -405,8 +401,6 @@ class Supervisor:
         delay_s = restart_delay_s(early, _FIRST_DELAY_S, _LAST_DELAY_S)
         fields = {} if child is None else {"pid": child.process.pid}
         self._events.event("process_ended", reason=reason, **fields, again_in_s=delay_s)
-        if delay_s > _KEPT_S:
-            self._listening.release(index)
         self._restarts += 1
         self._delayed[index] = self._loop.call_later(delay_s, self._start, index)
 
