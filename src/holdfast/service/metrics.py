@@ -77,8 +77,8 @@ class ServiceReport(msgspec.Struct):
     """The earliest end of a certificate in use, in seconds since 1970."""
     stale_credentials: int = 0
     """Processes that could not read their changed credentials."""
-    credentials_gone: str | None = None
-    """What of the credentials is missing, unreadable, expired or revoked."""
+    why_not_ready: str | None = None
+    """Why a process takes no robots; None if it does."""
 
     def without_gauges(self) -> ServiceReport:
         """Return the report of an ended process: its counters, without what it held."""
