@@ -7,7 +7,7 @@ so a process that dies takes no connections. A local socket is one file, so all 
 
 from __future__ import annotations
 
-import os
+import contextlib
 import socket
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,6 +26,8 @@ class SharedEndpoints:
     ----------
     endpoints : tuple of Endpoint
         With the ports that were free instead of 0.
+    descriptors : list of int
+        The sockets that a process is to inherit, one for each endpoint.
 
     Raises
     ------
@@ -34,47 +36,33 @@ class SharedEndpoints:
     """
 
     def __init__(self, endpoints: Sequence[Endpoint]) -> None:
-        self._sockets: list[socket.socket] = []
-        self._files: list[tuple[Endpoint, os.stat_result]] = []
-        bound = []
-        for endpoint in endpoints:
-            try:
-                bound.append(self._bind(endpoint))
-            except TransportError:
-                self.close()
-                raise
-            except OSError as error:
-                self.close()
-                raise TransportError(
-                    f"cannot listen on {endpoint}: {why_not_bound(error)}"
-                ) from error
-        self.endpoints = tuple(bound)
-
-    @property
-    def descriptors(self) -> list[int]:
-        """The sockets that a process is to inherit, one for each endpoint."""
-        return [each.fileno() for each in self._sockets]
+        self.descriptors: list[int] = []
+        with contextlib.ExitStack() as stack:
+            self.endpoints = tuple([self._bind(endpoint, stack) for endpoint in endpoints])
+            self._bound = stack.pop_all()
 
     def close(self) -> None:
         """Close all sockets; may be repeated."""
-        while self._files:
-            remove_socket_file(*self._files.pop())
-        for each in self._sockets:
-            each.close()
+        self._bound.close()
 
-    def _bind(self, endpoint: Endpoint) -> Endpoint:
-        if endpoint.is_local_socket:
-            self._sockets.append(listen(endpoint))
-            self._files.append((endpoint, Path(endpoint.host).stat()))
-            return endpoint
-        family, *_, where = socket.getaddrinfo(
-            endpoint.host, endpoint.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-        bound = socket.socket(family)
-        self._sockets.append(bound)
-        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        # First make sure that no other program has the port, then share it with our processes.
-        bound.bind(where)
-        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
-        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-        return endpoint._replace(port=bound.getsockname()[1])
+    def _bind(self, endpoint: Endpoint, stack: contextlib.ExitStack) -> Endpoint:
+        try:
+            if endpoint.is_local_socket:
+                bound = stack.enter_context(listen(endpoint))
+                stack.callback(remove_socket_file, endpoint, Path(endpoint.host).stat())
+            else:
+                family, *_, where = socket.getaddrinfo(
+                    endpoint.host, endpoint.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+                )[0]
+                bound = stack.enter_context(socket.socket(family))
+                bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                # First make sure that no other program has the port, then share it with our
+                # processes.
+                bound.bind(where)
+                bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
+                bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+                endpoint = endpoint._replace(port=bound.getsockname()[1])
+        except OSError as error:
+            raise TransportError(f"cannot listen on {endpoint}: {why_not_bound(error)}") from error
+        self.descriptors.append(bound.fileno())
+        return endpoint
