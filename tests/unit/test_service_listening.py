@@ -14,7 +14,6 @@ import pytest
 from tests.ports import free_port
 
 from holdfast.errors import TransportError
-from holdfast.service import listening
 from holdfast.service.listening import SharedEndpoints
 from holdfast.transport import listener
 from holdfast.transport.endpoints import Endpoint, parse_endpoint
@@ -36,6 +35,12 @@ def connect(endpoint: Endpoint) -> socket.socket:
     return socket.create_connection((endpoint.host, endpoint.port), timeout=PATIENCE_S)
 
 
+def process_of(sockets: SharedEndpoints) -> list[socket.socket]:
+    """Return the sockets at which a process listens that inherits those."""
+    inherited = [socket.socket(fileno=os.dup(each)) for each in sockets.descriptors]
+    return [listener._listen_beside(each) for each in inherited]
+
+
 def accepted(listening: Sequence[socket.socket]) -> int:
     (one,) = listening
     one.setblocking(False)
@@ -50,7 +55,7 @@ def accepted(listening: Sequence[socket.socket]) -> int:
 def test_connections_are_spread_over_the_processes() -> None:
     with shared("tcp/127.0.0.1:0") as sockets, contextlib.ExitStack() as stack:
         (endpoint,) = sockets.endpoints
-        each = [sockets.of(index) for index in range(2)]
+        each = [[stack.enter_context(one) for one in process_of(sockets)] for _ in range(2)]
         for _ in range(100):
             stack.enter_context(connect(endpoint))
         numbers = [accepted(one) for one in each]
@@ -58,29 +63,28 @@ def test_connections_are_spread_over_the_processes() -> None:
     assert min(numbers) > 0  # all at one of two fair ones: once in 2**99
 
 
-def test_what_waits_for_a_process_is_there_for_the_next() -> None:
-    with shared("tcp/127.0.0.1:0") as sockets:
+def test_a_process_that_is_dead_takes_no_connection() -> None:
+    with shared("tcp/127.0.0.1:0") as sockets, contextlib.ExitStack() as stack:
         (endpoint,) = sockets.endpoints
-        sockets.of(0)
-        with connect(endpoint):
-            assert accepted(sockets.of(0)) == 1
+        (dead,), (living,) = process_of(sockets), process_of(sockets)
+        stack.enter_context(living)
+        dead.close()
+        for _ in range(20):
+            stack.enter_context(connect(endpoint))
+        assert accepted([living]) == 20
 
 
 def test_a_port_stays_ours_while_no_process_listens() -> None:
     with shared("tcp/127.0.0.1:0") as sockets:
         (endpoint,) = sockets.endpoints
-        sockets.of(0)
-        with connect(endpoint) as waiting:
-            sockets.release(0)
-            with contextlib.suppress(ConnectionResetError):
-                assert waiting.recv(1) == b""
+        process_of(sockets)[0].close()
         with pytest.raises(ConnectionRefusedError):
             connect(endpoint)
         with pytest.raises(TransportError, match=f"{endpoint}: Address already in use"):
             SharedEndpoints([endpoint])
-        sockets.of(0)
-        with connect(endpoint):
-            assert accepted(sockets.of(0)) == 1
+        (next_one,) = process_of(sockets)
+        with next_one, connect(endpoint):
+            assert accepted([next_one]) == 1
 
 
 @pytest.mark.parametrize("reuse", [False, True])
@@ -99,11 +103,10 @@ def test_a_port_that_is_taken(*, reuse: bool) -> None:
 def test_closed_sockets_are_free_for_others() -> None:
     with shared("tcp/127.0.0.1:0") as sockets:
         (endpoint,) = sockets.endpoints
-        sockets.of(0)
-        with connect(endpoint):
+        (listening,) = process_of(sockets)
+        with listening, connect(endpoint):
             # Our end is closed first, so the system remembers the connection for a while.
-            assert accepted(sockets.of(0)) == 1
-        sockets.of(1)
+            assert accepted([listening]) == 1
     with shared(str(endpoint)) as again:
         assert again.endpoints == (endpoint,)
 
@@ -112,12 +115,12 @@ def test_a_local_socket_is_shared_and_removed(tmp_path: Path) -> None:
     path = tmp_path / "socket"
     with socket.socket(socket.AF_UNIX) as killed:
         killed.bind(str(path))  # what a service has left that was killed
-    with shared(f"unix/{path}") as sockets:
-        assert sockets.of(0) == sockets.of(1)
-        sockets.release(0)  # the other process still listens
-        with socket.socket(socket.AF_UNIX) as client:
-            client.connect(str(path))
-            assert accepted(sockets.of(1)) == 1
+    with shared(f"unix/{path}") as sockets, socket.socket(socket.AF_UNIX) as client:
+        (dead,), (living,) = process_of(sockets), process_of(sockets)
+        client.connect(str(path))
+        dead.close()  # the other process still listens, with what waits there
+        with living:
+            assert accepted([living]) == 1
         with pytest.raises(TransportError, match="another process listens there"):
             SharedEndpoints(sockets.endpoints)
     assert not path.exists()
@@ -208,19 +211,3 @@ def test_no_local_socket_is_left_if_another_endpoint_cannot_be(tmp_path: Path) -
     with pytest.raises(TransportError, match="there is a file of that name"):
         SharedEndpoints([parse_endpoint(f"unix/{tmp_path / name}") for name in ("free", "file")])
     assert not (tmp_path / "free").exists()
-
-
-def test_a_process_has_all_of_its_sockets_or_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    with shared("tcp/127.0.0.1:0", "tcp/127.0.0.1:0") as sockets:
-        listen_at = listening._listen
-        second = sockets.endpoints[1].port
-
-        def fail(bound: socket.socket) -> socket.socket:
-            if bound.getsockname()[1] == second:
-                raise OSError("too many open files")
-            return listen_at(bound)
-
-        with monkeypatch.context() as patch, pytest.raises(OSError, match="too many"):
-            patch.setattr(listening, "_listen", fail)
-            sockets.of(0)
-        assert len(sockets.of(0)) == 2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import subprocess
 from typing import cast
 
@@ -18,9 +17,7 @@ class Started:
 
 @pytest.mark.parametrize("serves", [False, True])
 def test_one_that_says_nothing_is_stuck_after_a_while(*, serves: bool) -> None:
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    with ours, theirs:
-        child = _Child(cast("subprocess.Popen[bytes]", Started()), ours)
+    child = _Child(cast("subprocess.Popen[bytes]", Started()))
     if serves:
         child.report = ServiceReport()
     bound_s = _SILENT_S if serves else _START_S

@@ -14,7 +14,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypeAlias
 
@@ -227,7 +227,7 @@ class _ServiceProcess:
             incarnation=self._incarnation,
             listen=options.listen,
             connect=options.connect,
-            listening=[socket.socket(fileno=each) for each in options.sockets],
+            shared=[socket.socket(fileno=each) for each in options.sockets],
             lease_ms=options.lease_ms,
             # Otherwise robots with many links would leave no descriptor for a new one.
             max_links=min(MAX_LINKS, max(allowed // 4, allowed - reserved)),
@@ -278,7 +278,7 @@ class _ServiceProcess:
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(self._loop_failed)
         options, shell, supervised = self._options, self._shell, self._supervised
-        async with _watched(options, lambda: None, self._why_not_ready, self._reported) as watched:
+        async with _watched(options, lambda: None, self._why_not_ready, self._report) as watched:
             try:
                 for number in options.ending_signals:
                     loop.add_signal_handler(number, shell.stop, number.name)
@@ -309,13 +309,11 @@ class _ServiceProcess:
                     self._manager.watch(loop, self._status)
                     self._manager.ready()
                 else:
-                    supervised.start(self._report, lambda: shell.stop("the supervisor is gone"))
+                    supervised.start(self._report)
                 reason = await shell.wait()
                 if supervised is None:
                     self.events.event("stopping", reason=reason)
                     self._manager.stopping(options.drain_s + 2 * _CLOSE_TIMEOUT_S)
-                else:
-                    supervised.not_ready()
                 if reason == signal.SIGTERM.name:
                     draining = loop.create_task(self._drain())
                     for number in options.ending_signals:
@@ -327,8 +325,8 @@ class _ServiceProcess:
                 finally:
                     if self._extension is not None:
                         self._extension.close(_CLOSE_TIMEOUT_S)
-                if supervised is not None:
-                    supervised.close()
+            if supervised is not None:
+                supervised.tell(self._report())
         return _exit_status(reason)
 
     def _why_not_ready(self) -> str | None:
@@ -346,15 +344,13 @@ class _ServiceProcess:
     def _report(self) -> ServiceReport:
         from holdfast.service.metrics import ServiceReport
 
-        report = ServiceReport(self._shell.statistics(), self._times)
+        report = ServiceReport(
+            self._shell.statistics(), self._times, why_not_ready=self._why_not_ready()
+        )
         if self._credentials is not None:
             report.certificate_expires_s = self._credentials.expires_s
             report.stale_credentials = int(self._credentials.is_stale)
-            report.credentials_gone = self._credentials.why_gone()
         return report
-
-    async def _reported(self) -> ServiceReport:
-        return self._report()
 
     def _reload(self, credentials: ServiceCredentials) -> None:
         self._manager.reloading()
@@ -430,7 +426,7 @@ async def _watched(
     options: ServeOptions,
     why_not_alive: Callable[[], str | None],
     why_not_ready: Callable[[], str | None],
-    report: Callable[[], Awaitable[ServiceReport]],
+    report: Callable[[], ServiceReport],
     processes: Callable[[], Sequence[int]] = lambda: (os.getpid(),),
 ) -> AsyncIterator[dict[str, str]]:
     """Serve health and metrics if the options say so; yield their addresses."""
@@ -455,9 +451,8 @@ async def _watched(
         exposition = Exposition(options.name, processes)
 
         async def metrics() -> Page:
-            return Page(
-                200, exposition.text(await report(), is_ready=why_not_ready() is None), CONTENT_TYPE
-            )
+            text = exposition.text(report(), is_ready=why_not_ready() is None)
+            return Page(200, text, CONTENT_TYPE)
 
         offered["metrics"] = options.metrics, {"/metrics": metrics}
     watched = MonitoringServers()

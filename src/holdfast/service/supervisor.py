@@ -4,13 +4,11 @@ One interpreter computes on one core. So N processes serve, each an ordinary ``h
 They share nothing but the address: a robot that reaches another process than before sends its
 state, as after any lost link. The system chooses the process of a connection.
 
-The supervisor binds the addresses. It gives every process a listening socket, and keeps that socket
-for the next process when one dies: connections wait there, and are refused only if the process
-cannot be restarted at once. Processes are spawned, not forked, and end when the supervisor does. It
-serves no robot itself, so little in it can fail.
+The supervisor binds the addresses, and each process listens there by itself. Processes are spawned,
+not forked, and end when the supervisor does. It serves no robot itself, so little in it can fail.
 
-Supervisor and process talk over a pair of SEQPACKET sockets. A process reports its counters every
-second and on request; each report is a heartbeat, too.
+A process reports its counters every second over a SEQPACKET socket; each report is a heartbeat,
+too. The socket closes when the process ends.
 """
 
 from __future__ import annotations
@@ -40,8 +38,6 @@ if TYPE_CHECKING:
 __all__ = ["Supervised", "Supervisor"]
 
 _REPORT_EVERY_S = 1.0
-_FRESH_WITHIN_S = 1.0
-"""A request for metrics waits this long for the processes' newest reports."""
 
 _SILENT_S = 10.0
 _START_S = 60.0
@@ -50,105 +46,47 @@ _START_S = 60.0
 _STEADY_S = 10.0
 """A process that ends earlier than this has failed at its start; its restart is delayed."""
 
-_END_S = 0.5
 _FIRST_DELAY_S, _LAST_DELAY_S = 0.2, 30.0
-_KEPT_S = 1.0
-"""With a longer delay, waiting connections are refused."""
+_CHECK_INTERVAL_S = 0.01
 
 _MAX_MESSAGE_BYTES = 65_536
 _MAX_TEXT = 4000
 
 
-class _StatusReport(msgspec.Struct, tag="told"):
-    """A process's status; ``answers`` is the number of the request for it, 0 without one."""
-
-    ready: bool
-    report: ServiceReport
-    answers: int = 0
-
-
-class _StartFailure(msgspec.Struct, tag="failed"):
-    """Why a process cannot serve."""
-
-    text: str
-
-
 class Supervised:
-    """A process's end of the pair: reports to the supervisor over an inherited descriptor."""
+    """A process's end: reports to the supervisor over an inherited descriptor."""
 
     def __init__(self, descriptor: int) -> None:
-        self._socket = socket.socket(fileno=descriptor)
-        self._socket.setblocking(False)
-        self._socket.set_inheritable(False)
-        self._ready = False
-        self._timer: asyncio.TimerHandle | None = None
+        os.set_blocking(descriptor, False)
+        os.set_inheritable(descriptor, False)
+        # Never closed: the supervisor takes that for the end of this process.
+        self._descriptor = descriptor
+        self.has_served = False
 
-    @property
-    def has_served(self) -> bool:
-        """Whether this process has said that it serves."""
-        return self._timer is not None
-
-    def start(self, report: Callable[[], ServiceReport], lost: Callable[[], None]) -> None:
-        """Report that this process serves, and its counters regularly, in the running loop.
-
-        ``lost`` is called when the supervisor is gone.
-        """
-        self._loop = asyncio.get_running_loop()
-        self._report, self._lost = report, lost
-        self._ready = True
-        self._loop.add_reader(self._socket, self._on_request)
-        self._report_regularly()
-
-    def not_ready(self) -> None:
-        """Report that this process takes no more robots."""
-        self._ready = False
-        self._report_status(0)
+    def start(self, report: Callable[[], ServiceReport]) -> None:
+        """Report that this process serves, now and regularly, in the running loop."""
+        self.has_served = True
+        self.tell(report())
+        asyncio.get_running_loop().call_later(_REPORT_EVERY_S, self.start, report)
 
     def failed(self, text: str) -> None:
         """Report why this process cannot serve."""
-        self._send(_StartFailure(text[:_MAX_TEXT]))
+        self.tell(text[:_MAX_TEXT])
 
-    def close(self) -> None:
-        """Report nothing more. The supervisor sees the socket close when the process ends."""
-        if self._timer is not None:
-            self._timer.cancel()
-            self._loop.remove_reader(self._socket)
-        self._socket.detach()
-
-    def _report_regularly(self) -> None:
-        self._report_status(0)
-        self._timer = self._loop.call_later(_REPORT_EVERY_S, self._report_regularly)
-
-    def _on_request(self) -> None:
-        with contextlib.suppress(BlockingIOError, ConnectionResetError):
-            request = self._socket.recv(16)
-            if request:
-                self._report_status(int.from_bytes(request, "big"))
-                return
-        self._loop.remove_reader(self._socket)
-        self._lost()
-
-    def _report_status(self, answers: int) -> None:
-        self._send(_StatusReport(self._ready, self._report(), answers))
-
-    def _send(self, message: _StatusReport | _StartFailure) -> None:
+    def tell(self, message: ServiceReport | str) -> None:
+        """Send a report, or a failure."""
         # A dropped report is no loss: the next one has all counters.
         with contextlib.suppress(BlockingIOError, BrokenPipeError, ConnectionResetError):
-            self._socket.send(msgspec.msgpack.encode(message))
+            os.write(self._descriptor, msgspec.msgpack.encode(message))
 
 
 class _Child:
     """A process, as the supervisor sees it."""
 
-    def __init__(self, process: subprocess.Popen[bytes], control: socket.socket) -> None:
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self.process = process
-        self.control = control
         self.started_at = self.heard_at = monotonic()
         self.report: ServiceReport | None = None
-        self.ready = False
-        self.reload = False
-        self.answered = 0
-        self.failure: str | None = None
 
     def trouble(self, now: float) -> str | None:
         """Return what is wrong with it, if anything."""
@@ -174,19 +112,14 @@ class Supervisor:
     ) -> None:
         # -P: modules in the current directory are not imported.
         self._command = [sys.executable, "-P", "-m", "holdfast", "serve", *arguments]
+        self._processes = processes
         self._listening = listening
         self._events = events
-        self._children: list[_Child | None] = [None] * processes
-        self._early_ends = [0] * processes
-        self._delayed: dict[int, asyncio.TimerHandle] = {}
+        self._living: list[_Child] = []
         self._past = ServiceReport()
-        self._requests = 0
-        self._stopping = False
         self._loop = asyncio.get_running_loop()
-        self._change: asyncio.Future[None] = self._loop.create_future()
-        self._failure: str | None = None
-        self._has_served = False
-        self._restarts = 0
+        self._serving: asyncio.Future[None] = self._loop.create_future()
+        self._stopping: asyncio.Future[signal.Signals] = self._loop.create_future()
 
     async def run(
         self,
@@ -206,131 +139,117 @@ class Supervisor:
         ServiceProcessError
             If one of them cannot serve; the message says why.
         """
-        loop = self._loop
-        stopping: asyncio.Future[signal.Signals] = loop.create_future()
 
         def stop(number: signal.Signals) -> None:
-            if stopping.done():
-                self._kill()
+            if self._stopping.done():
+                self._signal_all(signal.SIGKILL)
             else:
-                stopping.set_result(number)
+                self._stopping.set_result(number)
 
         def reload() -> None:
             manager.reloading()
-            for child in self._living():
-                if child.ready:
+            for child in self._living:
+                if child.report:  # one that starts sees by itself which files have changed
                     child.process.send_signal(signal.SIGHUP)
-                else:
-                    child.reload = True  # it may have read the old credentials already
-            if starting.done():
+            if self._serving.done():
                 manager.ready()
 
-        loop.add_signal_handler(signal.SIGHUP, reload)
+        self._loop.add_signal_handler(signal.SIGHUP, reload)
         for each in ending:
-            loop.add_signal_handler(each, stop, each)
-        starting = loop.create_task(self._start_all())
+            self._loop.add_signal_handler(each, stop, each)
+        kept = [self._loop.create_task(self._keep_one()) for _ in range(self._processes)]
         try:
-            awaited: set[asyncio.Future[Any]] = {starting, stopping}
-            await asyncio.wait(awaited, return_when=asyncio.FIRST_COMPLETED)
-            if starting.done():
-                starting.result()
+            await _first_of(self._serving, self._stopping, *kept)
+            if self._serving.done():
                 ready()
-                manager.watch(loop, self._status, lambda: self.why_not_alive() is None)
+                manager.watch(self._loop, self._status, lambda: self.why_not_alive() is None)
                 manager.ready()
-            number = await stopping
+                await _first_of(self._stopping, *kept)
+            number = self._stopping.result()
             self._events.event("stopping", reason=number.name)
             manager.stopping(drain_s)
+            # An open local socket would go on accepting connections.
+            self._listening.close()
             self._signal_all(number)
-            await self._until(lambda: not self._living(), drain_s)
+            await asyncio.wait(kept, timeout=drain_s)
             return number
         finally:
-            starting.cancel()
-            self._kill()
-
-    async def _start_all(self) -> None:
-        """Start all processes; return when all of them serve, raise if one has ended before."""
-        for index in range(len(self._children)):
-            self._start(index)
-        await self._until(
-            lambda: (
-                self._stopping
-                or self._failure is not None
-                or all(child is not None and child.ready for child in self._children)
-            )
-        )
-        if self._failure is not None:
-            raise ServiceProcessError(self._failure)
-        self._has_served = True
-
-    def _kill(self) -> None:
-        """End all processes now; may be repeated."""
-        self._signal_all(signal.SIGKILL)
-        for index, dead in enumerate(self._children):
-            if dead is not None:
-                self._reap(index, dead)
-        self._changed()
+            self._stopping.cancel()
+            self._signal_all(signal.SIGKILL)
+            await asyncio.gather(*kept, return_exceptions=True)
 
     def _signal_all(self, number: int) -> None:
-        self._stopping = True
-        for timer in self._delayed.values():
-            timer.cancel()
-        # An open listening socket would go on accepting connections.
-        self._listening.close()
-        for child in self._living():
+        for child in self._living:
             child.process.send_signal(number)
 
     def process_ids(self) -> list[int]:
         """Return the ids of this process and of the service's processes."""
-        return [os.getpid(), *(child.process.pid for child in self._living())]
+        return [os.getpid(), *(child.process.pid for child in self._living)]
 
     def why_not_ready(self) -> str | None:
         """Return why no process takes robots; None if one does."""
-        if self._stopping:
+        if self._stopping.done():
             return "draining"
-        serving = [child.report for child in self._living() if child.ready and child.report]
-        gone = [report.credentials_gone for report in serving]
-        return None if None in gone else next(iter(gone), "starting")
+        reasons = [report.why_not_ready for report in self._reports()]
+        return None if None in reasons else next(iter(reasons), "starting")
 
     def why_not_alive(self) -> str | None:
         """Return which process is stuck; None if none is."""
         now = monotonic()
-        return next(filter(None, (child.trouble(now) for child in self._living())), None)
+        return next(filter(None, (child.trouble(now) for child in self._living)), None)
 
     def _status(self) -> str:
         """Return the status in a few words, from the processes' last reports."""
-        living = self._living()
-        sessions = sum(each.report.statistics.sessions for each in living if each.report)
+        reports = self._reports()
+        sessions = sum(report.statistics.sessions for report in reports)
         serving = (
             f"serving, {sessions} session{'' if sessions == 1 else 's'} at "
-            f"{sum(each.ready for each in living)} of {len(self._children)} processes"
+            f"{len(reports)} of {self._processes} processes"
         )
         return self.why_not_alive() or self.why_not_ready() or serving
 
-    async def report(self) -> ServiceReport:
-        """Return the sum of all processes' counters, those that have ended included."""
-        self._requests = number = self._requests + 1
-        for child in self._living():
-            with contextlib.suppress(OSError):
-                child.control.send(number.to_bytes(8, "big"))
-        await self._until(
-            lambda: all(child.answered >= number for child in self._living() if child.ready),
-            _FRESH_WITHIN_S,
-        )
-        reports = (child.report for child in self._living())
-        total = summed([self._past, *(report for report in reports if report is not None)])
-        total.restarts = self._restarts
-        return total
+    def report(self) -> ServiceReport:
+        """Return the sum of all processes' last reports, those that have ended included."""
+        return summed([self._past, *self._reports()])
 
-    def _living(self) -> list[_Child]:
-        return [child for child in self._children if child is not None]
+    def _reports(self) -> list[ServiceReport]:
+        return [child.report for child in self._living if child.report is not None]
 
-    def _start(self, index: int) -> None:
-        self._delayed.pop(index, None)
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        ours.setblocking(False)
+    async def _keep_one(self) -> None:
+        """Run one of the processes, and start it again whenever it ends, until all are to end.
+
+        At once, or with a delay if it keeps failing at its start. Raises a ServiceProcessError if
+        it ends before all of them serve.
+        """
+        early_ends = 0
+        while not self._stopping.done():
+            started_at = monotonic()
+            fields = {}
+            try:
+                child, control = self._start()
+            except OSError as error:
+                reason = f"cannot be started: {error.strerror}"
+            else:
+                fields["pid"] = child.process.pid
+                with control:
+                    reason = await self._until_it_ends(child, control)
+            if self._stopping.done():
+                return
+            if not self._serving.done():
+                raise ServiceProcessError(reason)
+            early_ends = 0 if monotonic() - started_at >= _STEADY_S else early_ends + 1
+            delay_s = restart_delay_s(early_ends, _FIRST_DELAY_S, _LAST_DELAY_S)
+            self._events.event("process_ended", reason=reason, **fields, again_in_s=delay_s)
+            self._past.restarts += 1
+            await asyncio.wait([self._stopping], timeout=delay_s)
+
+    def _start(self) -> tuple[_Child, socket.socket]:
+        """Start a process; return it and the socket that gets its reports."""
+        control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        control.setblocking(False)
+        descriptors = self._listening.descriptors
         with theirs:
             try:
-                descriptors = [each.fileno() for each in self._listening.of(index)]
                 process = subprocess.Popen(
                     [
                         *self._command,
@@ -342,83 +261,40 @@ class Supervisor:
                     # A terminal's Ctrl-C is the supervisor's to answer.
                     start_new_session=True,
                 )
-            except OSError as error:
-                ours.close()
-                self._restart(index, f"cannot be started: {error.strerror}", lived_s=0.0)
-                return
-        child = self._children[index] = _Child(process, ours)
-        self._loop.add_reader(ours, self._on_message, index, child)
+            except OSError:
+                control.close()
+                raise
+        child = _Child(process)
+        self._living.append(child)
+        return child, control
 
-    def _on_message(self, index: int, child: _Child) -> None:
-        try:
-            data = child.control.recv(_MAX_MESSAGE_BYTES)
-        except BlockingIOError:
-            return
-        except OSError:
-            data = b""
-        if not data:
-            self._ended(index, child)
-            return
-        message = msgspec.msgpack.decode(data, type=_StatusReport | _StartFailure)
-        child.heard_at = monotonic()
-        if isinstance(message, _StartFailure):
-            child.failure = message.text
-            return
-        if message.ready and not child.ready and self._has_served:
-            started_ms = round((child.heard_at - child.started_at) * 1000)
-            self._events.event("process_started", pid=child.process.pid, launch_ms=started_ms)
-        child.report, child.ready = message.report, message.ready
-        if child.ready and child.reload:
-            child.reload = False
-            child.process.send_signal(signal.SIGHUP)
-        child.answered = max(child.answered, message.answers)
-        self._changed()
-
-    def _ended(self, index: int, child: _Child) -> None:
-        """Handle the end of a process, which closes its end of the pair."""
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            # The system closes a process's files a moment before its exit status is known.
-            child.process.wait(_END_S)
-        child.process.kill()
-        reason = how_it_ended(self._reap(index, child))
-        if not self._stopping:
-            self._restart(index, child.failure or reason, monotonic() - child.started_at, child)
-        self._changed()
-
-    def _reap(self, index: int, child: _Child) -> int:
-        """Keep the counters of a process that has ended or been killed; return its exit status."""
-        self._loop.remove_reader(child.control)
-        child.control.close()
-        self._children[index] = None
+    async def _until_it_ends(self, child: _Child, control: socket.socket) -> str:
+        """Take a process's reports until it ends; return how it ended."""
+        failure = None
+        while data := await self._loop.sock_recv(control, _MAX_MESSAGE_BYTES):
+            message = msgspec.msgpack.decode(data, type=ServiceReport | str)
+            child.heard_at = monotonic()
+            if isinstance(message, str):
+                failure = message
+                continue
+            if child.report is None and self._serving.done():
+                started_ms = round((child.heard_at - child.started_at) * 1000)
+                self._events.event("process_started", pid=child.process.pid, launch_ms=started_ms)
+            child.report = message
+            if not self._serving.done() and len(self._reports()) == self._processes:
+                self._serving.set_result(None)
+        # The system closes a process's files a moment before its exit status is known. It is read
+        # in this thread, so that metrics count the process's time once.
+        while (code := child.process.poll()) is None:
+            await asyncio.sleep(_CHECK_INTERVAL_S)
+        self._living.remove(child)
         if child.report is not None:
             self._past = summed([self._past, child.report.without_gauges()])
-        return child.process.wait()
+        return failure or how_it_ended(code)
 
-    def _restart(
-        self, index: int, reason: str, lived_s: float, child: _Child | None = None
-    ) -> None:
-        """Restart a process: at once, or with a delay if it keeps failing at its start."""
-        if not self._has_served:
-            self._failure = reason
-            return
-        early = self._early_ends[index] = 0 if lived_s >= _STEADY_S else self._early_ends[index] + 1
-        delay_s = restart_delay_s(early, _FIRST_DELAY_S, _LAST_DELAY_S)
-        fields = {} if child is None else {"pid": child.process.pid}
-        self._events.event("process_ended", reason=reason, **fields, again_in_s=delay_s)
-        if delay_s > _KEPT_S:
-            self._listening.release(index)
-        self._restarts += 1
-        self._delayed[index] = self._loop.call_later(delay_s, self._start, index)
 
-    def _changed(self) -> None:
-        change, self._change = self._change, self._loop.create_future()
-        change.set_result(None)
-
-    async def _until(self, reached: Callable[[], bool], timeout_s: float | None = None) -> None:
-        """Wait until something holds, or for this long."""
-        until = None if timeout_s is None else monotonic() + timeout_s
-        while not reached():
-            left_s = None if until is None else until - monotonic()
-            if left_s is not None and left_s <= 0.0:
-                return
-            await asyncio.wait({self._change}, timeout=left_s)
+async def _first_of(*futures: asyncio.Future[Any]) -> None:
+    """Wait until one is done; raise its exception if it has one."""
+    done, _ = await asyncio.wait(futures, return_when=asyncio.FIRST_COMPLETED)
+    for each in done:
+        each.result()

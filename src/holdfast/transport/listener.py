@@ -25,7 +25,6 @@ from holdfast.transport.endpoints import Endpoint, why_not_bound
 from holdfast.transport.links import OPENING_TIMEOUT_S
 
 __all__ = [
-    "BACKLOG",
     "MAX_SILENT",
     "Listener",
     "connection_to_drop",
@@ -33,7 +32,7 @@ __all__ = [
     "remove_socket_file",
 ]
 
-BACKLOG: Final = 1024
+_BACKLOG: Final = 1024
 """Connections that wait to be accepted."""
 
 _ACCEPTED_AT_ONCE: Final = 2
@@ -66,8 +65,8 @@ class Listener:
         Gets the socket of such a connection, and the network from which it came.
     speaks_first : bool
         Whether this end speaks first; then connections are delivered at once.
-    listening : socket or None
-        A socket that listens there already and is shared with its owner.
+    shared : socket or None
+        A socket that is bound there for several processes, of which this one listens, too.
 
     Raises
     ------
@@ -81,13 +80,13 @@ class Listener:
         accepted: Callable[[socket.socket, bytes], None],
         *,
         speaks_first: bool = False,
-        listening: socket.socket | None = None,
+        shared: socket.socket | None = None,
     ) -> None:
         self._accepted = accepted
         self._speaks_first = speaks_first
         self._loop = asyncio.get_running_loop()
         try:
-            self._socket = listen(endpoint) if listening is None else listening
+            self._socket = listen(endpoint) if shared is None else _listen_beside(shared)
             self._socket.setblocking(False)
         except OSError as error:
             raise TransportError(f"cannot listen on {endpoint}: {why_not_bound(error)}") from error
@@ -95,7 +94,7 @@ class Listener:
         self._socket_file: os.stat_result | None = None
         if not endpoint.is_local_socket:
             self.endpoint = endpoint._replace(port=self._socket.getsockname()[1])
-        elif listening is None:
+        elif shared is None:
             self._socket_file = Path(endpoint.host).stat()
         self._silent: dict[socket.socket, bytes] = {}
         self._timers: dict[socket.socket, asyncio.TimerHandle] = {}
@@ -201,6 +200,21 @@ def listen(endpoint: Endpoint) -> socket.socket:
     return _listening(made, address)
 
 
+def _listen_beside(shared: socket.socket) -> socket.socket:
+    """Return a socket of this process that listens where one is bound, and close that one.
+
+    The system spreads a port's connections over its sockets; a local socket is one file, so all
+    processes accept from one.
+    """
+    if shared.family == socket.AF_UNIX:
+        return shared
+    with shared:
+        made = socket.socket(shared.family)
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        return _listening(made, shared.getsockname())
+
+
 def remove_socket_file(endpoint: Endpoint, made: os.stat_result) -> None:
     """Remove a local socket's file, unless another process listens there now.
 
@@ -216,7 +230,7 @@ def remove_socket_file(endpoint: Endpoint, made: os.stat_result) -> None:
 def _listening(made: socket.socket, address: Any) -> socket.socket:
     try:
         made.bind(address)
-        made.listen(BACKLOG)
+        made.listen(_BACKLOG)
     except BaseException:
         made.close()
         raise

@@ -122,8 +122,8 @@ class StreamServiceTransport(LinkOwner):
     ----------
     listen, connect : sequence of str
         Endpoints at which robots connect, and of robots that listen.
-    listening : sequence of socket
-        If given, a socket for each of ``listen`` that listens there already and is shared.
+    shared : sequence of socket
+        If given, a socket for each of ``listen`` that is bound there, for several processes.
     lease_ms : float
         After this much silence robots consider this service lost. A robot's own lease is in its
         hello.
@@ -152,7 +152,7 @@ class StreamServiceTransport(LinkOwner):
         incarnation: str,
         listen: Sequence[str] = (),
         connect: Sequence[str] = (),
-        listening: Sequence[socket.socket] = (),
+        shared: Sequence[socket.socket] = (),
         lease_ms: float = 400.0,
         max_message_bytes: int = DEFAULT_MAX_MESSAGE_BYTES,
         max_links: int | None = None,
@@ -165,7 +165,7 @@ class StreamServiceTransport(LinkOwner):
         self._connect = [check_endpoint(text, "service", listens=False) for text in connect]
         for endpoint in (*self._listen, *self._connect):
             check_credentials(endpoint, tls)
-        self._listening: Sequence[socket.socket | None] = listening or [None] * len(listen)
+        self._shared: Sequence[socket.socket | None] = shared or [None] * len(listen)
         self._schemes = {
             endpoint.protocol: load_scheme(endpoint.protocol)
             for endpoint in (*self._listen, *self._connect)
@@ -216,9 +216,9 @@ class StreamServiceTransport(LinkOwner):
         self._started = True
         self._deliver = deliver
         try:
-            for endpoint, listening in zip(self._listen, self._listening, strict=True):
+            for endpoint, shared in zip(self._listen, self._shared, strict=True):
                 accepted = partial(self._accepted, endpoint)
-                self._listeners.append(Listener(endpoint, accepted, listening=listening))
+                self._listeners.append(Listener(endpoint, accepted, shared=shared))
         except TransportError:
             self._stop_listening()
             raise
