@@ -63,7 +63,6 @@ test-deploy-slow: $(INSTALLED_DEV) ## those of them that take minutes
 
 test-ros: $(INSTALLED_DEV) ## a real ROS 1 and ROS 2, which tests/ros/set_up_ros2 installs the first time
 	tests/ros/set_up_ros2 $(ROS2) $(PYTHON)
-	tests/ros/set_up_peers $(ROS2) $(PYTHON)
 	if [ -e /usr/bin/rosmaster ]; then tests/ros/set_up_ros1 $(ROS1); fi
 	ROS1=$(ROS1) ROS2=$(ROS2) $(BIN)/pytest -q -m ros -n 2 --dist loadfile tests/ros
 

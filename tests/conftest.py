@@ -75,10 +75,8 @@ REAL = (
     "unit/test_probe.py",
     "unit/test_recovery_launcher.py",
     "unit/test_ros1_client.py",
-    "unit/test_ros2_client.py",
     "unit/test_standby.py",
     "unit/test_survey.py",
-    "unit/test_zenoh_session.py",
 )
 """Folders, files, classes and tests with real sockets, waits or signals."""
 

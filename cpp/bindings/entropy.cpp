@@ -20,7 +20,7 @@ using namespace holdfast::bindings;
 
 namespace {
 
-using Flag = nb::ndarray<const std::uint8_t, nb::shape<1>, nb::c_contig, nb::device::cpu>;
+using Flag = nb::ndarray<std::uint8_t, nb::shape<1>, nb::c_contig, nb::device::cpu>;
 
 // About what one particle of a posterior takes; from it follows how many threads are worth their
 // waking.
@@ -89,8 +89,11 @@ void holdfast::bind_entropy(nb::module_& module) {
     // The caller keeps the flag alive until it watches another one, or none.
     define(
         module, "watch_interruption",
-        [](std::optional<Flag> flag) { watch_interruption(flag ? flag->data() : nullptr); },
-        nb::arg("flag").none());
+        [](std::optional<Flag> flag, double most_s) {
+            watch_interruption(flag ? flag->data() : nullptr, most_s);
+        },
+        nb::arg("flag").none(), nb::arg("most_s"));
+    define(module, "is_interrupted", [] { return is_interrupted(); });
 
     define(module, "entropies",
            [](const Input<2>& points, const Input<2>& rows_in, bool logarithms, int number,

@@ -2,12 +2,15 @@
 
 #include <pthread.h>
 #include <sched.h>
+#include <time.h>
 
 #include <algorithm>
 #include <atomic>
+#include <cmath>
 #include <condition_variable>
 #include <cstdlib>
 #include <exception>
+#include <limits>
 #include <memory>
 #include <mutex>
 #include <system_error>
@@ -27,11 +30,38 @@ constexpr int max_threads = 256;
 /// on it.
 constexpr int patience = 100;
 
-thread_local const std::uint8_t* interruption = nullptr;
+constexpr std::uint8_t took_too_long = 2;
 
-/// Raises Interrupted if a flag is set.
-void require_awaited(const std::uint8_t* flag) {
-    if (flag != nullptr && __atomic_load_n(flag, __ATOMIC_RELAXED) != 0) throw Interrupted();
+thread_local std::uint8_t* interruption = nullptr;
+/// Until when the calling thread may compute, by its own processor time; and the earliest moment at
+/// which that can be, because the monotonic clock is cheaper to read.
+thread_local double ends_at = std::numeric_limits<double>::infinity();
+thread_local double looked_at_from = std::numeric_limits<double>::infinity();
+
+double seconds_of(clockid_t clock) {
+    timespec time{};
+    clock_gettime(clock, &time);
+    return static_cast<double>(time.tv_sec) + 1e-9 * static_cast<double>(time.tv_nsec);
+}
+
+/// Sets the flag once the calling thread's time is used up; helpers have no limit of their own.
+void look_at_the_clock(std::uint8_t* flag) {
+    if (std::isinf(looked_at_from) || seconds_of(CLOCK_MONOTONIC) < looked_at_from) return;
+    if (seconds_of(CLOCK_THREAD_CPUTIME_ID) < ends_at) return;
+    std::uint8_t expected = 0;
+    __atomic_compare_exchange_n(flag, &expected, took_too_long, false, __ATOMIC_RELAXED,
+                                __ATOMIC_RELAXED);
+}
+
+bool must_end(std::uint8_t* flag) {
+    if (flag == nullptr) return false;
+    look_at_the_clock(flag);
+    return __atomic_load_n(flag, __ATOMIC_RELAXED) != 0;
+}
+
+/// Raises Interrupted if a computation is to end.
+void require_awaited(std::uint8_t* flag) {
+    if (must_end(flag)) throw Interrupted();
 }
 
 /// One call's tasks. Helpers hold it by shared pointer: one that comes late finds nothing left to
@@ -44,12 +74,12 @@ struct Job {
     std::atomic<std::size_t> finished{0};
     std::atomic<bool> failed{false};
     std::exception_ptr failure;
-    const std::uint8_t* interrupted = interruption;
+    std::uint8_t* interrupted = interruption;
 
     /// Works until no task is left; tells whether there was any.
     bool work() {
         std::size_t mine = 0;
-        const std::uint8_t* const before = std::exchange(interruption, interrupted);
+        std::uint8_t* const before = std::exchange(interruption, interrupted);
         for (std::size_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < tasks; ++mine) {
             if (failed.load(std::memory_order_relaxed)) continue;
             try {
@@ -195,8 +225,16 @@ double use_threads_from(double nanoseconds) {
     return threads_from.exchange(nanoseconds);
 }
 
-void watch_interruption(const std::uint8_t* flag) {
+void watch_interruption(std::uint8_t* flag, double most_s) {
     interruption = flag;
+    looked_at_from = ends_at = most_s;
+    if (std::isinf(most_s)) return;
+    ends_at += seconds_of(CLOCK_THREAD_CPUTIME_ID);
+    looked_at_from += seconds_of(CLOCK_MONOTONIC);
+}
+
+bool is_interrupted() {
+    return must_end(interruption);
 }
 
 void check_interruption() {

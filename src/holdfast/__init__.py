@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from holdfast.recording.reading import open_run
     from holdfast.robot.environment import LATER, Environment, SimulatedEnvironment
     from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
-    from holdfast.robot.late_sensing import SenseInBackground, SenseLater
+    from holdfast.robot.late_sensing import SenseInBackground
     from holdfast.robot.trial import run_trial
 
 __all__ = [
@@ -53,7 +53,6 @@ __all__ = [
     "Scene",
     "SelectorSettings",
     "SenseInBackground",
-    "SenseLater",
     "SimulatedEnvironment",
     "entropy",
     "load_configuration",
@@ -74,7 +73,6 @@ _PLACES = {
     "LATER": "robot.environment.LATER",
     "MoveResult": "outcome.MoveResult",
     "SenseInBackground": "robot.late_sensing.SenseInBackground",
-    "SenseLater": "robot.late_sensing.SenseLater",
     "GaussianMixture": "estimators.GaussianMixture",
     "GymnasiumEnvironment": "robot.gymnasium_environment.GymnasiumEnvironment",
     "HoldfastError": "errors.HoldfastError",

@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import checked, interruption, numerics, sensing
-from holdfast.arrays import FloatArray, floats, in_brief, plain, whole
+from holdfast.arrays import FloatArray, floats, in_brief, whole
 from holdfast.belief import (
     Belief,
     ObservationInfo,
@@ -48,7 +48,6 @@ from holdfast.config.settings import (
     Method,
     PlanningSettings,
     check_settings,
-    plain_settings,
 )
 from holdfast.errors import CheckpointError, InvalidValueError, ProblemError
 from holdfast.floating_mode import in_own_mode
@@ -60,7 +59,7 @@ from holdfast.problem_attributes import (
     sensing_action_of,
 )
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Purpose, stream
+from holdfast.randomness import Purpose, seed_and_trial, stream
 from holdfast.sensing import SensingInfo
 
 __all__ = [
@@ -151,18 +150,14 @@ class Planner:
         check_sizes(problem)
         self.problem = problem
         settings = PlanningSettings() if settings is None else settings
-        check_settings(settings)
-        self.settings = plain_settings(settings)
+        settings = check_settings(settings, PlanningSettings)
         if particles is not None:
-            self._replace_setting("particle_filter", "num_particles", plain(particles))
+            settings = _replaced(settings, "particle_filter", "num_particles", particles)
         if method is not None:
-            self._replace_setting("selector", "method", plain(method))
+            settings = _replaced(settings, "selector", "method", method)
         if particles is not None or method is not None:
-            check_settings(self.settings)
-
-    def _replace_setting(self, section: str, key: str, value: object) -> None:
-        changed = msgspec.structs.replace(getattr(self.settings, section), **{key: value})
-        self.settings = msgspec.structs.replace(self.settings, **{section: changed})
+            settings = check_settings(settings, PlanningSettings)
+        self.settings = settings
 
     @in_own_mode
     def init(self, seed: int, trial: int = 0) -> PlanningState:
@@ -173,14 +168,13 @@ class Planner:
         Raises
         ------
         InvalidValueError
-            If seed, trial or a setting is out of bounds.
+            If seed or trial is out of bounds.
         ProblemError
             If the problem breaks its contract: its initial states are not finite, say.
         """
-        seed, trial = whole("seed", seed, 0, 2**63 - 1), whole("trial", trial, 0, 2**32 - 1)
+        seed, trial = seed_and_trial(seed, trial)
         problem = self.problem
         check_problem(problem)
-        check_settings(self.settings)
         count = self.settings.particle_filter.num_particles
         random = stream(seed, trial, 0, Purpose.INITIAL_BELIEF)
         states = checked.initial_states(problem, random, count)
@@ -194,7 +188,6 @@ class Planner:
         """
         problem = self.problem
         check_problem(problem)
-        check_settings(self.settings)
         self._require_size(state)
         count = state.belief.states.shape[0]
         if count != self.settings.particle_filter.num_particles:
@@ -461,6 +454,13 @@ class Planner:
             state.belief, self.settings.particle_filter.estimate, circular_states(self.problem)
         )
         return estimated, checked.next_stage(self.problem, estimated, state.stage)
+
+
+def _replaced(
+    settings: PlanningSettings, section: str, key: str, value: object
+) -> PlanningSettings:
+    changed = msgspec.structs.replace(getattr(settings, section), **{key: value})
+    return msgspec.structs.replace(settings, **{section: changed})
 
 
 def digest(state: PlanningState) -> bytes:

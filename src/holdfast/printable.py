@@ -11,7 +11,9 @@ run a program. An apostrophe before it says that it is a text.
 
 from __future__ import annotations
 
-__all__ = ["cell", "one_line", "printable"]
+from collections.abc import Iterable, Sequence
+
+__all__ = ["cell", "did_you_mean", "one_line", "printable"]
 
 
 def printable(text: str, *, keep: str = "\n\t") -> str:
@@ -29,6 +31,14 @@ def printable(text: str, *, keep: str = "\n\t") -> str:
 def one_line(text: str) -> str:
     """Return the text on one line, with every other unprintable character escaped."""
     return printable(" ".join(text.split()), keep="")
+
+
+def did_you_mean(text: str, known: Iterable[str], most: int = 1, sure: Sequence[str] = ()) -> str:
+    """Return a question after the ``sure`` words, else after the nearest known ones, if any."""
+    import difflib  # for a mistake alone
+
+    close = sure or difflib.get_close_matches(text, list(known), n=most)
+    return f"; did you mean {' or '.join(close)}?" if close else ""
 
 
 def cell(value: object) -> object:

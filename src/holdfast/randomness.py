@@ -380,6 +380,11 @@ class NoiseFreeStream(Stream):
 NOISE_FREE = NoiseFreeStream()
 
 
+def seed_and_trial(seed: object, trial: object) -> tuple[int, int]:
+    """Return what a user gave as whole numbers that :func:`stream` allows; else it raises."""
+    return whole("seed", seed, 0, 2**63 - 1), whole("trial", trial, 0, _WORD - 1)
+
+
 def stream(seed: int, trial: int, step: int, purpose: Purpose) -> Stream:
     """Return the stream of one purpose at one step of one trial.
 

@@ -127,7 +127,7 @@ OBJECTS: dict[str, Kept] = {
     ),
     "world": Kept(moved_world, after),
     "world of another": Kept(
-        lambda: hf.SenseLater(moved_world(), 1),
+        lambda: hf.SenseInBackground(moved_world()),
         lambda world: (world.perform_sensing(0), world.perform(np.zeros(3)), world.step),
     ),
     "gymnasium's world": Kept(

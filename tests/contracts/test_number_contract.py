@@ -117,7 +117,6 @@ WHOLE: dict[str, tuple[Callable[[Any], Any], int]] = {
     "SimulatedEnvironment(seed)": (lambda n: world_after(n, 0, 0), 3),
     "SimulatedEnvironment(trial)": (lambda n: world_after(0, n, 0), 3),
     "perform_sensing": (lambda n: world_after(0, 0, n), 1),
-    "SenseLater": (lambda n: hf.SenseLater(World(), n).perform(np.zeros(1)), 2),
     "neighbors": (lambda n: hf.entropy(POINTS, None, hf.NearestNeighbor(n)), 3),
     "circular": (lambda n: hf.entropy(POINTS, circular=[n]), 1),
     "threads": (lambda n: hf.entropy(POINTS, threads=n), 1),

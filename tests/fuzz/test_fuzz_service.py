@@ -35,7 +35,14 @@ from holdfast.protocol.messages import (
     with_checksum,
 )
 from holdfast.protocol.request_queue import RequestQueue
-from holdfast.protocol.service_sessions import PendingTask, Session
+from holdfast.protocol.service_sessions import (
+    BRIEF,
+    LONG,
+    MEDIUM,
+    NEW,
+    PendingTask,
+    Session,
+)
 
 HONEST = (1, 2)
 KEYS = st.integers(100, 115)
@@ -238,8 +245,6 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
         assert holding.configuration_bytes == sum(len(session.configuration) for session in theirs)
         if owner is not None and limits["max_sessions_per_robot"] is not None:
             assert len(theirs) <= limits["max_sessions_per_robot"]
-            known = [session for session in theirs if not session.newcomer and not session.served]
-            assert len(known) <= 1
     # States.
     assert sum(session.num_bytes for session in kept) == sessions.state_bytes
     assert sum(session.size() for session in kept) <= sessions.state_bytes
@@ -254,20 +259,18 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     waiting = [task for task in tasks if not task.running]
     assert statistics.running == len(running) == len(bench.jobs)
     fewer = max(1, bench.workers - 1)
-    assert all(lane.num_running <= fewer for lane in lanes[1:])
-    assert sum(lane.num_running for lane in lanes[:2]) <= bench.workers
+    most = {NEW: fewer, BRIEF: bench.workers, MEDIUM: fewer, LONG: fewer}
+    assert all(lanes[number].num_running <= most[number] for number in most)
     assert statistics.waiting == len(waiting)
     for lane in lanes:
         check_lane(lane, [task for task in waiting if queue._of(task) is lane])
-    for lane in lanes:
+    for number, lane in enumerate(lanes):
         requested = [
             task for task in waiting if task.request is not None and queue._of(task) is lane
         ]
-        # Whoever was served before finds room, if newcomers have taken that of all, and so does
-        # one owner, if another has.
-        assert len(requested) <= max(limits["max_waiting"], 2 * bench.workers) + 2 * bench.workers
-        newcomers = sum(task.newcomer for task in requested)
-        assert newcomers <= max((limits["max_waiting"] + 1) // 2, bench.workers)
+        room = limits["max_waiting"] if number != NEW else (limits["max_waiting"] + 1) // 2
+        # One owner finds room, if another has taken that of all.
+        assert len(requested) <= max(room, 2 * bench.workers) + 2 * bench.workers
     for session in kept:
         assert sum(not task.running for task in works_of(session)) <= 2
         assert len(session.pending) <= 4
@@ -289,22 +292,16 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
 
 def check_lane(queue: RequestQueue, waiting: list[PendingTask]) -> None:
     """Check that a lane's counts are those of its tasks."""
-    lined_up = [*queue._urgent, *queue._newcomers, *queue._later]
+    lined_up = [*queue._urgent, *queue._later]
     held = list(queue._held.values())
     assert {id(task) for task in waiting} == {id(task) for task in (*lined_up, *held)}
     assert set(queue._waiting_of) == {task.session.owner for task in waiting}
     for owner in (*queue._waiting_of, "all"):
-        loads = queue._waiting if owner == "all" else queue._waiting_of[owner]
-        for newcomer in (False, True):
-            some = [
-                task
-                for task in waiting
-                if task.newcomer == newcomer and owner in ("all", task.session.owner)
-            ]
-            load = loads.of(newcomer=newcomer)
-            assert load.num == len(some)
-            assert load.num_bytes == sum(task.size for task in some)
-            assert abs(load.cost_s - sum(task.cost_s for task in some)) < 1e-6
+        load = queue._waiting if owner == "all" else queue._waiting_of[owner]
+        some = [task for task in waiting if owner in ("all", task.session.owner)]
+        assert load.num == len(some)
+        assert load.num_bytes == sum(task.size for task in some)
+        assert abs(load.cost_s - sum(task.cost_s for task in some)) < 1e-6
 
 
 @pytest.mark.parametrize(

@@ -272,7 +272,7 @@ class TestErrors:
     )
     def test_settings(self, settings: PlanningSettings, message: str) -> None:
         with pytest.raises(InvalidValueError, match=re.escape(message)):
-            check_settings(settings)
+            check_settings(settings, PlanningSettings)
 
     def test_settings_of_a_single_decision(self) -> None:
         problem = Plane()

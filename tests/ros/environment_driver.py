@@ -1,6 +1,6 @@
 """A node that calls a robot's environment as it is told, line by line, on its standard input.
 
-    {"id": 1, "do": "make", "parameters": {...}, "trial": 0, "resumed": false}
+    {"id": 1, "do": "make", "act": "action", "timeout_ms": 60000, "trial": 0, "resumed": false}
     {"id": 2, "do": "perform_sensing", "arguments": [0]}
     {"id": 3, "do": "cancel"}
 
@@ -22,10 +22,9 @@ import rclpy
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 
-from holdfast.config.loader import load
-from holdfast.errors import ConfigurationError, EnvironmentFailedError
+from holdfast.errors import EnvironmentFailedError
 from holdfast.ros.ros2_connections import Connections
-from holdfast.ros.ros2_environment import make_ros_environment
+from holdfast.ros.ros2_environment import Ros2Environment
 
 
 def _plain(value: Any) -> Any:
@@ -41,7 +40,6 @@ def say(answer: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    configuration = load(sys.argv[1])
     rclpy.init()
     node = Node("driver")
     executor = MultiThreadedExecutor(num_threads=4)
@@ -54,15 +52,15 @@ def main() -> None:
     def do(command: dict[str, Any]) -> Any:
         nonlocal environment
         if command["do"] == "make":
-            environment = make_ros_environment(
+            environment = Ros2Environment(
                 connections,
-                command.get("parameters", {}),
-                configuration.problem,
-                0,
-                command.get("trial", 0),
-                command.get("resumed", False),
+                trial=command.get("trial", 0),
+                resumed=command.get("resumed", False),
+                act=command.get("act", "action"),
+                timeout_ms=command.get("timeout_ms", 60_000.0),
+                discovery_timeout_ms=command.get("discovery_timeout_ms", 5000.0),
             )
-            return type(environment).__name__
+            return None
         arguments = command.get("arguments", [])
         if command["do"] == "perform":
             arguments = [np.array(arguments[0])]
@@ -74,7 +72,7 @@ def main() -> None:
             begun = time.monotonic()
             try:
                 answer = {"result": do(command)}
-            except (ConfigurationError, EnvironmentFailedError) as error:
+            except EnvironmentFailedError as error:
                 public = next(
                     kind for kind in type(error).__mro__ if not kind.__name__.startswith("_")
                 )

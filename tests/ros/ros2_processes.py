@@ -64,9 +64,12 @@ class Process:
 class Driver(Process):
     """A node that calls an environment: see environment_driver.py."""
 
-    def __init__(self, python: Path, environment: Mapping[str, str], configuration: Path) -> None:
+    def __init__(
+        self, python: Path, environment: Mapping[str, str], remapped: Sequence[str] = ()
+    ) -> None:
         script = Path(__file__).with_name("environment_driver.py")
-        super().__init__([str(python), str(script), str(configuration)], environment)
+        rules = [word for rule in remapped for word in ("-r", rule)]
+        super().__init__([str(python), str(script), "--ros-args", *rules], environment)
         self._number = 0
         self._answers: dict[int, dict[str, Any]] = {}
 

@@ -31,7 +31,7 @@ def graph(tmp_path: Path, ros1: dict[str, str]) -> Iterator[Graph]:
 
 
 class TestItsOwnMaster:
-    # (test_ros1_runs.py does so in the midst of runs.)
+    # (test_ros1_runs.py does so in the midst of a run.)
     @pytest.mark.slow
     def test_killed_ten_times(self, graph: Graph) -> None:
         guard = graph.guard()

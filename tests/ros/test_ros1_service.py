@@ -355,6 +355,13 @@ def test_rosnode_kill_ends_it(around: Ros1) -> None:
     assert around.service_uri(CLOUD) is None
 
 
+def test_the_later_one_of_a_name_has_it_and_the_earlier_one_ends(around: Ros1) -> None:
+    first, second = (around.serve(CLOUD, EXAMPLE) for _ in range(2))
+    assert first.wait(30.0) == 0
+    assert around.service_uri(CLOUD) is not None
+    assert second.poll() is None
+
+
 def test_what_a_robot_decides_can_be_watched(around: Ros1, here: RosEnvironment) -> None:
     around.serve(CLOUD, EXAMPLE)
     with Ros1Client("arm", ros_environment=here, deadline_s=30.0) as client:

@@ -48,12 +48,12 @@ class BringUp:
         self._started.append(process)
         return process
 
-    def executable(self, name: str, *, parameters: str = "holdfast.yaml", **more: Any) -> Process:
+    def executable(self, name: str, **more: Any) -> Process:
         command = [
             str(self.prefix / "lib" / PACKAGE / name),
             "--ros-args",
             "--params-file",
-            str(self.share / "config" / parameters),
+            str(self.share / "config" / "holdfast.yaml"),
             "-p",
             f"configuration:={self.configuration}",
         ]
@@ -205,14 +205,3 @@ class TestTheExample:
         assert peer.do("change", transition="activate")
         assert peer.do("goal")
         assert peer.do("result")["trials"] == in_process(bring_up.configuration)
-
-
-def test_parameters_of_a_robot_of_ones_own_are_accepted(bring_up: BringUp) -> None:
-    bring_up.executable("holdfast_node", parameters="own_robot.yaml", autostart="true")
-    peer = bring_up.peer()
-    peer.wait_until_active()
-    # Only when a trial begins is the robot missing.
-    assert peer.do("goal")
-    result = peer.do("result")
-    assert result["code"] == "HELD"
-    assert "nobody offers service /arm/touch (environment.sense.name)" in result["message"]

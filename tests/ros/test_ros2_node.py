@@ -192,7 +192,7 @@ class TestARun:
         assert {order[6] for order in acting} == {"standard"}
         assert all(len(order[5]) == 3 for order in acting)
         assert seen["feedback"][0] in seen["decisions"]
-        assert {tuple(cloud) for cloud in seen["clouds"]} == {("task", 100)}
+        assert {tuple(cloud) for cloud in seen["clouds"]} == {("task", 500)}
 
         belief = peer.do("belief")
         states = np.reshape(belief["states"], (-1, belief["size"]))
@@ -329,9 +329,9 @@ class TestARobot:
         assert trials(result) == in_process()
 
     def test_has_parameters_that_are_checked_at_once(self, ros: Ros) -> None:
-        node = ros.node(wait=False, environment__kind="ros", environment__act__type="a/srv/B")
+        node = ros.node(wait=False, environment__kind="ros", environment__act="topic")
         node.wait_for("not configured: ")
-        assert "environment.act.type" in node.said()
+        assert "environment.act" in node.said()
 
 
 def statuses(seen: dict[str, Any]) -> list[str]:
@@ -569,7 +569,7 @@ class TestParameters:
     def test_what_no_parameter_can_hold_is_assigned(self, ros: Ros) -> None:
         node = ros.node(
             assignments="['selector.resolution=null','model.init_mean=[4, 2, 0]']",
-            particle_filter__num_particles=100,
+            particle_filter__num_particles=500,
         )
         peer = ros.peer()
         assert peer.do("goal")
@@ -584,7 +584,7 @@ class TestParameters:
         assert node.interrupt() == 0
         other = ros.node(wait=False, particle_filter__num_particles=50)
         other.wait_for("not configured: ")
-        assert "particle_filter.num_particles is 100 there and 50 here" in other.said()
+        assert "particle_filter.num_particles is 500 there and 50 here" in other.said()
         assert "another directory (run_directory)" in other.said()
 
     def test_another_process_has_the_run(self, ros: Ros) -> None:

@@ -27,27 +27,26 @@ crowd service=cloud-1 at=0.18 robots=60
    0.1826  robot    performs task actions 13 to 17
    0.2336  robot    performs sensing action 0 of step 18
    0.2346  robot    asks cloud-1, call 4
-   0.2420  robot    hears of call 4: TaskAnswer
-   0.2420  robot    performs task actions 18 to 22
-   0.2920  robot    hears of call 4: Progress
-   0.2930  robot    performs task action 23
-   0.3010  robot    hears of call 4: SensingAnswer
-   0.3010  robot    hears of call 4: its end
-   0.3032  robot    performs task actions 24 to 26
-   0.3338  robot    performs sensing action 0 of step 27
-   0.3348  robot    asks cloud-1, call 5
-   0.3630  robot    hears of call 5: TaskAnswer
-   0.3630  robot    performs task actions 27 to 31
-   0.4130  robot    hears of call 5: Progress
-   0.4140  robot    performs task action 32
-   0.4210  robot    hears of call 5: SensingAnswer
-   0.4210  robot    hears of call 5: its end
-   0.4242  robot    performs task actions 33 to 35
-   0.4548  robot    performs sensing action 2 of step 36
-   0.4558  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
-   0.4558  robot    asks cloud-1, call 6
-   0.4840  robot    hears of call 6: TaskAnswer
-   0.4840  robot    performs task actions 36 to 39
-   0.5248  robot    ends trial 0 after 40 steps
+   0.2376  robot    hears of call 4: TaskAnswer
+   0.2376  robot    performs task actions 18 to 20
+   0.2676  robot    hears of call 4: SensingAnswer
+   0.2676  robot    hears of call 4: its end
+   0.2682  robot    performs task actions 21 to 26
+   0.3294  robot    performs sensing action 0 of step 27
+   0.3304  robot    asks cloud-1, call 5
+   0.3334  robot    hears of call 5: TaskAnswer
+   0.3334  robot    performs task actions 27 to 29
+   0.3634  robot    hears of call 5: SensingAnswer
+   0.3634  robot    hears of call 5: its end
+   0.3640  robot    performs task actions 30 to 35
+   0.4252  robot    performs sensing action 2 of step 36
+   0.4262  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
+   0.4262  robot    asks cloud-1, call 6
+   0.4292  robot    hears of call 6: TaskAnswer
+   0.4292  robot    performs task actions 36 to 38
+   0.4592  robot    hears of call 6: SensingAnswer
+   0.4592  robot    hears of call 6: its end
+   0.4598  robot    performs task action 39
+   0.4700  robot    ends trial 0 after 40 steps
 
 decided as without faults

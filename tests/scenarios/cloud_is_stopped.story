@@ -49,10 +49,10 @@ stop node=cloud-1 at=0.1 for_s=0.6
    0.7000  cloud-1  goes on
    0.7010  robot    hears of call 3: its end
    0.7010  robot    hears of call 4: its end
-   0.7030  robot    hears of call 7: TaskAnswer
-   0.7030  robot    status from=local_recovery to=keep_alive outage_ms=341.2 reason=cloud-1 has answered
-   0.7060  robot    hears of call 7: SensingAnswer
-   0.7060  robot    hears of call 7: its end
+   0.7020  robot    hears of call 7: TaskAnswer
+   0.7020  robot    status from=local_recovery to=keep_alive outage_ms=340.2 reason=cloud-1 has answered
+   0.7050  robot    hears of call 7: SensingAnswer
+   0.7050  robot    hears of call 7: its end
    0.7088  robot    performs sensing action 0 of step 27
    0.7098  robot    asks cloud-1, call 8
    0.7128  robot    hears of call 8: TaskAnswer

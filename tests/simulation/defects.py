@@ -136,7 +136,7 @@ _defect(
     "old_process_still_served",
     "The service notes that a robot's process was replaced, but still answers what that one had "
     "asked before.",
-    Edit(Service, "_take_over", "self._supersede(session, None, now)", "pass"),
+    Edit(Service, "_take_over", "self._supersede(session, None)", "pass"),
 )
 _defect(
     "epoch_forgotten_with_session",

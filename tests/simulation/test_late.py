@@ -5,13 +5,14 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
+from tests.late_world import LateWorld
 
+from holdfast import tracking
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import LostSettings
 from holdfast.lab.errors import Violation
 from holdfast.lab.simulation.checkers import WireChecker
 from holdfast.lab.simulation.environment_model import EnvironmentModel
-from holdfast.lab.simulation.memo_cache import MemoizingPlanner
 from holdfast.lab.simulation.peg_with_encoders import PegWithEncoders
 from holdfast.lab.simulation.reference_runs import (
     BEFORE_CHOOSING,
@@ -26,6 +27,7 @@ from holdfast.lab.simulation.reference_runs import (
 from holdfast.lab.simulation.schedule import RunSettings, SimulationSchedule, parse_schedule
 from holdfast.lab.simulation.schedule_draws import draw_schedule
 from holdfast.lab.simulation.world import Setup, Simulator
+from holdfast.lost import LostTest
 from holdfast.outcome import MoveResult
 from holdfast.protocol.records import (
     ActingRecord,
@@ -35,8 +37,6 @@ from holdfast.protocol.records import (
     Record,
 )
 from holdfast.randomness import Stream, stream
-from holdfast.robot.environment import SimulatedEnvironment
-from holdfast.robot.late_sensing import SenseLater
 from holdfast.robot.trial import run_trial
 
 MAX_STEPS = 40
@@ -58,7 +58,7 @@ def decisions(run: ReferenceRun) -> list[tuple[int | None, bytes]]:
     return [(step.sensing_action, step.action) for step in run.steps]
 
 
-class ShowsSometimes(SimulatedEnvironment):
+class ShowsSometimes(LateWorld):
     """Leaves out of what a move shows the same as the reference runs, and is carried away then."""
 
     kidnapped = False
@@ -83,21 +83,22 @@ class TestReferenceRuns:
     @pytest.mark.parametrize("reinitialises", [False, True])
     @pytest.mark.parametrize("moves", [0, 1, 3, 9, 10, 25])
     def test_the_digest_is_the_one_of_a_trial_in_process(
-        self, setup: Setup, moves: int, reinitialises: bool
+        self, setup: Setup, moves: int, reinitialises: bool, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         planner, seed = setup.planner, Simulator().seed
         lost = LostSettings()
         if reinitialises:
-            lost = LostSettings(false_alarm_rate=1.0, on_lost="reinitialise")
+            lost = LostSettings(on_lost="reinitialise")
+            monkeypatch.setattr(tracking, "LostTest", lambda _rate: LostTest(1.0))
         for trial in range(1, 3):
-            world = ShowsSometimes(planner.problem, seed, trial)
+            world = ShowsSometimes(planner.problem, seed, trial, moves)
             world.kidnapped = reinitialises
             result = run_trial(
                 planner,
                 seed,
                 trial,
                 max_steps=MAX_STEPS,
-                environment=SenseLater(world, moves) if moves else world,
+                environment=world,
                 lost=lost,
             )
             circumstances = Circumstances(
@@ -303,7 +304,7 @@ def test_a_service_that_diverges_is_found() -> None:
 
 
 def test_what_a_move_shows_is_folded_in_once() -> None:
-    planner = MemoizingPlanner(Setup(True, False).planner)
+    planner = Setup(True, False).planner
     state = planner.init(1, 0)
     one, other = (planner.observe_move(state, np.zeros(3), np.array([1.0])) for _ in range(2))
     assert one[0] is other[0]

@@ -6,14 +6,15 @@ import msgspec
 import numpy as np
 import pytest
 
+from holdfast.arrays import FloatArray
 from holdfast.config.settings import PlanningSettings
 from holdfast.lab.errors import Violation
+from holdfast.lab.simulation.checked_memo import CheckedPlanner
 from holdfast.lab.simulation.checkers import StatusChecker, WireChecker, check_size
 from holdfast.lab.simulation.disk import Disk
 from holdfast.lab.simulation.environment_model import EnvironmentModel
 from holdfast.lab.simulation.event_queue import Clock, EventQueue
 from holdfast.lab.simulation.exploration import shrink
-from holdfast.lab.simulation.memo_cache import MemoizingPlanner
 from holdfast.lab.simulation.reference_runs import (
     UNDISTURBED,
     Circumstances,
@@ -30,9 +31,10 @@ from holdfast.lab.simulation.schedule import (
 )
 from holdfast.lab.simulation.schedule_draws import draw_schedule
 from holdfast.outcome import TrialResult
-from holdfast.planning import Planner, PlanningState
+from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.records import ActingRecord, PerformedRecord, TrialHistory
+from holdfast.randomness import Stream
 
 
 class TestEventQueue:
@@ -297,23 +299,21 @@ def test_statuses() -> None:
 
 class TestMemory:
     def test_an_impure_function_is_found(self) -> None:
-        class Impure(Planner):
+        class Impure(PegInHole2D):
             calls = 0
 
-            def advance(
-                self, state: PlanningState, task_action: object, motion: object = None
-            ) -> PlanningState:
+            def move(self, states: FloatArray, action: FloatArray, random: Stream) -> FloatArray:
                 self.calls += 1
-                return state._replace(step=state.step + (2 if self.calls > 1 else 1))
+                return super().move(states, action + 0.01 * self.calls, random)
 
-        planner = MemoizingPlanner(Impure(PegInHole2D(), PlanningSettings()))
+        planner = CheckedPlanner(Impure(), PlanningSettings())
         state = planner.init(1, 0)
         with pytest.raises(Violation, match="another state"):
             for _ in range(200):
                 planner.advance(state, np.zeros(3))
 
     def test_the_same_is_not_computed_again(self) -> None:
-        planner = MemoizingPlanner(Planner(PegInHole2D(), PlanningSettings()))
+        planner = CheckedPlanner(PegInHole2D(), PlanningSettings())
         state = planner.init(1, 0)
         assert planner.init(1, 0) is state
         after = planner.advance(state, np.zeros(3))

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from tests.command_line import run_here
 
-from holdfast.cli.serve import make_ros_services
+from holdfast.cli.serve import make_ros_service
 from holdfast.errors import ConfigurationError, InvalidValueError
 from holdfast.service.options import parse_options
 
@@ -31,10 +31,10 @@ def test_an_address_of_ros1_that_others_reach_is_refused(
     monkeypatch.delenv("ROS_HOSTNAME", raising=False)
     options = parse_options(["--ros1", "--configuration", str(tmp_path / "run.yaml")])
     with pytest.raises(InvalidValueError, match="no peer proves its identity"):
-        make_ros_services(options)
+        make_ros_service(options)
 
 
 def test_its_configuration_must_be_there(tmp_path: Path) -> None:
     options = parse_options(["--ros1", "--configuration", str(tmp_path / "none.yaml")])
     with pytest.raises(ConfigurationError, match="there is no such file"):
-        make_ros_services(options)
+        make_ros_service(options)

@@ -68,7 +68,7 @@ from holdfast.robot.environment import SimulatedEnvironment
 )
 def test_settings_made_in_python_are_checked(settings: Any, message: str) -> None:
     with pytest.raises(InvalidValueError, match=message):
-        check_settings(settings)
+        check_settings(settings, PlanningSettings)
     with pytest.raises(InvalidValueError, match=message):
         Planner(PegInHole2D(), settings)
 

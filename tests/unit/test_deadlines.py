@@ -32,7 +32,7 @@ class SlowCondition(threading.Condition):
 
 def test_waits_end_with_the_deadline() -> None:
     clock = ManualClock()
-    deadline = Deadline(1.0, "environment.act.timeout_ms", clock)
+    deadline = Deadline(1.0, "environment.timeout_ms", clock)
     condition = SlowCondition(clock, 0.0)
     deadline.wait(condition, 0.75)
     assert (deadline.is_over(), deadline.waited_s()) == (False, 0.75)

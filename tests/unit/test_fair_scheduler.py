@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import asyncio
 
+import pytest
+
+from holdfast.transport import link_settings
 from holdfast.transport.link_settings import SLICE_S, FairScheduler
 
 
@@ -38,13 +41,42 @@ async def test_owners_go_by_turns_however_many_they_are() -> None:
     assert taken == ["mallory", "anna"] * 3 + ["mallory"] * 3
 
 
-async def test_one_goes_on_in_each_turn_of_the_loop() -> None:
+async def test_waiting_ones_go_on_for_so_long_in_each_turn_of_the_loop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each slice takes 1 ms of the thread's time, and a turn has 2 ms."""
     scheduler, taken = FairScheduler(), list[object]()
-    for _ in range(2):
-        Busy(scheduler, "mallory", 3, taken).enqueue()
-    for number in range(6):
-        assert len(taken) == number
+    monkeypatch.setattr(link_settings, "thread_time", lambda: 1e-3 * len(taken))
+    for owner in ("anna", "berta", "mallory"):
+        Busy(scheduler, owner, 2, taken).enqueue()
+    for turn in range(3):
+        assert len(taken) == 2 * turn
         await asyncio.sleep(0)
+    assert taken == ["anna", "berta", "mallory"] * 2
+    assert not scheduler._waiting
+
+
+async def test_a_slice_that_fails_stops_no_other() -> None:
+    scheduler, taken = FairScheduler(), list[object]()
+
+    def fails() -> None:
+        raise RuntimeError
+
+    scheduler.enqueue("mallory", fails)
+    Busy(scheduler, "anna", 1, taken).enqueue()
+    asyncio.get_running_loop().set_exception_handler(lambda *_: None)
+    for _ in range(2):
+        await asyncio.sleep(0)
+    assert taken == ["anna"]
+
+
+async def test_all_that_is_handled_at_once_takes_half_of_the_time() -> None:
+    scheduler = FairScheduler()
+    for number in range(3):
+        assert scheduler.may_run(number, 1.0)
+        scheduler.charge(number, 0.9 * SLICE_S)
+    assert not scheduler.may_run("anna", 1.004)
+    assert scheduler.may_run("anna", 1.006)
 
 
 async def test_an_owner_has_one_turn_at_once_in_a_while() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
+import time
 from typing import Any, get_args
 
 import numpy as np
@@ -99,14 +101,54 @@ def test_the_kernel_ends_between_its_tasks(threads: int) -> None:
         _kernel.use_threads_from(before)
 
 
-def test_the_outer_interruption_is_watched_again_after_the_inner_one() -> None:
+def test_a_computation_ends_once_its_thread_has_computed_for_so_long() -> None:
+    planner = Planner(CapsuleRobot(), particles=50)
+    state = planner.init(3)
+    for most_s in (0.0, 3600.0):
+        interruption = Interruption(most_s)
+        with contextlib.suppress(InterruptedComputationError), interruptible(interruption):
+            planner.choose_sensing_action(state)
+        assert interruption.took_too_long == (most_s == 0.0)
+        assert interruption.is_set == interruption.took_too_long
+
+
+def compute_for(seconds: float) -> None:
+    began = time.thread_time()
+    while time.thread_time() < began + seconds:
+        pass
+
+
+def test_only_what_its_own_thread_computes_counts() -> None:
+    interruption = Interruption(0.05)
+    with interruptible(interruption):
+        other = threading.Thread(target=compute_for, args=(0.1,))
+        other.start()
+        other.join()
+        check()
+        compute_for(0.06)
+        with pytest.raises(InterruptedComputationError, match=r"takes more than 0\.05 s"):
+            check()
+
+
+def interruption_error(interruption: Interruption) -> None:
+    with interruptible(interruption):
+        check()
+
+
+def test_one_that_is_set_before_its_time_is_over_was_not_too_long() -> None:
+    interruption = Interruption(0.0)
+    interruption.set()
+    with pytest.raises(InterruptedComputationError, match="nobody awaits"):
+        interruption_error(interruption)
+    assert not interruption.took_too_long
+
+
+def test_outside_the_context_nothing_ends() -> None:
     points, rows = np.arange(600.0).reshape(200, 3), np.zeros((4, 200))
-    outer = Interruption()
-    with pytest.raises(InterruptedComputationError), interruptible(outer):
-        with interruptible(Interruption()):
-            outer.set()
-            _kernel.all_finite(points)
-        _kernel.entropies(points, rows, True, 0, 5, 1e-3, 0.0, 0.0, 1, (1.0,), np.empty(0))
+    interruption = Interruption(0.0)
+    with contextlib.suppress(InterruptedComputationError):
+        interruption_error(interruption)
+    _kernel.entropies(points, rows, True, 0, 5, 1e-3, 0.0, 0.0, 1, (1.0,), np.empty(0))
 
 
 def test_one_block_of_particles_in_an_obstacle_leaves_the_interpreter_and_ends() -> None:

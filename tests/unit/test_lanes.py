@@ -8,8 +8,7 @@ from tests.unit.test_protocol_service import Bench, Robot, content, planning_of,
 
 from holdfast.config.settings import PlanningSettings
 from holdfast.protocol.decision_cost import cost_of_sensing
-from holdfast.protocol.messages import Busy, Progress, Refused
-from holdfast.protocol.service_jobs import Job
+from holdfast.protocol.messages import Busy, Refused
 from holdfast.protocol.service_limits import ServiceLimits
 
 
@@ -165,127 +164,88 @@ class TestNobodyAwaitsIt:
         assert content(bench.ask(robot.request())) == robot.right_answer()
 
 
-def held_up(bench: Bench) -> tuple[Robot, int, Robot, int, Job]:
-    """Have a brief decision run for far too long, while another robot waits for the worker."""
-    slow, other = Robot(key=1), Robot(key=2)
-    call = bench.send(slow.request())
-    (job,) = bench.jobs
-    waits = bench.send(other.request())
-    assert len(bench.jobs) == 1, "there is one worker"
-    limit_s = ServiceLimits().max_brief_s
-    bench.now += 4.0 * limit_s
-    bench.apply(bench.service.tick(bench.now))
-    assert not job.is_cancelled
-    bench.now += 2.0 * limit_s
-    due = bench.service.next_wakeup()
-    assert due is not None
-    assert due <= bench.now
-    bench.apply(bench.service.tick(bench.now))
-    return slow, call, other, waits, job
+def overrun(bench: Bench, index: int = -1) -> None:
+    """Have a job use up its time."""
+    bench.jobs[index].interruption.use_up()
+    bench.run(index)
 
 
 class TestTheEstimateIsFarTooLow:
-    def test_what_holds_up_others_is_computed_as_a_long_one(self) -> None:
+    def test_the_decision_is_computed_as_a_long_one(self) -> None:
         bench = Bench()
-        slow, call, other, waits, job = held_up(bench)
-        assert job.is_cancelled
-        due = bench.service.next_wakeup()
-        assert due is None or due > bench.now
-        again = bench.send(slow.request())
-        bench.run()
+        slow, other = bench.known(1, 2)
+        call = bench.send(slow.request())
+        waits = bench.send(other.request())
+        assert len(bench.jobs) == 1, "there is one worker"
+        overrun(bench)
         assert [each._most is None for each in bench.jobs] == [False, True]
-        bench.run_all()
-        assert content(bench.replies[waits]) == other.right_answer()
-        assert call in bench.ended, "superseded by the same robot's next request"
-        assert content(bench.replies[again]) == slow.right_answer()
-
-    def test_whoever_waits_for_it_gets_the_answer(self) -> None:
-        bench = Bench()
-        slow, call, other, waits, _ = held_up(bench)
         bench.run_all()
         assert content(bench.replies[call]) == slow.right_answer()
         assert content(bench.replies[waits]) == other.right_answer()
 
-    def test_one_that_has_just_ended_is_answered_at_once(self) -> None:
-        bench, robot = Bench(), Robot()
-        call = bench.send(robot.request())
-        outcome = bench.jobs[0].run()
-        bench.send(Robot(key=2).request())
-        # The machine stood still meanwhile.
+    def test_the_next_ones_are_too_until_one_takes_less(self) -> None:
+        bench = Bench()
+        (slow,) = bench.known(1)
+        bench.send(slow.request())
+        overrun(bench)
         bench.now += 1.0
-        bench.apply(bench.service.tick(bench.now))
-        bench.apply(bench.service.finished(bench.jobs.popleft(), outcome, bench.now))
-        bench.run_all()
-        assert content(bench.replies[call]) == robot.right_answer()
-
-    def test_one_that_holds_up_nobody_goes_on(self) -> None:
-        bench, robot = Bench(), Robot()
-        call = bench.send(robot.request())
-        bench.now += 1.0
-        bench.apply(bench.service.tick(bench.now))
-        (job,) = bench.jobs
-        assert not job.is_cancelled
-        bench.send(Robot(key=2).request())
-        due = bench.service.next_wakeup()
-        assert due is not None
-        assert due <= bench.now, "now it does"
-        bench.run_all()
-        assert content(bench.replies[call]) == robot.right_answer()
-
-    def test_one_that_nobody_awaits_ends_at_its_lanes_limit(self) -> None:
-        for before in (0.0, 1.1):
-            bench, robot = Bench(), Robot()
-            call = bench.send(robot.request())
-            (job,) = bench.jobs
-            limit_s = ServiceLimits().max_brief_s
-            bench.now += before * limit_s
-            bench.apply(bench.service.gone(call, bench.now))
-            assert job.is_cancelled == (before > 1.0)
-            bench.now += 1.1 * limit_s
-            due = bench.service.next_wakeup()
-            assert job.is_cancelled or (due is not None and due <= bench.now)
-            bench.apply(bench.service.tick(bench.now))
-            assert job.is_cancelled
-            bench.run_all()
-            assert content(bench.ask(robot.request())) == robot.right_answer()
-
-    def test_a_medium_one_has_more_time(self) -> None:
-        bench, robot = Bench(), robot_of(medium_planning(), 1)
-        call = bench.send(robot.request())
+        bench.run()  # as a long one
+        assert bench.jobs[0]._most is None, "the sensing part, which nothing has shown to be slow"
         bench.run()
-        bench.send(Robot(key=2).request())
-        bench.now += 0.4
-        bench.apply(bench.service.tick(bench.now))
-        assert [each.is_cancelled for each in bench.jobs] == [False]
-        bench.now += 0.2
-        bench.apply(bench.service.tick(bench.now))
-        assert [each.is_cancelled for each in bench.jobs] == [True]
+        slow.act_until_sensing()
+        slow.sense()
+        bench.send(slow.request())
+        assert bench.jobs[0]._most is not None
+
+    def test_a_newer_request_takes_its_place(self) -> None:
+        bench = Bench()
+        (slow,) = bench.known(1)
+        call = bench.send(slow.request())
+        overrun(bench)
+        slow.act()
+        newer = bench.send(slow.request())
         bench.run_all()
-        assert content(bench.replies[call]) == robot.right_answer()
+        assert call in bench.ended
+        assert content(bench.replies[newer]) == slow.right_answer()
+
+    def test_what_nobody_awaits_is_not_computed_again(self) -> None:
+        bench = Bench()
+        (slow,) = bench.known(1)
+        call = bench.send(slow.request())
+        bench.apply(bench.service.gone(call, bench.now))
+        overrun(bench)
+        assert not bench.jobs
+        assert bench.service.statistics.waiting == 0
+
+    def test_each_lane_has_its_time(self) -> None:
+        """So many times its limit; new ones have that of brief ones."""
+        bench, limits, most = Bench(), ServiceLimits(), []
+        (known,) = bench.known(3)
+        for robot in (known, robot_of(medium_planning(), 1), robot_of(long_planning(), 2)):
+            bench.send(robot.request())
+            most.append(bench.jobs[-1].interruption.most_s)
+            bench.run()
+            if bench.jobs:
+                most.append(bench.jobs[-1].interruption.most_s)
+            bench.jobs.clear()
+            bench.service.forget_everything()
+        brief_s = 5 * limits.max_brief_s
+        medium_s, long_s = 5 * limits.max_medium_s, 4 * limits.max_decision_s
+        assert most == [brief_s, brief_s, brief_s, medium_s, brief_s, long_s]
 
 
-def test_what_takes_much_longer_than_estimated_is_refused_and_cancelled() -> None:
+def test_what_takes_much_longer_than_estimated_is_refused() -> None:
     bench = Bench(workers=1)
     (call,) = ask_for_long_ones(bench, 1)
-    (job,) = bench.jobs
-    limit_s = ServiceLimits().max_decision_s
-    bench.now += 2.0 * limit_s
-    bench.apply(bench.service.tick(bench.now))
-    assert all(isinstance(reply, Progress) for reply in bench.replies[call])
-    due = bench.service.next_wakeup()
-    bench.now += 2.0 * limit_s
-    assert due is not None
-    assert due <= bench.now
-    bench.apply(bench.service.tick(bench.now))
+    overrun(bench)
     reply = bench.replies[call][-1]
     assert isinstance(reply, Refused)
     assert reply.code == "invalid"
+    assert "has taken 40 s" in reply.text
     assert "at most 10 s (--max-decision-s)" in reply.text
     assert "rollout_steps 2000" in reply.text
-    assert job.run().cancelled
-    bench.apply(bench.service.tick(bench.now + 1.0))
-    wakeup = bench.service.next_wakeup()
-    assert wakeup is None or wakeup > bench.now
+    assert call in bench.ended
+    assert bench.service.statistics.running == 0
 
 
 def test_long_decisions_share_a_bound_on_memory() -> None:

@@ -1,22 +1,22 @@
-"""Sensing that takes time: on a thread, or shown so many moves later."""
+"""Sensing that takes time: on a thread, or by a world that shows it later."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from tests.late_world import LateWorld
 
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
-from holdfast.errors import EnvironmentFailedError, InvalidValueError
+from holdfast.errors import EnvironmentFailedError
 from holdfast.outcome import MoveResult, TrialResult
 from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.robot.environment import LATER, Environment, SimulatedEnvironment
-from holdfast.robot.late_sensing import SenseInBackground, SenseLater
+from holdfast.robot.late_sensing import SenseInBackground
 from holdfast.robot.trial import LateStep, SensingStep, TaskStep, TrialObserver, run_trial
 
 PATIENCE_S = 30.0
@@ -63,24 +63,27 @@ def world() -> SimulatedEnvironment:
     return SimulatedEnvironment(PegInHole2D(), 5, 0)
 
 
+def late_world(moves: int) -> LateWorld:
+    return LateWorld(PegInHole2D(), 5, 0, moves)
+
+
 @pytest.mark.parametrize("moves", [1, 2, 3, 7])
 def test_each_observation_comes_so_many_moves_later(moves: int) -> None:
-    result, noting = run(SenseLater(world(), moves))
+    result, noting = run(late_world(moves))
     assert noting.sensed_at == list(range(0, result.steps, 3))
     assert noting.late == [
         (step, step + moves) for step in noting.sensed_at if step + moves <= result.steps
     ]
-    again, _ = run(SenseLater(world(), moves))
+    again, _ = run(late_world(moves))
     assert again.digest == result.digest
 
 
 def test_a_late_robot_gets_there_all_the_same() -> None:
-    result, _ = run(SenseLater(world(), 3), 500)
+    result, _ = run(late_world(3), 500)
     assert result.success
 
 
-@pytest.mark.parametrize("make", [SenseInBackground, lambda robot: SenseLater(robot, 2)])
-def test_no_reading_may_be_found_late(make: Callable[[Any], Any]) -> None:
+def test_no_reading_may_be_found_late() -> None:
     """The belief stays as it is; the observation just does not come."""
 
     class Blind(SimulatedEnvironment):
@@ -93,16 +96,11 @@ def test_no_reading_may_be_found_late(make: Callable[[Any], Any]) -> None:
         if planner.needs_sensing(state):
             state, _ = planner.observe(state, planner.choose_sensing_action(state)[0], None)
         state = planner.advance(state, planner.choose_task_action(state)[0])
-    result, noting = run(make(Blind(PegInHole2D(), 5, 0)), steps)
+    result, noting = run(SenseInBackground(Blind(PegInHole2D(), 5, 0)), steps)
     assert result.decisions is not None
     assert result.decisions.log.endswith(planner.digest(state))
     assert noting.late == []
     assert result.missing_observations == len(noting.sensed_at) == 7
-
-
-def test_no_moves_are_no_lateness() -> None:
-    with pytest.raises(InvalidValueError, match="moves 0: allowed are whole numbers from 1"):
-        SenseLater(world(), 0)
 
 
 def test_what_an_environment_keeps_may_change() -> None:
@@ -142,8 +140,7 @@ def test_what_an_environment_keeps_may_change() -> None:
     assert len(digests) == 1
 
 
-@pytest.mark.parametrize("kind", ["later", "in the background"])
-def test_what_waits_is_kept_as_it_came(kind: str) -> None:
+def test_what_waits_is_kept_as_it_came() -> None:
     """The environment shows the next observation in the same array."""
     buffer = np.zeros(1)
 
@@ -152,14 +149,12 @@ def test_what_waits_is_kept_as_it_came(kind: str) -> None:
             buffer[:] = sensing_action
             return buffer
 
-    reusing = Reusing(PegInHole2D(), 5, 0)
-    robot: Any = SenseLater(reusing, 1) if kind == "later" else SenseInBackground(reusing)
+    robot = SenseInBackground(Reusing(PegInHole2D(), 5, 0))
     for sensing_action in (1, 2, 0):
         robot.perform_sensing(sensing_action)
     robot.perform(ACTION)
-    if kind != "later":
-        robot.close()
-    assert [float(shown[0]) for _, shown in robot.late_observations()] == [1.0, 2.0, 0.0]
+    robot.close()
+    assert [np.asarray(shown)[0] for _, shown in robot.late_observations()] == [1.0, 2.0, 0.0]
 
 
 @pytest.mark.parametrize("what", ["motion", "observation"])
@@ -261,16 +256,3 @@ def test_it_is_closed_when_sensing_has_ended() -> None:
     robot.close()
     assert ended == ["sensed", "closed"]
     SenseInBackground(Slow()).close()
-
-
-def test_what_is_due_is_shown_once() -> None:
-    """Neither too early, nor again with the next move."""
-    inner = SimulatedEnvironment(PegInHole2D(), 3, 0)
-    later = SenseLater(inner, 2)
-    assert later.perform_sensing(0) is LATER
-    shown = []
-    for _ in range(4):
-        later.perform(ACTION)
-        shown.append([step for step, _ in later.late_observations()])
-        assert later.late_observations() == []
-    assert shown == [[], [0], [], []]

@@ -46,7 +46,6 @@ NUMBERS = [
     ["serve", "--max-sessions-per-robot"],
     ["serve", "--max-decision-s"],
     ["serve", "--max-decision-mb"],
-    ["serve", "--ros2-domain"],
 ]
 PATHS = [
     ["run"],

@@ -127,7 +127,7 @@ class Bench:
                 self.trace.append((f"run {effect.job.kind}", -1))
             elif isinstance(effect, LogEvent):
                 self.notes.append(effect)
-        assert len(self.jobs) <= self.workers + max(1, self.workers - 1)  # these are long
+        assert len(self.jobs) <= self.service.max_running
 
     def send(self, message: Request | bytes, owner: str | None = None) -> int:
         call = len(self.replies)
@@ -152,6 +152,15 @@ class Bench:
         self.run_all()
         assert call in self.ended
         return self.replies[call]
+
+    def known(self, *keys: int, owner: str | None = None) -> list[Robot]:
+        """Return robots that were served, and have sensed since."""
+        robots = [Robot(key=key) for key in keys]
+        for robot in robots:
+            self.ask(robot.request(), owner)
+            robot.sense()
+        self.trace.clear()
+        return robots
 
     def kinds(self, call: int) -> list[str]:
         return [type(reply).__name__ for reply in self.replies[call]]
@@ -550,8 +559,8 @@ class TestOnce:
         assert refused(bench.ask(robot.request(step=1, sensed=False))).code == "invalid"
 
     def test_prefetch_that_was_dropped_is_taken_up_again(self) -> None:
-        bench, robot, other = Bench(), Robot(), Robot(key=2)
-        robot.sense()
+        bench = Bench()
+        robot, other = bench.known(1, 2)
         call = bench.send(robot.request())
         bench.send(other.request())
         bench.run()
@@ -562,18 +571,14 @@ class TestOnce:
         assert bench.kinds(again) == ["TaskAnswer"]
         bench.run_all()
         assert content(bench.replies[again]) == robot.right_answer()
-        assert self.computed(bench) == (1, 2)
+        assert self.computed(bench) == (2, 4)
         assert bench.service.statistics.superseded == 1
 
 
 class TestOrder:
     def test_first_parts_go_before_prefetches(self) -> None:
         bench = Bench()
-        robots = [Robot(key=key) for key in (1, 2, 3)]
-        calls = []
-        for robot in robots:
-            robot.sense()
-            calls.append(bench.send(robot.request()))
+        calls = [bench.send(robot.request()) for robot in bench.known(1, 2, 3)]
         bench.run_all()
         assert bench.trace == [
             ("run task", -1),
@@ -594,9 +599,7 @@ class TestOrder:
 
     def test_a_prefetch_is_not_put_off_for_ever(self) -> None:
         bench = Bench(prefetch_patience_ms=20.0)
-        robots = [Robot(key=key) for key in range(1, 9)]
-        for robot in robots:
-            robot.sense()
+        robots = bench.known(*range(1, 9))
         first = bench.send(robots[0].request())
         bench.send(robots[1].request())
         bench.run()  # the first's task part; the second's is handed out
@@ -670,8 +673,8 @@ class TestOrder:
         assert not bench.jobs
 
     def test_one_robot_has_one_worker_for_its_requests(self) -> None:
-        bench, robot, other = Bench(workers=2), Robot(), Robot(key=2)
-        robot.sense()
+        bench = Bench(workers=2)
+        robot, other = bench.known(1, 2)
         bench.send(robot.request())
         robot.act()
         newer = bench.send(robot.request())
@@ -1046,26 +1049,32 @@ class TestCapacity:
         bench.run_all()
         assert set(calls) <= bench.ended
 
-    def test_a_robot_that_was_served_waits_for_one_newcomer_at_most(self) -> None:
+    def test_a_robot_that_was_served_waits_for_no_newcomer(self) -> None:
         """However many there are, and however long they have waited."""
         bench = Bench(max_wait_ms=100.0)
-        known = Robot(key=1)
-        bench.ask(known.request())
-        known.sense()
+        (known,) = bench.known(1)
         for key in range(2, 60):
             bench.send(Robot(key=key).request())
         bench.now += 10.0
         for _ in range(3):
             right = known.right_answer()
             call = bench.send(known.request())
-            jobs = 0
-            while not bench.replies[call]:
-                bench.run()
-                jobs += 1
-            assert jobs <= 3, "what ran, one newcomer, and this one"
-            assert content(bench.replies[call]) == right[:1]
+            assert len(bench.jobs) == 2, "a newcomer, and this one beside it"
+            while call not in bench.ended:
+                bench.run(-1)
+            assert content(bench.replies[call]) == right
             known.act_until_sensing()
             known.sense()
+
+    def test_nor_for_states_from_outside(self) -> None:
+        """A checkpoint may hold anything; its request begins with those of newcomers."""
+        bench = Bench()
+        robot, other = bench.known(1, 2)
+        bench.send(robot.restore())
+        call = bench.send(other.request())
+        assert len(bench.jobs) == 2
+        bench.run_all()
+        assert content(bench.replies[call]) == other.right_answer()
 
     def test_prefetches_do_not_starve_behind_newcomers(self) -> None:
         bench = Bench(max_wait_ms=100.0, prefetch_patience_ms=20.0)
@@ -1097,12 +1106,10 @@ class TestCapacity:
 
     def test_one_more_robot_than_workers_is_never_too_many(self) -> None:
         bench = Bench(max_wait_ms=1.0, max_waiting=1)
-        first = Robot(key=1)
-        bench.send(first.request())
+        bench.send(Robot(key=1).request())
         bench.now += 30.0
         bench.run()
-        first.sense()
-        bench.send(first.request())
+        bench.send(Robot(key=4).request())
         second = bench.send(Robot(key=2).request())
         assert bench.replies[second] == []
         third = bench.send(Robot(key=3).request())

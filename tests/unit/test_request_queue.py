@@ -126,7 +126,6 @@ def made(
     owner: str | None = None,
     *,
     size: int = 10,
-    newcomer: bool = False,
     prefetched: bool = False,
     since: float = 0.0,
 ) -> PendingTask:
@@ -140,7 +139,6 @@ def made(
         ExpectedTime(0.05),
         ExpectedTime(0.05),
     )
-    session.newcomer = newcomer
     return PendingTask(
         session,
         b"%d" % number,
@@ -174,7 +172,7 @@ def turns(queue: RequestQueue, count: int, now: float) -> list[bytes]:
 
 
 class TestTurns:
-    """Prefetches are patient for 20 ms, newcomers for 100 ms."""
+    """Prefetches are patient for 20 ms."""
 
     def order(self, *tasks: PendingTask, now: float) -> list[bytes]:
         queue = RequestQueue(99, ServiceLimits(prefetch_patience_ms=20.0, max_wait_ms=100.0))
@@ -202,36 +200,6 @@ class TestTurns:
         assert turns(queue, 2, 2.0) == [first, b"2"]
         assert queue._urgent._last_turn == {}  # of owners with tasks alone
 
-    @pytest.mark.parametrize(
-        ("came", "known", "first"), [(0.0, 0.1, b"1"), (0.0, 0.101, b"2"), (8.0, 8.05, b"1")]
-    )
-    def test_a_newcomer_waits_for_a_known_robot(
-        self, came: float, known: float, first: bytes
-    ) -> None:
-        """Unless that came more than 100 ms later."""
-        tasks = made(1, "anna", since=known), made(2, "berta", newcomer=True, since=came)
-        assert self.order(*tasks, now=9.0)[0] == first
-
-    def test_newcomers_have_every_second_turn_at_most(self) -> None:
-        newcomers = [made(k, f"new {k}", newcomer=True) for k in range(3)]
-        known = [made(k + 3, f"known {k}", since=0.5) for k in range(3)]
-        assert self.order(*newcomers, *known, now=0.5) == [b"0", b"3", b"1", b"4", b"2", b"5"]
-
-    @pytest.mark.parametrize(
-        ("now", "came", "first"),
-        [(0.02, 0.02, b"2"), (0.03, 0.02, b"2"), (0.03, 0.021, b"1"), (0.02, 0.021, b"2")],
-    )
-    def test_a_newcomer_and_a_prefetch(self, now: float, came: float, first: bytes) -> None:
-        """It goes first while the prefetch is patient, and later if it came in that time."""
-        tasks = made(1, "anna", prefetched=True), made(2, "berta", newcomer=True, since=came)
-        assert self.order(*tasks, now=now)[0] == first
-
-    def test_newcomers_do_not_stop_prefetches_for_ever(self) -> None:
-        newcomers = [made(k, f"new {k}", newcomer=True) for k in range(3)]
-        known = [made(k + 3, f"known {k}", prefetched=True) for k in range(3)]
-        assert self.order(*newcomers, *known, now=0.5) == [b"0", b"3", b"1", b"4", b"2", b"5"]
-        assert self.order(*newcomers, *known, now=0.0)[:3] == [b"0", b"1", b"2"]
-
 
 class TestTheWait:
     """Four workers; each task is expected to take 50 ms."""
@@ -240,18 +208,16 @@ class TestTheWait:
         self.limits = ServiceLimits(max_wait_ms=100.0)
         self.queue = RequestQueue(4, self.limits)
 
-    def add(
-        self, number: int, owner: str | None = None, *, size: int = 10, newcomer: bool = False
-    ) -> None:
-        self.queue.enqueue(made(number, owner, size=size, newcomer=newcomer))
+    def add(self, number: int, owner: str | None = None, *, size: int = 10) -> None:
+        self.queue.enqueue(made(number, owner, size=size))
 
-    def overloaded(self, owner: str | None = None, *, newcomer: bool = False) -> bool:
-        return self.queue.is_overloaded(0.0, owner, newcomer=newcomer)
+    def overloaded(self, owner: str | None = None) -> bool:
+        return self.queue.is_overloaded(0.0, owner)
 
     def test_the_longest_wait_is_that_of_all_workers_together(self) -> None:
         for number in range(8):
             self.add(number)
-        assert self.queue.wait_s(0.0, None, newcomer=False) == pytest.approx(0.1)
+        assert self.queue.wait_s(0.0, None) == pytest.approx(0.1)
         assert not self.overloaded()
         self.add(8)
         assert self.overloaded()
@@ -266,20 +232,15 @@ class TestTheWait:
         assert self.overloaded()
 
     @pytest.mark.parametrize("bound", ["max_waiting", "max_waiting_bytes"])
-    def test_half_of_the_room_is_kept_for_those_that_were_served(self, bound: str) -> None:
+    def test_a_lane_has_its_share_of_the_room(self, bound: str) -> None:
         limits = {"max_waiting": 16, "max_waiting_bytes": 16_000, "max_wait_ms": 1e6}
         limits["max_waiting_bytes" if bound == "max_waiting" else "max_waiting"] = 10**6
-        self.queue = RequestQueue(4, ServiceLimits(**limits))  # type: ignore[arg-type]
-        for number in range(16):
-            assert not self.overloaded()
-            assert self.overloaded(newcomer=True) == (number >= 8)
-            self.add(number, size=1000, newcomer=True)
-        assert not self.overloaded()  # of those that go before it, none waits
-        self.queue = RequestQueue(4, ServiceLimits(**limits))  # type: ignore[arg-type]
-        for number in range(16):
-            assert not self.overloaded()
-            self.add(number, size=1000)
-        assert self.overloaded()
+        for room, most in ((1.0, 16), (0.5, 8)):
+            self.queue = RequestQueue(4, ServiceLimits(**limits), room)  # type: ignore[arg-type]
+            for number in range(most):
+                assert not self.overloaded()
+                self.add(number, size=1000)
+            assert self.overloaded()
 
     def test_one_robot_has_no_more_than_its_share(self) -> None:
         limits = ServiceLimits(max_waiting_per_robot=6, max_wait_ms=1e6, max_waiting_bytes=1000)
@@ -313,7 +274,7 @@ class TestTheWait:
         assert (self.queue.num_running, self.wait_s(1.5)) == (0, 0.0)
 
     def wait_s(self, now: float) -> float:
-        return self.queue.wait_s(now, None, newcomer=False)
+        return self.queue.wait_s(now, None)
 
     def test_what_is_removed_or_replaced_counts_no_more(self) -> None:
         limits = ServiceLimits(max_waiting_bytes=100, max_wait_ms=1e6)
@@ -334,19 +295,10 @@ class TestTheWait:
         assert self.queue._waiting_of == {}
         assert self.queue.take(1.0) is None
 
-    def test_newcomers_ahead_are_as_many_as_the_others_at_most(self) -> None:
-        for number in range(6):
-            self.add(number, f"new {number}", newcomer=True)
-        assert self.wait_s(0.0) == 0.0
-        for number in range(6, 8):
-            self.add(number, f"known {number}")
-        assert self.wait_s(0.0) == pytest.approx((2 + 2) * 0.05 / 4)
-        assert self.queue.wait_s(0.0, None, newcomer=True) == pytest.approx((2 + 6) * 0.05 / 4)
-
     def test_before_an_owners_next_task_go_its_own_and_one_more_of_each(self) -> None:
         for number in range(12):
             self.add(number, "anna" if number < 8 else f"other {number}")
-        assert self.queue.wait_s(0.0, "berta", newcomer=False) == pytest.approx(5 * 0.05 / 4)
+        assert self.queue.wait_s(0.0, "berta") == pytest.approx(5 * 0.05 / 4)
         self.add(12, "berta")
-        assert self.queue.wait_s(0.0, "berta", newcomer=False) == pytest.approx(7 * 0.05 / 4)
-        assert self.queue.wait_s(0.0, "anna", newcomer=False) == pytest.approx(13 * 0.05 / 4)
+        assert self.queue.wait_s(0.0, "berta") == pytest.approx(7 * 0.05 / 4)
+        assert self.queue.wait_s(0.0, "anna") == pytest.approx(13 * 0.05 / 4)

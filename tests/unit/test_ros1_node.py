@@ -17,8 +17,6 @@ import pytest
 from tests.ports import free_port
 
 from holdfast.transport import ros1_node
-from holdfast.transport.endpoints import Endpoint
-from holdfast.transport.ros1 import RosScheme
 from holdfast.transport.ros1_calls import Connection, HttpHead
 from holdfast.transport.ros1_node import RosNode
 from holdfast.transport.tcpros import RosEnvironment, ServiceType, encode_header
@@ -192,19 +190,6 @@ class TestTheMasterLies:
         assert told[0] == ("unreachable", "KeyError: 'x'")
         assert [status for status, _ in told][:2] == ["unreachable", "registered"]
         await node.close()
-
-    @pytest.mark.parametrize("said", NO_ANSWERS.values(), ids=NO_ANSWERS)
-    async def test_a_robot_s_look_up_says_why_it_finds_nobody(
-        self, master: Master, said: bytes, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        from holdfast.errors import TransportError
-
-        monkeypatch.setenv("ROS_MASTER_URI", around(master).master)
-        master.says = lambda _: said
-        with pytest.raises(TransportError, match="does not say where it is"):
-            await asyncio.get_running_loop().run_in_executor(
-                None, RosScheme().look_up, Endpoint("ros1", "cloud", 0)
-            )
 
 
 @pytest.mark.parametrize(

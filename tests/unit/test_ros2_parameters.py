@@ -73,11 +73,10 @@ def test_another_world_is_another_configuration() -> None:
     }
 
 
-def test_how_a_robot_is_reached_is_handed_on() -> None:
-    found = read(
-        environment__kind="ros", environment__sense__name="look", environment__timeout_ms=9
-    )
-    assert found.mapping == {"environment.sense.name": "look", "environment.timeout_ms": 9.0}
+def test_how_a_robot_is_reached_is_the_nodes_own() -> None:
+    own = read(environment__kind="ros", environment__discovery_timeout_ms=9).own
+    assert (own.act, own.discovery_timeout_ms) == ("action", 9.0)
+    assert read(environment__kind="ros", environment__act="service").own.act == "service"
 
 
 def test_the_files_own_world_may_be_another(tmp_path: Path) -> None:
@@ -132,7 +131,12 @@ def test_help_needs_no_ros_and_names_every_parameter(
         ({"assignments": "a.b=1"}, 'assignments is "a.b=1"; expected a list, as in [a.b=1]'),
         ({"assignments": ["a.b="]}, "assignments[0] is 'a.b='; expected SECTION.KEY=YAML"),
         ({"assignments": ["a.b=1"]}, "a is not a known section"),
-        ({"environment__sense__name": "x"}, "environment.sense.name needs environment.kind ros"),
+        (
+            {"environment__kind": "ros", "environment__sense__index": "axis"},
+            "environment.sense.index: fields of other types are mapped no more; the robot offers",
+        ),
+        ({"environment__act": "topic"}, 'environment.act is "topic"; expected'),
+        ({"environment__discovery_timeout_ms": 0}, "environment.discovery_timeout_ms is 0"),
         (
             {"environment__kind": "ros", "environment__object": "a:B"},
             "environment.object is given, and environment.kind is ros, which needs none",

@@ -155,7 +155,6 @@ class Joined:
         self.shell = ServiceShell(
             Service(make_problem, workers, ServiceLimits(**limits)),
             self.network.service("service", "boot"),
-            workers,
             self.log,
             on_decision=lambda *times: self.timed.append(times),
         )
@@ -505,7 +504,7 @@ class Call:
 
 def scripted(*jobs: tuple[str, float, Callable[[], object]]) -> tuple[Script, ServiceShell]:
     machine = Script(*(StartJob(cast(Job, Scripted(kind, run)), s) for kind, s, run in jobs))
-    return machine, ServiceShell(machine, InProcessNetwork().service("service", "boot"), 2, Log())
+    return machine, ServiceShell(machine, InProcessNetwork().service("service", "boot"), Log())
 
 
 @on_a_loop
@@ -646,7 +645,7 @@ async def test_a_machine_with_a_defect_forgets_everything_and_goes_on(
     method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Half-way through a change its tables may not agree any more; it holds nothing of worth."""
-    async with joined() as both:
+    async with joined(workers=3) as both:
         turns, other = Robot(key=1), Robot(key=2)
         patient, busy = Patient(both.network), Patient(both.network)
         await patient.run_turns(turns, 1)

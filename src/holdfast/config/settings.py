@@ -4,8 +4,7 @@ Each class is one section of the configuration file and has the key names of the
 that its files load unchanged; the fields that the thesis does not have come after its own and have
 defaults. Bounds stand beside the fields, once, and docs/settings.md says of each key what it does.
 :func:`holdfast.config.loader.load` reports a breach of them with file, line, key and value; for
-settings that are made in Python :func:`check_settings` does, without the file, at the start of
-every trial.
+settings that are made in Python :func:`check_settings` does, without the file.
 """
 
 from __future__ import annotations
@@ -30,7 +29,6 @@ __all__ = [
     "check_settings",
     "estimator_of",
     "path_steps",
-    "plain_settings",
     "unfit_for_the_method",
 ]
 
@@ -75,7 +73,7 @@ class _Section(msgspec.Struct, metaclass=_Keys, frozen=True):
     """A section of the settings."""
 
 
-SettingsT = TypeVar("SettingsT", bound=_Section)
+SectionT = TypeVar("SectionT", bound=_Section)
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 NonNegativeCount = Annotated[int, msgspec.Meta(ge=0)]
@@ -461,42 +459,14 @@ def unfit_for_the_method(settings: PlanningSettings) -> tuple[tuple[str, str], s
     return None
 
 
-def plain_settings(settings: SettingsT) -> SettingsT:
-    """Return settings with Python's own numbers in the place of NumPy's.
-
-    What is out of bounds stays as it is, for :func:`check_settings` to name.
-    """
-    try:
-        msgspec.to_builtins(settings)
-    except TypeError:
-        pass  # It has something that is not plain.
-    else:
-        return settings
-    try:
-        plain = msgspec.to_builtins(settings, enc_hook=_plain)
-        return msgspec.convert(plain, type(settings))
-    except (TypeError, msgspec.ValidationError):
-        return settings
-
-
-def _plain(value: Any) -> Any:
-    from holdfast.arrays import plain
-
-    if (found := plain(value)) is value:
-        raise TypeError(f"{value!r:.80} is neither a number nor a text")
-    return found
-
-
 def _plain_or_text(value: Any) -> Any:
     from holdfast.arrays import plain
 
     return repr(value) if (found := plain(value)) is value else found
 
 
-def check_settings(
-    settings: object, schema: type[_Section] = PlanningSettings, what: str = "settings"
-) -> None:
-    """Check the type and the bounds of settings that were made in Python.
+def check_settings(settings: object, schema: type[SectionT], what: str = "settings") -> SectionT:
+    """Check settings that were made in Python; return them with Python's numbers for NumPy's.
 
     Raises
     ------
@@ -519,7 +489,7 @@ def check_settings(
             raise InvalidValueError(f"{what}: {error}") from error
         raise InvalidValueError(f"{what}: {dotted(found.path)} {found.in_words()}") from error
     if not isinstance(checked, PlanningSettings):
-        return
+        return checked
     for name in PlanningSettings.__struct_fields__:
         value, kind = getattr(settings, name), type(getattr(checked, name))
         if issubclass(kind, _Section) and not isinstance(value, kind):
@@ -529,6 +499,7 @@ def check_settings(
     if (unfit := unfit_for_the_method(checked)) is not None:
         (section, key), reason = unfit
         raise InvalidValueError(f"{what}: {section}.{key} {reason}")
+    return checked
 
 
 def _mistaken(given: object, schema: type[_Section]) -> str:

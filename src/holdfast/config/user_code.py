@@ -11,7 +11,6 @@ KeyboardInterrupt, which is Ctrl-C, and passes on what has no account here.
 
 from __future__ import annotations
 
-import difflib
 import functools
 import importlib
 import re
@@ -23,6 +22,7 @@ from typing import Any
 
 from holdfast.config.user_modules import find_in
 from holdfast.errors import ConfigurationError
+from holdfast.printable import did_you_mean
 
 __all__ = [
     "account_of_user_error",
@@ -188,15 +188,11 @@ def _registered(
         refused = f"{name} is registered as {value}, which cannot be imported"
         return _loaded(entry_point.load, name, value, refused, (ImportError, AttributeError))
     known = sorted({*built_in, *registered_names(group)})
-    likely = _classes_beside(name, search_directory) or difflib.get_close_matches(name, known, n=3)
+    hint = did_you_mean(name, known, 3, sure=_classes_beside(name, search_directory))
     raise ConfigurationError(
-        f"{name} is not a registered name{_did_you_mean(likely)} "
+        f"{name} is not a registered name{hint} "
         f"(registered: {', '.join(known) or 'none'}; a class of your own is named module:Class)"
     )
-
-
-def _did_you_mean(likely: list[str]) -> str:
-    return f"; did you mean {' or '.join(likely)}?" if likely else ""
 
 
 def _loaded(
@@ -271,8 +267,6 @@ def _imported(name: str, search_directory: Path | None) -> object:
     )
     if not hasattr(module, class_name):
         classes = [key for key, value in vars(module).items() if isinstance(value, type)]
-        close = difflib.get_close_matches(class_name, classes, n=3)
-        raise ConfigurationError(
-            f"{name}: the module {module_name} has no {class_name}{_did_you_mean(close)}"
-        )
+        hint = did_you_mean(class_name, classes, 3)
+        raise ConfigurationError(f"{name}: the module {module_name} has no {class_name}{hint}")
     return getattr(module, class_name)

@@ -7,7 +7,6 @@ is allowed there is read from the type (:func:`described`).
 
 from __future__ import annotations
 
-import difflib
 import json
 import re
 import types
@@ -17,6 +16,8 @@ from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin
 import msgspec
 import msgspec.inspect
 from msgspec.inspect import FloatType, IntType, ListType, StrType, VarTupleType
+
+from holdfast.printable import did_you_mean
 
 __all__ = [
     "KeyPath",
@@ -213,9 +214,7 @@ def close_match(text: str, allowed: Iterable[str]) -> str:
     texts = list(allowed)
     part = rf"(?:^|_){re.escape(text.lower())}(?:_|$)"
     close = [each for each in texts if re.search(part, each)]
-    if len(close) != 2:
-        close = difflib.get_close_matches(text.lower(), texts, n=1)
-    return f"; did you mean {' or '.join(close)}?" if close else ""
+    return did_you_mean(text.lower(), texts, sure=close if len(close) == 2 else ())
 
 
 def shown(value: Any) -> str:

@@ -1,10 +1,8 @@
-"""Which task a worker gets next, and how long a new request would wait.
+"""Which task of one lane a worker gets next, and how long a new request would wait.
 
-Tasks wait in three orders: those that a known robot waits for (urgent), those of newcomers, which
-were never served, and prefetches, which are ahead of their robots. Urgent ones go first, but not
-forever: a prefetch that has waited long enough has its turn. A new identity costs nothing, so one
-client can be thousands of newcomers; together they get at most every second turn while an urgent
-task of others waits.
+Tasks wait in two orders: those that a robot waits for (urgent), and prefetches, which are ahead of
+their robots. Urgent ones go first, but not forever: a prefetch that has waited long enough has its
+turn.
 
 Within an order the owners take turns, and each owner's tasks go in arrival order. So all sessions
 of one certificate together get one robot's turn; all robots without a certificate are one owner. A
@@ -92,50 +90,32 @@ class _Load:
         self.cost_s = self.cost_s + sign * task.cost_s if self.num else 0.0
 
 
-class _Loads:
-    """The load of known robots and of newcomers."""
-
-    def __init__(self) -> None:
-        self.known = _Load()
-        self.newcomers = _Load()
-
-    @property
-    def num(self) -> int:
-        return self.known.num + self.newcomers.num
-
-    @property
-    def num_bytes(self) -> int:
-        return self.known.num_bytes + self.newcomers.num_bytes
-
-    def of(self, *, newcomer: bool) -> _Load:
-        return self.newcomers if newcomer else self.known
-
-
 class RequestQueue:
-    """The tasks that wait or run.
+    """The tasks of one lane that wait or run.
 
     Parameters
     ----------
     workers : int
         Tasks that may run at a time.
+    room : float, optional
+        Share of the limits on what may wait.
     """
 
-    def __init__(self, workers: int, limits: ServiceLimits) -> None:
+    def __init__(self, workers: int, limits: ServiceLimits, room: float = 1.0) -> None:
         self._workers = workers
         self._limits = limits
-        self._urgent, self._newcomers, self._later = _RoundRobin(), _RoundRobin(), _RoundRobin()
+        self._max_waiting = room * limits.max_waiting
+        self._max_waiting_bytes = room * limits.max_waiting_bytes
+        self._urgent, self._later = _RoundRobin(), _RoundRobin()
         self._patience_s = 1e-3 * limits.prefetch_patience_ms
-        self._patience_of_newcomers_s = 1e-3 * limits.max_wait_ms
-        # Whether a newcomer had the last turn for which others waited too.
-        self._newcomer_went_first = False
         self._running: dict[Job, PendingTask] = {}
         # A task that comes while one of its session and slot runs is held back, so that a robot has
         # no more than its turn. Only prefetches that waited together may run together.
         self._running_of: dict[tuple[Session, int], PendingTask] = {}
         self._held: dict[tuple[Session, int], PendingTask] = {}
-        self._waiting = _Loads()
+        self._waiting = _Load()
         # Only of owners with waiting tasks.
-        self._waiting_of: dict[Owner, _Loads] = {}
+        self._waiting_of: dict[Owner, _Load] = {}
 
     @property
     def num_waiting(self) -> int:
@@ -170,7 +150,7 @@ class RequestQueue:
         if self._held.get(slot) is task:
             del self._held[slot]
         else:
-            self._remove_from_order(task)
+            self._order_of(task).remove(task)
         self._count(task, -1)
 
     def promote(self, task: PendingTask) -> None:
@@ -181,20 +161,14 @@ class RequestQueue:
             self._urgent.append(task)
 
     def _order_of(self, task: PendingTask) -> _RoundRobin:
-        if not task.urgent:
-            return self._later
-        return self._newcomers if task.newcomer else self._urgent
-
-    def _remove_from_order(self, task: PendingTask) -> None:
-        for order in (self._urgent, self._newcomers, self._later):
-            order.remove(task)
+        return self._urgent if task.urgent else self._later
 
     def _count(self, task: PendingTask, sign: int) -> None:
         owner = task.session.owner
-        loads = self._waiting_of.setdefault(owner, _Loads())
-        for each in (self._waiting, loads):
-            each.of(newcomer=task.newcomer).count(task, sign)
-        if not loads.num:
+        load = self._waiting_of.setdefault(owner, _Load())
+        for each in (self._waiting, load):
+            each.count(task, sign)
+        if not load.num:
             del self._waiting_of[owner]
 
     # -- running ---------------------------------------------------------------------------------
@@ -204,40 +178,21 @@ class RequestQueue:
 
         None, too, if it takes more than ``room_bytes`` of memory; it keeps its turn.
         """
-        if len(self._running) >= self._workers:
-            return None
-        known, newcomer = self._next_of_known(), self._newcomers.first()
-        task = known or newcomer
-        if known is not None and newcomer is not None and self._goes_first(newcomer, known, now):
-            task = newcomer
+        task = self._next() if len(self._running) < self._workers else None
         if task is None or task.num_bytes > room_bytes:
             return None
-        if known is not None and newcomer is not None:
-            self._newcomer_went_first = task is newcomer
         order = self._order_of(task)
         order.remove(task)
         order.end_turn(task.session.owner, now)
         self._count(task, -1)
         return task
 
-    def _next_of_known(self) -> PendingTask | None:
-        """Return the next task of robots that were served before; None if none waits."""
+    def _next(self) -> PendingTask | None:
         urgent, later = self._urgent.first(), self._later.first()
         if urgent is None or later is None:
             return urgent or later
         due = self._waits_since(later) + self._patience_s
         return urgent if self._waits_since(urgent) <= due else later
-
-    def _goes_first(self, newcomer: PendingTask, known: PendingTask, now: float) -> bool:
-        """Return whether a newcomer goes before a robot that was served before."""
-        came, known_since = self._waits_since(newcomer), self._waits_since(known)
-        if known.urgent:
-            return not self._newcomer_went_first and (
-                known_since > came + self._patience_of_newcomers_s
-            )
-        if now <= known_since + self._patience_s:
-            return True
-        return not self._newcomer_went_first and came <= known_since + self._patience_s
 
     def _waits_since(self, task: PendingTask) -> float:
         """Return since when a task waits for its turn.
@@ -294,67 +249,47 @@ class RequestQueue:
 
     # -- the wait --------------------------------------------------------------------------------
 
-    def is_overloaded(self, now: float, owner: Owner, *, newcomer: bool) -> bool:
+    def is_overloaded(self, now: float, owner: Owner) -> bool:
         """Return whether a new request is to be turned away."""
-        limits, waiting = self._limits, self._waiting
-        ahead, ahead_s = self._ahead(now, owner, newcomer=newcomer)
+        ahead, ahead_s = self._ahead(now, owner)
         if ahead < self._workers:
             return False
-        newcomers = waiting.newcomers
         return (
-            waiting.num >= limits.max_waiting
-            or waiting.num_bytes >= limits.max_waiting_bytes
-            # Half of the room is kept for those that were served before.
-            or (newcomer and 2 * newcomers.num >= limits.max_waiting)
-            or (newcomer and 2 * newcomers.num_bytes >= limits.max_waiting_bytes)
+            self._waiting.num >= self._max_waiting
+            or self._waiting.num_bytes >= self._max_waiting_bytes
             or self._has_its_share(owner)
-            # Nobody who was served before is turned away because of newcomers.
-            or 1e3 * ahead_s > limits.max_wait_ms * self._workers
+            or 1e3 * ahead_s > self._limits.max_wait_ms * self._workers
         )
 
-    def wait_s(self, now: float, owner: Owner, *, newcomer: bool) -> float:
+    def wait_s(self, now: float, owner: Owner) -> float:
         """Estimate the wait of a new request."""
-        _, ahead_s = self._ahead(now, owner, newcomer=newcomer)
-        if not newcomer:
-            # Of the newcomers as many at most are ahead as of the others: the two take turns.
-            ahead_s += min(ahead_s, self._goes_before(owner, newcomer=True)[1])
-        return ahead_s / self._workers
+        return self._ahead(now, owner)[1] / self._workers
 
     def _has_its_share(self, owner: Owner) -> bool:
         """Return whether an owner has as many waiting tasks as one may have."""
         own = self._waiting_of.get(owner)
         if owner is None or own is None:
             return False
-        limits = self._limits
         return (
-            own.num >= limits.max_waiting_per_robot or 2 * own.num_bytes >= limits.max_waiting_bytes
+            own.num >= self._limits.max_waiting_per_robot
+            or 2 * own.num_bytes >= self._max_waiting_bytes
         )
 
-    def _ahead(self, now: float, owner: Owner, *, newcomer: bool) -> tuple[int, float]:
-        """Return number and time of the tasks ahead; newcomers count only for newcomers."""
-        ahead, ahead_s = self._goes_before(owner, newcomer=False)
-        if newcomer:
-            others, others_s = self._goes_before(owner, newcomer=True)
-            ahead, ahead_s = ahead + others, ahead_s + others_s
-        for task in self._running.values():
-            ahead_s += max(0.0, task.cost_s - (now - task.started_at))
-        return ahead, ahead_s
+    def _ahead(self, now: float, owner: Owner) -> tuple[int, float]:
+        """Return number and time of the tasks that go before an owner's next one.
 
-    def _goes_before(self, owner: Owner, *, newcomer: bool) -> tuple[int, float]:
-        """Return number and time of the tasks in an order that go before an owner's next one.
-
-        These are the owner's own, and of each other owner as many, and one more.
+        These are those that run, the owner's own, and of each other owner as many, and one more.
         """
-        whole = self._waiting.of(newcomer=newcomer)
-        own = self._waiting_of.get(owner)
-        if not whole.num or (own is not None and len(self._waiting_of) == 1):
-            return whole.num, whole.cost_s
-        turns = 1 + (0 if own is None else own.of(newcomer=newcomer).num)
+        running_s = sum(
+            max(0.0, task.cost_s - (now - task.started_at)) for task in self._running.values()
+        )
+        whole, own = self._waiting, self._waiting_of.get(owner)
+        if own is not None and len(self._waiting_of) == 1:
+            return whole.num, running_s + whole.cost_s
+        turns = 1 + (0 if own is None else own.num)
         num, cost_s = 0, 0.0
-        for loads in self._waiting_of.values():
-            load = loads.of(newcomer=newcomer)
-            if load.num:
-                going = min(load.num, turns)
-                num += going
-                cost_s += load.cost_s * going / load.num
-        return num, cost_s
+        for load in self._waiting_of.values():
+            going = min(load.num, turns)
+            num += going
+            cost_s += load.cost_s * going / load.num
+        return num, running_s + cost_s

@@ -13,7 +13,7 @@ go first, within limits.
 
 The machine computes nothing itself and has no clock, thread or socket. Methods take an event and
 the time and return effects, to be carried out in order. The caller runs each :class:`Job` that it
-is handed (at most ``workers`` at a time) anywhere, and returns its :class:`JobResult` with
+is handed (at most ``max_running`` at a time) anywhere, and returns its :class:`JobResult` with
 :meth:`Service.finished`.
 
 This module decides what requests and results mean. Memory is in
@@ -56,6 +56,8 @@ from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
 from holdfast.protocol.service_sessions import (
     BRIEF,
     LONG,
+    MEDIUM,
+    NEW,
     REQUESTED,
     CachedAnswer,
     Owner,
@@ -84,7 +86,7 @@ class Service:
         Builds the problem of a session configuration; raises the robot's mistakes as errors of
         :mod:`holdfast.errors`. Jobs call it, several at a time.
     workers : int
-        Jobs that may run at a time.
+        Brief jobs that may run at a time.
     describe_error : callable, optional
         Turns an error of a problem's code into a message.
     pricing : Pricing, optional
@@ -124,6 +126,11 @@ class Service:
         # Of all robots; each session has its own, which begin here.
         self._task_time = ExpectedTime(1e-3)
         self._sensing_time = ExpectedTime(1e-3)
+
+    @property
+    def max_running(self) -> int:
+        """Jobs that may be handed out at a time; more than ``workers``, see :class:`Lanes`."""
+        return self._queue.max_running
 
     @property
     def statistics(self) -> ServiceStatistics:
@@ -184,17 +191,16 @@ class Service:
             session.built = session.built or outcome.problem is not None
             session.price = outcome.price or session.price
             if outcome.cancelled or outcome.postponed is not None:
-                if is_awaited and not self._queue.postpone(task, outcome.postponed, now):
-                    for record in self._calls.detach(task):
-                        call, number, newcomer = record.call, record.number, task.newcomer
-                        self._reject_busy(call, number, session.key, now, newcomer=newcomer)
+                if is_awaited:
+                    self._postpone(task, outcome.postponed, now)
             elif outcome.failure is not None or outcome.lacks_state:
-                self._failed(task, outcome, now)
+                self._failed(task, outcome)
             else:
+                computed_s = now - task.started_at
+                session.overran = session.overran and computed_s > self._queue.limits_s[MEDIUM]
                 if typical:
-                    computed_s = now - task.started_at
-                    if task.lane == BRIEF:
-                        # What newcomers are expected to take.
+                    if task.lane <= BRIEF:
+                        # What new robots are expected to take.
                         (self._sensing_time if task.sensing else self._task_time).learn(computed_s)
                     task.expected_time.learn(computed_s)
                 self._succeeded(task, outcome, now)
@@ -206,26 +212,20 @@ class Service:
         """Handle the end of a call by itself: its link has ended, and nobody awaits replies."""
         task = self._calls.drop(call)
         if task is not None and not task.calls:
-            self._statistics.superseded += self._queue.drop(task, now)
+            self._statistics.superseded += self._queue.drop(task)
         self._dispatch(now)
         return self._effects.take()
 
     def tick(self, now: float) -> list[ServiceEffect]:
         """Handle the passing of time."""
-        for task in self._queue.overdue(now):
-            for record in self._calls.detach(task):
-                text = self._queue.overdue_in_words(task, now)
-                self._calls.send_refused(record.call, record.number, "invalid", text)
-            self._queue.cancel(task)
-        self._queue.interrupt_overrunning(now)
         self._calls.send_progress(now)
         while (session := self._sessions.idle(now)) is not None:
-            self._forget(session, "idle", now)
+            self._forget(session, "idle")
         return self._effects.take()
 
     def next_wakeup(self) -> float | None:
         """Return when :meth:`tick` is due if nothing happens before; None if never."""
-        due = (self._calls.progress_at(), self._sessions.idle_at(), self._queue.next_end_at())
+        due = (self._calls.progress_at(), self._sessions.idle_at())
         return min((at for at in due if at is not None), default=None)
 
     # -- requests --------------------------------------------------------------------------------
@@ -249,7 +249,7 @@ class Service:
                     text = "this session was opened with another problem, settings or seed"
                     self._calls.send_refused(call, request.number, "invalid", text)
                     return
-                self._forget(session, "opened anew", now)
+                self._forget(session, "opened anew")
                 session = None
         if session is None:
             if configuration is None:
@@ -273,7 +273,7 @@ class Service:
             task = self._enqueue(session, call, request, size, now)
             if task is None:
                 return
-        self._supersede(session, task, now)
+        self._supersede(session, task)
 
     def _open_session(
         self,
@@ -293,10 +293,9 @@ class Service:
             )
             self._calls.send_refused(call, request.number, "invalid", text)
             return None
-        newcomer = self._sessions.is_newcomer(key[0])
-        if self._queue.is_overloaded(now, key[0], newcomer=newcomer):
+        if self._queue.is_overloaded(now, key[0], NEW):
             self._sessions.note_epoch(key, request.epoch)
-            self._reject_busy(call, request.number, key, now, newcomer=newcomer)
+            self._reject_busy(call, request.number, key, NEW, now)
             return None
         session = Session(
             key,
@@ -312,11 +311,9 @@ class Service:
                 # It is free once another robot has left, not once the next decision is computed.
                 self._sessions.note_epoch(key, request.epoch)
                 least_ms = _NO_ROOM_RETRY_MS
-                self._reject_busy(
-                    call, request.number, key, now, newcomer=newcomer, least_ms=least_ms
-                )
+                self._reject_busy(call, request.number, key, NEW, now, least_ms=least_ms)
                 return None
-            self._forget(unused, "room needed", now)
+            self._forget(unused, "room needed")
         self._sessions.add(session)
         self._statistics.sessions_opened += 1
         named = {"problem": configuration.problem, "particles": count, "epoch": request.epoch}
@@ -330,7 +327,7 @@ class Service:
         # The next process numbers its requests anew.
         session.epoch, session.number = epoch, -1
         self._sessions.use(session, now)
-        self._supersede(session, None, now)
+        self._supersede(session, None)
 
     def _answer_from_cache(
         self, session: Session, call: int, request: Request, now: float, *, newest: bool
@@ -392,18 +389,17 @@ class Service:
             request = msgspec.structs.replace(request, session_configuration=None)
         interval = session.planning.sensing_interval + 1
         sensing = not request.sensed and request.step % interval == 0
+        lane = session.lane_of(request)
         waiting = next(
             (
                 task
                 for task in session.pending.values()
-                if task.slot == REQUESTED and not task.running and task.lane == BRIEF
+                if task.slot == REQUESTED and not task.running and task.lane == lane
             ),
             None,
         )
-        newcomer = session.newcomer
-        full = self._queue.is_overloaded(now, session.owner, newcomer=newcomer)
-        if waiting is None and full:
-            self._reject_busy(call, request.number, session.key, now, newcomer=newcomer)
+        if waiting is None and self._queue.is_overloaded(now, session.owner, lane):
+            self._reject_busy(call, request.number, session.key, lane, now)
             return None
         if waiting is not None:
             # It keeps the turn of the request that it replaces, and adds nothing to the backlog.
@@ -427,12 +423,12 @@ class Service:
         self._calls.attach(task, call, request.number, now)
         return task
 
-    def _supersede(self, session: Session, keep: PendingTask | None, now: float) -> None:
+    def _supersede(self, session: Session, keep: PendingTask | None) -> None:
         """Drop everything the robot waits for, except ``keep``."""
         for task in list(session.pending.values()):
             if task is not keep:
                 self._calls.end(task)
-                self._statistics.superseded += self._queue.drop(task, now)
+                self._statistics.superseded += self._queue.drop(task)
 
     # -- work ------------------------------------------------------------------------------------
 
@@ -463,7 +459,7 @@ class Service:
                     self._calls.send_need_state(record.call, record.number, differs=True)
                 return
         alone = self._queue.is_alone(task)
-        most_s = self._queue.limits_s[task.lane]
+        estimated_s = self._queue.limits_s[task.lane]
         problem = self._problems.acquire(session.problem_key)
         expected_s = math.inf
         if problem is not None and task.is_typical(state):
@@ -481,14 +477,29 @@ class Service:
             state,
             self._pricing,
             session.price,
-            None if task.lane == LONG else Cost(most_s, self._limits.max_medium_bytes),
+            None if task.lane == LONG else Cost(estimated_s, self._limits.max_medium_bytes),
+            self._queue.most_s(task),
         )
         self._queue.handed_out(task, job, now)
         self._effects.append(StartJob(job, expected_s))
 
     # -- outcomes --------------------------------------------------------------------------------
 
-    def _failed(self, task: PendingTask, outcome: JobResult, now: float) -> None:
+    def _postpone(self, task: PendingTask, cost: Cost | None, now: float) -> None:
+        """Queue a task again that takes more than its lane allows.
+
+        None: more than was estimated, as its job has found.
+        """
+        if cost is None and task.lane == LONG:
+            for record in self._calls.detach(task):
+                text = self._queue.overdue_in_words(task)
+                self._calls.send_refused(record.call, record.number, "invalid", text)
+        elif not self._queue.postpone(task, cost, now):
+            for record in self._calls.detach(task):
+                key = task.session.key
+                self._reject_busy(record.call, record.number, key, task.lane, now)
+
+    def _failed(self, task: PendingTask, outcome: JobResult) -> None:
         session, request = task.session, task.request
         if outcome.diverged and request is not None:
             self._statistics.states_diverged += 1
@@ -505,7 +516,7 @@ class Service:
                 self._calls.send_refused(record.call, record.number, *outcome.failure)
         if not session.built:
             # There is nothing to keep: whoever asks again sends all of it.
-            self._forget(session, "refused", now)
+            self._forget(session, "refused")
 
     def _succeeded(self, task: PendingTask, outcome: JobResult, now: float) -> None:
         session, statistics = task.session, self._statistics
@@ -538,7 +549,7 @@ class Service:
             answer = CachedAnswer(*where, outcome.num_actions, outcome.actions, following)
             session.remember(task.digest, answer, most)
             self._send_task(task, answer, now)
-        self._limit_memory(session, now)
+        self._limit_memory(session)
 
     def _send_task(self, task: PendingTask, answer: CachedAnswer, now: float) -> None:
         """Send the task part, and let the calls wait for the sensing part that follows."""
@@ -562,18 +573,17 @@ class Service:
         call: int,
         number: int,
         key: SessionKey,
+        lane: int,
         now: float,
-        *,
-        newcomer: bool,
         least_ms: float = 1.0,
     ) -> None:
         owner, session = key
-        wait_ms = max(least_ms, 1e3 * self._queue.wait_s(now, owner, newcomer=newcomer))
+        wait_ms = max(least_ms, 1e3 * self._queue.wait_s(now, owner, lane))
         self._calls.send_busy(call, number, session, wait_ms, self._queue.num_waiting)
 
     # -- sessions --------------------------------------------------------------------------------
 
-    def _limit_memory(self, session: Session, now: float) -> None:
+    def _limit_memory(self, session: Session) -> None:
         """Count a session's memory; if all take too much, forget others, or its states."""
         sessions = self._sessions
         sessions.update_size(session)
@@ -581,13 +591,13 @@ class Service:
             unused = sessions.largest_evictable()
             if unused is None or unused is session:
                 break
-            self._forget(unused, "room needed", now)
+            self._forget(unused, "room needed")
         if sessions.over_budget:
             # The others are all in use: this robot sends its state each time.
             sessions.drop_states(session)
 
-    def _forget(self, session: Session, reason: str, now: float) -> None:
-        self._supersede(session, None, now)
+    def _forget(self, session: Session, reason: str) -> None:
+        self._supersede(session, None)
         self._sessions.forget(session)
         self._statistics.sessions_evicted += 1
         self._note("evicted", session, reason=reason)

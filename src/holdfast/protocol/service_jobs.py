@@ -11,6 +11,7 @@ never an error of the service, and each instance is lent to one job at a time
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Literal, NamedTuple, TypeAlias
@@ -90,7 +91,7 @@ class JobResult(NamedTuple):
     postponed : Cost or None
         The estimated cost; nothing was computed, because it is more than this job may take.
     cancelled : bool
-        It was ended from outside.
+        It was ended from outside, or has used up its time.
     """
 
     failure: tuple[str, str] | None = None
@@ -138,6 +139,13 @@ class Job:
     most : Cost or None
         What it may take; if it is estimated to take more, nothing is computed. None: what a
         decision may take at all.
+    most_s : float
+        Processor time after which it ends, whatever was estimated.
+
+    Attributes
+    ----------
+    interruption : Interruption
+        Ends it.
     """
 
     def __init__(
@@ -155,12 +163,13 @@ class Job:
         pricing: Pricing = ANY_MACHINE,
         price: Price | None = None,
         most: Cost | None = None,
+        most_s: float = math.inf,
     ) -> None:
         self.kind = kind
         self._pricing = pricing
         self._price = price
         self._most = most
-        self._interruption = Interruption()
+        self.interruption = Interruption(most_s)
         self._problem = problem
         self._make_problem = make_problem
         self._describe_error = describe_error
@@ -190,11 +199,11 @@ class Job:
     @property
     def is_cancelled(self) -> bool:
         """Whether it is to end."""
-        return self._interruption.is_set
+        return self.interruption.is_set
 
     def cancel(self) -> None:
         """End it as soon as it can be; from any thread."""
-        self._interruption.set()
+        self.interruption.set()
 
     def run(self) -> JobResult:
         """Compute. Anything that the problem's functions raise becomes part of the result.
@@ -205,7 +214,7 @@ class Job:
         problem = self._problem
         try:
             # All of it: a model may take long to build, and to measure.
-            with interruptible(self._interruption):
+            with interruptible(self.interruption):
                 if problem is None:
                     problem = self._make_problem(unpack_configuration(self._configuration))
                 if self._price is None:

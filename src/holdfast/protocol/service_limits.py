@@ -24,12 +24,12 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
     max_idle_s : float
         A session unused for this long is dropped.
     max_waiting : int
-        Tasks that wait for a worker. Newcomers have half of it at most. (A service always queues as
+        Tasks that wait in a lane; in that of new robots half as many. (A service always queues as
         many tasks of each kind as it has workers.)
     max_waiting_per_robot : int
         The same of one certificate.
     max_waiting_bytes : int
-        Bytes of all waiting requests. Newcomers together, and each certificate, have half at most.
+        Bytes of the requests that wait in a lane, likewise. A certificate has half at most.
     max_wait_ms : float
         A request with a longer expected wait is turned away, unless fewer wait than there are
         workers.

@@ -33,6 +33,7 @@ __all__ = [
     "BRIEF",
     "LONG",
     "MEDIUM",
+    "NEW",
     "PREFETCHED",
     "REQUESTED",
     "CachedAnswer",
@@ -64,7 +65,7 @@ SessionKey: TypeAlias = tuple[Owner, bytes]
 _ESTIMATING_S = 1e-4
 """Time of a job that does no more than that."""
 
-BRIEF, MEDIUM, LONG = 0, 1, 2
+NEW, BRIEF, MEDIUM, LONG = range(4)
 """Lanes."""
 
 REQUESTED, PREFETCHED = 0, 1
@@ -142,9 +143,8 @@ class PendingTask:
         self.since = since
         self.slot = PREFETCHED if request is None else REQUESTED
         self.urgent = request is not None
-        self.newcomer = session.newcomer
         self.calls: dict[int, WaitingCall] = {}
-        self.lane = BRIEF
+        self.lane = session.lane_of(request)
         self.num_bytes = 0.0
         self.cost_s = self._expected_s()
         self.running = False
@@ -165,7 +165,8 @@ class PendingTask:
         session = self.session
         mean_s = session.sensing_time.mean_s + (0.0 if self.sensing else session.task_time.mean_s)
         # One that may be too long for its lane is only estimated there.
-        return mean_s if self.lane != BRIEF or session.is_brief else _ESTIMATING_S
+        is_computed = self.lane > BRIEF or session.is_brief
+        return mean_s if is_computed else _ESTIMATING_S
 
     def move_to(self, lane: int, cost: Cost) -> None:
         """Move to another lane, for an estimated cost; it waits in none meanwhile."""
@@ -204,8 +205,9 @@ class PendingTask:
 class Session:
     """What is remembered of one robot.
 
-    :class:`SessionTable` writes ``served``, ``newcomer``, ``closed`` and ``num_bytes``, and drops
-    states and answers; :class:`~holdfast.protocol.service.Service` writes all else.
+    :class:`SessionTable` writes ``served``, ``closed`` and ``num_bytes``, and drops states and
+    answers; :class:`~holdfast.protocol.service.Service` and
+    :class:`~holdfast.protocol.lanes.Lanes` write all else.
 
     Attributes
     ----------
@@ -219,14 +221,16 @@ class Session:
         Whether the problem was built before, and whether it is part of holdfast.
     is_brief : bool
         Whether no decision was estimated to be too long for the lane of brief ones.
+    overran : bool
+        Whether its last decision took much longer than was estimated.
     restored_trial : int or None
         The last trial of which a state came from a checkpoint.
     price : Price or None
         What its decisions cost; None before the first.
     planning : PlanningSettings
         With the threads that a decision has when it is computed alone.
-    served, newcomer : bool
-        Whether the robot got an answer, and whether it ranks with unknown robots.
+    served : bool
+        Whether the robot got an answer.
     acknowledged, ahead : PlanningState or None
         The state last asked about, and that at the next sensing step.
     answers, pending : dict
@@ -264,6 +268,7 @@ class Session:
         )
         self.built = False
         self.is_brief = True
+        self.overran = False
         self.restored_trial: int | None = None
         self.price: Price | None = None
         self.built_in = configuration.problem in BUILT_IN
@@ -272,7 +277,6 @@ class Session:
         self.planning = with_cores(configuration.planning, most)
         self.seed = configuration.seed
         self.served = False
-        self.newcomer = True
         self.acknowledged: PlanningState | None = None
         self.ahead: PlanningState | None = None
         self.ahead_digest = b""
@@ -288,6 +292,15 @@ class Session:
     def owner(self) -> Owner:
         """Name in its certificate, or None."""
         return self.key[0]
+
+    def lane_of(self, request: Request | None) -> int:
+        """Return the lane in which a task begins.
+
+        Nothing is known of a session that was not served, nor of a state that comes from outside.
+        """
+        if not self.served or (request is not None and request.checkpoint is not None):
+            return NEW
+        return LONG if self.overran else BRIEF
 
     def remove_task(self, task: PendingTask) -> None:
         """Remove a task, unless another has taken its place."""
@@ -412,26 +425,15 @@ class SessionTable:
         session = self._sessions.get(key)
         return session.epoch if session is not None else self._epochs.get(key)
 
-    def is_newcomer(self, owner: Owner) -> bool:
-        """Return whether a new session of this owner has the rank of an unknown robot.
-
-        A new identity costs nothing without a certificate. With one, each owner may have one
-        session that was never served and still ranks with the known robots.
-        """
-        holding = self._holdings.get(owner)
-        return owner is None or (holding is not None and holding.unserved > 0)
-
     def mark_served(self, session: Session) -> None:
         """Note that a robot got an answer."""
         if not session.served:
             for holding in self._holdings_with(session):
                 holding.unserved -= 1
         session.served = True
-        session.newcomer = False
 
     def add(self, session: Session) -> None:
         """Add a session."""
-        session.newcomer = self.is_newcomer(session.owner)
         self._sessions[session.key] = session
         self._holdings.setdefault(session.owner, _Holding())
         for holding in self._holdings_with(session):

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
 from holdfast.config.settings import OffloadSettings
-from holdfast.errors import HoldfastError, TransportError
+from holdfast.errors import HoldfastError
 from holdfast.planning import digest
 from holdfast.printable import printable
 from holdfast.protocol.messages import (
@@ -146,11 +146,6 @@ def check(service: str, tls: Path | None) -> Endpoint:
         If it is none, or credentials are given that it does not use.
     """
     endpoint = check_endpoint(service, "robot", listens=False)
-    if endpoint.is_ros1:
-        raise TransportError(
-            f"endpoint {endpoint}: of a service in ROS 1, 'rosservice info "
-            f"{endpoint.host}/exchange' says where it is, and whether it answers"
-        )
     if not endpoint.is_encrypted and tls is not None:
         check_credentials(endpoint, TlsFiles.of(tls))
     if endpoint.protocol == "udp":

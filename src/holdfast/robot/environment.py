@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import checked
-from holdfast.arrays import FloatArray, KeepsReadOnly, floats, real_numbers, whole
+from holdfast.arrays import FloatArray, KeepsReadOnly, floats, real_numbers
 from holdfast.config.settings import EnvironmentSettings
 from holdfast.config.user_code import find_class
 from holdfast.config.user_modules import find_in
@@ -29,7 +29,7 @@ from holdfast.floating_mode import in_own_mode
 from holdfast.outcome import Done, MoveResult
 from holdfast.problem_attributes import check_sizes, has_general_observations, sensing_action_of
 from holdfast.problems.problem import Problem, ProblemBase
-from holdfast.randomness import Purpose, Stream, stream
+from holdfast.randomness import Purpose, Stream, seed_and_trial, stream
 
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
@@ -162,8 +162,7 @@ class SimulatedEnvironment(KeepsReadOnly):
     @in_own_mode
     def __init__(self, problem: Problem, seed: int, trial: int = 0) -> None:
         self._problem = problem
-        self._seed = seed = whole("seed", seed, 0, 2**63 - 1)
-        self._trial = trial = whole("trial", trial, 0, 2**32 - 1)
+        self._seed, self._trial = seed, trial = seed_and_trial(seed, trial)
         self.step = 0
         check_sizes(problem)
         self._moves_show = any(

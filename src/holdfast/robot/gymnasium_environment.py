@@ -35,13 +35,12 @@ from holdfast.arrays import (
     plain,
     real_number,
     real_numbers,
-    whole,
 )
 from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import Done, Ending, MoveResult
 from holdfast.printable import one_line
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Purpose, stream
+from holdfast.randomness import Purpose, seed_and_trial, stream
 
 if TYPE_CHECKING:
     import gymnasium
@@ -142,8 +141,7 @@ class GymnasiumEnvironment:
         self.environment = _made(env_id, env_arguments)
         spec = self.environment.spec
         self._name = spec.id if spec is not None else type(self.environment.unwrapped).__name__
-        self._seed = seed = whole("seed", seed, 0, 2**63 - 1)
-        self._trial = trial = whole("trial", trial, 0, 2**32 - 1)
+        self._seed, self._trial = seed, trial = seed_and_trial(seed, trial)
 
         self._sensing, self._sensing_noise = self._sensing_readers(sensing, sensing_noise, problem)
         self._action = None if action is None else _function(action, "action")

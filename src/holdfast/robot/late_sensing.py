@@ -14,44 +14,15 @@ from typing import Any
 
 import numpy.typing as npt
 
-from holdfast.arrays import FloatArray, whole
+from holdfast.arrays import FloatArray
 from holdfast.errors import EnvironmentFailedError
 from holdfast.outcome import Done, MoveResult
 from holdfast.robot.environment import LATER, Environment, Later
 
-__all__ = ["SenseInBackground", "SenseLater"]
+__all__ = ["SenseInBackground"]
 
 
-class _Around:
-    """An environment around another one; what it does not know, the other does."""
-
-    def __init__(self, environment: Environment) -> None:
-        self._environment = environment
-        self._count = 0
-
-    def __getattr__(self, name: str) -> Any:
-        # steps_performed, close, state: only if the other one has them.
-        if name.startswith("_"):
-            raise AttributeError(name)
-        return getattr(self._environment, name)
-
-    @property
-    def _step(self) -> int:
-        count = getattr(self._environment, "steps_performed", None)
-        return int(count()) if callable(count) else self._count
-
-    def perform(self, task_action: FloatArray) -> float | MoveResult | None:
-        """Perform a task action."""
-        result = self._environment.perform(task_action)
-        self._count += 1
-        return result
-
-    def is_done(self) -> Done:
-        """Return how the task stands."""
-        return self._environment.is_done()
-
-
-class SenseInBackground(_Around):
+class SenseInBackground:
     """An environment that senses on a thread while the robot moves.
 
     Its ``perform_sensing`` and ``perform`` must bear to run at the same time. A sensing action
@@ -65,10 +36,17 @@ class SenseInBackground(_Around):
     """
 
     def __init__(self, environment: Environment) -> None:
-        super().__init__(environment)
+        self._environment = environment
+        self._count = 0
         self._thread: threading.Thread | None = None
         self._came: deque[tuple[int, npt.ArrayLike]] = deque()
         self._failed: tuple[int, BaseException] | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        # steps_performed, close, state: only if the other one has them.
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(self._environment, name)
 
     def perform_sensing(self, sensing_action: int) -> Later:
         """Begin to sense; wait first for a sensing action that has not ended."""
@@ -76,10 +54,20 @@ class SenseInBackground(_Around):
             self._thread.join()
         self._raise()
         self._thread = threading.Thread(
-            target=self._sense, args=(self._step, sensing_action), name="sensing", daemon=True
+            target=self._sense, args=(self._steps(), sensing_action), name="sensing", daemon=True
         )
         self._thread.start()
         return LATER
+
+    def perform(self, task_action: FloatArray) -> float | MoveResult | None:
+        """Perform a task action."""
+        result = self._environment.perform(task_action)
+        self._count += 1
+        return result
+
+    def is_done(self) -> Done:
+        """Return how the task stands."""
+        return self._environment.is_done()
 
     def late_observations(self) -> list[tuple[int, npt.ArrayLike]]:
         """Return what has come; raise what sensing has raised."""
@@ -93,6 +81,10 @@ class SenseInBackground(_Around):
         close = getattr(self._environment, "close", None)
         if callable(close):
             close()
+
+    def _steps(self) -> int:
+        count = getattr(self._environment, "steps_performed", None)
+        return int(count()) if callable(count) else self._count
 
     def _sense(self, step: int, sensing_action: int) -> None:
         try:
@@ -109,33 +101,3 @@ class SenseInBackground(_Around):
             raise EnvironmentFailedError(
                 f"perform_sensing, begun at step {step} in the background, raised {what}"
             ) from error
-
-
-class SenseLater(_Around):
-    """An environment that shows each observation so many moves later, to try lateness out.
-
-    Parameters
-    ----------
-    environment : Environment
-    moves : int
-        Task actions from sensing to the observation, at least 1.
-    """
-
-    def __init__(self, environment: Environment, moves: int) -> None:
-        super().__init__(environment)
-        self._moves = whole("moves", moves, 1)
-        self._due: list[tuple[int, npt.ArrayLike]] = []
-
-    def perform_sensing(self, sensing_action: int) -> Later:
-        """Sense, and keep the observation."""
-        shown = self._environment.perform_sensing(sensing_action)
-        # A copy: the environment may show the next one in the same array.
-        self._due.append((self._step, copy.deepcopy(shown)))  # type: ignore[arg-type]
-        return LATER
-
-    def late_observations(self) -> list[tuple[int, npt.ArrayLike]]:
-        """Return what is due."""
-        now = self._step
-        due = [each for each in self._due if each[0] + self._moves <= now]
-        self._due = [each for each in self._due if each[0] + self._moves > now]
-        return due

@@ -104,12 +104,8 @@ def make_links(configuration: Configuration, log_path: Path | None, events: Even
             events.event(
                 "insecure",
                 service=service,
-                reason="whoever is on the way can read along and decide in its place; "
-                + (
-                    "ROS_HOSTNAME=127.0.0.1 keeps ROS 1 on this machine"
-                    if endpoint.is_ros1
-                    else "use tls/... or udp/... with --tls"
-                ),
+                reason="whoever is on the way can read along and decide in its place; use tls/... "
+                "or udp/... with --tls",
             )
     addresses = {service: ServiceAddress(service) for service in offload.services}
     with contextlib.ExitStack() as stack:

@@ -75,7 +75,7 @@ class MemoizingPlanner(Planner):
         self, state: PlanningState, sensing_action: int, observation: npt.ArrayLike | None
     ) -> tuple[PlanningState, ObservationInfo]:
         """Fold an observation into the belief."""
-        key = id(state), sensing_action, bytes_of(observation)
+        key = id(state), sensing_action, _bytes_of(observation)
         return self._once(key, state, partial(super().observe, state, sensing_action, observation))
 
     def advance(
@@ -85,14 +85,27 @@ class MemoizingPlanner(Planner):
         motion: npt.ArrayLike | None = None,
     ) -> PlanningState:
         """Predict the belief and go to the next step."""
-        key = id(state), task_action.tobytes(), bytes_of(motion)
+        key = id(state), task_action.tobytes(), _bytes_of(motion)
         return self._once(key, state, partial(super().advance, state, task_action, motion))
+
+    def observe_move(
+        self, state: PlanningState, task_action: FloatArray, observation: npt.ArrayLike
+    ) -> tuple[PlanningState, ObservationInfo]:
+        """Fold what came with a move into the belief."""
+        key = "move", id(state), task_action.tobytes(), _bytes_of(observation)
+        compute = partial(super().observe_move, state, task_action, observation)
+        return self._once(key, state, compute)
+
+    def reinitialise(self, state: PlanningState) -> PlanningState:
+        """Begin the belief anew."""
+        key = "reinitialised", id(state)
+        return self._once(key, state, partial(super().reinitialise, state))
 
     def digest(self, state: PlanningState) -> bytes:
         """Return 32 bytes that are equal for equal states only."""
         return self._once(id(state), state, partial(super().digest, state))
 
 
-def bytes_of(shown: npt.ArrayLike | None) -> bytes:
+def _bytes_of(shown: npt.ArrayLike | None) -> bytes:
     """Return the bits of what was shown; empty for nothing."""
     return b"" if shown is None else np.asarray(shown, dtype=np.float64).tobytes()

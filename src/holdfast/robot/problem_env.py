@@ -26,7 +26,7 @@ from gymnasium import spaces
 from holdfast import checked, numerics
 from holdfast.arrays import FloatArray, floats_or_none, integer, whole
 from holdfast.belief import Belief, standard_deviation
-from holdfast.config.settings import Method, PlanningSettings, SimulatorSettings, check_settings
+from holdfast.config.settings import Method, PlanningSettings, SimulatorSettings
 from holdfast.errors import InvalidValueError
 from holdfast.floating_mode import in_own_mode
 from holdfast.outcome import Ending, MoveResult, ending_of
@@ -41,7 +41,7 @@ from holdfast.problem_attributes import (
 )
 from holdfast.problems.problem import Problem
 from holdfast.problems.registry import make
-from holdfast.randomness import Purpose, stream
+from holdfast.randomness import Purpose, seed_and_trial, stream
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.tracking import Trial
 
@@ -148,7 +148,6 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
         built, planning, steps = _built(problem, model, settings)
         planning = _changed(planning, sensing_interval, sensing_is_optional)
         self.planner = Planner(built, planning, particles=particles)
-        check_settings(self.planner.settings)
         check_problem(built)
         self.problem = built
         self.max_steps = whole("max_steps", steps if max_steps is None else max_steps, 1)
@@ -192,9 +191,9 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; see the class for seeds and ``options``."""
         following = self._trial + 1 if seed is None else 0
-        trial = whole("trial", (options or {}).get("trial", following), 0, 2**32 - 1)
-        own = self._seed if seed is None else whole("seed", seed, 0, 2**63 - 1)
-        if own < 0:
+        own = max(self._seed, 0) if seed is None else seed
+        own, trial = seed_and_trial(own, (options or {}).get("trial", following))
+        if seed is None and self._seed < 0:
             own = int(self.np_random.integers(2**63))
         track = Trial(self.planner, own, trial)
         world = SimulatedEnvironment(self.problem, own, trial)

@@ -14,7 +14,6 @@ from collections.abc import Collection
 from time import perf_counter
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -25,7 +24,6 @@ from holdfast.config.settings import (
     OnLost,
     SimulatorSettings,
     check_settings,
-    plain_settings,
 )
 from holdfast.errors import EnvironmentFailedError, HeldError, InvalidValueError, ProblemError
 from holdfast.outcome import Ending, MoveResult, TrialResult, ending_of
@@ -176,10 +174,9 @@ def run_trial(
     else:
         _require_new(environment)
     require_methods(environment, type(environment).__name__)
-    lost = plain_settings(lost)
-    check_settings(_within_bounds(lost), LostSettings, "lost")
-    missed = plain_settings(EnvironmentSettings(max_missing_in_a_row=max_missing_in_a_row))
-    check_settings(missed, EnvironmentSettings, "environment")
+    lost = check_settings(lost, LostSettings, "lost")
+    missed = EnvironmentSettings(max_missing_in_a_row=max_missing_in_a_row)
+    missed = check_settings(missed, EnvironmentSettings, "environment")
     track = Trial(planner, seed, trial, lost.false_alarm_rate)
     missing = MissingReadings(missed.max_missing_in_a_row)
     name = type(environment).__name__
@@ -291,18 +288,6 @@ def _act_if_lost(
     if again:
         track.reinitialise()
         observer.reinitialised(track.state)
-
-
-def _within_bounds(lost: LostSettings) -> LostSettings:
-    """Return the settings with a rate that a configuration may have, too.
-
-    Here it may be up to 1, where every observation outside the gate raises an alarm: to try what
-    follows from one.
-    """
-    rate = real_number(getattr(lost, "false_alarm_rate", None))
-    if rate is None or not 0.1 < rate <= 1.0:
-        return lost
-    return msgspec.structs.replace(lost, false_alarm_rate=0.1)
 
 
 def _reading(environment: Environment, method: str, shown: object) -> FloatArray:

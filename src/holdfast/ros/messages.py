@@ -1,21 +1,16 @@
-"""The typed service as ROS messages: in CDR for ROS 2, and in ROS 1's own serialisation.
+"""The typed service as messages of ROS 1.
 
-ROS identifies a type by a digest of its definition, and two ends with different digests do not
-connect. So the definitions are in one place, ``interfaces``, which colcon and catkin read, too. The
-serialisation and both digests are made from them: RIHS01 of ROS 2 (REP 2016) and the MD5 sum of
-ROS 1.
-
-rosbags does this for messages. For RIHS01 a service is a message with three fields: its request,
-its response, and an event that contains both.
+ROS 1 identifies a type by the MD5 sum of its definition, and two ends with different sums do not
+connect. So the definitions are in one place, ``interfaces``, which catkin reads, too. Serialisation
+and sum are made from them, by rosbags.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Callable
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -40,15 +35,12 @@ if TYPE_CHECKING:
 __all__ = [
     "MAX_BYTES",
     "SERVICE",
-    "Serialization",
     "answer_message",
     "decode_answer",
     "decode_request",
     "encode_answer",
     "encode_request",
     "md5_sum",
-    "service_types",
-    "type_hash",
     "typestore",
 ]
 
@@ -58,18 +50,8 @@ SERVICE = "holdfast_interfaces/srv/ActiveSensing"
 MAX_BYTES = 16_000_000
 """Of a message; a state of 100,000 particles in nine coordinates has half of it."""
 
-Serialization: TypeAlias = Literal["cdr", "ros1"]
-
 _PACKAGE = "holdfast_interfaces"
 _MESSAGES = ("Belief", "PlanningState")
-
-# What a service's event has, as ROS 2 defines it (REP 2012); REP 2016 makes it part of the hash.
-_TIME = "int32 sec\nuint32 nanosec\n"
-_EVENT_INFO = (
-    "uint8 REQUEST_SENT=0\nuint8 REQUEST_RECEIVED=1\nuint8 RESPONSE_SENT=2\n"
-    "uint8 RESPONSE_RECEIVED=3\nuint8 event_type\nbuiltin_interfaces/Time stamp\n"
-    "uint8[16] client_gid\nint64 sequence_number\n"
-)
 
 
 @functools.cache
@@ -85,70 +67,31 @@ def typestore() -> Typestore:
             f"ROS messages need rosbags: pip install 'holdfast[ros]' ({error})"
         ) from error
     folder = files("holdfast.ros") / "interfaces"
-    store = get_typestore(Stores.EMPTY)
-    types = get_types_from_msg(_TIME, "builtin_interfaces/msg/Time")
-    types |= get_types_from_msg(_EVENT_INFO, "service_msgs/msg/ServiceEventInfo")
+    types: Typesdict = {}
     for name in _MESSAGES:
         text = (folder / "msg" / f"{name}.msg").read_text(encoding="utf-8")
         types |= get_types_from_msg(text, f"{_PACKAGE}/msg/{name}")
     name = SERVICE.rpartition("/")[2]
     text = (folder / "srv" / f"{name}.srv").read_text(encoding="utf-8")
-    store.register(types | service_types(SERVICE, text))
+    for part, definition in zip(("Request", "Response"), text.split("\n---\n"), strict=True):
+        # Parsed as a message, so that a name without a package means one of the service's own.
+        message = f"{_PACKAGE}/msg/{name}_{part}"
+        types[f"{SERVICE}_{part}"] = get_types_from_msg(definition, message)[message]
+    store = get_typestore(Stores.EMPTY)
+    store.register(types)
     return store
 
 
-def service_types(service: str, definition: str) -> Typesdict:
-    """Return the types of a service, for a store, from the text of its ``.srv`` file."""
-    from rosbags.interfaces import Nodetype
-    from rosbags.typesys import get_types_from_msg
-
-    package, _, name = service.split("/")
-    types: Typesdict = {}
-    request, _, response = f"\n{definition}\n".partition("\n---\n")
-    for part, text in (("Request", request), ("Response", response)):
-        # As a message, so that a name without a package means one of the service's own.
-        parsed = get_types_from_msg(f"{text}\n", f"{package}/msg/{name}_{part}")
-        types[f"{service}_{part}"] = parsed[f"{package}/msg/{name}_{part}"]
-
-    def one_at_most(part: str) -> Any:
-        return (Nodetype.SEQUENCE, ((Nodetype.NAME, f"{service}_{part}"), 1))
-
-    types[f"{service}_Event"] = (
-        [],
-        [
-            ("info", (Nodetype.NAME, "service_msgs/msg/ServiceEventInfo")),
-            ("request", one_at_most("Request")),
-            ("response", one_at_most("Response")),
-        ],
-    )
-    types[service] = (
-        [],
-        [
-            (f"{part.lower()}_message", (Nodetype.NAME, f"{service}_{part}"))
-            for part in ("Request", "Response", "Event")
-        ],
-    )
-    return types
-
-
-def type_hash(name: str = SERVICE, store: Typestore | None = None) -> str:
-    """Return the RIHS01 hash by which ROS 2 knows a type of the store, services among them."""
-    return (store or typestore()).hash_rihs01(name)
-
-
-def md5_sum(name: str = SERVICE, store: Typestore | None = None) -> str:
-    """Return the MD5 sum by which ROS 1 knows a type of the store, services among them."""
-    store = store or typestore()
-    if "/srv/" not in name:
-        return store.gendefhash(name, {})[1]
-    texts = (_hashed_text(store, f"{name}_{part}") for part in ("Request", "Response"))
+def md5_sum() -> str:
+    """Return the MD5 sum by which ROS 1 knows the service."""
+    texts = (_hashed_text(f"{SERVICE}_{part}") for part in ("Request", "Response"))
     return hashlib.md5("".join(texts).encode(), usedforsecurity=False).hexdigest()
 
 
-def _hashed_text(store: Typestore, name: str) -> str:
+def _hashed_text(name: str) -> str:
     """Return what the MD5 sum is made of: the definition, with sums in place of messages' names."""
     parts: dict[str, tuple[str, str]] = {}
-    text, _ = store.gendefhash(name, parts)
+    text, _ = typestore().gendefhash(name, parts)
     sums = {part.replace("/msg/", "/"): md5 for part, (_, md5) in parts.items()}
     lines = []
     for line in text.splitlines():
@@ -158,7 +101,7 @@ def _hashed_text(store: Typestore, name: str) -> str:
     return "\n".join(lines)
 
 
-def encode_request(request: DecisionRequest, serialization: Serialization = "cdr") -> bytes:
+def encode_request(request: DecisionRequest) -> bytes:
     """Return a request as a message.
 
     Raises InvalidValueError if a number does not fit into its field, or the text is none.
@@ -173,18 +116,16 @@ def encode_request(request: DecisionRequest, serialization: Serialization = "cdr
         sensing_action=_whole("sensing_action", request.sensing_action, 0, 32),
         observation=_flat(request.observation),
     )
-    return _encode(message, "Request", serialization)
+    return _encode(message, "Request")
 
 
-def decode_request(
-    data: bytes | memoryview, serialization: Serialization = "cdr"
-) -> DecisionRequest:
+def decode_request(data: bytes | memoryview) -> DecisionRequest:
     """Return the request that a message has.
 
     Raises InvalidValueError if it is no message of this type. Raises CheckpointError if its state
     is none.
     """
-    message = _decode(data, "Request", serialization)
+    message = _decode(data, "Request")
     return DecisionRequest(
         kind=message.kind,
         configuration=message.configuration,
@@ -196,7 +137,7 @@ def decode_request(
     )
 
 
-def encode_answer(answer: DecisionAnswer, serialization: Serialization = "cdr") -> bytes:
+def encode_answer(answer: DecisionAnswer) -> bytes:
     """Return an answer as a message.
 
     Raises InvalidValueError if a number does not fit into its field, or a text is none.
@@ -213,16 +154,16 @@ def encode_answer(answer: DecisionAnswer, serialization: Serialization = "cdr") 
         action_size=actions.shape[1] if len(actions) else 0,
         task_actions=_flat(actions),
     )
-    return _encode(message, "Response", serialization)
+    return _encode(message, "Response")
 
 
-def decode_answer(data: bytes | memoryview, serialization: Serialization = "cdr") -> DecisionAnswer:
+def decode_answer(data: bytes | memoryview) -> DecisionAnswer:
     """Return the answer that a message has.
 
     Raises InvalidValueError if it is no message of this type, or its fields contradict each other.
     Raises CheckpointError if its state is none.
     """
-    message = _decode(data, "Response", serialization)
+    message = _decode(data, "Response")
     try:
         error = ErrorCode(message.error)
     except ValueError:
@@ -245,28 +186,18 @@ def decode_answer(data: bytes | memoryview, serialization: Serialization = "cdr"
     )
 
 
-def answer_message(
-    service: ActiveSensing,
-    request: bytes,
-    serialization: Serialization = "cdr",
-    on_refused: Callable[[str], None] = lambda _: None,
-) -> bytes:
-    """Have a service answer a request, both as messages; every failure is an answer, too.
-
-    ``on_refused`` gets the reason if the bytes are no request.
-    """
+def answer_message(service: ActiveSensing, request: bytes) -> bytes:
+    """Have a service answer a request, both as messages; every failure is an answer, too."""
     try:
-        decoded = decode_request(request, serialization)
+        decoded = decode_request(request)
     except HoldfastError as error:
-        on_refused(str(error))
         answer = service.refusal(ErrorCode.BAD_REQUEST, str(error))
     else:
         answer = service.answer(decoded)
     try:
-        return encode_answer(answer, serialization)
+        return encode_answer(answer)
     except HoldfastError as error:
-        refusal = service.refusal(ErrorCode.PROBLEM_FAILED, str(error))
-        return encode_answer(refusal, serialization)
+        return encode_answer(service.refusal(ErrorCode.PROBLEM_FAILED, str(error)))
 
 
 def _state_message(state: PlanningState | None) -> Any:
@@ -298,11 +229,9 @@ def _state(message: Any) -> PlanningState | None:
     )
 
 
-def _encode(message: Any, part: str, serialization: Serialization) -> bytes:
-    store = typestore()
-    serialize = store.serialize_cdr if serialization == "cdr" else store.serialize_ros1
+def _encode(message: Any, part: str) -> bytes:
     try:
-        data = bytes(serialize(message, f"{SERVICE}_{part}"))
+        data = bytes(typestore().serialize_ros1(message, f"{SERVICE}_{part}"))
     except UnicodeEncodeError as error:
         raise InvalidValueError(f"{part}: a text in it is none: {error}") from error
     if len(data) > MAX_BYTES:
@@ -310,20 +239,17 @@ def _encode(message: Any, part: str, serialization: Serialization) -> bytes:
     return data
 
 
-def _decode(data: bytes | memoryview, part: str, serialization: Serialization) -> Any:
+def _decode(data: bytes | memoryview, part: str) -> Any:
     if len(data) > MAX_BYTES:
         raise InvalidValueError(f"{part} of {len(data)} bytes: at most {MAX_BYTES} are allowed")
-    store = typestore()
-    deserialize = store.deserialize_cdr if serialization == "cdr" else store.deserialize_ros1
     try:
-        return deserialize(data, f"{SERVICE}_{part}")
+        return typestore().deserialize_ros1(data, f"{SERVICE}_{part}")
     except HoldfastError:
         raise
     except Exception as error:
         # The generated code checks nothing; invalid bytes raise many kinds of errors.
         raise InvalidValueError(
-            f"{len(data)} bytes are no {SERVICE}_{part} in {serialization}: "
-            f"{type(error).__name__} {error}".rstrip()
+            f"{len(data)} bytes are no {SERVICE}_{part}: {type(error).__name__} {error}".rstrip()
         ) from error
 
 

@@ -118,9 +118,9 @@ class Ros1Service:
             If there is no answer; the message gives the reason.
         """
         until = monotonic() + deadline_s
-        message = encode_message(encode_request(request, "ros1"))
+        message = encode_message(encode_request(request))
         try:
-            return decode_answer(self._exchange(message, until), "ros1")
+            return decode_answer(self._exchange(message, until))
         except TimeoutError:
             self._disconnect()
             raise TransportError(f"no answer in {deadline_s:g} s") from None

@@ -94,7 +94,7 @@ class Ros1Server:
 
     async def _answer(self, request: bytes) -> bytes:
         future = self._decisions.submit(
-            lambda: answer_message(self._answers, request, "ros1"),
-            lambda reason: encode_answer(self._answers.refusal(ErrorCode.BUSY, reason), "ros1"),
+            lambda: answer_message(self._answers, request),
+            lambda reason: encode_answer(self._answers.refusal(ErrorCode.BUSY, reason)),
         )
         return await asyncio.wrap_future(future)

@@ -3,62 +3,44 @@
 from __future__ import annotations
 
 import threading
-import time
 import weakref
-from collections import deque
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from holdfast.ros.robot_interface import RobotCall
-
-__all__ = ["CallClients", "Connections", "Instant", "TopicBuffer"]
-
-_MESSAGES_KEPT = 10
+__all__ = ["CallClients", "Connections", "LatchedTopic", "RobotCall"]
 
 
-class Instant(NamedTuple):
-    """A moment on the node's clock and on the machine's clock; they differ in simulated time."""
+class RobotCall(NamedTuple):
+    """A service or an action of the robot's, by its resolved name."""
 
-    ros_ns: int
-    system_ns: int
+    name: str
+    type: Any
+    may_repeat: bool
 
+    @property
+    def is_action(self) -> bool:
+        """Whether it is an action."""
+        return hasattr(self.type, "Goal")
 
-class ReceivedMessage(NamedTuple):
-    """A message, and when the machine's clock saw it arrive."""
-
-    number: int
-    message: Any
-    system_ns: int
-
-    def age_ns(self, instant: Instant) -> int:
-        """Return how long before an instant it was taken; 0 or less if it was not before."""
-        stamp = getattr(getattr(self.message, "header", None), "stamp", None)
-        if stamp is not None and (stamp.sec or stamp.nanosec):
-            return instant.ros_ns - (1_000_000_000 * int(stamp.sec) + int(stamp.nanosec))
-        return instant.system_ns - self.system_ns
+    def __str__(self) -> str:
+        """Return a description for messages."""
+        package, kind, *_ = self.type.__module__.split(".")
+        word = "action" if self.is_action else "service"
+        return f"{word} {self.name} ({package}/{kind}/{self.type.__name__})"
 
 
-class TopicBuffer:
-    """The last messages of a topic."""
+class LatchedTopic:
+    """The last message of a topic that tells a state; None before the first."""
 
     def __init__(self) -> None:
-        self.messages: deque[ReceivedMessage] = deque(maxlen=_MESSAGES_KEPT)
-        self.number = 0
-        self.condition: threading.Condition | None = None
+        self.message: Any = None
 
-    def take(self, message: Any, info: Mapping[str, int]) -> None:
-        """Keep a message, and wake the waiting environment."""
-        received_ns = int(info.get("received_timestamp") or 0) or time.time_ns()
-        self.messages.append(ReceivedMessage(self.number, message, received_ns))
-        self.number += 1
-        condition = self.condition
-        if condition is not None:
-            with condition:
-                condition.notify_all()
+    def take(self, message: Any) -> None:
+        """Keep a message."""
+        self.message = message
 
 
 class CallClients(NamedTuple):
@@ -83,8 +65,8 @@ class Connections:
         self.node = node
         # Answers arrive whatever else the node does in its callbacks.
         self._group = ReentrantCallbackGroup()
-        self._clients: dict[tuple[str, str], CallClients] = {}
-        self._topics: dict[tuple[str, str], TopicBuffer] = {}
+        self._clients: dict[RobotCall, CallClients] = {}
+        self._topics: dict[str, LatchedTopic] = {}
         self._lock = threading.Lock()
         self._users: weakref.WeakSet[Any] = weakref.WeakSet()
 
@@ -100,42 +82,38 @@ class Connections:
         for environment in environments:
             environment.cancel(why)
 
+    def call(self, name: str, call_type: Any, *, may_repeat: bool = True) -> RobotCall:
+        """Return a service or an action by its name before remapping."""
+        # ROS itself would not remap an action by one rule, only each of its services.
+        return RobotCall(self.node.resolve_service_name(name), call_type, may_repeat)
+
     def clients(self, call: RobotCall) -> CallClients:
         """Return the clients of a call."""
-        key = (call.name, call.type_name)
-        if key not in self._clients:
-            if call.kind == "srv":
-                self._clients[key] = CallClients(self._client(call.type, call.name))
+        if call not in self._clients:
+            if not call.is_action:
+                self._clients[call] = CallClients(self._client(call.type, call.name))
             else:
                 parts = call.type.Impl
-                self._clients[key] = CallClients(
+                self._clients[call] = CallClients(
                     self._client(parts.SendGoalService, f"{call.name}/_action/send_goal"),
                     self._client(parts.GetResultService, f"{call.name}/_action/get_result"),
                     self._client(parts.CancelGoalService, f"{call.name}/_action/cancel_goal"),
                 )
-        return self._clients[key]
+        return self._clients[call]
 
-    def topic(self, name: str, message_type: Any, *, latched: bool) -> TopicBuffer:
-        """Return the last messages of a topic."""
-        key = (name, f"{message_type.__module__}.{message_type.__name__}")
-        if key not in self._topics:
-            topic = TopicBuffer()
-            # Best effort hears every kind of publisher, and a lost message is followed by another
-            # one. A latched state must not be lost.
-            quality = (
-                QoSProfile(
-                    depth=1,
-                    reliability=ReliabilityPolicy.RELIABLE,
-                    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-                )
-                if latched
-                else QoSProfile(depth=_MESSAGES_KEPT, reliability=ReliabilityPolicy.BEST_EFFORT)
+    def latched_topic(self, name: str, message_type: Any) -> LatchedTopic:
+        """Return the last message of a topic."""
+        if name not in self._topics:
+            topic = self._topics[name] = LatchedTopic()
+            quality = QoSProfile(
+                depth=1,
+                reliability=ReliabilityPolicy.RELIABLE,
+                durability=DurabilityPolicy.TRANSIENT_LOCAL,
             )
             self.node.create_subscription(
                 message_type, name, topic.take, quality, callback_group=self._group
             )
-            self._topics[key] = topic
-        return self._topics[key]
+        return self._topics[name]
 
     def _client(self, service_type: Any, name: str) -> Any:
         return self.node.create_client(service_type, name, callback_group=self._group)

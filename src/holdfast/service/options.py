@@ -33,9 +33,6 @@ DEFAULT_NAME = "cloud_active_sensing"
 
 _DEFAULT_PLACE = "127.0.0.1:7447"
 
-_DEFAULT_ROUTER = "tcp/localhost:7447"
-"""Where nodes of ROS 2 with rmw_zenoh look for their router."""
-
 
 def http_address(text: str) -> HttpAddress:
     """Read the address at which HTTP is answered: ``HOST:PORT``, or ``PORT`` of the loopback."""
@@ -168,27 +165,7 @@ class ServeOptions(Options):
     configuration: Path | None = option(
         read=location,
         metavar="FILE",
-        help="Configuration for the nodes of ROS, which have none.",
-    )
-    ros2_domain: int | None = option(
-        read=whole_number(0, 232),
-        metavar="N",
-        help="Offer a service to ROS 2 nodes of this domain that use rmw_zenoh. It needs no ROS "
-        "(pip install 'holdfast[ros]'). Then nothing else listens here without --listen.",
-    )
-    ros2_name: str = option(
-        default=DEFAULT_NAME,
-        metavar="NAME",
-        help="Name of that service in ROS 2.",
-    )
-    ros2_router: str | None = option(
-        metavar="ENDPOINT",
-        help=f"Where rmw_zenohd listens (default: {_DEFAULT_ROUTER}). It may start later, and go "
-        "away.",
-    )
-    ros2_listen: str | None = option(
-        metavar="ENDPOINT",
-        help="Where nodes of ROS 2 can connect, instead of a router.",
+        help="Configuration for the nodes of ROS 1, which have none.",
     )
     ros1: bool = flag(
         help="Offer a service in ROS 1, at the address of ROS_MASTER_URI and the like. It needs no "
@@ -216,11 +193,6 @@ class ServeOptions(Options):
         ending = [signal.SIGINT, signal.SIGTERM, *([] if self.tls else [signal.SIGHUP])]
         return [number for number in ending if signal.getsignal(number) is not signal.SIG_IGN]
 
-    @property
-    def has_extensions(self) -> bool:
-        """Whether the service offers something in ROS, too."""
-        return self.ros2_domain is not None or self.ros1
-
 
 def parse_options(arguments: Sequence[str]) -> ServeOptions:
     """Read what follows ``serve`` on the command line.
@@ -231,50 +203,32 @@ def parse_options(arguments: Sequence[str]) -> ServeOptions:
         If an option cannot be used, or two do not go together.
     """
     options = ServeOptions.parse("serve", arguments)
-    _check_extensions(options)
+    _check_ros1(options)
     if options.processes > 1:
         for name, given in (
             ("--connect", options.connect),
-            ("--ros2-domain", options.ros2_domain is not None),
             ("--ros1", options.ros1),
-            ("--listen ros1/NAME", any(each.startswith("ros1/") for each in options.listen)),
             ("--until-stdin-closes", options.until_stdin_closes),
         ):
             if given:
                 raise InvalidValueError(f"{name}: goes with one process only, not with --processes")
-    if not options.listen and not options.connect and not options.has_extensions:
+    if not options.listen and not options.connect and not options.ros1:
         options.listen = (f"{'tls' if options.tls else 'tcp'}/{_DEFAULT_PLACE}",)
     return options
 
 
-def _check_extensions(options: ServeOptions) -> None:
-    """Refuse options for ROS that do not go together."""
-    if options.ros2_domain is None:
-        for name, given in (
-            ("--ros2-name", options.ros2_name != DEFAULT_NAME),
-            ("--ros2-router", options.ros2_router),
-            ("--ros2-listen", options.ros2_listen),
-        ):
-            if given:
-                raise InvalidValueError(f"{name}: goes with --ros2-domain only")
-    elif options.ros2_router and options.ros2_listen:
-        raise InvalidValueError(
-            "--ros2-router and --ros2-listen do not go together: nodes are reached through a "
-            "router, or they connect to this service"
-        )
-    elif not options.ros2_listen:
-        options.ros2_router = options.ros2_router or _DEFAULT_ROUTER
+def _check_ros1(options: ServeOptions) -> None:
+    """Refuse options for ROS 1 that do not go together."""
     if not options.ros1 and options.ros1_name != DEFAULT_NAME:
         raise InvalidValueError("--ros1-name: goes with --ros1 only")
-    if options.has_extensions and options.configuration is None:
+    if options.ros1 and options.configuration is None:
         raise InvalidValueError(
-            f"{'--ros1' if options.ros1 else '--ros2-domain'}: --configuration is missing; it says "
-            "for which problem and with which settings this service decides in ROS"
+            "--ros1: --configuration is missing; it says for which problem and with which settings "
+            "this service decides in ROS"
         )
-    if options.configuration is not None and not options.has_extensions:
+    if options.configuration is not None and not options.ros1:
         raise InvalidValueError(
-            "--configuration: goes with --ros2-domain or --ros1 only; other robots bring theirs "
-            "along"
+            "--configuration: goes with --ros1 only; other robots bring theirs along"
         )
 
 
@@ -287,7 +241,7 @@ def checked_endpoints(options: ServeOptions) -> list[Endpoint]:
         If an endpoint is malformed or cannot be used so, or is one that other machines can reach
         although they do not have to prove who they are; the message names the option.
     InvalidValueError
-        If health or metrics are to be offered, or a router of ROS 2 is, at the same port.
+        If health or metrics are to be offered at the same port.
     """
     from holdfast.transport.endpoints import check_endpoint
 
@@ -300,12 +254,6 @@ def checked_endpoints(options: ServeOptions) -> list[Endpoint]:
             except TransportError as error:
                 raise TransportError(f"{name}: {error}") from None
             # Of an encrypted one without credentials the transport says that they are missing.
-            if endpoint.is_ros1 and not (endpoint.is_loopback or options.insecure):
-                raise TransportError(
-                    f"{name}: endpoint {endpoint}: other machines can reach it, and no peer "
-                    f"proves its identity; set ROS_HOSTNAME=127.0.0.1 to prevent that, or "
-                    f"say --insecure"
-                )
             if not (endpoint.is_loopback or options.insecure or endpoint.is_encrypted):
                 raise TransportError(
                     f"{name}: endpoint {endpoint}: other machines can reach it, and no peer "
@@ -315,14 +263,6 @@ def checked_endpoints(options: ServeOptions) -> list[Endpoint]:
                 )
             if listens:
                 listen.append(endpoint)
-    _check_ros2_endpoint("--ros2-listen", options.ros2_listen, options)
-    router = _check_ros2_endpoint("--ros2-router", options.ros2_router, options)
-    for endpoint in listen:
-        if router is not None and router.port == endpoint.port and router.is_loopback:
-            raise InvalidValueError(
-                f"--listen {endpoint} and --ros2-router {router} name the same port, which "
-                f"rmw_zenohd needs; robots need one of their own"
-            )
     for name, address in (("--health", options.health), ("--metrics", options.metrics)):
         for endpoint in listen:
             if address is not None and _is_same_port(endpoint, address):
@@ -331,29 +271,6 @@ def checked_endpoints(options: ServeOptions) -> list[Endpoint]:
                     f"one of their own"
                 )
     return listen
-
-
-def _check_ros2_endpoint(name: str, text: str | None, options: ServeOptions) -> Endpoint | None:
-    from holdfast.transport.endpoints import parse_endpoint
-
-    if text is None:
-        return None
-    try:
-        endpoint = parse_endpoint(text)
-    except TransportError as error:
-        raise TransportError(f"{name}: {error}") from None
-    if endpoint.protocol != "tcp" or not endpoint.port:
-        raise TransportError(
-            f"{name}: endpoint {endpoint}: rmw_zenoh is spoken over tcp, at a port that is "
-            f"given, as in tcp/localhost:7447"
-        )
-    if not (endpoint.is_loopback or options.insecure):
-        raise TransportError(
-            f"{name}: endpoint {endpoint}: it is on other machines or they can reach it, and "
-            f"no peer proves its identity; use one of this machine alone, as in "
-            f"tcp/localhost:7447, or say --insecure"
-        )
-    return endpoint
 
 
 def _is_same_port(endpoint: Endpoint, address: HttpAddress) -> bool:

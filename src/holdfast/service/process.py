@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from holdfast.service.shell import ServiceShell
     from holdfast.service.supervisor import Supervised
 
-__all__ = ["Extension", "MakeExtensions", "main"]
+__all__ = ["Extension", "MakeExtension", "main"]
 
 _SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while another waits for it."""
@@ -40,17 +40,15 @@ _BETWEEN_COLLECTIONS = 10_000
 _CLOSE_TIMEOUT_S = 0.7
 _CHECK_INTERVAL_S = 0.01
 _STDIN = 0
-_ROS1 = "ros1"
 
-_OFFERED = ("health", "metrics", "ros2", "ros1")
+_OFFERED = ("health", "metrics", "ros1")
 """Keys of the ready line for what else is offered, and where."""
 
 
 class Extension(Protocol):
-    """Something else that runs in a service's process, on threads of its own: a service in ROS.
+    """Something else that runs in a service's process, on threads of its own: a service in ROS 1.
 
-    This package knows none. Who starts the service passes a function that makes those for which the
-    options ask.
+    This package knows none. Who starts the service passes a function that makes it.
     """
 
     @property
@@ -78,11 +76,11 @@ class Extension(Protocol):
         ...
 
 
-MakeExtensions: TypeAlias = "Callable[[ServeOptions], Sequence[Extension]]"
-"""Makes the extensions for some options; raises a HoldfastError if they cannot be used."""
+MakeExtension: TypeAlias = "Callable[[ServeOptions], Extension]"
+"""Makes the extension for some options; raises a HoldfastError if they cannot be used."""
 
 
-def main(arguments: Sequence[str], make_extensions: MakeExtensions | None = None) -> int:
+def main(arguments: Sequence[str], make_extension: MakeExtension | None = None) -> int:
     """Run ``holdfast serve`` until it has to stop.
 
     Returns
@@ -105,7 +103,7 @@ def main(arguments: Sequence[str], make_extensions: MakeExtensions | None = None
         return _serve_with_several(options)
     if options.supervised is not None:
         return _serve_supervised(options, *options.supervised)
-    return _serve(options, make_extensions=make_extensions)
+    return _serve(options, make_extension=make_extension)
 
 
 def _serve_with_several(options: ServeOptions) -> int:
@@ -174,7 +172,7 @@ def _serve_supervised(options: ServeOptions, parent: int, descriptor: int) -> in
 def _serve(
     options: ServeOptions,
     supervised: Supervised | None = None,
-    make_extensions: MakeExtensions | None = None,
+    make_extension: MakeExtension | None = None,
 ) -> int:
     if options.until_stdin_closes and sys.stdin is None:
         raise InvalidValueError("--until-stdin-closes: this process has no standard input")
@@ -184,8 +182,8 @@ def _serve(
 
     if credentials is None:
         _import_without_openssl()
-    extensions = make_extensions(options) if make_extensions and options.has_extensions else ()
-    process = _ServiceProcess(options, credentials, extensions, supervised)
+    extension = make_extension(options) if make_extension and options.ros1 else None
+    process = _ServiceProcess(options, credentials, extension, supervised)
 
     import asyncio
 
@@ -208,7 +206,7 @@ class _ServiceProcess:
         self,
         options: ServeOptions,
         credentials: ServiceCredentials | None,
-        extensions: Sequence[Extension],
+        extension: Extension | None,
         supervised: Supervised | None,
     ) -> None:
         # First the transport, which refuses options.
@@ -217,12 +215,10 @@ class _ServiceProcess:
 
         self._options = options
         self._credentials = credentials
-        self._extensions = extensions
+        self._extension = extension
         self._supervised = supervised
         self._is_serving = False
-        # Parts that ROS has asked to end; None: the links over ROS 1.
-        self._withdrawn: set[Extension | None] = set()
-        self._withdrawing: set[asyncio.Task[None]] = set()
+        self._withdrawing: asyncio.Task[None] | None = None
         self._incarnation = os.urandom(8).hex()
         reserved = NEEDED + MAX_UNKNOWN
         allowed = allow_descriptors(reserved + MAX_LINKS)
@@ -237,7 +233,6 @@ class _ServiceProcess:
             max_links=min(MAX_LINKS, max(allowed // 4, allowed - reserved)),
             tls=None if credentials is None else credentials.files,
             on_event=lambda event, **fields: self._shell.note(event, **fields),
-            on_shutdown=functools.partial(self._end_for_ros, None),
         )
 
         import msgspec
@@ -267,13 +262,14 @@ class _ServiceProcess:
         service = Service(problems, workers, limits, _describe_error, pricing)
         self.events = EventLog(sys.stderr, format=options.log, component=options.name)
         self._times = DecisionTimes()
-        self._shell = ServiceShell(service, self._transport, workers, self.events, self._times.add)
+        self._shell = ServiceShell(service, self._transport, self.events, self._times.add)
         self._manager = ServiceManager()
 
     @property
     def is_computing(self) -> bool:
         """Whether a thread is still computing."""
-        return self._shell.is_computing or any(each.is_busy for each in self._extensions)
+        extension = self._extension
+        return self._shell.is_computing or (extension is not None and extension.is_busy)
 
     async def run(self) -> int:
         """Serve until there is a reason to stop; return the exit status."""
@@ -291,11 +287,11 @@ class _ServiceProcess:
                 await shell.start()
                 if self._credentials is not None:
                     self._credentials.watch(loop, self._transport, self.events)
-                offered: dict[str, object] = {}
-                for each in self._extensions:
-                    offered |= each.start(
-                        functools.partial(_call_soon, loop, self._shell.note),
-                        functools.partial(_call_soon, loop, self._end_for_ros, each),
+                offered: Mapping[str, str] = {}
+                if (extension := self._extension) is not None:
+                    offered = extension.start(
+                        functools.partial(_call_soon, loop, shell.note),
+                        functools.partial(_call_soon, loop, self._end_for_ros, extension),
                     )
                 if options.until_stdin_closes:
                     _watch_stdin(loop, shell)
@@ -329,8 +325,8 @@ class _ServiceProcess:
                 try:
                     await shell.close(_CLOSE_TIMEOUT_S)
                 finally:
-                    for each in self._extensions:
-                        each.close(_CLOSE_TIMEOUT_S)
+                    if self._extension is not None:
+                        self._extension.close(_CLOSE_TIMEOUT_S)
                 if supervised is not None:
                     supervised.close()
         return _exit_status(reason)
@@ -372,60 +368,47 @@ class _ServiceProcess:
         told = {"reason": str(context["message"])} if error is None else defect_fields(error)
         self._shell.note(DEFECT, **told)
 
-    def _end_for_ros(self, part: Extension | None, reason: str) -> None:
-        """Withdraw a part in ROS 1 that ROS asks to end: an extension, or the links.
+    def _end_for_ros(self, extension: Extension, reason: str) -> None:
+        """Withdraw the service in ROS 1, which ROS asks to end.
 
         Anybody who reaches a node's port can ask for it, so it must not end what is served beside
         it, to robots that have to prove who they are. If nothing is, the process ends as after
         SIGTERM: ``rosnode kill`` and a second node of the same name are to end a node.
         """
-        self._withdrawn.add(part)
-        links_end = None in self._withdrawn
-        goes_on = bool(
-            self._options.connect
-            or any(not (links_end and each.startswith(_ROS1)) for each in self._transport.endpoints)
-            or any(each not in self._withdrawn for each in self._extensions)
-        )
+        goes_on = bool(self._options.connect or self._transport.endpoints)
         self._shell.note("ros_shutdown", reason=reason, goes_on=goes_on)
         if not goes_on:
             os.kill(os.getpid(), signal.SIGTERM)
             return
         import asyncio
 
-        # Kept, because the loop's own references are weak.
-        task = asyncio.get_running_loop().create_task(self._withdraw(part))
-        self._withdrawing.add(task)
-        task.add_done_callback(self._withdrawing.discard)
+        if self._withdrawing is None:  # it may be asked again
+            # Kept, because the loop's own references are weak.
+            self._withdrawing = asyncio.get_running_loop().create_task(self._withdraw(extension))
 
-    async def _withdraw(self, part: Extension | None) -> None:
+    async def _withdraw(self, extension: Extension) -> None:
         import asyncio
 
-        if part is None:
-            await self._transport.withdraw(_ROS1, self._options.drain_s)
-            return
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._drain_extensions((part,)), self._options.drain_s)
-        await asyncio.to_thread(part.close, _CLOSE_TIMEOUT_S)
+            await asyncio.wait_for(_drained(extension), self._options.drain_s)
+        await asyncio.to_thread(extension.close, _CLOSE_TIMEOUT_S)
 
     async def _drain(self) -> None:
         import asyncio
 
         drain_s = self._options.drain_s
+        extensions = [] if self._extension is None else [_drained(self._extension)]
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(
-                asyncio.gather(
-                    self._shell.drain(drain_s), self._drain_extensions(self._extensions)
-                ),
-                drain_s,
-            )
+            await asyncio.wait_for(asyncio.gather(self._shell.drain(drain_s), *extensions), drain_s)
 
-    async def _drain_extensions(self, extensions: Sequence[Extension]) -> None:
-        import asyncio
 
-        for each in extensions:
-            each.take_no_more()
-        while any(each.is_busy for each in extensions):
-            await asyncio.sleep(_CHECK_INTERVAL_S)
+async def _drained(extension: Extension) -> None:
+    """Have it refuse new requests, and wait until it owes no answer."""
+    import asyncio
+
+    extension.take_no_more()
+    while extension.is_busy:
+        await asyncio.sleep(_CHECK_INTERVAL_S)
 
 
 def _describe_error(error: BaseException) -> str:

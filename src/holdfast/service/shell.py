@@ -83,13 +83,12 @@ class ServiceShell:
         self,
         service: Service,
         transport: ServiceTransport,
-        workers: int,
         events: EventSink,
         on_decision: DecisionHook | None = None,
     ) -> None:
         self._service = service
         self._transport = transport
-        self._jobs = ThreadPool(workers + max(1, workers - 1), "holdfast-worker")
+        self._jobs = ThreadPool(service.max_running, "holdfast-worker")
         self._decoder = ThreadPool(1, "holdfast-decoder")
         self._events = events
         self._on_decision = on_decision

@@ -23,6 +23,7 @@ import errno
 import socket
 import struct
 from collections import deque
+from time import thread_time
 from typing import Any, Final
 
 from holdfast.errors import FrameError, KeysExhaustedError
@@ -170,8 +171,9 @@ class _DatagramLink(Link):
         # Charged after decryption: forged datagrams must not use up the owner's slices.
         backlog, scheduler = self._backlog, self._settings.scheduler
         if not backlog and scheduler.may_run(self.owner, now):
+            began = thread_time()
             self._handle(message)
-            scheduler.charge(self.owner, self._loop.time() - now)
+            scheduler.charge(self.owner, thread_time() - began)
         elif len(backlog) < _MAX_BACKLOG:
             backlog.append(message)
             if len(backlog) == 1:
@@ -188,11 +190,11 @@ class _DatagramLink(Link):
     def _handle_backlog(self) -> None:
         """Handle waiting messages for one slice."""
         backlog, scheduler = self._backlog, self._settings.scheduler
-        began = now = self._loop.time()
+        began = now = thread_time()
         while backlog and not self._ended and now < began + SLICE_S:
             self._handle(backlog[0])
             backlog.popleft()
-            now = self._loop.time()
+            now = thread_time()
         scheduler.charge(self.owner, now - began)
         if self._ended:
             backlog.clear()

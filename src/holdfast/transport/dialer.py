@@ -23,10 +23,8 @@ import threading
 from collections.abc import Callable
 from typing import Any, Final, TypeAlias
 
-from holdfast.errors import TransportError
 from holdfast.transport.endpoints import Endpoint, system_words
 from holdfast.transport.links import Link
-from holdfast.transport.schemes import Scheme
 
 __all__ = ["Dialer"]
 
@@ -44,6 +42,9 @@ _CONNECT_TIMEOUT_S: Final = 2.0
 _NEXT_LINK_S: Final = 0.25
 """After a connection, no second one is made for so long."""
 
+_LOOKUP_INTERVAL_S = 1.0
+"""Between two look-ups of a host while no peer is reached."""
+
 _REFUSED_PAUSE_S: Final = 1.0
 """After one end has refused the other."""
 
@@ -60,13 +61,11 @@ class Dialer:
     def __init__(
         self,
         endpoint: Endpoint,
-        scheme: Scheme,
         make_link: Callable[[], Link],
         on_failed: Callable[[str], None] = lambda _: None,
         identity: str = "",
     ) -> None:
         self._endpoint = endpoint
-        self._scheme = scheme
         self._identity = identity
         self._make_link = make_link
         self._on_failed = on_failed
@@ -218,14 +217,11 @@ class Dialer:
 
     def _resolve(self) -> None:
         """Look up the host's addresses; on a thread of its own."""
-        host = self._endpoint.host
+        _, host, port = self._endpoint
         reason = ""
         found: list[Any] = []
         try:
-            host, port, family = self._scheme.look_up(self._endpoint)
-            found = socket.getaddrinfo(host, port, family, type=socket.SOCK_STREAM)
-        except TransportError as error:
-            reason = str(error)
+            found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
         except (OSError, UnicodeError):
             reason = f"host name not found: {host}"
         except Exception as error:  # noqa: BLE001 - look-ups must go on
@@ -238,7 +234,7 @@ class Dialer:
         addresses.sort(key=lambda each: (kinds.index(each[0]), self._rank_of(each[1])))
 
         def take() -> None:
-            self._resolve_at = self._loop.time() + self._scheme.lookup_interval_s
+            self._resolve_at = self._loop.time() + _LOOKUP_INTERVAL_S
             self._addresses = addresses or self._addresses
             if not self._addresses:
                 self._on_failed(reason)

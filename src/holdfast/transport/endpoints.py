@@ -1,7 +1,7 @@
 """Endpoints: where a service is.
 
 An endpoint is a protocol and a place: ``tcp/127.0.0.1:7447``, ``tls/planner.example:7447``,
-``udp/planner.example:7447``, ``unix//run/holdfast/robot.sock``, ``ros1/cloud_active_sensing``.
+``udp/planner.example:7447``, ``unix//run/holdfast/robot.sock``.
 Endpoints are checked here before anything is opened, and errors give the reason.
 """
 
@@ -18,6 +18,7 @@ from typing import Literal, NamedTuple, TypeAlias
 import msgspec
 
 from holdfast.errors import TransportError
+from holdfast.printable import did_you_mean
 
 __all__ = [
     "AUTHORITY_FILE",
@@ -57,6 +58,7 @@ NEXT_KEY_FILE = "key.next.pem"
 _RENAMED = {
     "quic": "over UDP, services are at udp/HOST:PORT",
     "unixsock-stream": "a local socket is written unix/PATH",
+    "ros1": "sessions go over tcp/HOST:PORT; in ROS 1 there is the typed service, serve --ros1",
 }
 """Protocols of earlier releases, and their replacements."""
 
@@ -74,7 +76,7 @@ class SchemeEntry(NamedTuple):
 
     implementation: str  # MODULE:CLASS, a Scheme
     is_encrypted: bool = False  # and both ends authenticate by a certificate
-    place: Literal["address", "path", "name"] = "address"  # HOST:PORT, a path, or a name in ROS 1
+    place: Literal["address", "path"] = "address"  # HOST:PORT or a path
     services_listen: str = ""  # why a robot cannot listen, as a sentence; empty if it can
 
 
@@ -90,11 +92,6 @@ SCHEMES = {
         "write tls/... where a robot listens",
     ),
     "unix": SchemeEntry(_STREAMS, place="path"),
-    "ros1": SchemeEntry(
-        "holdfast.transport.ros1:RosScheme",
-        place="name",
-        services_listen="in ROS 1 it is the service that is offered and the robot that calls it",
-    ),
 }
 """The protocols of endpoints."""
 
@@ -120,9 +117,8 @@ class TlsFiles(msgspec.Struct, frozen=True):
 class Endpoint(NamedTuple):
     """A protocol and a place, checked. ``str`` gives the text back.
 
-    The host is a name or address, an IPv6 address without its brackets; for ``unix`` the path, for
-    ``ros1`` the name in ROS 1. Port 0 means any free port, where something listens; for ``unix``
-    and ``ros1`` it is always 0.
+    The host is a name or address, an IPv6 address without its brackets; for ``unix`` the path.
+    Port 0 means any free port, where something listens; for ``unix`` it is always 0.
     """
 
     protocol: str
@@ -130,7 +126,7 @@ class Endpoint(NamedTuple):
     port: int
 
     def __str__(self) -> str:
-        if SCHEMES[self.protocol].place != "address":
+        if self.is_local_socket:
             return f"{self.protocol}/{self.host}"
         return f"{self.protocol}/{host_and_port(self.host, self.port)}"
 
@@ -145,11 +141,6 @@ class Endpoint(NamedTuple):
         return SCHEMES[self.protocol].place == "path"
 
     @property
-    def is_ros1(self) -> bool:
-        """Whether a ROS 1 master knows its address."""
-        return SCHEMES[self.protocol].place == "name"
-
-    @property
     def is_loopback(self) -> bool:
         """Whether only this machine can reach it.
 
@@ -158,10 +149,6 @@ class Endpoint(NamedTuple):
         """
         if self.is_local_socket:
             return True
-        if self.is_ros1:
-            from holdfast.transport.tcpros import RosEnvironment
-
-            return _is_loopback_address(ipaddress.ip_address(RosEnvironment.of().bind))
         address = _address_of(self.host)
         if address is not None:
             return _is_loopback_address(address)
@@ -206,10 +193,7 @@ def parse_endpoint(text: str) -> Endpoint:
     if protocol not in SCHEMES:
         instead = _RENAMED.get(protocol)
         if instead is None:
-            import difflib  # for a mistake alone
-
-            close = difflib.get_close_matches(protocol, SCHEMES, n=1)
-            instead = f"did you mean {close[0]}?" if close else None
+            instead = did_you_mean(protocol, SCHEMES).removeprefix("; ")
         raise TransportError(
             f"endpoint {text!r}: protocol {protocol} is not allowed"
             + (f" ({instead})" if instead else "")
@@ -220,11 +204,8 @@ def parse_endpoint(text: str) -> Endpoint:
             f"endpoint {text!r}: options after '?' or '#' are not allowed; "
             f"give the place alone, as in tcp/127.0.0.1:7447"
         )
-    kind = SCHEMES[protocol].place
-    if kind == "path":
+    if SCHEMES[protocol].place == "path":
         return _local_socket(text, protocol, place)
-    if kind == "name":
-        return _name_in_ros1(text, protocol, place)
     host, colon, port_text = place.rpartition(":")
     if not colon or place.endswith("]"):
         raise TransportError(
@@ -309,7 +290,7 @@ def check_endpoint(text: str, role: Role, *, listens: bool) -> Endpoint:
         listens.
     """
     endpoint = parse_endpoint(text)
-    if not listens and endpoint.port == 0 and SCHEMES[endpoint.protocol].place == "address":
+    if not listens and endpoint.port == 0 and not endpoint.is_local_socket:
         raise TransportError(
             f"endpoint {endpoint}: port 0 is for listening; to connect, give the port, "
             f"as in {endpoint._replace(port=7447)}"
@@ -362,16 +343,6 @@ def _local_socket(text: str, protocol: str, path: str) -> Endpoint:
             f"{MAX_SOCKET_PATH_BYTES}"
         )
     return Endpoint(protocol, path, 0)
-
-
-def _name_in_ros1(text: str, protocol: str, name: str) -> Endpoint:
-    from holdfast.transport.tcpros import RosEnvironment
-
-    try:
-        RosEnvironment.of().resolved(name)
-    except TransportError as error:
-        raise TransportError(f"endpoint {text!r}: {error}") from error
-    return Endpoint(protocol, name, 0)
 
 
 def _address_of(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:

@@ -6,6 +6,7 @@ import asyncio
 import math
 from collections import OrderedDict, deque
 from collections.abc import Callable
+from time import thread_time
 from typing import TYPE_CHECKING, Final
 
 from holdfast.transport.frames import HEADER_BYTES
@@ -22,14 +23,21 @@ SLICE_S: Final = 0.001
 _WINDOW_S: Final = 0.005
 """An owner may use one slice per window without waiting."""
 
+_TURN_S: Final = 0.002
+"""For so long waiting links run in one turn of the event loop."""
+
 
 class FairScheduler:
     """A round-robin scheduler: a link that receives much does not delay the others.
 
     One read of a socket can return hundreds of kilobytes with tens of thousands of messages. So a
     link handles what it has received for a slice of one millisecond. What is left waits, and the
-    link reads nothing more meanwhile. In each turn of the event loop (or after ``pause_s``) one
-    waiting link runs for another slice, and all other links are read in between.
+    link reads nothing more meanwhile. In each turn of the event loop (or after ``pause_s``) waiting
+    links run for another slice each, until :data:`_TURN_S` is over, and other links are read in
+    between. All that is handled as it is read takes half of the time at most. So a turn is short,
+    and a link waits for as many slices as there are others with much to do.
+
+    Slices are measured in the thread's processor time: a link that was interrupted has not used it.
 
     Links of one *owner* share their slices, however many they are: those with the same certificate,
     and all those with an unfinished handshake. A link without TLS is an owner of its own.
@@ -39,40 +47,54 @@ class FairScheduler:
         self._pause_s = pause_s
         self._waiting: OrderedDict[object, deque[Callable[[], None]]] = OrderedDict()
         self._used_s: dict[object, float] = {}
+        self._all_used_s = 0.0
         self._window_ends_at = float("-inf")
+        self._is_scheduled = False
 
     def may_run(self, owner: object, now: float) -> bool:
         """Return whether an owner may handle at once what it has just received."""
         if now >= self._window_ends_at:
             self._used_s.clear()
+            self._all_used_s = 0.0
             self._window_ends_at = now + _WINDOW_S
-        return owner not in self._waiting and self._used_s.get(owner, 0.0) < SLICE_S
+        return (
+            owner not in self._waiting
+            and self._used_s.get(owner, 0.0) < SLICE_S
+            and self._all_used_s < _WINDOW_S / 2
+        )
 
     def charge(self, owner: object, seconds: float) -> None:
         """Add time that an owner has used."""
         self._used_s[owner] = self._used_s.get(owner, 0.0) + seconds
+        self._all_used_s += seconds
 
     def enqueue(self, owner: object, run_slice: Callable[[], None]) -> None:
         """Run a slice when the owner's turn comes; it enqueues again if there is more."""
-        if not self._waiting:
+        if not self._is_scheduled:
             self._schedule()
         self._waiting.setdefault(owner, deque()).append(run_slice)
 
-    def _run_next(self) -> None:
-        owner, waiting = self._waiting.popitem(last=False)
-        run_slice = waiting.popleft()
-        if waiting:
-            self._waiting[owner] = waiting
-        if self._waiting:
-            self._schedule()
-        run_slice()
+    def _run_waiting(self) -> None:
+        ends_at = thread_time() + _TURN_S
+        try:
+            while self._waiting and thread_time() < ends_at:
+                owner, waiting = self._waiting.popitem(last=False)
+                run_slice = waiting.popleft()
+                if waiting:
+                    self._waiting[owner] = waiting
+                run_slice()
+        finally:
+            self._is_scheduled = False
+            if self._waiting:
+                self._schedule()
 
     def _schedule(self) -> None:
+        self._is_scheduled = True
         loop = asyncio.get_running_loop()
         if self._pause_s:
-            loop.call_later(self._pause_s, self._run_next)
+            loop.call_later(self._pause_s, self._run_waiting)
         else:
-            loop.call_soon(self._run_next)
+            loop.call_soon(self._run_waiting)
 
 
 class MemoryBudget:

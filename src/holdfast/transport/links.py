@@ -21,6 +21,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
+from time import thread_time
 from typing import TYPE_CHECKING, Concatenate, Final, ParamSpec, TypeVar
 
 from holdfast.errors import FrameError
@@ -210,10 +211,6 @@ class Link(asyncio.BufferedProtocol):
         """Whether short messages go beside the stream."""
         return False
 
-    def protocol(self) -> asyncio.BaseProtocol:
-        """Return the protocol for asyncio: the link itself, or an adapter around it."""
-        return self
-
     def begin(self, stream: socket.socket) -> None:
         """Take over a connection, from the next turn of the loop on."""
         self._connecting = self._loop.create_task(self.connect(stream))  # asyncio's are weak
@@ -221,7 +218,7 @@ class Link(asyncio.BufferedProtocol):
     async def connect(self, stream: socket.socket) -> None:
         """Take over a connection; never raises."""
         try:
-            await self._loop.create_connection(self.protocol, sock=stream)
+            await self._loop.create_connection(lambda: self, sock=stream)
         except OSError as error:
             stream.close()
             self.connection_lost(error)
@@ -405,12 +402,12 @@ class Link(asyncio.BufferedProtocol):
         self._is_queued = False
         if self._ended or self._is_paused:
             return
-        owner, began = self.owner, self._loop.time()
+        owner, began = self.owner, thread_time()
         try:
             while self._handle_next():
                 if self.ended or self._is_paused:
                     break
-                if self._loop.time() >= began + SLICE_S and (self._frames or self._unread):
+                if thread_time() >= began + SLICE_S and (self._frames or self._unread):
                     self._enqueue()
                     break
             else:
@@ -421,7 +418,7 @@ class Link(asyncio.BufferedProtocol):
             self.end(
                 str(error), goodbye=str(error) if self.hello is not None else None, refused=True
             )
-        self._settings.scheduler.charge(owner, self._loop.time() - began)
+        self._settings.scheduler.charge(owner, thread_time() - began)
 
     def _handle_next(self) -> bool:
         """Handle one frame, or decode the next bytes; return whether there was anything."""

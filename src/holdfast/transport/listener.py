@@ -36,7 +36,7 @@ __all__ = [
 BACKLOG: Final = 1024
 """Connections that wait to be accepted."""
 
-_ACCEPTED_AT_ONCE: Final = 32
+_ACCEPTED_AT_ONCE: Final = 4
 """Before the event loop serves existing links."""
 
 _PAUSE_S: Final = 0.1

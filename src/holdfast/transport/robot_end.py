@@ -260,7 +260,6 @@ class _ServiceLinks(LinkOwner):
         else:
             self._dialer = Dialer(
                 self._endpoint,
-                self._scheme,
                 self._make_link,
                 self._all_failed,
                 self._robot.identity,

@@ -141,7 +141,6 @@ class RosNode:
         self._on_event = on_event
         self._max_message_bytes = max_message_bytes
         self._services: dict[str, _Offer] = {}
-        self._other_ports: dict[str, int] = {}
         self._topics: dict[str, Topic] = {}
         self._master = Connection(environment.master, self.name, _MAX_ANSWER_BYTES)
         self._parsing = asyncio.Lock()
@@ -156,10 +155,6 @@ class RosNode:
     def offer(self, name: str, type_: ServiceType, handler: ServiceHandler) -> None:
         """Offer a service, before the start; the caller and the log get the handler's errors."""
         self._services[self._environment.resolved(name)] = _Offer(type_, handler)
-
-    def offer_at(self, name: str, port: int) -> None:
-        """Register a service that this process offers at another port; before the start."""
-        self._other_ports[self._environment.resolved(name)] = port
 
     def publish(self, name: str, type_: TopicType, *, latched: bool = False) -> Topic:
         """Add a topic, before the start; new subscribers of a latched one get its last message."""
@@ -225,9 +220,8 @@ class RosNode:
     # -- the master --------------------------------------------------------------------------------
 
     def _uris_of_services(self) -> dict[str, str]:
-        host = self._environment.host
-        ports = {**dict.fromkeys(self._services, self._port), **self._other_ports}
-        return {name: f"rosrpc://{host_and_port(host, port)}" for name, port in ports.items()}
+        place = host_and_port(self._environment.host, self._port)
+        return dict.fromkeys(self._services, f"rosrpc://{place}")
 
     async def _stay_registered(self, registered: asyncio.Event) -> None:
         """Register with each master that does not know this node."""

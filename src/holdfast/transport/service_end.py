@@ -138,9 +138,6 @@ class StreamServiceTransport(LinkOwner):
         exception that no code here expects has ended a link; ``link_refused`` with ``reason`` and,
         if known, ``robot``; ``robot_connected`` with ``robot``; ``robot_disconnected`` with
         ``robot`` and ``reason``. Each has the robot's ``address``, None over a local socket.
-    on_shutdown : callable or None
-        Called with the reason when ROS asks this node to end, or another one takes its name there;
-        the caller may :meth:`withdraw` the protocol.
 
     Raises
     ------
@@ -161,7 +158,6 @@ class StreamServiceTransport(LinkOwner):
         max_links: int | None = None,
         tls: TlsFiles | None = None,
         on_event: Callable[..., None] | None = None,
-        on_shutdown: Callable[[str], None] | None = None,
     ) -> None:
         check_name("name of a service", name)
         check_name("incarnation of a service", incarnation)
@@ -191,7 +187,6 @@ class StreamServiceTransport(LinkOwner):
             max_unsent_bytes=MAX_UNSENT_BYTES,
         )
         self._on_event = on_event
-        self._on_shutdown = on_shutdown
         self._deliver: Callable[[IncomingCall], None] | None = None
         self._started = False
         self._takes_links = True
@@ -201,7 +196,6 @@ class StreamServiceTransport(LinkOwner):
         self._without_hello: dict[Link, bytes] = {}
         self._links: dict[Link, set[_StreamCall]] = {}
         self._closing: set[asyncio.Future[None]] = set()
-        self._protocols: dict[Link, str] = {}
         self._gone: asyncio.Future[None] | None = None
 
     @property
@@ -224,26 +218,15 @@ class StreamServiceTransport(LinkOwner):
         try:
             for endpoint, listening in zip(self._listen, self._listening, strict=True):
                 accepted = partial(self._accepted, endpoint)
-                place = self._schemes[endpoint.protocol].listening_endpoint(endpoint)
-                self._listeners.append(Listener(place, accepted, listening=listening))
+                self._listeners.append(Listener(endpoint, accepted, listening=listening))
         except TransportError:
             self._stop_listening()
             raise
-        ports: dict[str, dict[Endpoint, int]] = {}
-        for index, (endpoint, listener) in enumerate(
-            zip(self._listen, self._listeners, strict=True)
-        ):
-            ports.setdefault(endpoint.protocol, {})[endpoint] = listener.endpoint.port
-            scheme = self._schemes[endpoint.protocol]
-            self._listen[index] = scheme.bound_endpoint(endpoint, listener.endpoint)
+        self._listen = [listener.endpoint for listener in self._listeners]
         for endpoint in self._connect:
-            dialer = Dialer(
-                endpoint, self._schemes[endpoint.protocol], partial(self._make_dialled, endpoint)
-            )
+            dialer = Dialer(endpoint, partial(self._make_dialled, endpoint))
             self._dialers[endpoint] = dialer
             dialer.start()
-        for name, its_ports in ports.items():
-            await self._schemes[name].announce(its_ports, self._on_event, self._on_shutdown)
 
     def dismiss(self) -> asyncio.Future[None]:
         """Take no new links, and ask the robots to leave; the result is done when all have left.
@@ -271,31 +254,6 @@ class StreamServiceTransport(LinkOwner):
             dialer.stop()
         self._takes_links = False
 
-    async def withdraw(self, protocol: str, timeout_s: float) -> None:
-        """Stop listening with one protocol, and ask its robots to leave; all others go on.
-
-        Links that still stand after ``timeout_s`` are ended.
-        """
-        kept: list[tuple[Endpoint, Listener]] = []
-        for endpoint, listener in zip(self._listen, self._listeners, strict=True):
-            if endpoint.protocol == protocol:
-                listener.close()
-            else:
-                kept.append((endpoint, listener))
-        self._listen = [endpoint for endpoint, _ in kept]
-        self._listeners = [listener for _, listener in kept]
-        leaving = [link for link, its in self._protocols.items() if its == protocol]
-        for link in leaving:
-            if link in self._links:
-                link.send(encode_goodbye(""))
-            else:
-                link.end("")
-        await self._schemes[protocol].withdraw(timeout_s)
-        if leaving:
-            await asyncio.wait([link.closed for link in leaving], timeout=timeout_s)
-        for link in leaving:
-            self._end(link)
-
     async def close(self, timeout_s: float = 1.0) -> None:
         """End all calls, send what was to be sent, and close all links, within this time."""
         self._deliver = None
@@ -303,16 +261,13 @@ class StreamServiceTransport(LinkOwner):
         self._stop_listening()
         for link in (*self._links, *self._without_hello):
             self._end(link)
-        withdrawing = {
-            asyncio.ensure_future(scheme.withdraw(timeout_s)) for scheme in self._schemes.values()
-        }
-        if closing := self._closing | withdrawing:
-            await asyncio.wait(closing, timeout=timeout_s)
+        if self._closing:
+            await asyncio.wait(self._closing, timeout=timeout_s)
         for scheme in self._schemes.values():
             scheme.close()
 
     def _end(self, link: Link) -> None:
-        """End a link in order, because this service ends or withdraws its protocol."""
+        """End a link in order, because this service ends."""
         calls = self._links.get(link)
         if calls is None:
             link.end("")
@@ -393,7 +348,6 @@ class StreamServiceTransport(LinkOwner):
             del self._without_hello[other]
             other.end("has said no hello, and others wait", abort=True)
         self._without_hello[link] = network
-        self._protocols[link] = endpoint.protocol
         self._closing.add(link.closed)
         link.closed.add_done_callback(self._closing.discard)
         return link
@@ -481,7 +435,6 @@ class StreamServiceTransport(LinkOwner):
     def on_ended(self, link: Link) -> None:
         """Note that a link has ended."""
         self._without_hello.pop(link, None)
-        self._protocols.pop(link, None)
         calls = self._links.pop(link, None)
         was_there = calls is not None
         for call in calls or ():

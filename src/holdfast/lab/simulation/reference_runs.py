@@ -14,7 +14,7 @@ import numpy as np
 
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import PlanningSettings
-from holdfast.lab.simulation.memo_cache import Memo
+from holdfast.lab.simulation.checked_memo import Memo
 from holdfast.outcome import DecisionLog, MoveResult
 from holdfast.planning import ObservationInfo, Planner, PlanningState
 from holdfast.problems.problem import Problem

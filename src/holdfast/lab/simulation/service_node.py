@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -136,12 +137,19 @@ class ServiceNode:
                 network.end(self, effect.call)
             elif isinstance(effect, StartJob):
                 machine.started(effect.job, self._clock.now())
-                cost_s = max(self.slownesses, default=1.0) * self._cost_s[effect.job.kind]
-                queue.after(cost_s, self._finish, self._memory, effect.job)
+                self._begin(effect.job)
         due = machine.next_wakeup()
         if due is not None and (self._wakes_at is None or due < self._wakes_at):
             self._wakes_at = due
             queue.after(self._clock.until(due), self._tick, self._memory, due)
+
+    def _begin(self, job: Job) -> None:
+        """Compute for as long as the run says, and not as this machine does."""
+        most_s, job.interruption.most_s = job.interruption.most_s, math.inf
+        cost_s = max(self.slownesses, default=1.0) * self._cost_s[job.kind]
+        if cost_s > most_s:
+            job.interruption.use_up()
+        self._world.queue.after(min(cost_s, most_s), self._finish, self._memory, job)
 
     def _finish(self, memory: int, job: Job) -> None:
         if memory != self._memory or self._is_later(self._finish, memory, job):

@@ -14,9 +14,9 @@ from typing import Any
 from holdfast.config.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 from holdfast.errors import HoldfastError, IllegalTransitionError, MessageError
 from holdfast.lab.errors import Violation
+from holdfast.lab.simulation.checked_memo import CheckedPlanner, JobCache, Memo
 from holdfast.lab.simulation.checkers import WireChecker, check_size
 from holdfast.lab.simulation.event_queue import EventQueue
-from holdfast.lab.simulation.memo_cache import JobCache, Memo, MemoizingPlanner
 from holdfast.lab.simulation.network import Network
 from holdfast.lab.simulation.peg_with_encoders import PegWithEncoders
 from holdfast.lab.simulation.reference_runs import ReferenceRuns
@@ -42,7 +42,6 @@ from holdfast.lab.simulation.schedule import (
 )
 from holdfast.lab.simulation.service_node import ServiceNode
 from holdfast.lab.simulation.story import RunOutcome, StoryLine
-from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.events import (
     Act,
@@ -139,7 +138,7 @@ class Setup:
             ),
         )
         self.references = ReferenceRuns(problem, planning, _SEED)
-        self.planner = MemoizingPlanner(Planner(problem, planning))
+        self.planner = CheckedPlanner(problem, planning)
         self.jobs = JobCache()
         self.session_configuration = SessionConfiguration(problem.name, {}, {}, planning, _SEED)
         self._requests: Memo[tuple[int, int], bytes] = Memo(5_000)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import importlib.util
 import shlex
 import sys
@@ -15,6 +14,7 @@ import msgspec
 
 from holdfast.cli.exit_codes import ended_by_signals, interrupted_by
 from holdfast.errors import HoldfastError, InvalidValueError, OptionError, RunError
+from holdfast.printable import did_you_mean
 from holdfast.runtime.command_line import (
     MAX_JOBS,
     MAX_SEED,
@@ -133,9 +133,8 @@ def studies_of(names: Sequence[str]) -> list[Study]:
     """
     for name in names:
         if name != _ALL and name not in _STUDIES:
-            close = difflib.get_close_matches(name, [_ALL, *_STUDIES], n=1)
-            close = [_RENAMED[name]] if name in _RENAMED else close
-            hint = f"; did you mean {close[0]}?" if close else ""
+            renamed = [_RENAMED[name]] if name in _RENAMED else []
+            hint = did_you_mean(name, [_ALL, *_STUDIES], sure=renamed)
             raise InvalidValueError(
                 f"experiment {name!r}: there are {', '.join(_STUDIES)} and {_ALL}{hint}"
             )

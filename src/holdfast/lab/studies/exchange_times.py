@@ -243,7 +243,6 @@ async def _in_process(wanted: Exchange) -> AsyncIterator[tuple[str, RobotTranspo
     shell = ServiceShell(
         Service(lambda _: problem, workers=1),
         network.service(_IN_PROCESS, "0"),
-        workers=1,
         events=NullEventLog(),
     )
     robot = network.robot([_IN_PROCESS])

@@ -21,7 +21,6 @@ from holdfast.config.loader import Configuration, load, settings_keys
 from holdfast.config.validation import close_match, dotted, find_mismatch
 from holdfast.config.yaml_document import read
 from holdfast.errors import ConfigurationError
-from holdfast.ros.robot_interface import ROBOT_PARAMETERS
 
 __all__ = [
     "OWN",
@@ -33,7 +32,10 @@ __all__ = [
 ]
 
 _SECTIONS_OF_PROBLEMS = ("model.", "state_space_planner.")
-_ENVIRONMENT = "environment."
+_MAPPED = tuple(
+    f"environment.{role}." for role in ("sense", "act", "done", "steps", "reset", "observation")
+)
+"""Sections of earlier versions, which mapped the fields of other types."""
 _OF_ROS = ("use_sim_time", "start_type_description_service")
 _OF_ROS_SECTIONS = ("qos_overrides.",)
 
@@ -55,6 +57,10 @@ class OwnParameters(msgspec.Struct, frozen=True, kw_only=True):
     environment: Literal["configuration", "ros", "executive"] = msgspec.field(
         default="configuration", name="environment.kind"
     )
+    act: Literal["action", "service"] = msgspec.field(default="action", name="environment.act")
+    discovery_timeout_ms: Annotated[float, msgspec.Meta(gt=0.0, le=1e300)] = msgspec.field(
+        default=5000.0, name="environment.discovery_timeout_ms"
+    )
     decide_timeout_s: Annotated[float, msgspec.Meta(ge=0.0, le=60.0)] = 1.0
     pause_timeout_s: Annotated[float, msgspec.Meta(ge=0.0, le=3600.0)] = 5.0
     belief_rate_hz: Annotated[float, msgspec.Meta(ge=0.0, le=1000.0)] = 10.0
@@ -72,7 +78,11 @@ OWN: Mapping[str, str] = {
     "autostart": "whether the node configures and activates itself",
     "after_reboot": "whether a run goes on although the machine was rebooted since it last moved",
     "environment.kind": "what the robot acts on: configuration (what the file names, else a "
-    "simulated world), ros (the user's robot, through ROS), executive (whoever calls ~/decide)",
+    "simulated world), ros (what offers robot/sense, robot/act and robot/trial), executive "
+    "(whoever calls ~/decide)",
+    "environment.act": "what robot/act is: action or service",
+    "environment.discovery_timeout_ms": "how long nobody may offer one of these before that is an "
+    "error, ms",
     "decide_timeout_s": "a call of ~/decide is answered within this time, s",
     "pause_timeout_s": "how long a run that is to be held waits for the robot, s",
     "belief_rate_hz": "beliefs published a second, at most",
@@ -107,20 +117,16 @@ class NodeParameters(NamedTuple):
     ----------
     run_directory : Path
         Absolute.
-    mapping : dict
-        What says how the robot is reached through ROS, by the parameters' names.
     """
 
     own: OwnParameters
     configuration: Configuration
     run_directory: Path
-    mapping: dict[str, Any]
 
 
 def known_parameters() -> dict[str, str]:
     """Return what each parameter means, by name; those of the problem's own sections excepted."""
-    robot = {name: text for name, (_, text) in ROBOT_PARAMETERS.items()}
-    return {**OWN, **settings_keys(), **robot}
+    return {**OWN, **settings_keys()}
 
 
 def in_parameters(text: str) -> str:
@@ -145,7 +151,6 @@ def read_parameters(values: Mapping[str, Any]) -> NodeParameters:
     own = msgspec.convert(of_own, OwnParameters)
     settings = settings_keys()
     overrides: dict[str, Any] = {}
-    mapping: dict[str, Any] = {}
     for name, value in given.items():
         if name in OWN or name in _OF_ROS or name.startswith(_OF_ROS_SECTIONS):
             continue
@@ -154,8 +159,6 @@ def read_parameters(values: Mapping[str, Any]) -> NodeParameters:
         elif name.startswith("environment.arguments."):
             arguments = overrides.setdefault("environment.arguments", {})
             arguments[name.removeprefix("environment.arguments.")] = value
-        elif name.startswith(_ENVIRONMENT) and own.environment == "ros":
-            mapping[name] = value
         else:
             raise _unknown(name)
     for index, assignment in enumerate(own.assignments):
@@ -179,9 +182,7 @@ def read_parameters(values: Mapping[str, Any]) -> NodeParameters:
     here = Path.cwd()  # before the problem's code, which may go elsewhere
     configuration = load(own.configuration, problem=own.problem or None, overrides=overrides)
     default = Path("runs") / f"{Path(own.configuration).stem}-seed{configuration.simulator.seed}"
-    mapping["environment.timeout_ms"] = configuration.environment.timeout_ms
-    run_directory = here / (own.run_directory or default)
-    return NodeParameters(own, configuration, run_directory, mapping)
+    return NodeParameters(own, configuration, here / (own.run_directory or default))
 
 
 def _assigned(index: int, assignment: str) -> tuple[str, Any]:
@@ -196,7 +197,10 @@ def _assigned(index: int, assignment: str) -> tuple[str, Any]:
 
 
 def _unknown(name: str) -> ConfigurationError:
-    if name in ROBOT_PARAMETERS:
-        return ConfigurationError(f"{name} needs environment.kind ros: else it would do nothing")
+    if name.startswith(_MAPPED):
+        return ConfigurationError(
+            f"{name}: fields of other types are mapped no more; the robot offers robot/sense, "
+            "robot/act and robot/trial, or it is a Python class (environment.object): docs/ros.md"
+        )
     hint = close_match(name, known_parameters())
     return ConfigurationError(f"{name} is no parameter of this node{hint}")

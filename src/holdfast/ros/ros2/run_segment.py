@@ -27,7 +27,6 @@ from holdfast.errors import (
 )
 from holdfast.outcome import TrialResult
 from holdfast.planning import PlanningState
-from holdfast.problem_attributes import sensing_labels
 from holdfast.protocol.events import Act, Sense, Timing
 from holdfast.recording.robot_run import RobotObserver, perform_trials
 from holdfast.recording.run_directory import RunDirectory
@@ -110,12 +109,15 @@ def make_world(connections: Any, parameters: NodeParameters) -> World:
             interrupt_at_once=True,
             handover=handover,
         )
-    from holdfast.ros.robot_interface import RobotInterface
-    from holdfast.ros.ros2_environment import make_ros_environment
+    from holdfast.ros.ros2_environment import Ros2Environment
 
-    # Invalid parameters are reported now, not when a trial begins.
-    RobotInterface(parameters.mapping, sensing_labels(problem), problem.action_size)
-    make: Any = functools.partial(make_ros_environment, connections, parameters.mapping)
+    make: Any = functools.partial(
+        Ros2Environment,
+        connections,
+        act=parameters.own.act,
+        timeout_ms=timeout_ms,
+        discovery_timeout_ms=parameters.own.discovery_timeout_ms,
+    )
     maker = EnvironmentMaker(
         "the robot",
         problem,
