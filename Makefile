@@ -7,7 +7,9 @@ BIN := $(VENV)/bin
 # Beside it, what is as pip installs it: not editable, with the state machines compiled.
 COMPILED := .venv-compiled
 
-# Both stand inside the environment, so that they go when it goes.
+# They stand inside the environment, so that they go when it goes.
+INSTALLED_TOOLS := $(VENV)/.installed-tools
+INSTALLED_KERNEL := $(VENV)/.installed-kernel
 INSTALLED_FIGURES := $(VENV)/.installed-figures
 INSTALLED_DEV := $(VENV)/.installed-dev
 INSTALLED_COMPILED := $(COMPILED)/.installed
@@ -21,6 +23,7 @@ DIST ?= dist
 # Seconds since 1970 that archives bear, so that they come out the same whenever they are made.
 RELEASED = $(shell git log -1 --format=%ct 2>/dev/null || date +%s)
 
+BUILD_TOOLS := 'scikit-build-core>=0.11' 'nanobind>=2.4' cmake ninja
 NATIVE_SOURCES := $(wildcard CMakeLists.txt) $(shell find cpp -type f)
 PACKAGE_SOURCES := $(shell find cmake src -type f -not -name '*.pyc')
 CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
@@ -37,19 +40,23 @@ demo: $(INSTALLED_FIGURES) ## a cloud and a robot are killed, and no decision ch
 
 install: $(INSTALLED_DEV) $(INSTALLED_COMPILED) ## the environments, which the others make when they need them
 
-test: test-gate test-real ## the quick tests
+# Each of the two processes imports what it finds, which takes as long as many of the tests.
+PYTEST := $(BIN)/pytest -q -n 2 --dist worksteal --ignore=tests/deploy --ignore=tests/ros
+
+test: $(INSTALLED_DEV) ## the quick tests
+	$(PYTEST) -m "not slow"
 
 test-gate: $(INSTALLED_DEV) ## those of them that no clock and no network decides
-	$(BIN)/pytest -q -m "not real and not slow" -n 2 --dist worksteal
+	$(PYTEST) -m "not real and not slow"
 
 test-real: $(INSTALLED_DEV) ## those with real processes and sockets
-	$(BIN)/pytest -q -m "real and not slow and not deploy and not ros" -n 2 --dist worksteal
+	$(PYTEST) -m "real and not slow"
 
 test-defects: $(INSTALLED_DEV) ## the simulator finds every defect that is planted: a minute
-	$(BIN)/pytest -q -m slow -n 2 --dist worksteal tests/simulation/test_defects.py
+	$(PYTEST) -m slow tests/simulation/test_defects.py
 
 test-slow: $(INSTALLED_DEV) ## what repeats them with more seeds, problems and moments: half an hour
-	$(BIN)/pytest -q -m "slow and not deploy and not ros" -n 2 --dist worksteal
+	$(PYTEST) -m slow
 
 test-compiled: $(INSTALLED_COMPILED) ## the simulator's tests and 10,000 seeds through compiled machines
 	$(COMPILED)/bin/pytest -q -m "slow or not slow" tests/scenarios tests/simulation/test_world.py \
@@ -120,13 +127,13 @@ sbom: $(INSTALLED_DEV) ## dist/holdfast-VERSION.cdx.json: what the images' envir
 requirements: $(INSTALLED_DEV) ## deploy/*requirements.txt anew: the versions and digests that images are made of
 	$(BIN)/uv pip compile -q --upgrade --python-version 3.11 --generate-hashes --no-annotate --extra service --extra udp \
 	    --custom-compile-command "make requirements" pyproject.toml -o deploy/requirements.txt
-	printf 'scikit-build-core>=0.11\nnanobind>=2.4\ncmake\nninja\n' | \
+	printf '%s\n' $(BUILD_TOOLS) | \
 	    $(BIN)/uv pip compile -q --upgrade --python-version 3.11 --generate-hashes --no-annotate \
 	    --custom-compile-command "make requirements" - -o deploy/build-requirements.txt
 
 clean: ## remove what was built or run here, but keep .venv
 	rm -rf build dist demo-run chaos-run .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
-	rm -f $(INSTALLED_FIGURES) $(INSTALLED_DEV)
+	rm -f $(INSTALLED_KERNEL) $(INSTALLED_FIGURES) $(INSTALLED_DEV)
 	rm -rf $(COMPILED)
 
 # The interpreter is looked at first: without this, what is missing shows only as an error deep in
@@ -145,12 +152,22 @@ $(BIN)/python:
 	    echo "make: no C++ compiler; install gcc or clang, or set CXX" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
-$(INSTALLED_FIGURES): pyproject.toml $(NATIVE_SOURCES) | $(BIN)/python
-	@cmake/pip_install $(BIN)/python $(VENV)/pip.log -e ".[figures,service]"
+$(INSTALLED_TOOLS): pyproject.toml | $(BIN)/python
+	@cmake/pip_install $(BIN)/python $(VENV)/pip.log $(BUILD_TOOLS)
 	@touch $@
 
-$(INSTALLED_DEV): pyproject.toml $(NATIVE_SOURCES) | $(BIN)/python
-	@cmake/pip_install $(BIN)/python $(VENV)/pip.log -e ".[dev]"
+# With tools that stay where they are, only what has changed is compiled: pip's own are elsewhere
+# each time, and then so is all that CMake remembers.
+$(INSTALLED_KERNEL): pyproject.toml $(NATIVE_SOURCES) | $(INSTALLED_TOOLS)
+	@cmake/pip_install $(BIN)/python $(VENV)/pip.log --no-build-isolation --no-deps -e .
+	@touch $@
+
+$(INSTALLED_FIGURES): $(INSTALLED_KERNEL)
+	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[figures,service]"
+	@touch $@
+
+$(INSTALLED_DEV): $(INSTALLED_KERNEL)
+	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[dev]"
 	@touch $(INSTALLED_FIGURES) $@
 
 # The sources are copied into it, so whatever of them changes is installed again.

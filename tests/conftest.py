@@ -21,8 +21,10 @@ from typing import Any, NoReturn
 import pytest
 
 # Images for containers set it. The processes that tests start would compile all of holdfast each
-# time: half a second, in tests of how soon something is noticed or launched.
+# time: half a second, in tests of how soon something is noticed or launched. And pytest would
+# rewrite the assertions of all tests at every start, in each of its processes: ten seconds.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 HERE = Path(__file__).parent
 

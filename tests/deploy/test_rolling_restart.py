@@ -30,7 +30,7 @@ from tests.processes.faults import (
 )
 from tests.processes.test_faults import GATED, SERVES_GATED
 
-ROBOTS, SEEDS, TRIALS = 20, 4, 2
+ROBOTS, SEEDS, TRIALS = 8, 2, 2
 FAILURES = {"launch", "service_suspected", "service_vanished", "status", "hedge", "wrong_answer"}
 
 

@@ -204,7 +204,9 @@ def test_extras_exist_and_keep_the_editable_installation(page: Page) -> None:
         assert set(extras.split(",")) <= known
     if page is README:
         assert installed
-        assert '-e ".[figures,service]"' in (ROOT / "Makefile").read_text(encoding="utf-8")
+        makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+        assert '"holdfast[figures,service]"' in makefile
+        assert " -e .\n" in makefile
 
 
 LINKING = sorted(

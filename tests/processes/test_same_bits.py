@@ -183,7 +183,14 @@ def test_worker_processes(run: Run, usual: Report) -> None:
     assert found == {name: digests[name] for name in names}
 
 
-@pytest.mark.parametrize("simd", ["baseline", "avx2", "avx512"])
+@pytest.mark.parametrize(
+    "simd",
+    [
+        pytest.param("baseline", marks=pytest.mark.slow),  # test_all_at_once has it, too
+        "avx2",
+        "avx512",
+    ],
+)
 def test_instruction_sets(run: Run, usual: Report, simd: str) -> None:
     finished = run(HOLDFAST_SIMD=simd)
     if simd != "baseline" and "allowed here are baseline" in finished.stderr:
@@ -193,6 +200,7 @@ def test_instruction_sets(run: Run, usual: Report, simd: str) -> None:
     assert report["digests"] == usual["digests"]
 
 
+@pytest.mark.slow  # test_all_at_once has none, too
 @pytest.mark.skipif(not numpy_features(), reason="NumPy makes no choices by processor here")
 def test_numpy_without_its_instruction_sets(run: Run, usual: Report) -> None:
     report = report_of(run(NPY_DISABLE_CPU_FEATURES=" ".join(numpy_features())))
@@ -219,6 +227,8 @@ def test_all_at_once(run: Run, usual: Report) -> None:
             OPENBLAS_CORETYPE="Prescott",
         )
     )
+    assert usual["numpy"] == numpy_features()
+    assert (report["simd"], report["numpy"]) == ("baseline", [])
     assert report["digests"] == usual["digests"]
 
 

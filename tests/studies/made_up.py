@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Sequence
+from functools import cache
 
 import numpy as np
 import pandas as pd
@@ -35,4 +36,9 @@ def report_on(
 def noise(task: Task, number: int, names: Sequence[str]) -> float:
     """Return a standard normal number that is the same for tasks that differ in other things."""
     named = "".join(str(task.parameters[name]) for name in names)
-    return float(np.random.default_rng([number, zlib.crc32(named.encode())]).normal())
+    return _normal(number, zlib.crc32(named.encode()))
+
+
+@cache
+def _normal(*seeds: int) -> float:
+    return float(np.random.default_rng(seeds).normal())

@@ -36,6 +36,17 @@ THREE_PLATES = "multitier_peg_in_hole_2d"
 DEFAULT = msgspec.to_builtins(selectors.WAYS[selectors.DEFAULT])
 
 
+@pytest.fixture
+def _few_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two intervals and three problems, where a test asks the same of each."""
+    few = (4, 14)
+    monkeypatch.setattr(selectors, "INTERVALS", few)
+    each_and_all = (*((interval, (interval,)) for interval in few), ("mean", few))
+    monkeypatch.setattr(selectors, "_EACH_AND_ALL", each_and_all)
+    cases = {name: parameters._CASES[name] for name in ("tight hole", "peg in space", "passer-by")}
+    monkeypatch.setattr(parameters, "_CASES", cases)
+
+
 def selector_of(task: Task) -> dict[str, object]:
     found: dict[str, object] = task.parameters["planning"]["selector"]
     return found
@@ -161,6 +172,7 @@ def begins_in_the_goal(task: Task, number: int) -> bool:
     return number == 3 and task.parameters["model"] == {"hole_tolerance": 0.05}
 
 
+@pytest.mark.usefixtures("_few_cells")
 def test_a_trial_that_begins_in_the_goal_says_nothing_of_steps(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -439,6 +451,7 @@ def columns_of(report: Report) -> dict[str, str]:
     return {name: to_csv(table) for name, table in report.tables.items()}
 
 
+@pytest.mark.usefixtures("_few_cells")
 @pytest.mark.parametrize("study", [selectors.Selectors(), parameters.Parameters()])
 def test_all_follows_from_the_file_of_trials(
     study: selectors.Selectors | parameters.Parameters,

@@ -14,7 +14,8 @@ import signal
 import sqlite3
 import sys
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -208,6 +209,12 @@ def by_mcap(path: Path) -> list[Message]:
 READERS = pytest.mark.parametrize("read", [by_rosbags, by_mcap])
 
 
+@cache
+def messages_in(directory: Path, read: Callable[[Path], list[Message]]) -> list[Message]:
+    """Return what the export of a built-in problem holds, which many tests look at."""
+    return read(directory / "run.mcap")
+
+
 def of_topic(messages: list[Message], topic: str) -> list[Message]:
     return [message for message in messages if message.topic == topic]
 
@@ -257,7 +264,7 @@ class TestReadBack:
     @READERS
     def test_particle_clouds_and_beliefs(self, built_in: Any, read: Any) -> None:
         configuration, directory, seen = built_in
-        messages = read(directory / "run.mcap")
+        messages = messages_in(directory, read)
         clouds = of_topic(messages, "/holdfast/particle_cloud")
         tables = of_topic(messages, "/holdfast/belief")
         expected = different_beliefs(seen)
@@ -277,7 +284,7 @@ class TestReadBack:
     @READERS
     def test_estimates_and_truths(self, built_in: Any, read: Any) -> None:
         configuration, directory, seen = built_in
-        messages = read(directory / "run.mcap")
+        messages = messages_in(directory, read)
         layout = layout_of(configuration)
         rows = [
             row
@@ -309,7 +316,7 @@ class TestReadBack:
     @READERS
     def test_choices_observations_and_actions(self, built_in: Any, read: Any) -> None:
         configuration, directory, seen = built_in
-        messages = read(directory / "run.mcap")
+        messages = messages_in(directory, read)
         sensed = [step for observer in seen for step in observer.sensed_steps]
         actions = [step.action.tolist() for observer in seen for step in observer.steps]
         chosen = [message.data.data for message in of_topic(messages, "/holdfast/sensing_action")]
@@ -331,7 +338,7 @@ class TestReadBack:
 
     def test_paths_end_with_the_whole_way(self, built_in: Any) -> None:
         configuration, directory, seen = built_in
-        paths = of_topic(by_mcap(directory / "run.mcap"), "/holdfast/true_path")
+        paths = of_topic(messages_in(directory, by_mcap), "/holdfast/true_path")
         layout = layout_of(configuration)
         ends = [
             [numbers(stamped.pose) for stamped in path.data.poses]
@@ -492,7 +499,7 @@ class TestTheFile:
 
     def test_frames(self, built_in: Any) -> None:
         configuration, directory, _ = built_in
-        messages = by_mcap(directory / "run.mcap")
+        messages = messages_in(directory, by_mcap)
         (static,) = of_topic(messages, "/tf_static")
         (transform,) = static.data.transforms
         assert (transform.header.frame_id, transform.child_frame_id) == ("map", "task")
@@ -501,7 +508,7 @@ class TestTheFile:
 
     def test_the_scene_has_obstacles_bodies_and_a_goal(self, built_in: Any) -> None:
         _, directory, _ = built_in
-        scenes = of_topic(by_mcap(directory / "run.mcap"), "/holdfast/scene")
+        scenes = of_topic(messages_in(directory, by_mcap), "/holdfast/scene")
         assert len(scenes) == 2
         for scene in scenes:
             first, *markers = scene.data.markers

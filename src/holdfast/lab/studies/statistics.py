@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -72,10 +73,15 @@ def exactly(value: float) -> Interval:
     return Interval(value, value, value)
 
 
-def _students(mean: float, error: float, freedom: int) -> Interval:
+@cache
+def _students_quantile(freedom: int) -> float:
     from scipy import stats
 
-    half = float(stats.t.ppf(0.5 + 0.5 * _LEVEL, freedom)) * error
+    return float(stats.t.ppf(0.5 + 0.5 * _LEVEL, freedom))
+
+
+def _students(mean: float, error: float, freedom: int) -> Interval:
+    half = _students_quantile(freedom) * error
     return Interval(mean, mean - half, mean + half)
 
 
