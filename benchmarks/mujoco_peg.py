@@ -19,7 +19,7 @@ from benchmarks import trial_table
 from holdfast.config.loader import load
 from holdfast.lab.studies.statistics import mean_interval
 from holdfast.planning import Planner
-from holdfast.robot.environment import load_environment
+from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.trial import run_trial
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "mujoco_peg"

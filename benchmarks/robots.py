@@ -18,7 +18,7 @@ from holdfast.config.loader import Configuration, load
 from holdfast.outcome import TrialResult
 from holdfast.protocol.events import Timing, TransportEvent
 from holdfast.recording.run_directory import RunDirectory
-from holdfast.robot.environment import load_environment
+from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.links import make_links
 from holdfast.robot.process import RobotProcess
 from holdfast.transport.contract import RobotTransport

@@ -25,7 +25,7 @@ from holdfast.config.loader import load
 from holdfast.lab.studies.statistics import mean_interval
 from holdfast.outcome import Ending
 from holdfast.planning import Planner
-from holdfast.robot.environment import load_environment
+from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.trial import run_trial
 
 FILE = Path(__file__).parents[1] / "examples" / "taskboard" / "taskboard.yaml"

@@ -36,7 +36,8 @@ from holdfast.protocol.events import (
     EnvironmentReady,
     Sensed,
 )
-from holdfast.robot.environment import Environment, EnvironmentMaker, Later, load_environment
+from holdfast.robot.environment import Environment, Later
+from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
 from holdfast.robot.environment_runner import EnvironmentRunner, make_runner
 from holdfast.robot.trial import run_trial
 
@@ -405,7 +406,7 @@ import sys
 import numpy as np
 
 from holdfast.config.loader import load
-from holdfast.robot.environment import load_environment
+from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.environment_runner import make_runner
 
 file, port, timeout_ms, steps = sys.argv[1:]

@@ -10,7 +10,7 @@ from holdfast.outcome import TrialResult
 from holdfast.recording.robot_run import RobotObserver, perform_trials
 from holdfast.recording.run_directory import RunDirectory
 from holdfast.recording.timings import read_timings
-from holdfast.robot.environment import load_environment
+from holdfast.robot.environment_maker import load_environment
 
 
 def test_it_decides_what_the_planner_decides(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from holdfast.config.loader import Configuration, load
 from holdfast.outcome import Ending
 from holdfast.planning import Planner
 from holdfast.randomness import NOISE_FREE
-from holdfast.robot.environment import load_environment
+from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.trial import run_trial
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "mujoco_peg"

@@ -25,13 +25,8 @@ from holdfast.protocol.events import (
     Sensed,
 )
 from holdfast.randomness import Stream
-from holdfast.robot.environment import (
-    LATER,
-    Environment,
-    EnvironmentMaker,
-    MissingReadings,
-    SimulatedEnvironment,
-)
+from holdfast.robot.environment import LATER, Environment, MissingReadings, SimulatedEnvironment
+from holdfast.robot.environment_maker import EnvironmentMaker
 from holdfast.robot.environment_runner import (
     EnvironmentRunner,
     InlineRunner,

@@ -17,12 +17,8 @@ import holdfast as hf
 from holdfast.config.loader import load
 from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import MoveResult
-from holdfast.robot.environment import (
-    CountingEnvironment,
-    MissingReadings,
-    RememberingEnvironment,
-    load_environment,
-)
+from holdfast.robot.environment import CountingEnvironment, MissingReadings, RememberingEnvironment
+from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
 
 CAR = "MountainCarContinuous-v0"

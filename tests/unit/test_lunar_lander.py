@@ -13,7 +13,7 @@ from holdfast.config.loader import Configuration, load
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner
 from holdfast.randomness import NOISE_FREE, Purpose, stream
-from holdfast.robot.environment import load_environment
+from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
 from holdfast.robot.trial import run_trial
 

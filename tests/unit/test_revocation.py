@@ -19,9 +19,10 @@ from hypothesis import strategies as st
 from tests.unit.test_key_ring import run_keys
 
 from holdfast.errors import CredentialsError, TransportError
-from holdfast.transport.credentials import load_credentials, refuse_revoked, revoked_serials
+from holdfast.transport.credentials import load_credentials
 from holdfast.transport.endpoints import REVOKED_FILE, Role
 from holdfast.transport.key_ring import list_credentials, make_credentials, revoke_credentials
+from holdfast.transport.revocation import refuse_revoked, revoked_serials
 
 NOW = datetime.now(UTC)
 DAY = timedelta(days=1)

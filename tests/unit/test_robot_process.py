@@ -38,7 +38,7 @@ from holdfast.protocol.status import Status
 from holdfast.recording.run_directory import RunDirectory
 from holdfast.robot import in_process_planner
 from holdfast.robot import process as robot_process
-from holdfast.robot.environment import EnvironmentMaker, load_environment
+from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
 from holdfast.robot.links import Links, make_links
 from holdfast.robot.process import RobotProcess
 from holdfast.robot.trial import run_trial

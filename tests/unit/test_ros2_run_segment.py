@@ -13,7 +13,8 @@ from tests.recordings import robot_configuration
 from holdfast.config.loader import Configuration
 from holdfast.planning import Planner
 from holdfast.recording import journal_file
-from holdfast.robot.environment import EnvironmentMaker, SimulatedEnvironment, load_environment
+from holdfast.robot.environment import SimulatedEnvironment
+from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
 from holdfast.robot.trial import run_trial
 from holdfast.ros.ros2.run_segment import Ending, RunSegment, SegmentResult, World
 from holdfast.runtime.events import NullEventLog

@@ -11,7 +11,7 @@ import pytest
 
 from holdfast.config.loader import load
 from holdfast.randomness import NOISE_FREE, Purpose, stream
-from holdfast.robot.environment import load_environment
+from holdfast.robot.environment_maker import load_environment
 
 FILE = Path(__file__).parents[2] / "examples" / "taskboard" / "taskboard.yaml"
 

@@ -15,7 +15,7 @@ from holdfast.config.loader import Configuration, load
 from holdfast.config.settings import LostSettings, OnLost
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner
-from holdfast.robot.environment import load_environment
+from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.trial import run_trial
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

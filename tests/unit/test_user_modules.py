@@ -13,7 +13,7 @@ import holdfast as hf
 from holdfast.config.user_modules import find_in
 from holdfast.errors import ConfigurationError
 from holdfast.problems import registry
-from holdfast.robot.environment import load_environment
+from holdfast.robot.environment_maker import load_environment
 
 ROBOT = """
 class Robot:

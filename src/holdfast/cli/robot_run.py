@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
     from holdfast.outcome import TrialResult
     from holdfast.recording.run_directory import RunDirectory
-    from holdfast.robot.environment import EnvironmentMaker
+    from holdfast.robot.environment_maker import EnvironmentMaker
     from holdfast.runtime.events import EventSink
     from holdfast.runtime.service_manager import ServiceManager
 

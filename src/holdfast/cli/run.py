@@ -67,7 +67,7 @@ def _run(options: RunOptions) -> int:
         claim_default_directory,
         latest_default_directory,
     )
-    from holdfast.robot.environment import load_environment
+    from holdfast.robot.environment_maker import load_environment
     from holdfast.robot.trials import available_cores, run_trials
     from holdfast.runtime.service_manager import ServiceManager
 

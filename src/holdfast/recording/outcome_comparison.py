@@ -26,7 +26,7 @@ from holdfast.recording.run_directory import (
     recorded_configuration,
     world_of,
 )
-from holdfast.robot.environment import BUILT_IN
+from holdfast.robot.environment_maker import BUILT_IN
 
 __all__ = ["OutcomeComparison", "OutcomeEffect", "RunOutcomes", "compare_outcomes", "effects_of"]
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from holdfast.protocol.events import Act, Sense
     from holdfast.recording.live_view import LiveView
     from holdfast.recording.run_directory import RunDirectory
-    from holdfast.robot.environment import EnvironmentMaker
+    from holdfast.robot.environment_maker import EnvironmentMaker
     from holdfast.robot.health import RobotWatch
     from holdfast.runtime.events import EventSink
 

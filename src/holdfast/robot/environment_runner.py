@@ -35,13 +35,8 @@ from holdfast.protocol.events import (
     Sensed,
 )
 from holdfast.protocol.messages import MAX_ACTION_SIZE
-from holdfast.robot.environment import (
-    LATER,
-    Environment,
-    EnvironmentMaker,
-    MissingReadings,
-    ObservationSizes,
-)
+from holdfast.robot.environment import LATER, Environment, MissingReadings, ObservationSizes
+from holdfast.robot.environment_maker import EnvironmentMaker
 from holdfast.runtime.pool import ThreadPool
 from holdfast.tracking import LateObservation
 

@@ -57,7 +57,7 @@ from holdfast.protocol.robot import Robot
 from holdfast.protocol.status import Status
 from holdfast.robot.answer_check import AnswerChecker
 from holdfast.robot.ending_signals import ending_signals
-from holdfast.robot.environment import EnvironmentMaker
+from holdfast.robot.environment_maker import EnvironmentMaker
 from holdfast.robot.environment_runner import EnvironmentRunner, make_runner
 from holdfast.robot.health import Condition, RobotWatch
 from holdfast.robot.in_process_planner import InProcessPlanner

@@ -22,7 +22,8 @@ from holdfast.arrays import FloatArray
 from holdfast.errors import EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import Done
 from holdfast.problems.problem import Problem
-from holdfast.robot.environment import EnvironmentMaker, ObservationSizes
+from holdfast.robot.environment import ObservationSizes
+from holdfast.robot.environment_maker import EnvironmentMaker
 
 __all__ = [
     "DecideCode",

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from holdfast.errors import CredentialsGoneError, HoldfastError
 from holdfast.runtime.events import EventSink
-from holdfast.transport.credentials import date_text, file_versions, load_credentials
+from holdfast.transport.credentials import date_text, load_credentials
 from holdfast.transport.endpoints import TlsFiles
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class ServiceCredentials:
         self.files = TlsFiles.of(directory)
         self._directory = directory
         self._warn = warn
-        self._used = self._seen = file_versions(self.files)
+        self._used = self._seen = self.files.versions()
         self._failure: str | None = None
         self._gone: str | None = None
         self.expires_s = load_credentials(directory, "service", warn=warn).expires_s
@@ -70,7 +70,7 @@ class ServiceCredentials:
         events: EventSink,
     ) -> None:
         """Check the files from now on."""
-        seen = file_versions(self.files)
+        seen = self.files.versions()
         if seen == self._seen and seen != self._used:
             self.reload(transport, events, requested=False)
         self._seen = seen
@@ -83,7 +83,7 @@ class ServiceCredentials:
 
         Unless an operator has requested it, a repeated failure is logged only once.
         """
-        read_at = file_versions(self.files)
+        read_at = self.files.versions()
         warnings: list[str] = []
         try:
             # This check names more faults than the transport's.

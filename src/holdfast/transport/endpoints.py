@@ -113,6 +113,22 @@ class TlsFiles(msgspec.Struct, frozen=True):
         """Return the files of a robot's or a service's directory, which need not be there."""
         return cls(*(directory / name for name in (AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE)))
 
+    def versions(self) -> list[tuple[int, int, int] | None]:
+        """Return inode, change time and size of each file and of the revocation list.
+
+        Not the modification time: a copied file may keep that of its original.
+        """
+        found: list[tuple[int, int, int] | None] = []
+        revoked = self.authority.with_name(REVOKED_FILE)
+        for path in (self.authority, self.certificate, self.key, revoked):
+            try:
+                status = path.stat()
+            except OSError:
+                found.append(None)
+            else:
+                found.append((status.st_ino, status.st_ctime_ns, status.st_size))
+        return found
+
 
 class Endpoint(NamedTuple):
     """A protocol and a place, checked. ``str`` gives the text back.

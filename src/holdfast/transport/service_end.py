@@ -319,7 +319,7 @@ class StreamServiceTransport(LinkOwner):
 
     def _read_credentials(self, tls: TlsFiles) -> None:
         # Imported here, because OpenSSL is slow to load.
-        from holdfast.transport.credentials import revoked_serials
+        from holdfast.transport.revocation import revoked_serials
         from holdfast.transport.tls import server_context
 
         context = server_context(tls, self._incarnation)

@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from holdfast.errors import FrameError, TransportError
-from holdfast.transport.credentials import file_versions, refuse_revoked
 from holdfast.transport.endpoints import AUTHORITY_FILE, NEXT_KEY_FILE, TlsFiles
+from holdfast.transport.revocation import refuse_revoked
 
 __all__ = [
     "REMEDIES",
@@ -155,12 +155,12 @@ class ClientCredentials:
     def __init__(self, files: TlsFiles, on_unusable: Callable[[str], None]) -> None:
         self._files = files
         self._on_unusable = on_unusable
-        self._seen = file_versions(files)
+        self._seen = files.versions()
         self._context = client_context(files)
 
     def context(self) -> ssl.SSLContext:
         """Return the context for a new link."""
-        seen = file_versions(self._files)
+        seen = self._files.versions()
         if seen != self._seen:
             self._seen = seen
             try:

@@ -30,7 +30,7 @@ from holdfast.planning import PlanningState
 from holdfast.protocol.events import Act, Sense, Timing
 from holdfast.recording.robot_run import RobotObserver, perform_trials
 from holdfast.recording.run_directory import RunDirectory
-from holdfast.robot.environment import EnvironmentMaker, load_environment
+from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
 from holdfast.robot.health import Condition
 from holdfast.robot.process import RobotProcess
 from holdfast.ros.executive import DecideCode, DecisionHandover, ExecutiveMaker

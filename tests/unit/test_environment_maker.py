@@ -1,0 +1,182 @@
+"""The environment that a configuration names is found, and given what it asks for."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from holdfast.config.loader import load
+from holdfast.errors import (
+    ConfigurationError,
+    EnvironmentFailedError,
+)
+from holdfast.robot.environment import Environment, SimulatedEnvironment
+from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+ROBOTS = """\
+class Robot:
+    made = []
+
+    def __init__(self, port=7500, *, places=(), trial, resumed, problem):
+        self.port, self.places, self.trial = port, places, trial
+        self.resumed, self.problem = resumed, problem
+        self.made.append(self)
+
+    def perform_sensing(self, sensing_action): return [0.0]
+    def perform(self, task_action): return None
+    def is_done(self): return False
+
+
+class Plain:
+    perform_sensing = perform = is_done = lambda self, *_: None
+
+
+class AnyArguments(Plain):
+    def __init__(self, **options): self.options = options
+
+
+class Late:
+    def __init__(self):
+        self.perform_sensing = self.perform = self.is_done = print
+
+
+class Half:
+    is_done = True
+    def perform(self, task_action): return None
+
+
+class Needy(Plain):
+    def __init__(self, port): pass
+
+
+robot = Robot
+number = 3
+"""
+
+
+class TestLoadEnvironment:
+    @pytest.fixture
+    def loaded(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> Iterator[Callable[..., EnvironmentMaker]]:
+        """Load what is named, beside a configuration file."""
+        monkeypatch.setattr(sys, "path", [*sys.path])
+        (tmp_path / "robots.py").write_text(ROBOTS)
+        (tmp_path / "broken_robots.py").write_text("1 + 'one'\n")
+        (tmp_path / "lonely_robots.py").write_text("import absent_library\n")
+
+        def load_one(name: str, **settings: object) -> EnvironmentMaker:
+            section = json.dumps({"object": name, **settings})
+            (tmp_path / "run.yaml").write_text(
+                f"problem: peg_in_hole_2d\nsimulator: {{seed: 5}}\nenvironment: {section}\n"
+            )
+            return load_environment(load(tmp_path / "run.yaml"))
+
+        yield load_one
+        for name in ("robots", "broken_robots", "lonely_robots"):
+            sys.modules.pop(name, None)
+
+    def test_without_a_name_the_world_is_simulated(self) -> None:
+        maker = load_environment(load(EXAMPLES / "peg_in_hole_2d.yaml", seed=8))
+        assert maker.simulated
+        first = maker(3)
+        assert isinstance(first, SimulatedEnvironment)
+        expected = SimulatedEnvironment(maker.problem, 8, 3)
+        assert first.state.tobytes() == expected.state.tobytes()
+        action = np.full(maker.problem.action_size, 1e-3)
+        expected.perform(action)
+        again = maker(3, resumed=True, performed=[action])
+        assert isinstance(again, SimulatedEnvironment)
+        assert again.state.tobytes() == expected.state.tobytes()
+
+    def test_one_of_ones_own_is_made_anew_for_each_trial(
+        self, loaded: Callable[..., EnvironmentMaker]
+    ) -> None:
+        maker = loaded("robots:Robot", arguments={"port": 3, "places": [1]}, timeout_ms=20)
+        assert not maker.simulated
+        assert (maker.name, maker.timeout_ms) == ("robots:Robot", 20.0)
+        first: Any = maker(0)
+        first.places.append(2)
+        second: Any = maker(1, resumed=True, performed=[np.zeros(3)])
+        assert sys.modules["robots"].Robot.made == [first, second]
+        assert (first.port, first.trial, first.resumed) == (3, 0, False)
+        assert (second.port, second.trial, second.resumed) == (3, 1, True)
+        assert second.places == [1]
+        assert first.problem is second.problem is maker.problem
+
+    def test_a_constructor_gets_only_what_it_names(
+        self, loaded: Callable[..., EnvironmentMaker]
+    ) -> None:
+        assert isinstance(loaded("robots:Plain")(0), Environment)
+        environment: Any = loaded("robots:AnyArguments", arguments={"port": 3})(0)
+        assert environment.options == {"port": 3}
+
+    def test_methods_may_be_made_by_the_constructor(
+        self, loaded: Callable[..., EnvironmentMaker]
+    ) -> None:
+        assert isinstance(loaded("robots:Late")(0), Environment)
+
+    def test_a_package_may_register_one(
+        self, tmp_path: Path, loaded: Callable[..., EnvironmentMaker]
+    ) -> None:
+        package = tmp_path / "turtle_robots-1.0.dist-info"
+        package.mkdir()
+        (package / "METADATA").write_text("Metadata-Version: 2.1\nName: turtle-robots\n")
+        (package / "entry_points.txt").write_text(
+            "[holdfast.environments]\nturtle = robots:Plain\n"
+        )
+        sys.path.insert(0, str(tmp_path))
+        assert type(loaded("turtle")(0)).__name__ == "Plain"
+
+    def test_it_lacks_a_method(self, loaded: Callable[..., EnvironmentMaker]) -> None:
+        maker = loaded("robots:Half")
+        with pytest.raises(
+            EnvironmentFailedError,
+            match=r"robots:Half is no environment: it lacks perform_sensing and is_done; it needs",
+        ):
+            maker(0)
+
+    @pytest.mark.parametrize(
+        ("name", "arguments", "expected"),
+        [
+            ("robots:Robt", {}, r"environment.object: robots:Robt: .* did you mean Robot"),
+            ("robots:number", {}, "is not a class but int"),
+            ("turtle", {}, r"environment.object: turtle is not a registered name \(registered: "),
+            ("robots", {}, "robots is not a registered name; did you mean robots:"),
+            ("robots.Plain", {}, r"did you mean robots:Plain\? "),
+            ("robots.py", {}, "did you mean robots:"),
+            ("lonely_robots:Robot", {}, "cannot be imported .*No module named 'absent_library'"),
+            (
+                "broken_robots:Robot",
+                {},
+                r"environment.object: broken_robots:Robot raised TypeError: (.|\n)*1 \+ 'one'",
+            ),
+            (
+                "robots:Robot",
+                {"prt": 3},
+                "environment.arguments.prt is no argument of robots:Robot; did you mean port.\n"
+                "allowed: port, places$",
+            ),
+            ("robots:Robot", {"trial": 3}, "environment.arguments.trial cannot be set: holdfast"),
+            ("robots:Plain", {"port": 3}, "arguments.port is no argument of robots:Plain\nallowed"),
+            ("robots:Needy", {}, "environment.arguments do not suit robots:Needy.*'port'"),
+        ],
+    )
+    def test_what_is_refused(
+        self,
+        name: str,
+        arguments: dict[str, object],
+        expected: str,
+        loaded: Callable[..., EnvironmentMaker],
+    ) -> None:
+        with pytest.raises(ConfigurationError, match=expected) as caught:
+            loaded(name, arguments=arguments)
+        assert "run.yaml: environment." in str(caught.value)
