@@ -46,6 +46,7 @@ async def test_waiting_ones_go_on_for_so_long_in_each_turn_of_the_loop(
 ) -> None:
     """Each slice takes 1 ms of the thread's time, and a turn has 2 ms."""
     scheduler, taken = FairScheduler(), list[object]()
+    monkeypatch.setattr(link_settings, "_TURN_S", 0.002)
     monkeypatch.setattr(link_settings, "thread_time", lambda: 1e-3 * len(taken))
     for owner in ("anna", "berta", "mallory"):
         Busy(scheduler, owner, 2, taken).enqueue()
