@@ -49,11 +49,12 @@ bool all_non_negative(const double* values, std::size_t count) {
 }
 
 // Lets other Python threads run while the work is long enough to be worth the switch, or proves to
-// be.
+// be: for many states, or few among many obstacles, where each of them is compared with all.
 class ReleaseForLongWork final : public LongWork {
   public:
-    explicit ReleaseForLongWork(std::size_t count) : before_(std::exchange(long_work, this)) {
-        if (count >= 1024) begins();
+    ReleaseForLongWork(std::size_t count, std::size_t obstacles)
+        : before_(std::exchange(long_work, this)) {
+        if (count >= 1024 || count * obstacles >= 8192) begins();
     }
     ~ReleaseForLongWork() { long_work = before_; }
     ReleaseForLongWork(const ReleaseForLongWork&) = delete;
@@ -95,7 +96,7 @@ bool collides_batch(const World& world, const Input<2>& states, InPlace<bool, 1>
     const double* state = states.data();
     if (!all_finite(state, count * World::dimension)) return false;
     bool* out = result.data();
-    ReleaseForLongWork release(count);
+    ReleaseForLongWork release(count, world.num_obstacles());
     for (std::size_t n = 0; n < count; ++n) out[n] = world.collides(state + n * World::dimension);
     return true;
 }
@@ -116,7 +117,7 @@ bool move_batch(const World& world, const Input<2>& states, const Input<2>& acti
         return false;
     }
     const std::size_t action_stride = actions.shape(0) == count ? d : 0;
-    ReleaseForLongWork release(count);
+    ReleaseForLongWork release(count, world.num_obstacles());
     move(world, count, states.data(), actions.data(), action_stride, standard_deviation.data(),
          tolerance, to_stream(stream), next.data());
     return true;
@@ -154,7 +155,7 @@ std::size_t draw_free_batch(const World& world, const Input<1>& mean,
     require(mean.shape(0) == d && standard_deviation.shape(0) == d && states.shape(1) == d,
             "shapes differ");
     const std::size_t count = states.shape(0);
-    ReleaseForLongWork release(count);
+    ReleaseForLongWork release(count, world.num_obstacles());
     return draw_free(world, count, mean.data(), standard_deviation.data(), to_stream(stream),
                      states.data());
 }

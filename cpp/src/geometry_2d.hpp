@@ -26,6 +26,8 @@ class DiscWorld {
 
     DiscWorld(double radius, std::vector<AxisAlignedRectangle> obstacles);
 
+    std::size_t num_obstacles() const { return obstacles_.size(); }
+
     bool collides(const double* state) const;
 
     // How far the state may move along each axis, and turn as it likes, without a collision. Zero
@@ -43,6 +45,8 @@ class RectangleWorld {
     static constexpr std::size_t dimension = 3, space_dimension = 2;
 
     RectangleWorld(double width, double height, std::vector<AxisAlignedRectangle> obstacles);
+
+    std::size_t num_obstacles() const { return obstacles_.size(); }
 
     bool collides(const double* state) const;
 

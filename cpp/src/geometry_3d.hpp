@@ -27,6 +27,8 @@ class BoxWorld {
 
     BoxWorld(const std::array<double, 3>& size, std::vector<AxisAlignedBox> obstacles);
 
+    std::size_t num_obstacles() const { return obstacles_.size(); }
+
     bool collides(const double* state) const;
 
     // How far the state may move along each axis, and turn as it likes, without a collision. Zero

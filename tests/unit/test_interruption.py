@@ -151,6 +151,23 @@ def test_outside_the_context_nothing_ends() -> None:
     _kernel.entropies(points, rows, True, 0, 5, 1e-3, 0.0, 0.0, 1, (1.0,), np.empty(0))
 
 
+def test_few_particles_among_many_obstacles_leave_the_interpreter() -> None:
+    """Nothing of it would end while another thread could not set the interruption."""
+    ahead = {"end_0": [-1000.0, -9.0], "end_1": [-1000.0, 9.0]}
+    elsewhere = {"end_0": [100.0, 100.0], "end_1": [100.0, 101.0]}
+    problem = CapsuleRobot.from_settings({"walls": [elsewhere] * 9000 + [ahead]}, {})
+    interruption = Interruption()
+    other = threading.Timer(0.02, interruption.set)
+    other.start()
+    with pytest.raises(InterruptedComputationError), interruptible(interruption):
+        problem.move(
+            np.tile([-1001.0, 0.0], (1000, 1)),
+            np.array([1.0, 0.0]),
+            stream(0, 0, 0, Purpose.PREDICTION),
+        )
+    other.join()
+
+
 def test_one_block_of_particles_in_an_obstacle_leaves_the_interpreter_and_ends() -> None:
     """With so many walls, each of a thousand attempts to place the noise takes long."""
     around = {"end_0": [-1000.0, 0.0], "end_1": [-1000.0, 3.0], "thickness": 500.0}
