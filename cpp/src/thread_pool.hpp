@@ -36,8 +36,8 @@ struct Interrupted : std::exception {
 };
 
 /// Sets the flag that ends what the calling thread computes, once it is not 0 any more; another
-/// thread may set it to 1 at any time. Null for none. It becomes 2 once this thread has computed for
-/// `most_s` seconds of its processor time, which goes on only while it has a processor.
+/// thread may set it to 1 at any time. Null for none. It becomes 2 once this thread has computed
+/// for `most_s` seconds of its processor time, which goes on only while it has a processor.
 void watch_interruption(std::uint8_t* flag, double most_s);
 
 /// Whether that flag is set.
