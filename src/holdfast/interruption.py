@@ -33,7 +33,7 @@ class Interruption:
     Parameters
     ----------
     most_s : float, optional
-        Processor time after which it ends by itself, from :func:`interruptible` on, in seconds.
+        Processor time after which it ends by itself, from :meth:`start_clock` on, in seconds.
     """
 
     def __init__(self, most_s: float = math.inf) -> None:
@@ -55,6 +55,10 @@ class Interruption:
         """End the computation at its next check; from any thread."""
         self.flag[0] = _NOT_AWAITED
 
+    def start_clock(self) -> None:
+        """Count the processor time of this thread from now on, to the end of its context."""
+        _kernel.watch_interruption(self.flag, self.most_s)
+
     def use_up(self) -> None:
         """Have it end as if its time was used up."""
         self.flag[0] = _TOO_LONG
@@ -70,7 +74,7 @@ def interruptible(interruption: Interruption) -> Iterator[None]:
     Such contexts are not nested.
     """
     token = _current.set(interruption)
-    _kernel.watch_interruption(interruption.flag, interruption.most_s)
+    _kernel.watch_interruption(interruption.flag, math.inf)
     try:
         yield
     except Exception as error:

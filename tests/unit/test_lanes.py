@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 from tests.fuzz.hostile_settings import with_key
-from tests.unit.test_protocol_service import Bench, Robot, content, planning_of, refused
+from tests.unit.test_protocol_service import (
+    Bench,
+    Robot,
+    content,
+    make_problem,
+    planning_of,
+    refused,
+)
 
 from holdfast.config.settings import PlanningSettings
+from holdfast.problems.problem import Problem
 from holdfast.protocol.decision_cost import cost_of_sensing
-from holdfast.protocol.messages import Busy, Refused
+from holdfast.protocol.messages import Busy, Refused, SessionConfiguration
 from holdfast.protocol.service_limits import ServiceLimits
 
 
@@ -171,6 +181,30 @@ def overrun(bench: Bench, index: int = -1) -> None:
 
 
 class TestTheEstimateIsFarTooLow:
+    def test_a_job_ends_once_it_has_used_up_its_time(self) -> None:
+        bench = Bench()
+        (slow,) = bench.known(1)
+        call = bench.send(slow.request())
+        bench.jobs[0].interruption.most_s = 0.0
+        bench.run()
+        assert bench.jobs[0]._most is None
+        bench.run_all()
+        assert content(bench.replies[call]) == slow.right_answer()
+
+    def test_building_a_problem_does_not_count(self) -> None:
+        """It would have to be built again."""
+
+        def slowly_made(configuration: SessionConfiguration) -> Problem:
+            began = time.thread_time()
+            while time.thread_time() < began + 6 * ServiceLimits().max_brief_s:
+                pass
+            return make_problem(configuration)
+
+        bench, robot = Bench(slowly_made), Robot()
+        call = bench.send(robot.request())
+        bench.run()
+        assert content(bench.replies[call]) == robot.right_answer()
+
     def test_the_decision_is_computed_as_a_long_one(self) -> None:
         bench = Bench()
         slow, other = bench.known(1, 2)

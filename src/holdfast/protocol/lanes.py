@@ -13,7 +13,8 @@ the cores between these:
 A job first estimates what it costs (:mod:`~holdfast.protocol.decision_cost`); if that is too much
 for its lane, nothing is computed, and the task moves. An estimate can be wrong, or made wrong: a
 belief may hold states for which the problem's functions take a thousand times as long as for those
-that were measured. So a job ends by itself once it has computed for several times its lane's limit.
+that were measured. So a job ends by itself once it has computed for several times its lane's limit
+(after its problem is built and measured, which happens once).
 It is computed anew as a long one, and so are the session's next ones until one takes less.
 
 The lanes go by cost and not by owner, because without certificates all robots are one owner, and

@@ -140,7 +140,8 @@ class Job:
         What it may take; if it is estimated to take more, nothing is computed. None: what a
         decision may take at all.
     most_s : float
-        Processor time after which it ends, whatever was estimated.
+        Processor time after which it ends, whatever was estimated; once its problem is built and
+        measured.
 
     Attributes
     ----------
@@ -219,6 +220,8 @@ class Job:
                     problem = self._make_problem(unpack_configuration(self._configuration))
                 if self._price is None:
                     self._price = self._pricing.price_of(problem, self._planning)
+                # Building and measuring happen once, and would have to be done again.
+                self.interruption.start_clock()
                 check()
                 cost = self._checked_cost(problem, self._price)
                 most = self._most
