@@ -55,6 +55,21 @@ async def test_only_its_own_threads_are_nice() -> None:
     pool.close()
 
 
+async def test_a_sandbox_that_refuses_it_stops_no_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Found by a real unit of systemd: its threads ended, and no decision came."""
+
+    def refused(*_: int) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "setpriority", refused)
+    found: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+    pool = ThreadPool(1, "nice", niceness=3)
+    pool.submit(lambda: 7, found.set_result)
+    async with asyncio.timeout(30.0):
+        assert await found == 7
+    pool.close()
+
+
 async def test_no_more_threads_than_allowed() -> None:
     pool = ThreadPool(2, "few", lambda _: None)
     gate = threading.Event()

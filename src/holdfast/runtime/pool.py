@@ -84,8 +84,10 @@ class ThreadPool:
     def _work(self) -> None:
         if self._niceness and sys.platform == "linux":
             thread = threading.get_native_id()
-            now = os.getpriority(os.PRIO_PROCESS, thread)
-            os.setpriority(os.PRIO_PROCESS, thread, min(19, now + self._niceness))
+            # A sandbox may refuse it (systemd's SystemCallFilter=~@resources); then all are equal.
+            with contextlib.suppress(OSError):
+                now = os.getpriority(os.PRIO_PROCESS, thread)
+                os.setpriority(os.PRIO_PROCESS, thread, min(19, now + self._niceness))
         while (task := self._queue.get()) is not None:
             function, done = task
             try:
