@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol, Self, runtime_checkable
+from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -25,9 +25,6 @@ from holdfast.outcome import Done, MoveResult
 from holdfast.problem_attributes import check_sizes, has_general_observations, sensing_action_of
 from holdfast.problems.problem import Problem, ProblemBase
 from holdfast.randomness import Purpose, Stream, seed_and_trial, stream
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = [
     "LATER",

@@ -14,14 +14,11 @@ import warnings
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from holdfast.errors import CredentialsError, CredentialsGoneError, TransportError
 from holdfast.transport.endpoints import AUTHORITY_FILE, REVOKED_FILE, Role, TlsFiles
 from holdfast.transport.revocation import refuse_revoked
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = [
     "EXPIRES_SOON_DAYS",
