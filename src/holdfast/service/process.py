@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypeAlias
 
 from holdfast.errors import DEFECT, HoldfastError, InvalidValueError, defect_fields
 from holdfast.printable import printable
+from holdfast.service.garbage import collect_in_loop
 from holdfast.service.options import ServeOptions, checked_endpoints, parse_options
 
 if TYPE_CHECKING:
@@ -36,7 +37,6 @@ __all__ = ["Extension", "MakeExtension", "main"]
 _SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while another waits for it."""
 
-_BETWEEN_COLLECTIONS = 10_000
 _CLOSE_TIMEOUT_S = 0.7
 _CHECK_INTERVAL_S = 0.01
 _STDIN = 0
@@ -295,10 +295,7 @@ class _ServiceProcess:
                     )
                 if options.until_stdin_closes:
                     _watch_stdin(loop, shell)
-                # Loaded modules stay; the collector need not scan them.
-                gc.freeze()
-                gc.set_threshold(_BETWEEN_COLLECTIONS)
-                gc.enable()
+                collect_in_loop(loop)
                 self._is_serving = True
                 if supervised is None:
                     where: dict[str, object] = {"boot": self._incarnation, **watched, **offered}
