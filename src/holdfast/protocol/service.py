@@ -55,7 +55,6 @@ from holdfast.protocol.service_jobs import (
 from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
 from holdfast.protocol.service_sessions import (
     BRIEF,
-    FIRST,
     LONG,
     MEDIUM,
     REQUESTED,
@@ -488,7 +487,7 @@ class Service:
             building_counts=task.lane != LONG,
         )
         self._queue.handed_out(task, job, now)
-        self._effects.append(StartJob(job, expected_s, task.lane in (FIRST, BRIEF)))
+        self._effects.append(StartJob(job, expected_s, task.lane <= BRIEF))
 
     # -- outcomes --------------------------------------------------------------------------------
 
