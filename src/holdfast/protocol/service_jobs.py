@@ -496,8 +496,8 @@ class StartJob(NamedTuple):
         Typical time of the robot's earlier jobs; infinite if that predicts nothing: the first job,
         a problem that is not built in, or an unusual request.
     is_brief : bool
-        Whether its lane ends it after a moment. The others' jobs may take any time, so their threads
-        have less weight (:class:`~holdfast.protocol.lanes.Lanes`).
+        Whether its lane ends it after a moment. All others may take any time, so their threads have
+        less weight (:class:`~holdfast.protocol.lanes.Lanes`).
     """
 
     job: Job
