@@ -308,32 +308,6 @@ def test_its_robots_end_at_once_if_it_is_killed(tmp_path: Path, started: list[Ch
         assert not (world.parent / "disturbed" / "summary.json").exists()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("numbers", [(signal.SIGINT,), (signal.SIGINT, signal.SIGTERM)])
-def test_a_storm_of_signals_is_one(
-    tmp_path: Path, started: list[Chaos], numbers: tuple[signal.Signals, ...]
-) -> None:
-    """Whoever holds Ctrl-C down does not keep it from ending its processes and its account."""
-    options = ["--trials", "4", "--jobs", "2", *only([FaultKind.CLOUD_STOPPED])]
-    chaos = Chaos(tmp_path, *options)
-    started.append(chaos)
-    chaos.wait_until("holdfast run", present=True)
-    number = 0
-    while chaos.process.poll() is None:
-        chaos.process.send_signal(numbers[number % len(numbers)])
-        number += 1
-        time.sleep(0.005)
-    _, errors = chaos.end()
-    assert chaos.process.returncode == 130
-    assert number > 1
-    assert chaos.others() == []
-    assert "Interrupted; all processes are ended. 0 of 4 trials are finished" in errors
-    assert "Traceback" not in errors
-    assert re.search(r"Go on with: (holdfast chaos .*)", errors)
-    assert not list(chaos.out.glob("trial-*"))
-    assert (chaos.out / "summary.json").exists()
-
-
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [

@@ -22,7 +22,7 @@ from typing import Any
 import msgspec
 import pytest
 from tests.processes.faults import PATIENT
-from tests.unit.test_protocol_service import Robot, content, planning_of
+from tests.unit.test_protocol_service import Robot, content
 
 from holdfast.protocol.events import (
     CallEnded,
@@ -42,9 +42,7 @@ from holdfast.protocol.messages import (
     encode,
     with_checksum,
 )
-from holdfast.transport.credentials import load_credentials
 from holdfast.transport.endpoints import ServiceAddress, TlsFiles
-from holdfast.transport.key_ring import make_credentials
 from holdfast.transport.private_socket import PrivateSocket
 from holdfast.transport.robot_end import StreamRobotTransport
 
@@ -401,27 +399,6 @@ class TestServing:
             assert "--problem" in reply.text
             run_turns(end, Robot(key=2), 2)
 
-    def test_many_robots_at_once(self) -> None:
-        with served(*ANYWHERE, "--workers", "3") as service, contextlib.ExitStack() as stack:
-            ends = [stack.enter_context(robots_end(service.endpoint)) for _ in range(6)]
-            robots = [Robot(key=key, seed=key) for key in range(1, 7)]
-            for end in ends:
-                end.appeared()
-            for _ in range(4):
-                for end, robot in zip(ends, robots, strict=True):
-                    end.send(encode(robot.request()))
-                for end, robot in zip(ends, robots, strict=True):
-                    assert content(end.collect()) == robot.right_answer()
-                    robot.act_until_sensing()
-                    robot.sense()
-
-    def test_state_of_many_particles(self) -> None:
-        robot = Robot(planning=planning_of(particles=20_000))
-        with served(*ANYWHERE) as service, robots_end(service.endpoint) as end:
-            end.appeared()
-            replies = end.ask(encode(robot.restore()))
-            assert content(replies) == robot.right_answer()
-
     def test_two_names_on_two_endpoints(self) -> None:
         with served(
             *ANYWHERE, "--listen", "tcp/127.0.0.1:0", "--name", "cloud_active_sensing_recovery"
@@ -526,17 +503,6 @@ class TestRefusing:
         assert "standard input has ended" in done.stderr
 
 
-class TestTls:
-    def test_robot_with_credentials(self, tmp_path: Path) -> None:
-        make_credentials(tmp_path)
-        tls = load_credentials(tmp_path / "robot", "robot").files
-        with served("--listen", "tls/127.0.0.1:0", "--tls", str(tmp_path / "service")) as service:
-            with robots_end(service.endpoint, tls=tls) as end:
-                end.appeared()
-                run_turns(end, Robot(), 2)
-            assert service.end()[0] == 0
-
-
 class TestTelling:
     def test_json(self) -> None:
         with served(*ANYWHERE, "--log", "json", "--max-sessions", "1") as service:
@@ -591,14 +557,6 @@ class TestTelling:
             taken.listen()
             port = str(taken.getsockname()[1])
             assert port in refused_to_start(*ANYWHERE, "--metrics", port)
-
-    def test_help(self) -> None:
-        done = subprocess.run(
-            [*COMMAND, "--help"], capture_output=True, text=True, timeout=PATIENCE_S
-        )
-        assert done.returncode == 0
-        for option in ("--listen", "--connect", "--tls", "--insecure", "--until-stdin-closes"):
-            assert option in done.stdout
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="where there are such arenas")
