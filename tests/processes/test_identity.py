@@ -8,7 +8,6 @@ import signal
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -112,28 +111,6 @@ def test_a_revoked_robot_is_cut_off_and_no_other(
     assert "has a certificate that has been revoked" in told
     (ended,) = cloud.process.matching("robot_disconnected", robot="anna")
     assert ended["reason"] == "has a certificate that has been revoked"
-
-
-@pytest.mark.slow  # without a run, both ends: unit/test_stream_credentials.py
-def test_a_robot_whose_certificate_expires_is_cut_off_and_no_other(
-    home: Path, site: Site, elsewhere: Site, references: References
-) -> None:
-    cloud = cloud_of(site, home).start()
-
-    def happens(story: Story) -> None:
-        expiring(home, "anna", seconds=8.0)
-        story.at("perform", 20, story.status(LOCAL_RECOVERY))
-
-    statuses, out = robot_beside(home, cloud, site, elsewhere, references, happens)
-    assert statuses == [LOST]
-    told = " ".join(str(each.get("reason")) for each in events_of(out))
-    assert "has a certificate that has expired" in told
-
-
-def expiring(home: Path, name: str, seconds: float) -> None:
-    """Give a robot a certificate that expires soon."""
-    end = datetime.now(UTC) + timedelta(seconds=seconds)
-    make_credentials(home, robots=[name], rotate=True, days=1, now=end - timedelta(days=1))
 
 
 def test_a_rotated_service_goes_on_with_the_links_that_it_has(
