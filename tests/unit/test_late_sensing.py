@@ -12,7 +12,7 @@ from tests.late_world import LateWorld
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.errors import EnvironmentFailedError
-from holdfast.outcome import MoveResult, TrialResult
+from holdfast.outcome import TrialResult
 from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.robot.environment import LATER, Environment, SimulatedEnvironment
@@ -155,22 +155,6 @@ def test_what_waits_is_kept_as_it_came() -> None:
     robot.perform(ACTION)
     robot.close()
     assert [np.asarray(shown)[0] for _, shown in robot.late_observations()] == [1.0, 2.0, 0.0]
-
-
-@pytest.mark.parametrize("what", ["motion", "observation"])
-@pytest.mark.parametrize(
-    "shown", ["abc", [[1], [1, 2]], np.zeros((2, 2)), [], [1j], np.zeros(5000)]
-)
-def test_what_is_no_array_of_numbers_is_named(what: str, shown: Any) -> None:
-    class Odd(SimulatedEnvironment):
-        def perform(self, task_action: FloatArray) -> Any:
-            return MoveResult(**{what: shown})
-
-    with pytest.raises(
-        EnvironmentFailedError,
-        match=f"Odd: perform returned a MoveResult whose {what} is .*of 1 to 4096 numbers",
-    ):
-        run_trial(planner_of(), 5, environment=Odd(PegInHole2D(), 5, 0))
 
 
 class Slow:
