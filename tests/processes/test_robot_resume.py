@@ -5,13 +5,11 @@ Whatever was performed is performed once: the world, which outlives the robot, h
 
 from __future__ import annotations
 
-import contextlib
 import os
 import pty
 import shlex
 import shutil
 import signal
-import subprocess
 import time
 from pathlib import Path
 
@@ -225,30 +223,6 @@ class TestEndedInOrder:
         assert_identical(robot.out, story.reference)
         story.world.assert_each_once(story.reference)
 
-    @pytest.mark.slow
-    def test_by_a_second_signal_while_the_robot_does_not_answer(
-        self, site: Site, references: References
-    ) -> None:
-        document = document_of(PEG)
-        cloud = site.service().start()
-        story = Story(site, references, document)
-
-        def press_until_it_ends() -> None:
-            pressed = story.running
-            deadline = time.monotonic() + 30.0
-            while pressed.process.poll() is None:
-                assert time.monotonic() < deadline
-                pressed.signal(signal.SIGINT)
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    pressed.process.wait(1.5)
-
-        story.at("perform", 30, press_until_it_ends)
-        robot = site.run(story.file, services=[cloud])
-        # The latter if it was pressed once more while it was ending already.
-        assert robot.wait() in (128 + signal.SIGINT, -signal.SIGINT)
-        assert story.world.step == 30
-        story.finish(site.run(story.file, services=[cloud], resume=True))
-
     @pytest.mark.parametrize(
         "number",
         # Its handler is that of SIGTERM, above; of Ctrl-C at a batch: test_run_command.py.
@@ -288,23 +262,6 @@ class TestEndedInOrder:
 
 
 class TestWorld:
-    @pytest.mark.parametrize("performed", [False, True])
-    @pytest.mark.slow
-    def test_a_robot_that_stalls_holds_and_is_resumed(
-        self, performed: bool, site: Site, references: References
-    ) -> None:
-        document = document_of(PEG)
-        cloud = site.service().start()
-        story = Story(site, references, document, environment={"timeout_ms": 1500.0})
-        story.at("perform", 22, lambda: story.running.wait(), afterwards=performed)
-        robot = site.run(story.file, services=[cloud])
-        assert robot.wait() == 2
-        assert "the robot holds still in trial 0, step 22" in robot.output
-        assert "perform has not returned within 1500 ms" in robot.output
-        assert "whether its task action was performed is not known" in robot.output
-        assert "Go on with: holdfast run" in robot.output
-        story.finish(site.run(story.file, services=[cloud], resume=True))
-
     def test_two_that_do_not_belong_together(self, site: Site, references: References) -> None:
         """The world has done more than the journal knows: nothing is performed."""
         document = document_of(PEG)
