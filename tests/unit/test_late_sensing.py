@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.late_world import LateWorld
 
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
@@ -15,7 +14,8 @@ from holdfast.errors import EnvironmentFailedError
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.robot.environment import LATER, Environment, SimulatedEnvironment
+from holdfast.problems.problem import Problem
+from holdfast.robot.environment import LATER, Environment, Later, SimulatedEnvironment
 from holdfast.robot.late_sensing import SenseInBackground
 from holdfast.robot.trial import LateStep, SensingStep, TaskStep, TrialObserver, run_trial
 
@@ -23,6 +23,28 @@ PATIENCE_S = 30.0
 """Longest wait for what is sure to come; nothing is measured by it."""
 
 ACTION = np.array([0.1, 0.0, 0.0])
+
+
+class LateWorld(SimulatedEnvironment):
+    """A simulated world whose observations come ``moves`` task actions later; 0 is at once."""
+
+    def __init__(self, problem: Problem, seed: int, trial: int, moves: int) -> None:
+        super().__init__(problem, seed, trial)
+        self._moves = moves
+        self._due: dict[int, tuple[int, FloatArray]] = {}
+
+    def perform_sensing(self, sensing_action: int) -> FloatArray | Later:  # type: ignore[override]
+        """Sense, and keep the observation until it is due."""
+        shown = super().perform_sensing(sensing_action)
+        if not self._moves:
+            return shown
+        self._due[self.step + self._moves] = self.step, shown
+        return LATER
+
+    def late_observations(self) -> list[tuple[int, FloatArray]]:
+        """Return what is due after this move."""
+        due = self._due.pop(self.step, None)
+        return [] if due is None else [due]
 
 
 def planner_of(interval: int = 2) -> Planner:
