@@ -50,9 +50,7 @@ def fails_in_its_sensing_part(service: SmallService, code: str, calls: int = 10*
 
 def test_without_faults_it_decides_as_in_process_with_one_request_per_sensing_step() -> None:
     world = World()
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     assert world.statuses() == []
     asked = [sent.request for sent in world.sent]
     # The first question of a trial is for its first sensing action; then one for each observation.
@@ -77,9 +75,7 @@ def test_the_exit_of_a_local_service_is_logged_although_its_link_still_stands() 
             )
 
     world.on_act = fault
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     assert world.reports("recovery_exited") == [{"reason": "signal 9"}]
     assert len([e for _, e in world.trace if isinstance(e, Launch)]) == 2
 
@@ -88,17 +84,13 @@ def test_busy_is_waited_for_if_short_and_evaded_if_long() -> None:
     world = World()
     cloud = world.services["cloud"]
     cloud.rule = lambda r: [Busy(r.number, 20)] if nth(r) in (3, 4) else None
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     assert world.statuses() == []
 
     world = World()
     cloud = world.services["cloud"]
     cloud.rule = lambda r: [Busy(r.number, 5000)] if nth(r) == 3 else None
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     assert world.statuses()[0] == "local_recovery"
 
 
@@ -180,9 +172,7 @@ def test_a_sensing_part_that_fails_after_its_task_part_stops_the_robot(
 def test_who_fails_in_its_sensing_part_leaves_the_rest_to_another_service() -> None:
     world = World(services=("broken", "sound"))
     fails_in_its_sensing_part(world.services["broken"], "failed")
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     told = world.reports("refused")
     assert [(each["service"], each["final"]) for each in told] == [
         ("broken", False),
@@ -195,9 +185,7 @@ def test_who_fails_in_its_sensing_part_leaves_the_rest_to_another_service() -> N
 def test_out_of_memory_for_a_while_is_asked_again_ever_later() -> None:
     world = World(launch="never")
     fails_in_its_sensing_part(world.services["cloud"], "out_of_memory", calls=4)
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     told = [at for at, e in world.trace if isinstance(e, LogEvent) and e.name == "refused"]
     waits = [after - before for before, after in itertools.pairwise(told)]
     assert len(waits) == 3
@@ -213,9 +201,7 @@ def test_an_answer_clears_earlier_refusals_of_the_same_part() -> None:
     world.services["cloud"].rule = lambda r: (
         [Refused(r.number, "failed", "policy gives nan")] if nth(r) in refuse else None
     )
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     assert len(world.reports("refused")) == len(refuse)
 
 
@@ -238,18 +224,14 @@ def test_the_machine_sleeps_while_nothing_can_be_done() -> None:
 
     world.services["busy"].rule = busy_once
     world.services["dying"].rule = lambda _: []
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     assert told
 
 
 def test_a_long_wait_is_told_although_the_service_shows_life() -> None:
     world = World()
     answer_third_slowly(world.services["cloud"], num_signs=20)
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     (told,) = world.reports("waiting")
     assert told["service"] == "cloud"
     assert float(str(told["waited_ms"])) >= 1000.0
@@ -268,9 +250,7 @@ def test_another_process_of_a_service_that_refused_for_good_is_asked() -> None:
             world.bring_up("cloud", 0.02)
 
     world.on_act = update
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     assert world.statuses() == ["local_recovery", "keep_alive"]
     assert len(world.reports("refused")) == 1
     back_at = next(
@@ -293,8 +273,6 @@ def test_the_same_process_behind_another_link_still_refuses() -> None:
             world.after(0.02, lambda: world.robot.handle(ServiceAppeared("cloud", boot), world.now))
 
     world.on_act = reconnect
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     assert world.statuses() == ["local_recovery"]
     assert [sent.service for sent in world.sent].count("cloud") == 1

@@ -46,9 +46,7 @@ def test_wrong_answers_are_refused() -> None:
         return [lies[nth(request)]] if nth(request) in lies else None
 
     cloud.rule = lie
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     assert world.reports("malformed_reply")
 
 
@@ -62,9 +60,7 @@ def test_a_service_that_begins_otherwise_is_sent_the_state_and_not_asked_for_eve
         return None
 
     cloud.rule = begins_otherwise
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     turns = sum(result.sensing_decisions for result in world.results) + len(world.results)
     assert len(world.sent) <= 3 * turns
 
@@ -72,9 +68,7 @@ def test_a_service_that_begins_otherwise_is_sent_the_state_and_not_asked_for_eve
 def test_a_service_that_always_needs_the_state_is_given_up() -> None:
     world = World()
     world.services["cloud"].rule = lambda r: [NeedState(r.number, True)]
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     assert world.statuses() == ["local_recovery"]
     assert len([sent for sent in world.sent if sent.service == "cloud"]) < 20
 
@@ -90,8 +84,6 @@ def test_a_state_that_came_out_otherwise_is_told() -> None:
         return None
 
     world.services["cloud"].rule = rule
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     (fields,) = world.reports("state_diverged")
     assert (fields["service"], fields["step"]) == ("cloud", told[0].step)

@@ -482,9 +482,7 @@ def test_rate_paces_the_steps_and_counts_missed_ticks() -> None:
             world.bring_up("cloud", 0.42)
 
     world.on_act = fault
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     times = [at for at, e in world.trace if isinstance(e, Act)][:20]
     gaps = np.diff(times)
     assert np.count_nonzero(np.abs(gaps - 0.05) < 1e-9) >= 17
@@ -512,9 +510,7 @@ def test_a_performance_is_written_down_before_the_robot_waits_for_anything() -> 
         world.after(0.05, look)  # between the performance and the next tick
 
     world.on_act = watch
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     assert waits >= 75
 
 
