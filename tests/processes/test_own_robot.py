@@ -12,7 +12,6 @@ import json
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -22,9 +21,7 @@ import numpy as np
 import pytest
 from tests.ports import free_port
 
-from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration, load
-from holdfast.outcome import Done, MoveResult
 from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.events import (
@@ -33,7 +30,6 @@ from holdfast.protocol.events import (
     EnvironmentReady,
     Sensed,
 )
-from holdfast.robot.environment import Environment, Later
 from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
 from holdfast.robot.environment_runner import EnvironmentRunner, make_runner
 from holdfast.robot.trial import run_trial
@@ -217,73 +213,7 @@ class TestController:
         second.close()
 
 
-class Meddling:
-    """An environment in whose steps something is done to the controller."""
-
-    def __init__(self, environment: Environment, controller: Controller) -> None:
-        self._environment = environment
-        self._controller = controller
-        self._step = 0
-
-    def perform_sensing(self, sensing_action: int) -> FloatArray | Later | None:
-        return self._environment.perform_sensing(sensing_action)
-
-    def perform(self, task_action: FloatArray) -> float | MoveResult | None:
-        self._step += 1
-        if self._step == 10:  # between two moves
-            self._controller.kill()
-            self._controller.start("--delay-ms", "300")
-        if self._step == 11:  # in the middle of one, if the machine is not too busy for that
-            thread = threading.Timer(0.1, self._restart)
-            thread.start()
-            reward = self._environment.perform(task_action)
-            thread.join(PATIENCE_S)
-            return reward
-        return self._environment.perform(task_action)
-
-    def _restart(self) -> None:
-        self._controller.kill()
-        self._controller.start()
-
-    def is_done(self) -> Done:
-        return self._environment.is_done()
-
-
 class TestTrial:
-    def test_it_succeeds_and_a_restarted_controller_changes_nothing(
-        self, controller: Controller
-    ) -> None:
-        controller.start()
-        configuration = configuration_for(controller)
-        planner = Planner(configuration.problem, configuration.planning)
-        maker = load_environment(configuration)
-        quiet: Any = maker(2)
-        expected = run_trial(
-            planner,
-            configuration.simulator.seed,
-            2,
-            max_steps=configuration.simulator.max_steps,
-            environment=quiet,
-        )
-        quiet.close()
-        assert expected.success
-        moves = controller.moves()
-        assert len(moves) == expected.steps
-        (controller.directory / "performed.log").unlink()
-
-        robot: Any = maker(2)
-        result = run_trial(
-            planner,
-            configuration.simulator.seed,
-            2,
-            max_steps=configuration.simulator.max_steps,
-            environment=Meddling(robot, controller),
-        )
-        robot.close()
-        assert result.digest == expected.digest
-        assert result.reward == expected.reward
-        assert controller.moves() == moves
-
     def test_the_simulation_has_the_same_file(self) -> None:
         """Without the name of the class, the same configuration is simulated."""
         configuration = load(EXAMPLE / "own_robot.yaml")
