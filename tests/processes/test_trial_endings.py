@@ -1,7 +1,7 @@
 """How trials end with a robot of one's own: in success, in failure, or out of steps.
 
-The commands are real, and so are the signals: the world's class sends them to its own process,
-right after the step that ends a trial.
+The commands are real; what a robot remembers that is killed in the step that ends a trial is in
+unit/test_protocol_robot.py.
 """
 
 from __future__ import annotations
@@ -28,9 +28,6 @@ AS_BEFORE = "c8620a9f2dab01e3b944d3e864944901548b38b9229c531cbe512fff9a22123f"
 
 # What was moved is in a file, which outlives the process, as a real robot does.
 LANDER = """
-import os
-import signal
-import time
 from pathlib import Path
 
 import numpy as np
@@ -57,48 +54,6 @@ class Lander:
 
     def steps_performed(self):
         return len(self.moves.read_text())
-
-
-class Crashing(Lander):
-    # The robot's process is killed once, right after the step that ended the trial.
-    def is_done(self):
-        done = super().is_done()
-        killed = Path(f"killed-{self.trial}")
-        if done and not killed.exists():
-            killed.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return done
-
-
-class Forgetful(Lander):
-    # Is asked to end during the last step, and does not know of it any more later on.
-    landed = False
-
-    def perform(self, task_action):
-        reward = super().perform(task_action)
-        if self.trial == 1 and self.steps_performed() == 6:
-            before = signal.getsignal(signal.SIGTERM)
-            os.kill(os.getpid(), signal.SIGTERM)
-            # Until it was heard; only what happens next may wake the one that hears it.
-            for _ in range(6000):
-                if signal.getsignal(signal.SIGTERM) is not before:
-                    break
-                time.sleep(0.005)
-        self.landed = self.steps_performed() == 6
-        return reward
-
-    def is_done(self):
-        return self.ending.get(self.trial, False) if self.landed else False
-
-
-class Killed(Lander):
-    # The robot's process is killed once in each trial, in the step in which it is found lost.
-    def perform(self, task_action):
-        killed = Path(f"killed-{self.trial}")
-        if self.steps_performed() == 4 and not killed.exists():
-            killed.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return super().perform(task_action)
 
 
 class Wrong(Lander):
@@ -182,23 +137,6 @@ def test_nobody_speaks_of_failures_where_there_are_none(tmp_path: Path) -> None:
     assert command.summary()["failures"] == 0
 
 
-def test_killed_right_after_the_step_that_ended_the_trial(tmp_path: Path) -> None:
-    command = Command(tmp_path, "Crashing")
-    ended = command.run()
-    for _ in range(2):
-        assert ended.returncode == -signal.SIGKILL
-        ended = command.run("--resume")
-    command.assert_ended(ended)
-
-
-def test_asked_to_end_in_the_step_that_ended_the_trial(tmp_path: Path) -> None:
-    command = Command(tmp_path, "Forgetful")
-    ended = command.run()
-    assert ended.returncode == 128 + signal.SIGTERM, ended.stderr
-    assert [row["outcome"] for row in command.rows()] == ["succeeded", "failed"]
-    command.assert_ended(command.run("--resume"))
-
-
 def test_anything_else_is_an_error_that_names_it(tmp_path: Path) -> None:
     ended = Command(tmp_path, "Wrong").run()
     assert ended.returncode == 4
@@ -227,28 +165,6 @@ def test_a_filter_that_has_lost_the_robot_is_told(tmp_path: Path) -> None:
     assert ended.stderr.count("lost") == 3
 
 
-def test_a_lost_robot_that_is_killed_begins_its_belief_anew_at_the_same_step(
-    tmp_path: Path,
-) -> None:
-    anew = ("--set", "lost.on_lost=reinitialise")
-    (tmp_path / "a").mkdir()
-    whole = Command(tmp_path / "a", "Lander", shown=1000.0)
-    assert whole.run(*anew).returncode == 0
-    (tmp_path / "b").mkdir()
-    command = Command(tmp_path / "b", "Killed", shown=1000.0)
-    assert command.run(*anew).returncode == -signal.SIGKILL
-    codes = [command.run(*anew, "--resume").returncode for _ in range(3)]
-    assert codes == [-signal.SIGKILL, -signal.SIGKILL, 0]
-    assert [row["digest"] for row in command.rows()] == [row["digest"] for row in whole.rows()]
-    again = [each for each in events_of(command.out) if each["event"] == "reinitialised"]
-    assert [(each["trial"], each["step"]) for each in again] == [(0, 4), (1, 4), (2, 4)]
-    # Whoever replays the record comes to the same beliefs.
-    exported = subprocess.run(
-        [*COMMAND, "export", str(command.out), "--csv", str(tmp_path / "csv")], check=False
-    )
-    assert exported.returncode == 0
-
-
 def test_a_lost_robot_that_holds_still_goes_on_as_it_is_told(tmp_path: Path) -> None:
     command = Command(tmp_path, "Lander", shown=1000.0)
     held = command.run("--set", "lost.on_lost=hold")
@@ -258,6 +174,11 @@ def test_a_lost_robot_that_holds_still_goes_on_as_it_is_told(tmp_path: Path) -> 
     assert command.run("--resume", "--set", "lost.on_lost=reinitialise").returncode == 0
     again = [each for each in events_of(command.out) if each["event"] == "reinitialised"]
     assert [(each["trial"], each["step"]) for each in again] == [(0, 4), (1, 4), (2, 4)]
+    # Whoever replays the record comes to the same beliefs.
+    exported = subprocess.run(
+        [*COMMAND, "export", str(command.out), "--csv", str(tmp_path / "csv")], check=False
+    )
+    assert exported.returncode == 0
 
 
 def test_a_run_from_before_trials_could_fail_goes_on(tmp_path: Path) -> None:
