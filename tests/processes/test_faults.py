@@ -17,7 +17,6 @@ from tests.processes.faults import (
     COMMAND,
     HERE,
     KEEP_ALIVE,
-    LOCAL_RECOVERY,
     LOST,
     LOST_AGAIN,
     PATIENT,
@@ -117,15 +116,6 @@ class TestCloud:
         robot = story.run(site.service())
         assert robot.statuses() == [LOST]
 
-    def test_late_but_within_the_time_for_starting(
-        self, site: Site, references: References
-    ) -> None:
-        story = Story(site, references, document_of(PEG))
-        cloud = site.service()
-        story.at("begin", 0, cloud.start)
-        robot = story.run(cloud)
-        assert robot.statuses() == []
-
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     def test_killed_before_the_first_request(
         self, problem: str, site: Site, references: References
@@ -163,38 +153,6 @@ class TestCloud:
         story.finish(robot)
         assert robot.statuses() == [LOST]
         assert not robot.matching("refused")
-
-    @pytest.mark.slow
-    def test_hung_while_it_shows_progress(self, site: Site, references: References) -> None:
-        gate = site.gate(9)
-        cloud = site.service(*SERVES_GATED)
-        cloud.variables["HOLDFAST_TEST_GATE"] = str(gate.port)
-        cloud.start()
-        offload = {"detection_timeout_ms": 1500.0, "decision_timeout_ms": 1500.0}
-        story = Story(site, references, GATED, offload=offload)
-        robot = story.run(cloud)
-        assert robot.statuses()[0] == LOST
-        reason = robot.matching("service_suspected")[0]["reason"]
-        assert reason == "a decision took longer than 1500 ms"
-
-    @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
-    def test_killed_again_after_it_was_used_again(
-        self, problem: str, site: Site, references: References
-    ) -> None:
-        document = document_of(problem)
-        steps = sensing_steps(document)
-        cloud = site.service().start()
-        story = Story(site, references, document)
-        story.at("sense", steps[1], cloud.kill)
-        story.at("perform", steps[2], cloud.start, story.status(KEEP_ALIVE, 1))
-        # This time while it moves, and found before anything is asked.
-        story.at("perform", steps[3] + 1, cloud.kill, story.status(LOCAL_RECOVERY, 2))
-        story.at("perform", steps[4], cloud.start, story.status(KEEP_ALIVE, 2))
-        story.at("sense", steps[5], cloud.kill)
-        robot = story.run(cloud)
-        assert robot.statuses() == [LOST, RESTORED, LOST_AGAIN, RESTORED, LOST_AGAIN]
-        # The local service stays ready: it is launched once.
-        assert len(robot.matching("launch")) == 1
 
 
 class TestRecovery:
@@ -325,16 +283,3 @@ class TestReplicas:
         assert not robot.matching("launch")
         deciding = services_in_order(robot)
         assert deciding == [first.endpoint, second.endpoint, first.endpoint, second.endpoint]
-
-    def test_the_preferred_one_is_only_stopped(self, site: Site, references: References) -> None:
-        document = document_of(PEG)
-        steps = sensing_steps(document)
-        first, second = site.service().start(), site.service().start()
-        story = Story(site, references, document, offload=QUICK)
-        # Nobody takes the place of one that is not there yet but the local service.
-        story.at("begin", 0, story.seen(first), story.seen(second))
-        story.at("sense", steps[1], first.stop)
-        story.at("perform", steps[3], first.resume)
-        robot = story.run(first, second)
-        assert robot.statuses() == []
-        assert second.endpoint in services_in_order(robot)
