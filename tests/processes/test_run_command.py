@@ -8,13 +8,12 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
 from tests.ports import free_port
-from tests.processes.faults import COMMAND, holdfast, rows_of, summary_of
+from tests.processes.faults import COMMAND, holdfast, rows_of, summary_of, wait_until
 
 from holdfast.recording.machine import machines
 from holdfast.source_digest import core_version
@@ -93,14 +92,6 @@ def workplace(tmp_path: Path) -> Path:
     (tmp_path / "held.yaml").write_text(HELD_CONFIGURATION)
     (tmp_path / "held_problem.py").write_text(HELD.replace("FREELY", str(FREELY)))
     return tmp_path
-
-
-def wait_until(condition: Callable[[], bool], what: str) -> None:
-    """Wait for something that other processes do; generous, because machines can be busy."""
-    deadline = time.monotonic() + 60.0
-    while not condition():
-        assert time.monotonic() < deadline, f"waited in vain for {what}"
-        time.sleep(0.02)
 
 
 class HeldRun:

@@ -33,7 +33,6 @@ from holdfast.protocol.events import (
 )
 from holdfast.protocol.messages import (
     PROTOCOL_VERSION,
-    NeedState,
     Progress,
     Refused,
     Reply,
@@ -260,21 +259,6 @@ def resident_kb(pid: int) -> int:
 
 
 class TestServing:
-    def test_decides_as_the_planner_does(self) -> None:
-        with served(*ANYWHERE) as service:
-            assert service.ready_line.startswith(
-                "cloud_active_sensing is listening on tcp/127.0.0.1:"
-            )
-            with robots_end(service.endpoint, name="cloud_active_sensing") as end:
-                end.appeared()
-                run_turns(end, Robot("peg_in_hole_2d"), 4)
-                assert isinstance(end.ask(with_checksum(b"rubbish"))[0], Refused)
-                run_turns(end, Robot("peg_in_hole_3d", key=2), 3)
-            code, log = service.end()
-        assert code == 0
-        assert "stopping" in log
-        assert "Traceback" not in log
-
     def test_a_large_message_that_is_no_request_disturbs_nobody(self) -> None:
         hostile = with_checksum(
             b"\xdd" + (10**7).to_bytes(4, "big") + bytes([PROTOCOL_VERSION]) + b"\x90" * 10**7
@@ -296,38 +280,6 @@ class TestServing:
             # As lists of lists these would be 640 MB; the message itself comes in parts.
             assert resident_kb(service.process.pid) - size_kb < 100_000
             run_turns(end, Robot(key=3), 1)
-
-    def test_restarted_after_a_kill_on_the_same_port(self) -> None:
-        robot = Robot()
-        with served(*ANYWHERE) as service, robots_end(service.endpoint) as end:
-            incarnation = end.appeared()
-            run_turns(end, robot, 2)
-            service.end(signal.SIGKILL)
-            assert end.events.get(timeout=PATIENCE_S) == ServiceVanished("service", incarnation)
-            with served("--listen", service.endpoint):
-                assert end.appeared() != incarnation
-                request = robot.request(session_configuration=False)
-                assert end.ask(encode(request)) == [NeedState(request.number, differs=False)]
-                assert content(end.ask(encode(robot.restore()))) == robot.right_answer()
-
-    def test_killed_while_it_computes(self, tmp_path: Path) -> None:
-        robot = robot_of_busy(tmp_path)
-        with (
-            served(*ANYWHERE, "--problem", "busy_problem:Busy", directory=tmp_path) as service,
-            robots_end(service.endpoint) as end,
-        ):
-            end.appeared()
-            end.send(encode(robot.request()))
-            # Signs of progress come, although the problem keeps the interpreter to itself.
-            for _ in range(3):
-                event = end.events.get(timeout=PATIENCE_S)
-                assert isinstance(event, ReplyReceived)
-                assert isinstance(decode_reply(event.payload), Progress)
-            service.end(signal.SIGKILL)
-            ended = [end.events.get(timeout=PATIENCE_S) for _ in range(2)]
-            while isinstance(ended[0], ReplyReceived):
-                ended = [ended[1], end.events.get(timeout=PATIENCE_S)]
-            assert {type(event) for event in ended} == {ServiceVanished, CallEnded}
 
     def test_stops_in_order_while_it_computes(self, tmp_path: Path) -> None:
         robot = robot_of_busy(tmp_path)
