@@ -48,6 +48,9 @@ __all__ = ["Verification"]
 MAX_OPEN_CHECKS = 64
 """Bound on the questions that wait for the own planner; further ones are left out and counted."""
 
+_Difference: TypeAlias = tuple[int, str, str]
+"""Step of the first action that differs, the service's action, and the own planner's."""
+
 
 class Verification:
     """Takes answers, has some recomputed and finds the service that was wrong.
@@ -307,10 +310,6 @@ def _use(question: Question, own: OwnAnswer) -> None:
         digest = own.ahead_digest[:DIGEST_SIZE]
         question.sensing = SensingAnswer(0, question.sensing_step, own.sensing_action, digest, 0)
         question.sensing_provenance = provenance
-
-
-_Difference: TypeAlias = tuple[int, str, str]
-"""Step of the first action that differs, the service's action, and the own planner's."""
 
 
 def _sensing_differs(question: Question, own: OwnAnswer) -> _Difference | None:
