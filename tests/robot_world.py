@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import heapq
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -211,8 +210,6 @@ class World:
         self.launchable = True
         self.launch_s = 0.2
         recovery = RecoverySettings(launch=launch)  # type: ignore[arg-type]
-        problem = copy.copy(PROBLEM)
-        problem.execute = lambda actions: self.limited(actions)  # type: ignore[method-assign]
         dispatcher = Dispatcher(
             services,
             LOCAL,
@@ -221,11 +218,10 @@ class World:
             b"s" * 16,
             1,
             OPENING,
-            problem,
+            PROBLEM,
             b"secret",
             distrusted,
         )
-        self.limited = PROBLEM.execute
         self.own_s = 0.005
         self.own = self.decide
         self.verified: list[VerificationNoted] = []

@@ -136,10 +136,6 @@ class IllegalTransitionError(RuntimeError):
     """An event that cannot occur in this status: a defect of the caller."""
 
 
-class OwnDecisionError(HoldfastError):
-    """Answers disagree, and the robot's own planner cannot decide between them."""
-
-
 class LostJournalError(OutputError):
     """The journal was removed or replaced while it was open."""
 

@@ -234,6 +234,7 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     epochs = list(sessions._epochs)
     assert len(epochs) == sessions._epochs._count <= max(4 * limits["max_sessions"], 4096)
     assert not set(epochs) & set(sessions._sessions)
+    assert sessions._num_unserved == sum(not session.served for session in kept)
     # Owners.
     owners = {session.owner for session in kept}
     assert set(sessions._holdings) == owners
@@ -241,7 +242,6 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
         theirs = [session for session in kept if session.owner == owner]
         holding = sessions._holdings[owner]
         assert holding.sessions == len(theirs)
-        assert holding.unserved == sum(not session.served for session in theirs)
         assert holding.state_bytes == sum(session.num_bytes for session in theirs)
         assert holding.configuration_bytes == sum(len(session.configuration) for session in theirs)
         if owner is not None and limits["max_sessions_per_robot"] is not None:

@@ -47,4 +47,4 @@ class LyingPeg(PegInHole2D):
 
 
 def _is_verifying() -> bool:
-    return threading.current_thread().name == "holdfast-own-decisions"
+    return threading.current_thread().name.startswith("holdfast-answer-check")

@@ -289,11 +289,11 @@ _defect(
     ),
     Edit(
         Question,
-        "read_sensing",
+        "check_sensing",
         "if self.task_count == 0 and reply.digest != self.digest:",
         "if False:",
     ),
-    Edit(Question, "read_sensing", "if reply.step != self.sensing_step:", "if False:"),
+    Edit(Question, "check_sensing", "if reply.step != self.sensing_step:", "if False:"),
     Edit(
         Robot,
         "_next_sensing",

@@ -32,8 +32,8 @@ class GatedPlanner(Planner):
         return super().decide(state, max_actions)
 
 
-def question(number: int, state: PlanningState, *, urgent: bool = False) -> ComputeOwnAnswer:
-    return ComputeOwnAnswer(number, state, urgent, again=False)
+def question(number: int, state: PlanningState, *, again: bool = False) -> ComputeOwnAnswer:
+    return ComputeOwnAnswer(number, state, again)
 
 
 def checker() -> tuple[AnswerChecker, GatedPlanner, asyncio.Queue[OwnAnswer | BaseException]]:
@@ -52,17 +52,17 @@ async def next_of(come: asyncio.Queue[OwnAnswer | BaseException]) -> OwnAnswer:
     return answer
 
 
-async def test_urgent_questions_come_first_and_once() -> None:
+async def test_what_is_asked_again_comes_first() -> None:
     checks, planner, answers = checker()
     state = planner.init(3, 0)
     checks.ask(question(0, state))
     assert planner.begun.acquire(timeout=PATIENCE_S)
     for number in (1, 2):
         checks.ask(question(number, state))
-    checks.ask(question(2, state, urgent=True))
-    for _ in range(3):
+    checks.ask(question(3, state, again=True))
+    for _ in range(4):
         planner.may.release()
-    assert [(await next_of(answers)).number for _ in range(3)] == [0, 2, 1]
+    assert [(await next_of(answers)).number for _ in range(4)] == [0, 3, 1, 2]
     checks.close(PATIENCE_S)
     assert answers.empty()
 

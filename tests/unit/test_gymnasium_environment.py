@@ -17,7 +17,7 @@ import holdfast as hf
 from holdfast.config.loader import load
 from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import MoveResult
-from holdfast.robot.environment import CountingEnvironment, MissingReadings, RememberingEnvironment
+from holdfast.robot.environment import Environment, MissingReadings
 from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
 
@@ -69,8 +69,7 @@ def counter(environment: Counter | None = None, **arguments: Any) -> GymnasiumEn
 class TestAnEpisode:
     def test_it_is_an_environment_that_counts_and_remembers(self) -> None:
         environment = car()
-        assert isinstance(environment, CountingEnvironment)
-        assert isinstance(environment, RememberingEnvironment)
+        assert isinstance(environment, Environment)
         first = environment.perform(RIGHT)
         assert environment.last_move() == first
         assert environment.steps_performed() == 1

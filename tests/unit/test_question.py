@@ -14,7 +14,6 @@ from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.messages import MAX_TASK_ACTIONS, SensingAnswer, TaskAnswer, encode_floats
 from holdfast.protocol.question import (
-    AnswerPart,
     DecisionSource,
     InProcessSource,
     Question,
@@ -42,7 +41,6 @@ def test_the_answer_ends_with_the_next_sensing_action(
     asked: Question, task_count: int, sensing_step: int | None
 ) -> None:
     assert (asked.task_count, asked.sensing_step) == (task_count, sensing_step)
-    assert asked.is_open
     assert not asked.complete
 
 
@@ -53,37 +51,31 @@ def test_it_is_complete_with_both_parts() -> None:
     other = question(sensed=True)
     other.task_actions, other.sensing = asked.task_actions, SensingAnswer(1, 3, 0, asked.digest, 0)
     assert other.complete
-    assert not other.is_open
 
 
 def test_replies_that_cannot_answer_it_are_refused() -> None:
     asked = question(sensed=True)
     actions = encode_floats(np.ones((3, 3)))
-    part = asked.read_tasks(TaskAnswer(1, 3, actions, 0), 3, "cloud")
-    assert part.kind == "task"
+    assert same_actions(asked.read_tasks(TaskAnswer(1, 3, actions, 0), 3), [np.ones(3)] * 3)
     with pytest.raises(MessageError, match="2 task actions where 3 were asked"):
-        asked.read_tasks(TaskAnswer(1, 2, actions, 0), 3, "cloud")
+        asked.read_tasks(TaskAnswer(1, 2, actions, 0), 3)
     with pytest.raises(MessageError, match="72 bytes are not"):
-        asked.read_tasks(TaskAnswer(1, 3, actions, 0), 2, "cloud")
+        asked.read_tasks(TaskAnswer(1, 3, actions, 0), 2)
     for step, action, digest, says in (
         (6, 0, asked.digest, "for step 6 where 3 was asked"),
         (3, 9, asked.digest, "there is no sensing action 9"),
     ):
         with pytest.raises(MessageError, match=says):
-            asked.read_sensing(SensingAnswer(1, step, action, digest, 0), 3, "cloud")
+            asked.check_sensing(SensingAnswer(1, step, action, digest, 0), 3)
     now = question()
     with pytest.raises(MessageError, match="for another state"):
-        now.read_sensing(SensingAnswer(1, 0, 0, b"\0" * 16, 0), 3, "cloud")
+        now.check_sensing(SensingAnswer(1, 0, 0, b"\0" * 16, 0), 3)
 
 
-def test_parts_agree_bit_for_bit() -> None:
-    zero, minus_zero = AnswerPart("a", [np.zeros(1)], None), AnswerPart("b", [-np.zeros(1)], None)
-    assert zero.agrees_with(AnswerPart("b", [np.zeros(1)], None))
-    assert not zero.agrees_with(minus_zero)
+def test_actions_are_the_same_bit_for_bit() -> None:
+    assert same_actions([np.zeros(1)], [np.zeros(1)])
+    assert not same_actions([np.zeros(1)], [-np.zeros(1)])
     assert not same_actions([np.zeros(1)], [])
-    first = AnswerPart("a", None, SensingAnswer(1, 0, 2, b"d" * 16, 5))
-    assert first.agrees_with(AnswerPart("b", None, SensingAnswer(7, 0, 2, b"d" * 16, 9)))
-    assert not first.agrees_with(AnswerPart("b", None, SensingAnswer(1, 0, 2, b"e" * 16, 5)))
 
 
 def test_its_checkpoint_is_the_state() -> None:

@@ -314,7 +314,7 @@ class TestTheTable:
         for _ in range(2):
             table.mark_served(first)
         assert (first.served, second.served) == (True, False)
-        assert table._total.unserved == 1
+        assert table._num_unserved == 1
 
     def test_when_there_is_room(self) -> None:
         sessions = [session_of(number) for number in range(4)]

@@ -14,7 +14,7 @@ from holdfast.lab.testbed.world import (
     performances,
 )
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.robot.environment import CountingEnvironment, SimulatedEnvironment
+from holdfast.robot.environment import SimulatedEnvironment
 
 ACTIONS = [np.array([-0.1 * step, 0.2, 1.0 / 3.0]) for step in range(5)]
 
@@ -33,7 +33,6 @@ def perform(path: Path, trial: int, actions: list[np.ndarray], *, resumed: bool 
 def test_it_is_the_simulated_world(tmp_path: Path) -> None:
     simulated = SimulatedEnvironment(PegInHole2D(), seed=3, trial=1)
     witnessed = world(tmp_path / "performed.txt", trial=1)
-    assert isinstance(witnessed, CountingEnvironment)
     for action in ACTIONS:
         assert witnessed.perform_sensing(1) == simulated.perform_sensing(1)
         assert witnessed.perform(action) == simulated.perform(action)

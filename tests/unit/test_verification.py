@@ -7,10 +7,11 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 import pytest
-from tests.robot_world import LOCAL, PROBLEM, World
+from tests.robot_world import LOCAL, PLANNING, PROBLEM, World
 
 from holdfast.arrays import FloatArray
-from holdfast.errors import OwnDecisionError, ServiceRefusedError
+from holdfast.errors import ProblemError, ServiceRefusedError
+from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.events import (
     Act,
@@ -29,8 +30,10 @@ from holdfast.protocol.messages import (
     decode_floats,
     encode_floats,
 )
-from holdfast.protocol.question import AnswerPart, Provenance, Question
+from holdfast.protocol.question import Provenance, Question, same_actions
 from holdfast.protocol.verification import MAX_OPEN_CHECKS, Verification
+
+PLANNER = Planner(PROBLEM, PLANNING)
 
 
 def lie(world: World, name: str, change: Callable[[Reply], Reply], after: int = 0) -> None:
@@ -86,14 +89,18 @@ def test_an_action_outside_the_limits_is_never_performed() -> None:
     world.start()
     world.run()
     world.assert_same_as_without_faults()
-    assert wrong(world) == [("cloud", "task")]
-    reason = str(world.reports("disagreement")[0]["reason"])
-    assert "outside the limits of the problem's execute" in reason
+    (found,) = world.reports("wrong_answer")
+    step = found["step"]
+    acts = [e for _, e in world.trace if isinstance(e, Act) and e.step == step]
+    own = acts[0].action.tolist()
+    assert (found["service"], found["kind"]) == ("cloud", "task")
+    assert found["own"] == str(tuple(own))
+    assert found["answered"] == str(tuple(77.7 * each for each in own))
     assert world.statuses() == ["local_recovery"]
-    assert verdicts(world) == [("cloud", "task", "different"), ("cloud", "sensing", "same")]
+    assert verdicts(world) == [("cloud", "task", "different")]
     assert not world.reports("limits_unknown")
-    # Impossible as it is, the planner need not be asked twice.
-    assert len([e for _, e in world.trace if isinstance(e, ComputeOwnAnswer)]) == 1
+    # Nothing waits for the thread of the own planner.
+    assert not [e for _, e in world.trace if isinstance(e, ComputeOwnAnswer)]
 
 
 def test_a_wrong_answer_does_not_end_the_recovery() -> None:
@@ -112,29 +119,6 @@ def test_a_wrong_answer_does_not_end_the_recovery() -> None:
     assert wrong(world) == [("cloud", "task")]
     assert world.statuses() == ["local_recovery"]
     assert sum(result.recoveries for result in world.results) == 1
-
-
-def test_where_two_answers_differ_the_robot_decides() -> None:
-    # The first is so slow once that the second is asked as well; that one lies, and is the sooner.
-    world = World(services=("first", "second"), verify_share=0.0)
-    first = world.services["first"]
-    lie(world, "second", other_actions(0.5))
-    honest = first.answer
-
-    def answer(payload: bytes) -> list[Reply]:
-        first.latency_s = 0.2535 if len(first.requests) == 1 else 0.001
-        return honest(payload)
-
-    first.answer = answer  # type: ignore[method-assign]
-    world.start()
-    world.run()
-    assert world.stopped is None
-    assert [each["kind"] for each in world.reports("disagreement")] == ["task"]
-    assert wrong(world) == [("second", "task")]
-    assert ("first", "task", "same") in verdicts(world)
-    assert ("second", "task", "different") in verdicts(world)
-    found_at = next(at for at, e in world.trace if is_report(e, "wrong_answer"))
-    assert {sent.service for sent in world.sent if sent.at > found_at} == {"first"}
 
 
 @pytest.mark.parametrize(
@@ -179,7 +163,7 @@ def test_the_share_is_kept_and_no_service_can_tell_which() -> None:
     drawn: dict[bytes, list[bool]] = {}
     for secret in (b"one", b"other"):
         effects: Effects[RobotEffect] = Effects()
-        verification = Verification(0.25, secret, None, PROBLEM, effects)
+        verification = Verification(0.25, secret, None, PLANNER, effects)
         drawn[secret] = []
         for number in range(2000):
             question = question_of(number)
@@ -197,20 +181,21 @@ def test_the_share_is_kept_and_no_service_can_tell_which() -> None:
 
 
 def question_of(number: int) -> Question:
-    world = World()
-    state = world.planner.init(number, 0)
-    return Question(world.planner, state, number.to_bytes(16, "big"), (), 0)
+    state = PLANNER.init(number, 0)
+    return Question(PLANNER, state, number.to_bytes(16, "big"), (), 0)
 
 
-def answer(verification: Verification, question: Question) -> None:
-    """Let a service choose the first sensing action."""
-    reply = SensingAnswer(1, question.state.step, 0, question.digest, 0)
-    verification.take(question, AnswerPart("cloud", None, reply), Provenance("cloud", 0.0, 0.0))
+def answer(
+    verification: Verification, question: Question, service: str = "cloud", action: int = 0
+) -> None:
+    """Let a service choose a sensing action."""
+    reply = SensingAnswer(1, question.state.step, action, question.digest, 0)
+    verification.take_sensing(question, reply, Provenance(service, 0.0, 0.0))
 
 
 def test_what_a_robot_cannot_keep_up_with_is_left_out_and_counted() -> None:
     effects: Effects[RobotEffect] = Effects()
-    verification = Verification(1.0, b"secret", None, PROBLEM, effects)
+    verification = Verification(1.0, b"secret", None, PLANNER, effects)
     for number in range(MAX_OPEN_CHECKS + 7):
         answer(verification, question_of(number))
     assert len(verification) == MAX_OPEN_CHECKS
@@ -257,59 +242,6 @@ def test_a_problem_that_is_not_deterministic_is_blamed_itself() -> None:
     assert "not_deterministic" in {verdict for _, _, verdict in verdicts(world)}
 
 
-def test_limits_that_change_what_they_let_through_tell_nothing() -> None:
-    # A gear, say: what is executed is half of what is commanded.
-    world = World(verify_share=0.0)
-    world.limited = lambda actions: 0.5 * actions
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
-    # It was looked at once; the service was right.
-    assert [each for each in verdicts(world) if each[1] == "task"] == [("cloud", "task", "same")]
-    assert len(world.reports("disagreement")) == len(world.reports("limits_unknown")) == 1
-    assert not wrong(world)
-
-
-def test_where_limits_tell_nothing_each_action_is_compared_before_it_is_performed() -> None:
-    world = World(verify_share=0.0)
-    world.limited = lambda actions: 0.5 * actions
-    lie(world, "cloud", other_actions(77.7), after=3)
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
-    assert wrong(world) == [("cloud", "task")]
-
-
-def test_the_robot_holds_still_if_its_own_planner_cannot_settle_it() -> None:
-    world = World(verify_share=0.0)
-    lie(world, "cloud", other_actions(77.7), after=1)
-    world.own = lambda effect: OwnAnswer(effect.number, failure="ValueError: no such state")
-    world.start()
-    world.run()
-    assert isinstance(world.stopped, Halt)
-    assert isinstance(world.stopped.error, OwnDecisionError)
-    assert "no such state" in str(world.stopped.error)
-    assert all(
-        np.array_equal(e.action, PROBLEM.execute(e.action))
-        for _, e in world.trace
-        if isinstance(e, Act)
-    )
-
-
-def test_a_planner_that_hangs_is_waited_for_no_longer_than_a_decision() -> None:
-    world = World(verify_share=0.0)
-    lie(world, "cloud", other_actions(77.7), after=1)
-    world.own_s = 1e6
-    world.start()
-    world.run(until_s=200.0)
-    assert isinstance(world.stopped, Halt)
-    assert isinstance(world.stopped.error, OwnDecisionError)
-    assert "offload.decision_timeout_ms" in str(world.stopped.error)
-    assert 59.0 < world.now < 62.0
-    (held,) = world.reports("holding")
-    assert held["reason"] == "the robot's own planner decides"
-
-
 def test_a_planner_that_fails_the_second_time_acquits_nobody() -> None:
     world = World(verify_share=1.0)
     lie(world, "cloud", other_actions(0.5), after=1)
@@ -353,34 +285,6 @@ def test_who_was_wrong_before_the_robot_was_resumed_is_not_asked() -> None:
     assert [each["service"] for each in world.reports("distrusted")] == ["first"]
 
 
-def test_until_the_planner_has_decided_twice_the_suspect_is_not_followed_blindly() -> None:
-    # Two answers of the liar come while the planner is asked the second time.
-    world = World(verify_share=1.0)
-    lie(world, "cloud", other_actions(0.5), after=1)
-    honest = world.own
-    seconds: list[float] = []
-
-    def own(effect: ComputeOwnAnswer) -> OwnAnswer:
-        if effect.again:
-            seconds.append(world.now)
-            world.own_s = 0.2
-        else:
-            world.own_s = 0.001
-        return honest(effect)
-
-    world.own = own
-    world.start()
-    world.run()
-    assert world.stopped is None
-    found_at = next(at for at, e in world.trace if is_report(e, "wrong_answer"))
-    acts = [
-        e.action for at, e in world.trace if isinstance(e, Act) and seconds[0] <= at <= found_at
-    ]
-    assert len(acts) > 4
-    # What is performed meanwhile is as long as the robot's own planner makes it.
-    assert all(np.array_equal(action, PROBLEM.execute(2.0 * action)) for action in acts[1:])
-
-
 def test_a_failed_verification_is_told_and_stops_nobody() -> None:
     world = World(verify_share=1.0)
     world.own = lambda effect: OwnAnswer(effect.number, failure="MemoryError")
@@ -413,25 +317,7 @@ def test_without_a_local_service_the_robot_stops_when_all_have_lied() -> None:
 
 
 def test_two_services_that_give_the_same_wrong_answer_are_both_found_out() -> None:
-    """They agree, so nothing is disputed; the robot's own planner says otherwise."""
-    effects: Effects[RobotEffect] = Effects()
-    verification = Verification(1.0, b"secret", None, PROBLEM, effects)
-    question = question_of(3)
-    for service in ("first", "second", "first"):
-        reply = SensingAnswer(1, question.state.step, 0, question.digest, 0)
-        part = AnswerPart(service, None, reply)
-        verification.take(question, part, Provenance(service, 0.0, 0.0))
-    assert [part.service for part in question.parts] == ["first", "second"]
-    assert not question.disputed
-    while asked := [each for each in effects.take() if isinstance(each, ComputeOwnAnswer)]:
-        for each in asked:
-            verification.decided(OwnAnswer(each.number, (), 1, question.digest), None)
-    wrong = [(each.service, each.step, each.kind) for each in verification.take_wrong()]
-    assert wrong == [("first", 0, "sensing"), ("second", 0, "sensing")]
-    assert verification.take_wrong() == []
-
-
-def test_a_second_liar_that_agrees_with_the_first_is_found_out_in_a_run() -> None:
+    """They agree; the robot's own planner says otherwise, of each when the robot follows it."""
     world = World(services=("first", "second"), verify_share=1.0)
     for name in ("first", "second"):
         lie(world, name, other_sensing)
@@ -442,61 +328,82 @@ def test_a_second_liar_that_agrees_with_the_first_is_found_out_in_a_run() -> Non
     assert world.statuses()[-1] == "local_recovery"
 
 
-def choice(service: str, question: Question, sensing_action: int) -> AnswerPart:
-    reply = SensingAnswer(1, question.state.step, sensing_action, question.digest, 0)
-    return AnswerPart(service, None, reply)
+def asked_of(effects: Effects[RobotEffect]) -> list[ComputeOwnAnswer]:
+    return [each for each in effects.take() if isinstance(each, ComputeOwnAnswer)]
 
 
-def test_of_many_answers_that_differ_it_is_said_and_asked_once() -> None:
+def test_of_two_answers_the_first_is_followed_and_computed_again() -> None:
     effects: Effects[RobotEffect] = Effects()
-    verification = Verification(0.0, b"secret", None, PROBLEM, effects)
+    verification = Verification(0.0, b"secret", None, PLANNER, effects)
     question = question_of(3)
-    for number, service in enumerate(("first", "second", "third", "fourth")):
-        part = choice(service, question, number % 3)
-        verification.take(question, part, Provenance(service, 0.0, 0.0))
-        assert question.disputed == (number > 0)
-    taken = effects.take()
-    assert [type(each) for each in taken if isinstance(each, LogEvent)] == [LogEvent]
-    (asked,) = [each for each in taken if isinstance(each, ComputeOwnAnswer)]
-    assert asked.urgent
-    verification.decided(OwnAnswer(asked.number, (), 1, question.digest), question)
-    assert not question.disputed
+    for service, action in (("first", 0), ("second", 0)):
+        answer(verification, question, service, action)
+    assert not effects
+    for service, action in (("third", 1), ("fourth", 2)):
+        answer(verification, question, service, action)
+    assert question.sensing is not None
+    assert question.sensing.sensing_action == 0
+    # Of many it is said and asked once.
+    (told,) = [each for each in effects if isinstance(each, LogEvent)]
+    assert (told.name, told.fields["service"], told.fields["kind"]) == (
+        "disagreement",
+        "third",
+        "sensing",
+    )
+    (asked,) = asked_of(effects)
+    own = OwnAnswer(asked.number, (), 1, question.digest)
+    assert verification.decided(own, question)
+    # The robot's own stands, also before it is certain who was wrong.
+    assert question.sensing.sensing_action == 1
+    assert not verification.take_wrong()
+    (again,) = asked_of(effects)
+    assert again.again
+    assert verification.decided(own._replace(number=again.number), question)
+    (wrong,) = verification.take_wrong()
+    state = question.digest.hex()
+    assert wrong == ("first", "sensing", 0, f"0 in state {state}", f"1 in state {state}")
+    assert not verification.take_wrong()
+
+
+def test_a_sensing_action_for_another_state_is_wrong() -> None:
+    effects: Effects[RobotEffect] = Effects()
+    verification = Verification(1.0, b"secret", None, PLANNER, effects)
+    question = question_of(3)
+    answer(verification, question)
+    elsewhere = b"elsewhere" * 4
+    for _ in range(2):
+        (asked,) = asked_of(effects)
+        verification.decided(OwnAnswer(asked.number, (), 0, elsewhere), None)
+    (wrong,) = verification.take_wrong()
+    assert wrong.own == f"0 in state {elsewhere[:16].hex()}"
+
+
+def test_a_part_that_comes_after_the_own_answer_is_compared_as_well() -> None:
+    effects: Effects[RobotEffect] = Effects()
+    verification = Verification(1.0, b"secret", None, PLANNER, effects)
+    question = tasks_of(PLANNER)
+    actions, ahead = PLANNER.plan_until_sensing(question.state, question.task_count)
+    verification.take_tasks(question, actions, Provenance("cloud", 0.0, 0.0))
+    (asked,) = asked_of(effects)
+    own = OwnAnswer(asked.number, tuple(actions), 1, PLANNER.digest(ahead))
+    assert verification.decided(own, question)
+    assert not asked_of(effects)
+    reply = SensingAnswer(1, 3, 0, PLANNER.digest(ahead)[:16], 0)
+    verification.take_sensing(question, reply, Provenance("cloud", 0.0, 0.0))
     assert question.sensing is not None
     assert question.sensing.sensing_action == 1
-    # Once it has decided, what still comes is compared, and disputes nothing.
-    verification.take(question, choice("fifth", question, 2), Provenance("fifth", 0.0, 0.0))
-    assert not question.disputed
-    assert question.sensing.sensing_action == 1
+    (asked,) = asked_of(effects)
+    assert asked.again
+    verification.decided(OwnAnswer(asked.number, failure="MemoryError"), question)
+    assert [each.kind for each in verification.take_wrong()] == ["sensing"]
 
 
-def test_one_service_that_answers_in_two_ways_is_wrong_in_one() -> None:
-    effects: Effects[RobotEffect] = Effects()
-    verification = Verification(0.0, b"secret", None, PROBLEM, effects)
-    question = question_of(3)
-    for action in (1, 0, 1):
-        verification.take(question, choice("cloud", question, action), Provenance("cloud", 0, 0))
-    assert question.disputed
-    while asked := [each for each in effects.take() if isinstance(each, ComputeOwnAnswer)]:
-        for each in asked:
-            verification.decided(OwnAnswer(each.number, (), 1, question.digest), None)
-    assert [each.service for each in verification.take_wrong()] == ["cloud"]
-
-
-def test_the_robots_own_service_is_not_sampled_but_a_suspect_is_disputed() -> None:
-    effects: Effects[RobotEffect] = Effects()
-    verification = Verification(1.0, b"secret", "local", PROBLEM, effects)
+def test_the_robots_own_service_is_not_sampled() -> None:
+    verification = Verification(1.0, b"secret", "local", PLANNER, Effects[RobotEffect]())
     for service, sampled in (("local", False), ("cloud", True)):
         question = question_of(3)
-        verification.take(question, choice(service, question, 0), Provenance(service, 0.0, 0.0))
+        answer(verification, question, service)
         assert question.check_decided == sampled
-    (asked,) = [each for each in effects.take() if isinstance(each, ComputeOwnAnswer)]
-    verification.decided(OwnAnswer(asked.number, (), 1, question.digest), None)
-    suspected = question_of(4)
-    verification.take(suspected, choice("cloud", suspected, 0), Provenance("cloud", 0.0, 0.0))
-    assert suspected.disputed
-    trusted = question_of(5)
-    verification.take(trusted, choice("local", trusted, 0), Provenance("local", 0.0, 0.0))
-    assert not trusted.disputed
 
 
 def test_a_rounding_error_is_no_excess() -> None:
@@ -507,7 +414,8 @@ def test_a_rounding_error_is_no_excess() -> None:
             return np.full_like(actions, self.limit)
 
     problem = Clipped()
-    verification = Verification(0.0, b"", None, problem, Effects[RobotEffect]())
+    planner = Planner(problem, PLANNING)
+    verification = Verification(0.0, b"", None, planner, Effects[RobotEffect]())
     for limit, slack in ((0.0, 1e-9), (1e6, 0.95e-3)):
         problem.limit = limit
         assert verification.outside_limits(np.full((2, 3), limit + slack)) is None
@@ -518,20 +426,51 @@ def test_a_rounding_error_is_no_excess() -> None:
         assert told.startswith("task action (")
 
 
-def test_the_robot_follows_the_first_of_each_part_and_keeps_a_bounded_number() -> None:
-    verification = Verification(0.0, b"secret", None, PROBLEM, Effects[RobotEffect]())
-    question = question_of(3)
-    step = PROBLEM.execute(np.full(3, 1e-3))
-    for number in range(70):
-        service = f"service {number}"
-        provenance = Provenance(service, 0.0, 0.0)
-        verification.take(question, choice(service, question, number % 2), provenance)
-        actions = [step * (0.5 if number else 1.0)]
-        verification.take(question, AnswerPart(service, actions, None), provenance)
-    assert question.sensing is not None
-    assert question.sensing.sensing_action == 0
+class Geared(PegInHole2D):
+    """What is executed is half of what is commanded."""
+
+    def execute(self, actions: FloatArray) -> FloatArray:
+        return np.asarray(0.5 * super().execute(actions))
+
+
+def tasks_of(planner: Planner) -> Question:
+    """Return a question for task actions."""
+    state = planner.init(3)._replace(sensed=True)
+    return Question(planner, state, planner.digest(state), (), 1)
+
+
+def test_limits_that_change_what_they_let_through_are_replaced_by_the_own_planner() -> None:
+    planner = Planner(Geared(), PLANNING)
+    effects: Effects[RobotEffect] = Effects()
+    verification = Verification(0.0, b"", None, planner, effects)
+    honest = tasks_of(planner)
+    own, _ = planner.plan_until_sensing(honest.state, honest.task_count)
+    for question in (honest, tasks_of(planner)):
+        verification.take_tasks(question, own, Provenance("cloud", 0.0, 0.0))
+        assert question.followed() == [("task", "cloud")]
+    # It is said once.
+    (told,) = [each for each in effects.take() if isinstance(each, LogEvent)]
+    assert told.name == "limits_unknown"
+    question = tasks_of(planner)
+    verification.take_tasks(question, [77.7 * each for each in own], Provenance("cloud", 0.0, 0.0))
+    assert question.followed() == [("task", "in_process")]
     assert question.task_actions is not None
-    assert np.array_equal(question.task_actions[0], step)
-    assert question.sensing_provenance == question.task_provenance
-    assert question.task_provenance == Provenance("service 0", 0.0, 0.0)
-    assert len(question.parts) == 64
+    assert same_actions(question.task_actions, own)
+    assert [(each.service, each.step) for each in verification.take_wrong()] == [("cloud", 0)]
+
+
+def test_the_robot_stops_if_its_own_planner_cannot_replace_an_action(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World(verify_share=0.0)
+    lie(world, "cloud", other_actions(77.7), after=1)
+
+    def fails(*_: object) -> None:
+        raise ProblemError("no such state")
+
+    monkeypatch.setattr(Planner, "plan_until_sensing", fails)
+    world.start()
+    world.run()
+    assert isinstance(world.stopped, Halt)
+    assert str(world.stopped.error) == "no such state"
+    assert not [e for _, e in world.trace if isinstance(e, Act)]

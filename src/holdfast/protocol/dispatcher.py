@@ -16,7 +16,8 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 from holdfast.config.settings import OffloadSettings, RecoverySettings
-from holdfast.errors import OwnDecisionError, ServiceRefusedError, StaleEpochError
+from holdfast.errors import HoldfastError, ServiceRefusedError
+from holdfast.planning import Planner
 from holdfast.problems.problem import Problem
 from holdfast.protocol.events import (
     CallEnded,
@@ -93,15 +94,16 @@ class Dispatcher(DecisionSource):
             1e-3 * offload.startup_timeout_ms,
             distrusted,
         )
+        planner = Planner(problem, session_configuration.planning)
         self._verification = Verification(
-            offload.verify_share, secret, local_service_name, problem, self.effects
+            offload.verify_share, secret, local_service_name, planner, self.effects
         )
         self._calls = OpenRequests(
             session,
             epoch,
             session_configuration,
             timeout_s,
-            problem,
+            planner,
             self._verification,
             self.effects,
         )
@@ -167,20 +169,11 @@ class Dispatcher(DecisionSource):
             self._local_exited(event, now)
         self.wake(now)
 
-    def recompute(self, *, before_acting: bool) -> None:
+    def recompute(self) -> None:
         """Have the own planner answer the question too."""
         question = self.question
-        if question is None or not question.parts:
-            return
-        if before_acting:
-            self._verification.dispute(question, question.parts[0].service)
-        else:
-            self._verification.check(question, question.parts[0].service)
-
-    @property
-    def limits_are_reliable(self) -> bool:
-        """Whether an action that the problem's ``execute`` would change must be wrong."""
-        return self._verification.limits_are_reliable
+        if question is not None:
+            self._verification.check(question)
 
     @property
     def num_unverified(self) -> int:
@@ -196,9 +189,7 @@ class Dispatcher(DecisionSource):
         if self._calls:
             due += [replica.detector.deadline() for replica in services]
             due.append(self._calls.first_sent_at() + self._limit_s)
-        if question is not None and question.disputed and question.needed_at is not None:
-            due.append(question.needed_at + self._limit_s)
-        if question is not None and question.is_open:
+        if question is not None and not question.complete:
             if not self._is_being_asked(question, self._woke_at):
                 due += [
                     self._calls.retry_at(replica, question)
@@ -271,13 +262,13 @@ class Dispatcher(DecisionSource):
         replica, question, is_first = call.replica, call.question, not call.answered
         try:
             reply = self._calls.take(call, payload, now)
-        except StaleEpochError as error:
+        except HoldfastError as error:
             self.stop(error)
             return
         self._drop_wrong_services()
         is_answer = isinstance(reply, TaskAnswer | SensingAnswer)
         if question is self.question:
-            if (is_answer or isinstance(reply, Progress)) and not question.disputed:
+            if is_answer or isinstance(reply, Progress):
                 self._end_hold(now)
             elif isinstance(reply, NeedState) and not call.has_everything:
                 # Told everything but the state, it came to another one: only the state will do.
@@ -285,13 +276,9 @@ class Dispatcher(DecisionSource):
                 self._calls.send(replica, question, now, whole_state=whole_state, is_retry=False)
         if is_answer and replica is self._services.local:
             self._launches.succeeded()
-        elif is_answer and is_first and self._ends_recovery(replica, question):
+        elif is_answer and is_first and self.tracker.is_recovering and replica.reliable:
             reason = f"{replica.name} has answered"
             self.effects.report("status", **self.tracker.change(Cause.CLOUD_ANSWERED, reason, now))
-
-    def _ends_recovery(self, replica: Replica, question: Question) -> bool:
-        """Return whether an answer does: one that is wrong, or may be, does not."""
-        return self.tracker.is_recovering and replica.reliable and not question.disputed
 
     def _ended(self, call: OpenRequest, now: float) -> None:
         self._calls.settle(call)
@@ -308,18 +295,13 @@ class Dispatcher(DecisionSource):
 
     def _decided(self, event: OwnAnswer) -> None:
         """Take the answer of the robot's own planner."""
-        try:
-            usable = self._verification.decided(event, self.question)
-        except OwnDecisionError as error:
-            self.stop(error)
-            return
-        if not usable:
+        if not self._verification.decided(event, self.question):
             # What was done cannot be undone; from where it led, a new question is asked.
             self.drop()
         self._drop_wrong_services()
 
     def _drop_wrong_services(self) -> None:
-        """Stop using services whose answers differ from the own planner's."""
+        """Ask services no longer whose answers differ from the own planner's."""
         for wrong in self._verification.take_wrong():
             replica = self._services.get(wrong.service)
             if replica is None:
@@ -333,15 +315,15 @@ class Dispatcher(DecisionSource):
                 service=replica.name,
                 step=wrong.step,
                 kind=wrong.kind,
+                answered=wrong.answered,
+                own=wrong.own,
                 reason="not what the robot's own planner decides in the same state; it is not "
                 "asked again in this run",
             )
             question = self.question
-            if question is not None and any(
-                part.service == wrong.service for part in question.parts
-            ):
+            if question is not None and wrong.service in dict(question.followed()).values():
                 # What it said last was perhaps not looked at yet.
-                self._verification.dispute(question, wrong.service)
+                self.drop()
 
     # -- deciding whom to ask --------------------------------------------------------------------
 
@@ -354,9 +336,6 @@ class Dispatcher(DecisionSource):
         self._enforce_decision_timeout(now)
         self._tend_recovery(now)
         question = self.question
-        if question is not None and question.disputed:
-            self._wait_for_own_planner(question, now)
-            return
         if question is not None:
             if question.complete:
                 self._end_hold(now)
@@ -369,20 +348,6 @@ class Dispatcher(DecisionSource):
             else:
                 self._ask_or_hold(question, now)
         self._note_lost_cloud(now)
-
-    def _wait_for_own_planner(self, question: Question, now: float) -> None:
-        self._hold(question, "the robot's own planner decides", now)
-        needed_at = question.needed_at
-        if needed_at is not None and now >= needed_at + self._limit_s:
-            state = question.state
-            self.stop(
-                OwnDecisionError(
-                    f"trial {state.trial}, step {state.step}: services answer differently, or "
-                    "outside the problem's limits, and the robot's own planner has not decided "
-                    f"when it has waited for {1e3 * self._limit_s:g} ms, which is "
-                    "offload.decision_timeout_ms"
-                )
-            )
 
     def _suspect_silent(self, now: float) -> None:
         for replica in self._services:
@@ -456,7 +421,10 @@ class Dispatcher(DecisionSource):
         if services.hopeless():
             self.stop(ServiceRefusedError(f"no service will decide: {services.why_nobody()}"))
             return
-        self._hold(question, services.why_nobody(), now)
+        if question.needed_at is not None and self.holding_since is None:
+            self.holding_since = now
+            reason = services.why_nobody()
+            self.effects.report("holding", step=question.state.step, reason=reason)
 
     def _try_others(self, question: Question, now: float) -> None:
         """Ask services that do not decide, and for a late answer a further one, the question too.
@@ -510,12 +478,6 @@ class Dispatcher(DecisionSource):
                 step=question.state.step,
                 waited_ms=1e3 * (now - needed_at),
             )
-
-    def _hold(self, question: Question, reason: str, now: float) -> None:
-        """Report why the robot holds still, if it needs the answer."""
-        if question.needed_at is not None and self.holding_since is None:
-            self.holding_since = now
-            self.effects.report("holding", step=question.state.step, reason=reason)
 
     def _end_hold(self, now: float) -> None:
         """Report that the robot need not hold still any more, if it does."""

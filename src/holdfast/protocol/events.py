@@ -260,15 +260,13 @@ class ComputeOwnAnswer(NamedTuple):
 
     Attributes
     ----------
-    urgent : bool
-        Whether the robot waits for it; it then goes first. It may repeat an earlier number.
     again : bool
-        Whether it was answered before; it is then computed with a new instance of the problem.
+        Whether it was answered before. It then goes before others, and is computed with a new
+        instance of the problem.
     """
 
     number: int
     state: PlanningState
-    urgent: bool
     again: bool
 
 

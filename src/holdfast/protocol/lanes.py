@@ -29,6 +29,7 @@ from __future__ import annotations
 
 import math
 
+from holdfast.errors import MessageError
 from holdfast.protocol.decision_cost import Cost, describe_cost
 from holdfast.protocol.messages import Request
 from holdfast.protocol.request_queue import RequestQueue
@@ -184,8 +185,20 @@ class Lanes:
         -------
         bool
             Whether there is room. (A prefetch has always room, at most one for each session.)
+
+        Raises
+        ------
+        MessageError
+            If it has used up the time of a long one.
         """
         session, limits = task.session, self._limits
+        if cost is None and task.lane == LONG:
+            raise MessageError(
+                "invalid",
+                f"a decision that has taken {self.most_s(task):.0f} s: this service expected less "
+                f"and takes at most {limits.max_decision_s:g} s (--max-decision-s). It has "
+                f"{describe_cost(None, session.planning)}",
+            )
         session.is_brief = False
         if cost is None:
             session.overran = True
@@ -223,11 +236,3 @@ class Lanes:
         for lane in self._lanes:
             for job, _ in lane.running():
                 job.cancel()
-
-    def overdue_in_words(self, task: PendingTask) -> str:
-        """Return why a task is refused after all that has used up the time of a long one."""
-        return (
-            f"a decision that has taken {self.most_s(task):.0f} s: this service expected less and "
-            f"takes at most {self._limits.max_decision_s:g} s (--max-decision-s). It has "
-            f"{describe_cost(None, task.session.planning)}"
-        )

@@ -38,11 +38,11 @@ from holdfast.protocol.status import StatusTracker
 
 __all__ = [
     "OWN_PLANNER",
-    "AnswerPart",
     "DecisionSource",
     "InProcessSource",
     "Provenance",
     "Question",
+    "WrongAnswer",
     "same_actions",
 ]
 
@@ -65,45 +65,23 @@ def same_actions(first: Sequence[FloatArray], second: Sequence[FloatArray]) -> b
     )
 
 
-class AnswerPart:
-    """One part of an answer as one service gave it.
+class WrongAnswer(NamedTuple):
+    """A service's answer that differs from the own planner's.
 
     Attributes
     ----------
-    task_actions, sensing
-        One of them is None.
-    outside_limits : bool
-        Whether the problem's ``execute`` would change the task actions.
-    judged : bool
-        Whether it was compared with the own planner's answer, or never can be.
+    kind : {"task", "sensing"}
+    step : int
+        Of the first action that differs.
+    answered, own : str
+        The service's action, and the own planner's; of sensing actions with the state's digest.
     """
 
-    def __init__(
-        self, service: str, task_actions: list[FloatArray] | None, sensing: SensingAnswer | None
-    ) -> None:
-        self.service = service
-        self.task_actions = task_actions
-        self.sensing = sensing
-        self.outside_limits = False
-        self.judged = False
-
-    @property
-    def kind(self) -> str:
-        """``task`` or ``sensing``."""
-        return "task" if self.sensing is None else "sensing"
-
-    def agrees_with(self, other: AnswerPart) -> bool:
-        """Return whether two parts of the same kind are equal."""
-        if self.sensing is not None and other.sensing is not None:
-            return (self.sensing.sensing_action, self.sensing.digest) == (
-                other.sensing.sensing_action,
-                other.sensing.digest,
-            )
-        return (
-            self.task_actions is not None
-            and other.task_actions is not None
-            and same_actions(self.task_actions, other.task_actions)
-        )
+    service: str
+    kind: str
+    step: int
+    answered: str
+    own: str
 
 
 class Question:
@@ -127,16 +105,12 @@ class Question:
         Task actions of the answer that are performed or ordered.
     task_actions, sensing
         What the robot follows; None until it arrives.
-    parts : list of AnswerPart
-        All distinct parts that services gave.
     check_decided : bool
         Whether a check by the own planner was ordered, or left out.
-    disputed : bool
-        Whether the robot must wait for the own planner.
     own : OwnAnswer or None
         The own planner's answer.
-    own_is_certain : bool or None
-        Whether the own planner, asked twice, agreed with itself; None until both have come.
+    differing : list of WrongAnswer
+        Answers that differ from it, until the own planner has decided a second time.
     """
 
     def __init__(
@@ -157,11 +131,9 @@ class Question:
         self.sensing: SensingAnswer | None = None
         self.task_provenance: Provenance | None = None
         self.sensing_provenance: Provenance | None = None
-        self.parts: list[AnswerPart] = []
         self.check_decided = False
-        self.disputed = False
         self.own: OwnAnswer | None = None
-        self.own_is_certain: bool | None = None
+        self.differing: list[WrongAnswer] = []
         self._checkpoint: bytes | None = None
         self.sensing_step: int | None
         if planner.needs_sensing(state):
@@ -189,18 +161,18 @@ class Question:
         """Whether its trial has only begun, so that a service needs nothing to reach its state."""
         return self.state.step == 0 and self.num_inputs == 0
 
+    def followed(self) -> list[tuple[str, str]]:
+        """Return the kind and the service of each part of the answer that the robot follows."""
+        parts = ("task", self.task_provenance), ("sensing", self.sensing_provenance)
+        return [(kind, given.service) for kind, given in parts if given is not None]
+
     def checkpoint(self) -> bytes:
         """Return the encoded state (computed once)."""
         if self._checkpoint is None:
             self._checkpoint = encode_checkpoint(self.state)
         return self._checkpoint
 
-    @property
-    def is_open(self) -> bool:
-        """Whether services are to be asked: the answer is incomplete and not disputed."""
-        return not self.disputed and not self.complete
-
-    def read_tasks(self, reply: TaskAnswer, action_size: int, service: str) -> AnswerPart:
+    def read_tasks(self, reply: TaskAnswer, action_size: int) -> list[FloatArray]:
         """Return the task actions of a reply.
 
         Raises
@@ -213,10 +185,10 @@ class Question:
                 "malformed", f"{reply.count} task actions where {self.task_count} were asked"
             )
         numbers = decode_floats(reply.actions, reply.count * action_size)
-        return AnswerPart(service, list(numbers.reshape(reply.count, action_size)), None)
+        return list(numbers.reshape(reply.count, action_size))
 
-    def read_sensing(self, reply: SensingAnswer, num_choices: int, service: str) -> AnswerPart:
-        """Return the sensing action of a reply.
+    def check_sensing(self, reply: SensingAnswer, num_choices: int) -> None:
+        """Check the sensing action of a reply.
 
         Raises
         ------
@@ -232,7 +204,6 @@ class Question:
             raise MessageError("malformed", "a sensing action for another state than was asked")
         if reply.sensing_action >= num_choices:
             raise MessageError("malformed", f"there is no sensing action {reply.sensing_action}")
-        return AnswerPart(service, None, reply)
 
 
 class DecisionSource:
@@ -251,8 +222,7 @@ class DecisionSource:
     tracker : StatusTracker
         Which service decides.
     holding_since : float or None
-        Since when the robot holds still because no service is usable, or its own planner has to
-        decide.
+        Since when the robot holds still because no service is usable.
     stopped : bool
         Whether this source has stopped the run.
     """
@@ -263,11 +233,6 @@ class DecisionSource:
         self.tracker = StatusTracker()
         self.holding_since: float | None = None
         self.stopped = False
-
-    @property
-    def limits_are_reliable(self) -> bool:
-        """Whether an action that the problem's ``execute`` would change must be wrong."""
-        return True
 
     @property
     def num_unverified(self) -> int:
@@ -285,14 +250,8 @@ class DecisionSource:
         """Drop the question: the trial has ended, or its answer is of no use."""
         self.question = None
 
-    def recompute(self, *, before_acting: bool) -> None:
-        """Have the own planner answer the question too.
-
-        Parameters
-        ----------
-        before_acting : bool
-            Whether the robot waits for it; else it is only compared.
-        """
+    def recompute(self) -> None:
+        """Have the own planner answer the question too."""
 
     def handle(
         self, event: TransportEvent | OwnAnswer | Planned | RecoveryExited, now: float

@@ -16,7 +16,6 @@ from collections.abc import Iterator
 
 from holdfast.errors import MessageError, StaleEpochError
 from holdfast.planning import Planner
-from holdfast.problems.problem import Problem
 from holdfast.protocol.events import Abandon, Effects, RobotEffect, Send
 from holdfast.protocol.messages import (
     PROTOCOL_VERSION,
@@ -125,13 +124,13 @@ class OpenRequests:
         epoch: int,
         session_configuration: SessionConfiguration,
         timeout_s: float,
-        problem: Problem,
+        planner: Planner,
         verification: Verification,
         effects: Effects[RobotEffect],
     ) -> None:
         self._timeout_s = timeout_s
-        self._action_size = problem.action_size
-        self._num_choices = Planner(problem, session_configuration.planning).num_choices
+        self._action_size = planner.problem.action_size
+        self._num_choices = planner.num_choices
         self._verification = verification
         self._session = session
         self._epoch = epoch
@@ -280,8 +279,8 @@ class OpenRequests:
 
         Raises
         ------
-        StaleEpochError
-            If another process of the robot has taken over.
+        HoldfastError
+            If another process of the robot has taken over, or the own planner fails.
         """
         replica = call.replica
         try:
@@ -346,15 +345,14 @@ class OpenRequests:
         replica, question = call.replica, call.question
         first = not call.answered
         sensing = isinstance(reply, SensingAnswer)
-        if isinstance(reply, SensingAnswer):
-            part = question.read_sensing(reply, self._num_choices, replica.name)
-        else:
-            part = question.read_tasks(reply, self._action_size, replica.name)
         provenance = Provenance(replica.name, now - call.sent_at, 1e-6 * reply.computed_us)
-        self._verification.take(question, part, provenance)
-        if sensing:
+        if isinstance(reply, SensingAnswer):
+            question.check_sensing(reply, self._num_choices)
+            self._verification.take_sensing(question, reply, provenance)
             call.has_sensing_part = True
         else:
+            actions = question.read_tasks(reply, self._action_size)
+            self._verification.take_tasks(question, actions, provenance)
             call.has_task_part = True
         replica.note_answer(question, now, sensing=sensing, restored=call.restores)
         for earlier in self.to(replica):

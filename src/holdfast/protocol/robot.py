@@ -42,7 +42,7 @@ from holdfast.protocol.events import (
 )
 from holdfast.protocol.messages import DIGEST_SIZE, encode_floats
 from holdfast.protocol.observation_reports import ObservationReports, held_error
-from holdfast.protocol.question import DecisionSource, Provenance, Question, same_actions
+from holdfast.protocol.question import DecisionSource, Provenance, Question
 from holdfast.protocol.records import (
     ActingRecord,
     LocalTookOverRecord,
@@ -115,7 +115,7 @@ class Robot:
 
     @property
     def is_holding(self) -> bool:
-        """Whether the robot holds still: no service is usable, or its own planner has to decide."""
+        """Whether the robot holds still, because no service is usable."""
         return self._source.holding_since is not None
 
     @property
@@ -432,7 +432,7 @@ class Robot:
             question = self._source.question
             assert question is not None
         answer = question.sensing
-        if answer is None or question.disputed:
+        if answer is None:
             self._need(now)
             return
         if (
@@ -441,7 +441,7 @@ class Robot:
         ):
             # Chosen for another state than this: the service's belief has drifted from ours.
             self._effects.report("prefetch_unused", trial=self._trial, step=state.step)
-            self._source.recompute(before_acting=False)
+            self._source.recompute()
             self._ask(self._planner.digest(state), now)
             self._need(now)
             return
@@ -466,7 +466,7 @@ class Robot:
             question = self._source.question
             assert question is not None
             offset = 0
-        if question.task_actions is None or question.disputed:
+        if question.task_actions is None:
             self._need(now)
             return
         provenance = question.task_provenance
@@ -477,12 +477,6 @@ class Robot:
         if not self._take_tick(now):
             return
         action = question.task_actions[offset]
-        if not self._source.limits_are_reliable and question.own is None:
-            own, _ = self._planner.choose_task_action(state)
-            if not same_actions([own], [action]):
-                self._source.recompute(before_acting=True)
-                self._need(now)
-                return
         self._write(ActingRecord(state.step, encode_floats(action)))
         history = self._current_history
         history.pending = action

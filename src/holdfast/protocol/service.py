@@ -413,13 +413,7 @@ class Service:
             task = waiting
         else:
             task = PendingTask(
-                session,
-                request.digest,
-                sensing=sensing,
-                request=request,
-                state=None,
-                size=size,
-                since=now,
+                session, request.digest, sensing=sensing, since=now, request=request, size=size
             )
             self._queue.enqueue(task)
         session.pending[task.digest] = task
@@ -438,9 +432,7 @@ class Service:
     def _prefetch(self, session: Session, now: float) -> PendingTask:
         """Queue the sensing part of the state ahead."""
         digest, state = session.ahead_digest, session.ahead
-        task = PendingTask(
-            session, digest, sensing=True, request=None, state=state, size=0, since=now
-        )
+        task = PendingTask(session, digest, sensing=True, since=now, state=state)
         session.pending[digest] = task
         self._queue.enqueue(task)
         return task
@@ -492,15 +484,14 @@ class Service:
     # -- outcomes --------------------------------------------------------------------------------
 
     def _postpone(self, task: PendingTask, cost: Cost | None, now: float) -> None:
-        """Queue a task again that takes more than its lane allows.
-
-        None: more than was estimated, as its job has found.
-        """
-        if cost is None and task.lane == LONG:
+        """Queue a task again that takes more than its lane allows."""
+        try:
+            has_room = self._queue.postpone(task, cost, now)
+        except MessageError as error:
             for record in self._calls.detach(task):
-                text = self._queue.overdue_in_words(task)
-                self._calls.send_refused(record.call, record.number, "invalid", text)
-        elif not self._queue.postpone(task, cost, now):
+                self._calls.send_refused(record.call, record.number, error.code, str(error))
+            return
+        if not has_room:
             for record in self._calls.detach(task):
                 key = task.session.key
                 self._reject_busy(record.call, record.number, key, task.lane, now)

@@ -130,10 +130,10 @@ class PendingTask:
         digest: bytes,
         *,
         sensing: bool,
-        request: Request | None,
-        state: PlanningState | None,
-        size: int,
         since: float,
+        request: Request | None = None,
+        state: PlanningState | None = None,
+        size: int = 0,
     ) -> None:
         self.session = session
         self.digest = digest
@@ -389,14 +389,12 @@ class _Holding:
 
     def __init__(self) -> None:
         self.sessions = 0
-        self.unserved = 0
         self.state_bytes = 0
         self.configuration_bytes = 0
 
     def count(self, session: Session, sign: int) -> None:
         """Add a session without states, or subtract it."""
         self.sessions += sign
-        self.unserved += 0 if session.served else sign
         self.configuration_bytes += sign * len(session.configuration)
 
 
@@ -409,6 +407,7 @@ class SessionTable:
         self._holdings: dict[Owner, _Holding] = {}
         self._epochs = ForgottenEpochs(max(4 * limits.max_sessions, _LEAST_EPOCHS))
         self._total = _Holding()
+        self._num_unserved = 0
 
     @property
     def state_bytes(self) -> int:
@@ -434,14 +433,13 @@ class SessionTable:
 
     def mark_served(self, session: Session) -> None:
         """Note that a robot got an answer."""
-        if not session.served:
-            for holding in self._holdings_with(session):
-                holding.unserved -= 1
+        self._num_unserved -= not session.served
         session.served = True
 
     def add(self, session: Session) -> None:
         """Add a session."""
         self._sessions[session.key] = session
+        self._num_unserved += not session.served
         self._holdings.setdefault(session.owner, _Holding())
         for holding in self._holdings_with(session):
             holding.count(session, 1)
@@ -456,6 +454,7 @@ class SessionTable:
         """Drop all of a session but its epoch. Nothing may wait for it."""
         session.closed = True
         del self._sessions[session.key]
+        self._num_unserved -= not session.served
         self._count_state(session, 0)
         for holding in self._holdings_with(session):
             holding.count(session, -1)
@@ -487,7 +486,7 @@ class SessionTable:
         if self._is_full_for(session.owner):
             owner = session.owner
             return self._first_unused(lambda each: each.owner == owner)
-        only_unserved = 2 * self._total.unserved >= self._limits.max_sessions
+        only_unserved = 2 * self._num_unserved >= self._limits.max_sessions
         if self._is_full:
             return self._unused_of_most(
                 lambda holding: holding.sessions, only_unserved=only_unserved

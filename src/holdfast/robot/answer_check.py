@@ -1,8 +1,8 @@
 """Some of the services' answers, recomputed with the robot's own planner on a thread.
 
-It has its own instance of the problem, so the robot's loop continues meanwhile. Answers that the
-robot waits for come before answers that are only verified. Thread and planner are made with the
-first question: most runs of a few steps need neither, and start-up time is part of recovery time.
+It has its own instance of the problem, so the robot's loop continues meanwhile. Thread and planner
+are made with the first question: most runs of a few steps need neither, and start-up time is part
+of recovery time.
 """
 
 from __future__ import annotations
@@ -42,9 +42,8 @@ class AnswerChecker:
         self._waiting: deque[ComputeOwnAnswer] = deque()
 
     def ask(self, effect: ComputeOwnAnswer) -> None:
-        """Queue a question; an urgent one goes first and replaces its earlier copy."""
-        if effect.urgent:
-            self._waiting = deque(each for each in self._waiting if each.number != effect.number)
+        """Queue a question; one that is asked again goes first."""
+        if effect.again:
             self._waiting.appendleft(effect)
         else:
             self._waiting.append(effect)

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
-import numpy.typing as npt
 
 from holdfast import checked
 from holdfast.arrays import FloatArray, KeepsReadOnly, floats, real_numbers
@@ -28,13 +27,10 @@ from holdfast.randomness import Purpose, Stream, seed_and_trial, stream
 
 __all__ = [
     "LATER",
-    "CountingEnvironment",
     "Environment",
-    "LateSensingEnvironment",
     "Later",
     "MissingReadings",
     "ObservationSizes",
-    "RememberingEnvironment",
     "SimulatedEnvironment",
     "require_methods",
 ]
@@ -55,14 +51,31 @@ LATER = Later.LATER
 
 @runtime_checkable
 class Environment(Protocol):
-    """A world that can be sensed and moved."""
+    """A world that can be sensed and moved.
+
+    It may have further methods, each of which is used if it is there:
+
+    ``late_observations()``
+        After each task action: returns what has come since the last call, a list of (step,
+        observation), None for no reading. The step says when the sensing action was performed: it
+        is the number of task actions that this trial had had then.
+    ``steps_performed()``
+        After a crash of the robot's process: returns how many task actions have been performed in
+        this trial. The environment counts them itself, and is right even if that process died
+        during a task action.
+    ``last_move()``
+        After a crash in the midst of a move: returns again what the last ``perform`` of this trial
+        has returned, or would have. Without it what the move has shown is lost: its reward counts
+        as 0, and its motion is the model's.
+    ``close()``
+        After the trial.
+    """
 
     def perform_sensing(self, sensing_action: int) -> FloatArray | Later | None:
         """Perform a sensing action and return the observation, shape ``(observation_size,)``.
 
         None, or NaN in every component, is no reading: the belief stays as it is. Or :data:`LATER`:
-        the robot goes on, and :meth:`LateSensingEnvironment.late_observations` returns it when it
-        is there.
+        the robot goes on, and ``late_observations`` returns it when it is there.
         """
         ...
 
@@ -79,45 +92,6 @@ class Environment(Protocol):
         ``"failed"`` ends the trial as well, but in failure: the robot has crashed, say, or broken
         what it was to handle. An :class:`~holdfast.outcome.Ending` also says why, and may say that
         the trial was cut off.
-        """
-        ...
-
-
-@runtime_checkable
-class LateSensingEnvironment(Environment, Protocol):
-    """An environment whose sensing takes time: it returns :data:`LATER`."""
-
-    def late_observations(self) -> Sequence[tuple[int, npt.ArrayLike | None]]:
-        """Return what has come since the last call; asked after each task action.
-
-        Each entry is a step and an observation, None for no reading. The step says when the sensing
-        action was performed: it is the number of task actions that this trial had had then.
-        """
-        ...
-
-
-@runtime_checkable
-class CountingEnvironment(Environment, Protocol):
-    """An environment that knows how far it is: after a crash of the robot's process it is asked."""
-
-    def steps_performed(self) -> int:
-        """Return how many task actions have been performed in this trial.
-
-        The count is the environment's own and survives the robot's process. It is right even if
-        that process died during a task action.
-        """
-        ...
-
-
-@runtime_checkable
-class RememberingEnvironment(CountingEnvironment, Protocol):
-    """A counting environment that can say again what its last task action has shown."""
-
-    def last_move(self) -> float | MoveResult | None:
-        """Return again what the last ``perform`` of this trial has returned, or would have.
-
-        Asked after a crash of the robot's process in the midst of a move. Without this method what
-        the move has shown is lost then: its reward counts as 0, and its motion is the model's.
         """
         ...
 

@@ -55,7 +55,7 @@ class Performance(NamedTuple):
 
 
 class WitnessedWorld:
-    """The world of one trial: see :class:`~holdfast.robot.environment.CountingEnvironment`.
+    """The world of one trial: see :class:`~holdfast.robot.environment.Environment`.
 
     A resumed trial goes on after the lines of another robot's process.
 
