@@ -13,7 +13,7 @@ from tests.command_line import run_here
 from tests.recordings import configuration_of, record_trial
 
 from holdfast.cli.run_figure import Deviation, repeat, service_that_decided
-from holdfast.outcome import Decisions
+from holdfast.outcome import TrialResult
 from holdfast.planning import Planner
 from holdfast.protocol.events import Timing
 from holdfast.protocol.question import OWN_PLANNER
@@ -51,21 +51,20 @@ def test_without_matplotlib_a_note_says_so(
     assert "note: no figure, because matplotlib is not installed" in said.stderr
 
 
-def decisions_of(tmp_path: Path) -> Decisions:
+def result_of(tmp_path: Path) -> TrialResult:
     result = record_trial(configuration_of(tmp_path)).record.result
     assert result is not None
-    assert result.decisions is not None
-    return result.decisions
+    return result
 
 
-def repeated(tmp_path: Path, kept: Decisions) -> Deviation | None:
+def repeated(tmp_path: Path, result: TrialResult) -> Deviation | None:
     configuration = configuration_of(tmp_path)
     planner = Planner(configuration.problem, configuration.planning)
-    return repeat(configuration, kept, 1, None, Recorder(1, planner))
+    return repeat(configuration, result, None, Recorder(1, planner))
 
 
 def test_the_same_trial_has_no_deviation(tmp_path: Path) -> None:
-    assert repeated(tmp_path, decisions_of(tmp_path)) is None
+    assert repeated(tmp_path, result_of(tmp_path)) is None
 
 
 @pytest.mark.parametrize(
@@ -78,10 +77,12 @@ def test_the_same_trial_has_no_deviation(tmp_path: Path) -> None:
     ],
 )
 def test_the_first_deviation_is_found(byte: int, deviation: Deviation, tmp_path: Path) -> None:
-    log = bytearray(decisions_of(tmp_path).log)
+    result = result_of(tmp_path)
+    assert result.decisions is not None
+    log = bytearray(result.decisions.log)
     log[byte] ^= 1
-    kept = msgspec.structs.replace(decisions_of(tmp_path), log=bytes(log))
-    assert repeated(tmp_path, kept) == deviation
+    kept = msgspec.structs.replace(result.decisions, log=bytes(log))
+    assert repeated(tmp_path, msgspec.structs.replace(result, decisions=kept)) == deviation
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,11 @@ from __future__ import annotations
 import contextlib
 import csv
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
+
+import msgspec
 
 from holdfast.cli.exit_codes import EXIT_WRONG_ANSWER
 from holdfast.cli.terminal import duration
@@ -20,10 +22,10 @@ from holdfast.errors import DecidedOtherwiseError
 
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
-    from holdfast.outcome import Decisions, TrialResult
+    from holdfast.outcome import TrialResult
+    from holdfast.protocol.records import Record
     from holdfast.recording.recorder import Recorder
     from holdfast.recording.run_directory import RunDirectory
-    from holdfast.robot.environment import Environment
 
 __all__ = [
     "Deviation",
@@ -90,14 +92,14 @@ def _drawn(
     from holdfast.recording.run_directory import FIGURE_NAME
 
     trial, path = recorder.trial, directory.path / FIGURE_NAME
-    world = None
+    records = None
     if recorder.record.result is None:
         result = next(each for each in directory.journal.results() if each.trial == trial)
         if configuration.environment.object is not None:
             if path.exists():
                 return
-            world = _recorded_world(directory, result)
-            if world is None:
+            records = directory.journal.kept_steps(trial) if result.steps else []
+            if records is None:
                 yield Remark(
                     f"no figure, because trial {trial} ended in an earlier part of the run, which "
                     "did not keep its observations"
@@ -121,12 +123,13 @@ def _drawn(
 
     if recorder.record.result is None:
         kept = directory.journal.decisions(trial)
-        deviation = repeat(configuration, kept, trial, world, recorder)
+        whole = msgspec.structs.replace(result, decisions=kept)
+        deviation = repeat(configuration, whole, records, recorder)
         if deviation is not None:
             yield _remark_on(deviation, configuration, directory, trial)
             if deviation.error is not None:
                 return
-        if world is not None:
+        if records is not None:
             recorder.record.result = result  # it alone has the reward of the last step
     trial_figure(configuration, recorder.record, path)
 
@@ -140,16 +143,6 @@ def own_backend() -> Iterator[None]:
     finally:
         if named is not None:
             os.environ["MPLBACKEND"] = named
-
-
-def _recorded_world(directory: RunDirectory, result: TrialResult) -> Environment | None:
-    """Return the world of the user's as it was in a trial, None if that is not known."""
-    from holdfast.recording.recorded_environment import RecordedEnvironment
-
-    records = directory.journal.kept_steps(result.trial)
-    if records is None and result.steps:
-        return None
-    return RecordedEnvironment(result.trial, records or [], result)
 
 
 def _remark_on(
@@ -177,34 +170,40 @@ def _remark_on(
 
 def repeat(
     configuration: Configuration,
-    kept: Decisions,
-    trial: int,
-    world: Environment | None,
+    result: TrialResult,
+    records: Sequence[Record] | None,
     recorder: Recorder,
 ) -> Deviation | None:
     """Run a trial again with the planner in this process, and return where it first differs.
 
-    ``kept`` has the decisions as they were; ``world`` is the recorded one, None for a simulated
-    one.
+    ``result`` has its decisions; the ``records`` are None for a simulated world.
     """
     from holdfast.planning import Planner
     from holdfast.recording.compare import difference_of_decisions
+    from holdfast.robot.recorded_trial import run_recorded_trial
     from holdfast.robot.trial import run_trial
 
+    planner = Planner(configuration.problem, configuration.planning)
+    seed, trial, kept = configuration.simulator.seed, result.trial, result.decisions
+    assert kept is not None
     try:
-        decisions = run_trial(
-            Planner(configuration.problem, configuration.planning),
-            configuration.simulator.seed,
-            trial,
-            max_steps=configuration.simulator.max_steps,
-            environment=world,
-            observer=recorder,
-            reinitialised_after=kept.reinitialised_after(),
-        ).decisions
+        again = (
+            run_trial(
+                planner,
+                seed,
+                trial,
+                max_steps=configuration.simulator.max_steps,
+                observer=recorder,
+                reinitialised_after=kept.reinitialised_after(),
+            )
+            if records is None
+            else run_recorded_trial(planner, seed, trial, records, recorder, result)
+        )
     except DecidedOtherwiseError as error:
         return Deviation(error.step, error.kind, error)
-    assert decisions is not None
-    found = difference_of_decisions(kept, decisions, trial)
+    assert again is not None
+    assert again.decisions is not None
+    found = difference_of_decisions(kept, again.decisions, trial)
     if found is None:
         return None
     kind = found.what.partition(" action")[0]
