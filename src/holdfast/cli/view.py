@@ -12,7 +12,6 @@ from holdfast.cli.export import (
     chosen_trials,
     notes_about,
     problem_directory_option,
-    rate_option,
     replay_trials,
     size_of,
     trials_option,
@@ -54,7 +53,6 @@ class ViewOptions(Options):
         help="Show it in the viewer that listens there; Rerun's port is 9876.",
     )
     problem_directory: Path | None = problem_directory_option()
-    rate: float = rate_option()
     quiet: bool = flag("-q", help="Show no progress.")
 
 
@@ -83,7 +81,7 @@ def _view(options: ViewOptions) -> None:
     own = options.problem_directory
     with RecordedRun(options.run, "view", problem_directory=own) as recorded, ExitStack() as stack:
         trials = chosen_trials(recorded, options.trials)
-        notes = notes_about(recorded, trials, options.rate)
+        notes = notes_about(recorded, trials)
         made = None
         if save is not None:
             made = stack.enter_context(directory_beside(save)) / save.name
@@ -100,7 +98,6 @@ def _view(options: ViewOptions) -> None:
                 recorded,
                 trials,
                 [sink],
-                options.rate,
                 quiet=options.quiet,
                 after_each=require_viewer,
             )

@@ -49,7 +49,6 @@ from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.recording.run_clock import RunClock
 from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME, recorded_configuration
 from holdfast.recording.step_times import (
-    NS_PER_S,
     StepClock,
     TrialTimes,
     dated,
@@ -157,12 +156,10 @@ class RecordedRun:
             return True
         return self._journal.kept_steps(trial) is not None
 
-    def replay(
-        self, trials: Sequence[int], sinks: Sequence[FactSink], rate_hz: float
-    ) -> Iterator[int]:
+    def replay(self, trials: Sequence[int], sinks: Sequence[FactSink]) -> Iterator[int]:
         """Write the facts of some trials to each sink, and yield each trial's number at its end.
 
-        ``trials`` ascend; a run without times has ``rate_hz`` steps a second.
+        ``trials`` ascend; in a run without times each step takes 0.1 s.
 
         Raises
         ------
@@ -171,7 +168,7 @@ class RecordedRun:
         HoldfastError
             If a trial is decided otherwise when it is run again.
         """
-        clock = StepClock(round(NS_PER_S / rate_hz))
+        clock = StepClock()
         chosen = set(trials)
         events = self._events if self.has_times else []
         output = _Output(sinks, events, with_others=chosen.issuperset(self.trials))
