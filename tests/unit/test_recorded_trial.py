@@ -102,7 +102,7 @@ class TestRunRecordedTrial:
         configuration = configuration_of(tmp_path)
         records, result = self.first(configuration)
         failed = msgspec.structs.replace(result, success=False, failed=True, steps=4)
-        upto = next(at for at, each in enumerate(records) if each.step == 4)
+        upto = next(at for at, each in enumerate(records) if getattr(each, "step", None) == 4)
         _, again = self.again(configuration, records[:upto], failed)
         assert (again.failed, again.steps) == (True, 4)
 
