@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,9 +33,9 @@ __all__ = [
     "chosen_trials",
     "main",
     "notes_about",
+    "print_written",
     "problem_directory_option",
     "replay_trials",
-    "size_of",
     "trials_option",
 ]
 
@@ -130,12 +130,7 @@ def _export(options: ExportOptions) -> None:
     with RecordedRun(path, problem_directory=options.problem_directory) as recorded:
         trials = chosen_trials(recorded, wanted)
         notes = _write(recorded, trials, options)
-    for note in () if options.quiet else notes:
-        sys.stderr.write(f"note: {printable(note)}\n")
-    for place in (mcap, tables):
-        if place is not None:
-            sys.stdout.write(printable(f"{shown_path(place)}  {size_of(place)}\n"))
-    sys.stdout.flush()
+    print_written([] if options.quiet else notes, mcap, tables)
 
 
 def chosen_trials(recorded: RecordedRun, wanted: range | None) -> list[int]:
@@ -199,14 +194,12 @@ def replay_trials(
     sinks: Sequence[FactSink],
     *,
     quiet: bool,
-    after_each: Callable[[], None] = lambda: None,
 ) -> None:
     """Write the facts of trials to sinks, and show the progress."""
     line = progress_line(len(trials), quiet=quiet)
     line.start(f"{counted(len(trials), 'trial')} of {shown_path(recorded.path)}", 0, _NOTE)
     try:
         for finished, _ in enumerate(recorded.replay(trials, sinks), start=1):
-            after_each()
             line.show(finished, _NOTE)
     except (HoldfastError, KeyboardInterrupt):
         raise
@@ -263,7 +256,16 @@ def _about(recorded: RecordedRun) -> dict[str, str]:
     }
 
 
-def size_of(place: Path) -> str:
+def print_written(notes: Sequence[str], *places: Path | None) -> None:
+    """Print notes, and the places that were written with their sizes."""
+    for note in notes:
+        sys.stderr.write(f"note: {printable(note)}\n")
+    for place in filter(None, places):
+        sys.stdout.write(printable(f"{shown_path(place)}  {_size_of(place)}\n"))
+    sys.stdout.flush()
+
+
+def _size_of(place: Path) -> str:
     """Return the size of a file or directory, for people."""
     files = sorted(place.iterdir()) if place.is_dir() else [place]
     size = sum(file.stat().st_size for file in files)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -11,14 +10,13 @@ from holdfast.cli.exit_codes import ended_by_signals
 from holdfast.cli.export import (
     chosen_trials,
     notes_about,
+    print_written,
     problem_directory_option,
     replay_trials,
-    size_of,
     trials_option,
 )
-from holdfast.errors import InvalidValueError, OptionError, ViewError
-from holdfast.files import directory_beside, move_into_place, require_free, shown_path
-from holdfast.printable import printable
+from holdfast.errors import InvalidValueError, OptionError
+from holdfast.files import directory_beside, move_into_place, require_free
 from holdfast.recording.view_target import ViewTarget, require_rerun, viewer_url
 from holdfast.runtime.command_line import (
     Options,
@@ -89,22 +87,7 @@ def _view(options: ViewOptions) -> None:
         with RerunSink(
             recorded.configuration, target, has_times=recorded.has_times, live=False
         ) as sink:
-
-            def require_viewer() -> None:
-                if sink.streams.lost is not None:
-                    raise ViewError(f"the viewer {sink.streams.lost}")
-
-            replay_trials(
-                recorded,
-                trials,
-                [sink],
-                quiet=options.quiet,
-                after_each=require_viewer,
-            )
+            replay_trials(recorded, trials, [sink], quiet=options.quiet)
         if save is not None and made is not None:
             move_into_place(made, save)
-    for note in () if options.quiet else notes:
-        sys.stderr.write(f"note: {printable(note)}\n")
-    if save is not None:
-        sys.stdout.write(printable(f"{shown_path(save)}  {size_of(save)}\n"))
-        sys.stdout.flush()
+    print_written([] if options.quiet else notes, save)
