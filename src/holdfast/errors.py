@@ -158,13 +158,6 @@ class DecidedOtherwiseError(RecordError):
         self.kind = kind
 
 
-class EndOfRecordsError(RecordError):
-    """The records end before the trial is finished."""
-
-    def __init__(self, trial: int) -> None:
-        super().__init__(f"trial {trial}: its records end before it is finished")
-
-
 class WorkerDiedError(HoldfastError):
     """A worker process ended unexpectedly."""
 

@@ -539,12 +539,12 @@ class TestTimes:
         self, place: Place, tmp_path: Path
     ) -> None:
         place.run(PEG)
-        said = place.export("--csv", "tables", "--rate", "4")
-        assert "recorded without times, so every step takes 0.25 s (--rate)" in said.stderr
+        said = place.export("--csv", "tables")
+        assert "recorded without times, so every step takes 0.1 s" in said.stderr
         steps = rows_of(tmp_path / "tables" / "steps.csv")
         times = [float(row["action_time"]) for row in steps]
-        assert times[0] == 1.125
-        assert np.diff(times[:20]).tolist() == [0.25] * 19
+        assert times[0] == 1.05
+        assert np.diff(times[:20]).tolist() == pytest.approx([0.1] * 19)
 
     def test_recorded_ones_are_kept(self, place: Place, tmp_path: Path) -> None:
         run = place.run(PEG, "--rate", "5000")
@@ -901,7 +901,6 @@ class TestRefusals:
             (("--csv", "one", "--trials", "5"), "--trials is '5'; allowed are two whole numbers"),
             (("--csv", "one", "--trials", "1:1"), "allowed are A:B with B above A"),
             (("--csv", "one", "--trials", "2:9"), "has no trial from 2 to 8 (--trials); it has 2"),
-            (("--csv", "one", "--rate", "0"), "--rate is '0'; allowed are numbers from 0.001"),
         ],
     )
     def test_options(

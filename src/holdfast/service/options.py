@@ -70,7 +70,8 @@ class ServeOptions(Options):
         many=True,
         read=absolute_endpoint,
         metavar="ENDPOINT",
-        help="A robot that listens. Then nothing listens here without --listen.",
+        help="The local socket at which a robot listens for this service (unix/PATH). Then nothing "
+        "listens here without --listen.",
     )
     name: str = option(metavar="NAME", default=DEFAULT_NAME, help="Name of the service.")
     tls: Path | None = option(

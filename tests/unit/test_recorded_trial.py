@@ -1,4 +1,4 @@
-"""The world of a recorded trial."""
+"""A recorded trial, run again from its records."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.recordings import configuration_of, record_trial
 
 from holdfast.config.loader import Configuration
 from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
-from holdfast.errors import EndOfRecordsError, RecordError
+from holdfast.errors import RecordError
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner, digest
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
@@ -24,9 +24,9 @@ from holdfast.protocol.records import (
     TrialHistory,
 )
 from holdfast.recording.figure import trial_figure
-from holdfast.recording.recorded_environment import RecordedEnvironment
 from holdfast.recording.recorder import Recorder
-from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
+from holdfast.robot.recorded_trial import run_recorded_trial
+from holdfast.robot.trial import NULL_OBSERVER, SensingStep, TaskStep, TrialObserver, run_trial
 from holdfast.tracking import LateObservation
 
 
@@ -47,7 +47,7 @@ class _Journalling(TrialObserver):
         self.records.append(PerformedRecord(step.state.step, step.reward))
 
 
-class TestRecordedEnvironment:
+class TestRunRecordedTrial:
     """What was observed, given to the same planner, leads to the same beliefs."""
 
     @staticmethod
@@ -55,14 +55,15 @@ class TestRecordedEnvironment:
         configuration: Configuration, records: list[Record], result: TrialResult
     ) -> tuple[Recorder, TrialResult]:
         recorder = Recorder(result.trial)
-        found = run_trial(
+        found = run_recorded_trial(
             Planner(configuration.problem, configuration.planning),
             configuration.simulator.seed,
             result.trial,
-            max_steps=configuration.simulator.max_steps,
-            environment=RecordedEnvironment(result.trial, records, result),
-            observer=recorder,
+            records,
+            recorder,
+            result,
         )
+        assert found is not None
         return recorder, found
 
     @staticmethod
@@ -101,7 +102,8 @@ class TestRecordedEnvironment:
         configuration = configuration_of(tmp_path)
         records, result = self.first(configuration)
         failed = msgspec.structs.replace(result, success=False, failed=True, steps=4)
-        _, again = self.again(configuration, records, failed)
+        upto = next(at for at, each in enumerate(records) if getattr(each, "step", None) == 4)
+        _, again = self.again(configuration, records[:upto], failed)
         assert (again.failed, again.steps) == (True, 4)
 
     def test_what_was_decided_otherwise_is_refused(self, tmp_path: Path) -> None:
@@ -145,11 +147,11 @@ def test_what_came_when_a_killed_robot_went_on_comes_there_again(again: tuple[st
             late(2)
     result = history.result(None)
 
-    def run(upto: list[Record], result: TrialResult | None) -> TrialResult:
-        world = RecordedEnvironment(0, upto, result)
-        return run_trial(planner, 3, 0, max_steps=4, environment=world)
+    def run(upto: list[Record], result: TrialResult | None) -> TrialResult | None:
+        return run_recorded_trial(planner, 3, 0, upto, NULL_OBSERVER, result)
 
-    assert run(records, result).decisions == result.decisions
+    found = run(records, result)
+    assert found is not None
+    assert found.decisions == result.decisions
     for count in range(1, len(records) - 1):
-        with pytest.raises(EndOfRecordsError):
-            run(records[:count], None)
+        assert run(records[:count], None) is None
