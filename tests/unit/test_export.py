@@ -955,7 +955,7 @@ class TestRefusals:
         make_run(capsys, tmp_path, PEG)
         monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
         said = export(capsys, tmp_path, "--mcap", "run.mcap", code=2)
-        assert "MCAP files need the library rosbags: pip install 'holdfast[ros]'" in said.stderr
+        assert "MCAP files need the library rosbags: pip install 'holdfast[mcap]'" in said.stderr
         export(capsys, tmp_path, "--csv", "tables")
 
     def test_an_empty_directory_may_be_there(

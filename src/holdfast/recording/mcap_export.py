@@ -2,7 +2,7 @@
 
 MCAP is what rosbag2 writes by default, so ``ros2 bag``, RViz, Foxglove and PlotJuggler open the
 file as one of their own. All messages are of packages that every ROS 2 has; their definitions are
-in the file. rosbags (extra ``ros``) knows these, encodes the messages and writes the file.
+in the file. rosbags (extra ``mcap``) knows these, encodes the messages and writes the file.
 
 Poses are in the frame ``task``, which stands in ``map`` so that what the problem calls up points
 up. Everything is offered as reliable, for then a subscriber of either kind gets it.
@@ -67,7 +67,7 @@ def require_rosbags() -> None:
         import rosbags.rosbag2  # noqa: F401
     except ImportError as error:
         raise MissingRosbagsError(
-            "MCAP files need the library rosbags: pip install 'holdfast[ros]'"
+            "MCAP files need the library rosbags: pip install 'holdfast[mcap]'"
         ) from error
 
 
