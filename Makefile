@@ -167,7 +167,7 @@ $(INSTALLED_FIGURES): $(INSTALLED_KERNEL)
 	@touch $@
 
 $(INSTALLED_DEV): $(INSTALLED_KERNEL)
-	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[dev]"
+	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[dev]" -e ros/ros1_master_guard -e ros/holdfast_ros
 	@touch $(INSTALLED_FIGURES) $@
 
 # The sources are copied into it, so whatever of them changes is installed again.

@@ -34,8 +34,6 @@ NUMBERS = [
     ["export", "run", "--rate"],
     ["view", "run", "--trials"],
     ["view", "run", "--rate"],
-    ["ros1-guard", "--port"],
-    ["ros1-guard", "--silent-s"],
     ["serve", "--workers"],
     ["serve", "--lease-ms"],
     ["serve", "--max-sessions"],
@@ -68,10 +66,8 @@ PATHS = [
     ["view", "run", "--save"],
     ["view", "run", "--problem-directory"],
     ["keys"],
-    ["ros1-guard", "--directory"],
     ["serve", "--tls"],
     ["serve", "--problem-directory"],
-    ["serve", "--configuration"],
 ]
 
 

@@ -27,7 +27,7 @@ class Command(NamedTuple):
 
 COMMANDS = {
     "run": Command("holdfast.cli.run", "Run the trials of a configuration."),
-    "serve": Command("holdfast.cli.serve", "Decide for robots, as a service."),
+    "serve": Command("holdfast.service.process", "Decide for robots, as a service."),
     "doctor": Command("holdfast.cli.doctor", "Check each layer between a robot and a service."),
     "demo": Command(
         "holdfast.lab.demo.command", "See a cloud and a robot killed, and no decision change."
@@ -43,10 +43,10 @@ COMMANDS = {
         "holdfast.lab.simulation.command", "Search for faults that change a decision."
     ),
     "keys": Command("holdfast.cli.keys", "Make keys for robots and services."),
-    "ros1-guard": Command("holdfast.cli.ros1_guard", "Keep a ROS 1 master alive."),
 }
 
 _PACKAGES = {"demo": "holdfast-lab", "simulate": "holdfast-lab", "chaos": "holdfast-lab"}
+_PACKAGES |= {"ros1-guard": "holdfast-ros", "ros1-serve": "holdfast-ros"}
 """Which package of this project adds a command, for whoever has not installed it."""
 
 _HELP = """\
