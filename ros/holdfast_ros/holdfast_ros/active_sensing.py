@@ -25,6 +25,7 @@ from holdfast.config.loader import Configuration
 from holdfast.config.user_code import account_of_user_error
 from holdfast.errors import CheckpointError, HoldfastError, InvalidValueError, ProblemError
 from holdfast.planning import Planner, PlanningState
+from holdfast.robot.environment import is_no_reading
 from holdfast.robot.session_configuration import session_configuration_of
 
 __all__ = [
@@ -201,8 +202,7 @@ class ActiveSensing:
         if needs_sensing:
             shown = request.observation
             chosen_not_to = request.sensing_action == planner.no_sensing and not shown.size
-            no_reading = bool(shown.size) and bool(np.isnan(shown).all())
-            observation = None if chosen_not_to or no_reading else shown
+            observation = None if chosen_not_to or is_no_reading(shown) else shown
             state, _ = planner.observe(state, request.sensing_action, observation)
         elif request.observation.size:
             raise InvalidValueError(

@@ -22,7 +22,7 @@ from holdfast.arrays import FloatArray
 from holdfast.errors import EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import Done
 from holdfast.problems.problem import Problem
-from holdfast.robot.environment import ObservationSizes
+from holdfast.robot.environment import ObservationSizes, is_no_reading
 from holdfast.robot.environment_maker import EnvironmentMaker
 
 __all__ = [
@@ -198,8 +198,7 @@ class DecisionHandover:
                 f"observation of {call.observation.size} values: sensing action "
                 f"{due.sensing_action} of {self._problem.name} has {size or 'at least 1'}"
             )
-        # NaN in every component is no reading, as for any environment.
-        if not np.isfinite(call.observation).all() and not np.isnan(call.observation).all():
+        if not np.isfinite(call.observation).all() and not is_no_reading(call.observation):
             place = int(np.argmin(np.isfinite(call.observation)))
             raise InvalidValueError(
                 f"observation[{place}] is {call.observation[place]}: must be a finite number"
