@@ -166,7 +166,7 @@ $(INSTALLED_FIGURES): $(INSTALLED_KERNEL)
 	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[figures,service]"
 	@touch $@
 
-$(INSTALLED_DEV): $(INSTALLED_KERNEL)
+$(INSTALLED_DEV): $(INSTALLED_KERNEL) $(wildcard ros/*/setup.py)
 	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[dev]" -e ros/ros1_master_guard -e ros/holdfast_ros
 	@touch $(INSTALLED_FIGURES) $@
 
