@@ -384,7 +384,7 @@ class TestAMasterOfOthers:
         graph.start("rosmaster", "--core", "-p", str(graph.port))
         wait_for(graph.master_pid)
         guard = graph.guard("--no-rosout")
-        directory = graph.directory / "run" / "holdfast"
+        directory = graph.directory / "run" / "ros1_master_guard"
         shutil.rmtree(directory)
         directory.touch()
         graph.run("rosparam", "set", "/speed", "1")
@@ -400,7 +400,7 @@ class TestAMasterOfOthers:
         graph.start("rosmaster", "--core", "-p", str(graph.port))
         wait_for(graph.master_pid)
         guard = graph.guard("--no-rosout")
-        directory = graph.directory / "run" / "holdfast"
+        directory = graph.directory / "run" / "ros1_master_guard"
         shutil.rmtree(directory)
         directory.touch()
         wait_for(lambda: graph.events(guard, "journal_failed"))

@@ -20,6 +20,7 @@ def test_json_has_every_field() -> None:
     line = logged("master_lost", as_json=True, reason=ValueError("a\nb"), pid=3, gone=None)
     told = json.loads(line)
     assert told.pop("time").endswith("+00:00")
+    assert told.pop("component") == "ros1-guard"
     assert told == {"event": "master_lost", "reason": "a\nb", "pid": 3, "gone": None}
 
 

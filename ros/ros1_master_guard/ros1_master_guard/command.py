@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import json
 import os
 import signal
 import sys
@@ -13,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ros1_master_guard.errors import GuardError
-from ros1_master_guard.events import EventLog
+from ros1_master_guard.events import EventLog, json_line
 from ros1_master_guard.guard import MasterGuard
 from ros1_master_guard.settings import GuardSettings, MasterAddress
 
@@ -133,8 +132,9 @@ async def _guard(settings: GuardSettings, events: EventLog, *, as_json: bool) ->
 
     def ready(how: str) -> None:
         uri = settings.address.uri
-        told = {"event": "ready", "service": uri, "pid": os.getpid(), "master": how}
-        line = json.dumps(told) if as_json else f"guards the master at {uri}, which was {how}"
+        told = {"service": uri, "pid": os.getpid(), "master": how}
+        text = f"guards the master at {uri}, which was {how}"
+        line = json_line("ready", told) if as_json else text
         # A closed standard output is no reason not to guard.
         with contextlib.suppress(OSError, ValueError):
             sys.stdout.write(f"{line}\n")

@@ -7,9 +7,10 @@ import datetime as dt
 import json
 import queue
 import threading
+from collections.abc import Mapping
 from typing import Protocol, TextIO
 
-__all__ = ["EventLog", "EventSink"]
+__all__ = ["EventLog", "EventSink", "json_line"]
 
 _MAX_QUEUED_LINES = 1000
 _MAX_LINE = 4000
@@ -40,7 +41,7 @@ class EventLog:
     def event(self, name: str, /, **fields: object) -> None:
         """Write an event."""
         with contextlib.suppress(queue.Full):
-            self._lines.put_nowait((_json if self._as_json else _text)(name, fields))
+            self._lines.put_nowait((json_line if self._as_json else _text)(name, fields))
 
     def close(self) -> None:
         """Write what can be written in half a second."""
@@ -55,12 +56,13 @@ class EventLog:
                 self._stream.flush()
 
 
-def _json(name: str, fields: dict[str, object]) -> str:
-    now = dt.datetime.now(dt.UTC).isoformat()
-    return json.dumps({"time": now, "event": name, **fields}, default=str)
+def json_line(name: str, fields: Mapping[str, object]) -> str:
+    """Return an event as JSON, on one line."""
+    head = {"time": dt.datetime.now(dt.UTC).isoformat(), "component": "ros1-guard", "event": name}
+    return json.dumps({**head, **fields}, default=str, separators=(",", ":"))
 
 
-def _text(name: str, fields: dict[str, object]) -> str:
+def _text(name: str, fields: Mapping[str, object]) -> str:
     told = {key: value for key, value in fields.items() if value is not None}
     reason = str(told.pop("reason", ""))
     parts = [reason] * bool(reason)
