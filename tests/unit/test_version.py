@@ -43,4 +43,4 @@ def test_the_packages_for_ros_have_it_too() -> None:
         for path in files
     }
     assert len(told) == 6
-    assert told == dict.fromkeys(told, [holdfast.__version__])
+    assert told == {path: [holdfast.__version__] for path in told}
