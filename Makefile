@@ -166,8 +166,8 @@ $(INSTALLED_FIGURES): $(INSTALLED_KERNEL)
 	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[figures,service]"
 	@touch $@
 
-$(INSTALLED_DEV): $(INSTALLED_KERNEL)
-	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[dev]"
+$(INSTALLED_DEV): $(INSTALLED_KERNEL) $(wildcard ros/*/setup.py)
+	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[dev]" -e ros/ros1_master_guard -e ros/holdfast_ros
 	@touch $(INSTALLED_FIGURES) $@
 
 # The sources are copied into it, so whatever of them changes is installed again.

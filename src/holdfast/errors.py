@@ -166,10 +166,6 @@ class TrialCrashError(RuntimeError):
     """An unexpected error in a worker process; the message holds its traceback."""
 
 
-class GuardError(HoldfastError):
-    """The guard cannot guard the ROS 1 master; the message says why."""
-
-
 class MissingRosbagsError(HoldfastError):
     """The library rosbags is not installed."""
 
@@ -204,18 +200,6 @@ class CredentialsGoneError(CredentialsError):
 
 class FrameError(TransportError):
     """Received bytes are no valid frame; the message completes a sentence about the sender."""
-
-
-class CallError(HoldfastError):
-    """No usable answer came."""
-
-
-class SilentError(CallError):
-    """No answer came in time."""
-
-
-class GoneError(CallError):
-    """Nothing listens at the endpoint: its process has ended."""
 
 
 class KeysExhaustedError(TransportError):

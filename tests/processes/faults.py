@@ -149,12 +149,13 @@ class Service(ServiceCommand):
         self._site = site
         self.options = tuple(options)
         self.command: tuple[str, ...] = lab.HOLDFAST
+        self.verb = "serve"
         self.variables: dict[str, str] = {}
 
     def _start_process(self) -> Process:
         return self._site.process(
             *self.command,
-            *("serve", "--listen", self.endpoint, "--log", "json"),
+            *(self.verb, "--listen", self.endpoint, "--log", "json"),
             *self.options,
             variables=self.variables,
         )

@@ -17,8 +17,8 @@ from tests.ros.conftest import PATIENCE_S
 from tests.ros.graph import Graph, keeps_on, replaced, settled, start_everything, topic_tool
 from tests.ros.ros1_processes import SYSTEM_PYTHON, wait_for
 
-from holdfast.errors import GuardError
-from holdfast.ros.master.settings import MasterAddress
+from ros1_master_guard.errors import GuardError
+from ros1_master_guard.settings import MasterAddress
 
 GUARD = (sys.executable, "-m", "holdfast", "ros1-guard")
 KILLS = 10
@@ -347,7 +347,7 @@ class TestAMasterOfOthers:
         graph.start("rosmaster", "--core", "-p", str(graph.port))
         wait_for(graph.master_pid)
         guard = graph.guard("--no-rosout")
-        directory = graph.directory / "run" / "holdfast"
+        directory = graph.directory / "run" / "ros1_master_guard"
         shutil.rmtree(directory)
         directory.touch()
         graph.run("rosparam", "set", "/speed", "1")
@@ -363,7 +363,7 @@ class TestAMasterOfOthers:
         graph.start("rosmaster", "--core", "-p", str(graph.port))
         wait_for(graph.master_pid)
         guard = graph.guard("--no-rosout")
-        directory = graph.directory / "run" / "holdfast"
+        directory = graph.directory / "run" / "ros1_master_guard"
         shutil.rmtree(directory)
         directory.touch()
         wait_for(lambda: graph.events(guard, "journal_failed"))
@@ -460,7 +460,7 @@ os._exit(0)
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
 def test_it_is_the_stock_master(seed: int, graph: Graph, tmp_path: Path) -> None:
-    from holdfast.ros.master import process as master_process
+    from ros1_master_guard import process as master_process
 
     script = str(Path(str(master_process.__file__)))
     journal = str(tmp_path / "journal")

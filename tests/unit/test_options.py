@@ -32,8 +32,6 @@ NUMBERS = [
     ["keys", "mine", "--days"],
     ["export", "run", "--trials"],
     ["view", "run", "--trials"],
-    ["ros1-guard", "--port"],
-    ["ros1-guard", "--silent-s"],
     ["serve", "--workers"],
     ["serve", "--lease-ms"],
     ["serve", "--max-sessions"],
@@ -66,10 +64,8 @@ PATHS = [
     ["view", "run", "--save"],
     ["view", "run", "--problem-directory"],
     ["keys"],
-    ["ros1-guard", "--directory"],
     ["serve", "--tls"],
     ["serve", "--problem-directory"],
-    ["serve", "--configuration"],
 ]
 
 

@@ -91,7 +91,7 @@ class ExportOptions(Options):
         metavar="FILE",
         read=location,
         help="Write FILE: standard ROS 2 messages, for RViz, Foxglove, PlotJuggler and ros2 bag "
-        "(extra ros).",
+        "(extra mcap).",
     )
     tables: Path | None = option(
         "--csv",
@@ -117,7 +117,7 @@ def main(arguments: Sequence[str]) -> int:
 def _export(options: ExportOptions) -> None:
     path, mcap, tables, wanted = options.run, options.mcap, options.tables, options.trials
     if mcap is not None:
-        from holdfast.ros.mcap_export import require_rosbags
+        from holdfast.recording.mcap_export import require_rosbags
 
         require_rosbags()
         require_free(mcap, "--mcap", directory=False)
@@ -162,7 +162,7 @@ def _write(recorded: RecordedRun, trials: Sequence[int], options: ExportOptions)
         # What closes the files stands on a stack of its own: it comes before they are moved.
         with contextlib.ExitStack() as files:
             if mcap is not None:
-                from holdfast.ros.mcap_export import McapSink
+                from holdfast.recording.mcap_export import McapSink
 
                 bag = stack.enter_context(directory_beside(mcap)) / mcap.stem
                 about = _about(recorded)

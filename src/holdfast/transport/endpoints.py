@@ -58,7 +58,7 @@ NEXT_KEY_FILE = "key.next.pem"
 _RENAMED = {
     "quic": "over UDP, services are at udp/HOST:PORT",
     "unixsock-stream": "a local socket is written unix/PATH",
-    "ros1": "sessions go over tcp/HOST:PORT; in ROS 1 there is the typed service, serve --ros1",
+    "ros1": "sessions go over tcp/HOST:PORT; in ROS 1 there is holdfast ros1-serve",
 }
 """Protocols of earlier releases, and their replacements."""
 
