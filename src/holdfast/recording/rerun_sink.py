@@ -230,10 +230,6 @@ class RerunSink:
         name = fact.name.replace("_", " ")
         self._text(severity(fact.name, fact.fields), f"{name}: {words}" if words else name)
 
-    def note(self, text: str) -> None:
-        """Log a remark of the view itself, at the time of the last fact."""
-        self._text("WARN", text)
-
     def _flush(self) -> None:
         self._recording.flush()
         if self._recording.lost is not None and not self._live:
