@@ -36,7 +36,7 @@ from holdfast.transport.datagram_sockets import (
     connected_socket,
     reported_errors,
 )
-from holdfast.transport.endpoints import Endpoint, Role
+from holdfast.transport.endpoints import Role
 from holdfast.transport.exchanges import (
     ECHO,
     MESSAGE_OVERHEAD,
@@ -570,14 +570,13 @@ class DatagramScheme(Scheme):
         self,
         owner: LinkOwner,
         settings: LinkSettings,
-        endpoint: Endpoint,
         tls: TlsStream | None,
         *,
         role: Role,
         dialled: bool,
     ) -> Link:
         """Make the link of a new connection."""
-        del endpoint, dialled
+        del dialled
         assert tls is not None
         if role == "robot":
             return RobotDatagramLink(owner, settings, tls=tls)

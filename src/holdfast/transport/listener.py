@@ -63,8 +63,6 @@ class Listener:
         Port 0 takes a free one; the attribute has its number.
     accepted : callable
         Gets the socket of such a connection, and the network from which it came.
-    speaks_first : bool
-        Whether this end speaks first; then connections are delivered at once.
     shared : socket or None
         A socket that is bound there for several processes, of which this one listens, too.
 
@@ -79,11 +77,9 @@ class Listener:
         endpoint: Endpoint,
         accepted: Callable[[socket.socket, bytes], None],
         *,
-        speaks_first: bool = False,
         shared: socket.socket | None = None,
     ) -> None:
         self._accepted = accepted
-        self._speaks_first = speaks_first
         self._loop = asyncio.get_running_loop()
         try:
             self._socket = listen(endpoint) if shared is None else _listen_beside(shared)
@@ -128,9 +124,6 @@ class Listener:
                 return  # otherwise the peer is gone already
             connection.setblocking(False)
             network = _network_of(connection.family, address)
-            if self._speaks_first:
-                self._accepted(connection, network)
-                continue
             if len(self._silent) >= MAX_SILENT:
                 other = connection_to_drop(self._silent)
                 self._forget(other)

@@ -310,7 +310,6 @@ class _ServiceLinks(LinkOwner):
         link = self._scheme.make_link(
             self,
             self._robot.settings,
-            self._endpoint,
             tls,
             role="robot",
             dialled=not self._address.listens,

@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from holdfast.transport.endpoints import SCHEMES, Endpoint, Role
+from holdfast.transport.endpoints import SCHEMES, Role
 from holdfast.transport.links import Link, LinkOwner
 
 if TYPE_CHECKING:
@@ -41,14 +41,13 @@ class Scheme:
         self,
         owner: LinkOwner,
         settings: LinkSettings,
-        endpoint: Endpoint,
         tls: TlsStream | None,
         *,
         role: Role,
         dialled: bool,
     ) -> Link:
         """Make the link of a new connection; ``dialled`` if this end has opened it."""
-        del endpoint, role
+        del role
         return Link(owner, settings, speaks_first=dialled, tls=tls)
 
     def close(self) -> None:

@@ -341,7 +341,7 @@ class StreamServiceTransport(LinkOwner):
             assert self._context is not None
             tls = TlsStream(self._context)
         link = self._schemes[endpoint.protocol].make_link(
-            self, self._settings, endpoint, tls, role="service", dialled=dialled
+            self, self._settings, tls, role="service", dialled=dialled
         )
         if len(self._without_hello) >= _MAX_WITHOUT_HELLO:
             other = connection_to_drop(self._without_hello)
