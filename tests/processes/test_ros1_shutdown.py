@@ -10,9 +10,9 @@ from tests.processes.faults import EXAMPLES, Site, wait_until
 from tests.unit.test_ros1_node import Master, master  # noqa: F401 - a fixture
 from tests.wire import RawClient
 
-from holdfast.lab.testbed.processes import HOLDFAST
 from holdfast.protocol.messages import SensingAnswer, encode
 from holdfast.transport.ros1_calls import CALLER
+from holdfast_lab.testbed.processes import HOLDFAST
 
 NODE = "/cloud_active_sensing"
 OPTIONS = ("--ros1", "--configuration", str(EXAMPLES / "peg_in_hole_2d.yaml"))

@@ -10,23 +10,6 @@ from tests.late_world import LateWorld
 from holdfast import tracking
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import LostSettings
-from holdfast.lab.errors import Violation
-from holdfast.lab.simulation.checkers import WireChecker
-from holdfast.lab.simulation.environment_model import EnvironmentModel
-from holdfast.lab.simulation.peg_with_encoders import PegWithEncoders
-from holdfast.lab.simulation.reference_runs import (
-    BEFORE_CHOOSING,
-    BEFORE_MOVING,
-    BEFORE_SENSING,
-    KIDNAPPED_AT,
-    KIDNAPPED_TO,
-    Circumstances,
-    Delivery,
-    ReferenceRun,
-)
-from holdfast.lab.simulation.schedule import RunSettings, SimulationSchedule, parse_schedule
-from holdfast.lab.simulation.schedule_draws import draw_schedule
-from holdfast.lab.simulation.world import Setup, Simulator
 from holdfast.lost import LostTest
 from holdfast.outcome import MoveResult
 from holdfast.protocol.records import (
@@ -38,6 +21,23 @@ from holdfast.protocol.records import (
 )
 from holdfast.randomness import Stream, stream
 from holdfast.robot.trial import run_trial
+from holdfast_lab.errors import Violation
+from holdfast_lab.simulation.checkers import WireChecker
+from holdfast_lab.simulation.environment_model import EnvironmentModel
+from holdfast_lab.simulation.peg_with_encoders import PegWithEncoders
+from holdfast_lab.simulation.reference_runs import (
+    BEFORE_CHOOSING,
+    BEFORE_MOVING,
+    BEFORE_SENSING,
+    KIDNAPPED_AT,
+    KIDNAPPED_TO,
+    Circumstances,
+    Delivery,
+    ReferenceRun,
+)
+from holdfast_lab.simulation.schedule import RunSettings, SimulationSchedule, parse_schedule
+from holdfast_lab.simulation.schedule_draws import draw_schedule
+from holdfast_lab.simulation.world import Setup, Simulator
 
 MAX_STEPS = 40
 SENSED = range(0, MAX_STEPS, 9)
