@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib
+import importlib.util
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -18,8 +19,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgspec
 
 import holdfast
-import holdfast_lab
-import studies
 from holdfast import _kernel
 from holdfast.config.imports import follow_imports
 from holdfast.recording.machine import describe
@@ -46,7 +45,8 @@ _OF_PROCESSES = frozenset({"exchange_times", "cloud_trials"})
 
 _PLACE = re.compile(r"\w+(\.\w+)+:\w+")
 
-_PACKAGES = {package.__name__: package for package in (holdfast, holdfast_lab, studies)}
+_PROGRAM = ("holdfast", "holdfast_lab")
+_PACKAGES = (*_PROGRAM, "studies")
 """Whose code results depend on."""
 
 _KEY_SIZE = 16
@@ -118,8 +118,7 @@ def _digest_behind(place: str, whole_program: bool = False) -> str:
             return known.digest
         sources = _sources_behind(place.partition(":")[0])
         if whole_program:
-            for package in (holdfast, holdfast_lab):
-                folder = Path(package.__file__).parent
+            for folder in map(_folder, _PROGRAM):
                 for path in folder.rglob("*.py"):
                     name = path.relative_to(folder.parent).with_suffix("").parts
                     sources[".".join(name)] = path
@@ -134,6 +133,15 @@ def _digest_behind(place: str, whole_program: bool = False) -> str:
     found = _Hashed(digest.hexdigest(), tuple(sources.values()), stats)
     _HASHED[place, whole_program] = found
     return found.digest
+
+
+@functools.cache
+def _folder(package: str) -> Path:
+    """Return where a package is, which need not be imported for that."""
+    spec = importlib.util.find_spec(package)
+    if spec is None or spec.origin is None:
+        raise TaskError(f"the package {package} is not installed here; make install brings it")
+    return Path(spec.origin).parent
 
 
 def _stats_of(files: Iterable[Path]) -> tuple[tuple[int, int], ...]:
@@ -159,7 +167,7 @@ def _sources_behind(module: str) -> dict[str, Path]:
         # This module knows all functions.
         if top not in _PACKAGES or name == __name__:
             return None
-        place = Path(_PACKAGES[top].__file__ or "").parent.joinpath(*rest)
+        place = _folder(top).joinpath(*rest)
         path = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
         return path if path.is_file() else None
 
