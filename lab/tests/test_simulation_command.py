@@ -13,7 +13,7 @@ from tests.command_line import Said, run_here
 from holdfast.protocol.messages import CHECKSUM_SIZE
 from holdfast_lab.simulation.exploration import ExplorationTally
 
-STORY = Path(__file__).parents[1] / "scenarios" / "cloud_comes_back.story"
+STORY = Path(__file__).parents[2] / "tests" / "scenarios" / "cloud_comes_back.story"
 
 
 class Simulate(Protocol):

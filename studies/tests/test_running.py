@@ -137,6 +137,7 @@ for name in ("studies/light_dark.py", "holdfast/belief.py", "holdfast_lab/chaos/
 """
         done = subprocess.run(
             [sys.executable, "-S", "-c", program],
+            cwd=tmp_path,
             env={
                 "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)]),
                 "PYTHONDONTWRITEBYTECODE": "1",
