@@ -120,8 +120,7 @@ def _digest_behind(place: str, whole_program: bool = False) -> str:
         if whole_program:
             for folder in map(_folder, _PROGRAM):
                 for path in folder.rglob("*.py"):
-                    name = path.relative_to(folder.parent).with_suffix("").parts
-                    sources[".".join(name)] = path
+                    sources[str(path.relative_to(folder.parent))] = path
         if _kernel.__file__:
             sources["kernel"] = Path(_kernel.__file__)
         stats = _stats_of(sources.values())

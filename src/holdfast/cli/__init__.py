@@ -21,7 +21,13 @@ from types import TracebackType
 __all__ = ["main"]
 
 
-def main(application: Callable[[Sequence[str]], int] | None = None) -> None:
+def _commands(arguments: Sequence[str]) -> int:
+    from holdfast.cli.application import run_application
+
+    return run_application(arguments)
+
+
+def main(application: Callable[[Sequence[str]], int] = _commands) -> None:
     """Run the command line and exit.
 
     ``application`` is run with the arguments instead of the commands of ``holdfast``; it returns
@@ -46,9 +52,6 @@ def main(application: Callable[[Sequence[str]], int] | None = None) -> None:
     arguments = sys.argv[1:]
     try:
         allow_descriptors()
-        if application is None:
-            from holdfast.cli.application import run_application as application
-
         if arguments[:1] == ["serve"]:  # which goes on when nobody reads its output
             sys.exit(application(arguments))
         end_with_reader()
