@@ -112,7 +112,7 @@ class TestTasks:
         """In a process of its own, whose package is a copy."""
         for package in (holdfast, holdfast_lab, studies):
             shutil.copytree(
-                Path(package.__file__).parent,
+                Path(str(package.__file__)).parent,
                 tmp_path / package.__name__,
                 ignore=shutil.ignore_patterns("__pycache__", "tests"),
             )
