@@ -1,8 +1,9 @@
 """Tasks on a Ray cluster.
 
-Every node has holdfast installed, and a task travels as its name and parameters, never as code. So
-a node could have other code than this machine, and its results would be kept as if they were of
-ours: each task brings the digest of the code that it wants, and a node with another one refuses.
+Every node has the clone, with its root in PYTHONPATH, and a task travels as its name and
+parameters, never as code. So a node could have other code than this machine, and its results would
+be kept as if they were of ours: each task brings the digest of the code that it wants, and a node
+with another one refuses.
 
 Ray itself computes again what a killed process or node had. Nothing of Ray is imported before there
 is something to compute.
