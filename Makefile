@@ -24,8 +24,9 @@ DIST ?= dist
 RELEASED = $(shell git log -1 --format=%ct 2>/dev/null || date +%s)
 
 BUILD_TOOLS := 'scikit-build-core>=0.11' 'nanobind>=2.4' cmake ninja
+LAB_BUILD_TOOLS := 'hatchling>=1.27'
 NATIVE_SOURCES := $(wildcard CMakeLists.txt) $(shell find cpp -type f)
-PACKAGE_SOURCES := $(shell find cmake src -type f -not -name '*.pyc')
+PACKAGE_SOURCES := $(shell find cmake src lab/src -type f -not -name '*.pyc') lab/pyproject.toml
 CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
 
 .DEFAULT_GOAL := help
@@ -107,19 +108,20 @@ chaos: $(INSTALLED_FIGURES) ## 500 runs with real faults, about 25 minutes; see 
 	$(BIN)/holdfast chaos --trials 500 --jobs 2 --out chaos-run
 
 results: $(INSTALLED_DEV) ## the experiments behind docs/results.md: hours, the last half hour with the machine to itself
-	$(BIN)/holdfast experiment all --out runs/experiments
+	$(BIN)/python -m studies all --out runs/experiments
 	for study in runs/experiments/*/origin.json; do \
 	    name=$$(basename $$(dirname $$study)); mkdir -p docs/results/$$name; \
 	    find runs/experiments/$$name -maxdepth 1 -type f -not -name '*_trials.csv' -exec cp {} docs/results/$$name/ \; ; \
 	done
 
-wheel: $(INSTALLED_DEV) ## dist/: the sources, and a wheel for machines of this kind, the same bytes each time
+wheel: $(INSTALLED_DEV) ## dist/: the sources, and a wheel for machines of this kind, the same bytes each time; dist/lab/
 	rm -rf $(DIST)
 	SOURCE_DATE_EPOCH=$(RELEASED) $(BIN)/python -m build --outdir $(DIST)/unrepaired
 	mv $(DIST)/unrepaired/*.tar.gz $(DIST)
 	PATH="$(CURDIR)/$(BIN):$$PATH" SOURCE_DATE_EPOCH=$(RELEASED) \
 	    $(BIN)/auditwheel repair -w $(DIST) $(DIST)/unrepaired/*.whl
 	rm -rf $(DIST)/unrepaired
+	SOURCE_DATE_EPOCH=$(RELEASED) $(BIN)/python -m build --outdir $(DIST)/lab lab
 
 sbom: $(INSTALLED_DEV) ## dist/holdfast-VERSION.cdx.json: what the images' environment is made of, with licences
 	$(BIN)/python deploy/sbom.py $(DIST)
@@ -153,7 +155,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(INSTALLED_TOOLS): pyproject.toml | $(BIN)/python
-	@cmake/pip_install $(BIN)/python $(VENV)/pip.log $(BUILD_TOOLS)
+	@cmake/pip_install $(BIN)/python $(VENV)/pip.log $(BUILD_TOOLS) $(LAB_BUILD_TOOLS)
 	@touch $@
 
 # With tools that stay where they are, only what has changed is compiled: pip's own are elsewhere
@@ -162,16 +164,21 @@ $(INSTALLED_KERNEL): pyproject.toml $(NATIVE_SOURCES) | $(INSTALLED_TOOLS)
 	@cmake/pip_install $(BIN)/python $(VENV)/pip.log --no-build-isolation --no-deps -e .
 	@touch $@
 
-$(INSTALLED_FIGURES): $(INSTALLED_KERNEL)
+# The laboratory, beside what it needs of others.
+INSTALL_LAB = @cmake/pip_install $(BIN)/python $(VENV)/pip.log --no-build-isolation --no-deps -e lab
+
+$(INSTALLED_FIGURES): $(INSTALLED_KERNEL) lab/pyproject.toml
 	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[figures,service]"
+	$(INSTALL_LAB)
 	@touch $@
 
-$(INSTALLED_DEV): $(INSTALLED_KERNEL) $(wildcard ros/*/setup.py)
+$(INSTALLED_DEV): $(INSTALLED_KERNEL) lab/pyproject.toml $(wildcard ros/*/setup.py)
 	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[dev]" -e ros/ros1_master_guard -e ros/holdfast_ros
+	$(INSTALL_LAB)
 	@touch $(INSTALLED_FIGURES) $@
 
 # The sources are copied into it, so whatever of them changes is installed again.
 $(INSTALLED_COMPILED): pyproject.toml $(NATIVE_SOURCES) $(PACKAGE_SOURCES) | $(BIN)/python
 	$(BIN)/python -m venv $(COMPILED)
-	@HOLDFAST_COMPILED=1 cmake/pip_install $(COMPILED)/bin/python $(COMPILED)/pip.log ".[test]"
+	@HOLDFAST_COMPILED=1 cmake/pip_install $(COMPILED)/bin/python $(COMPILED)/pip.log ".[test]" ./lab
 	@touch $@

@@ -2,7 +2,7 @@
 
 Robot and service are the commands as anybody starts them, each in a network of its own; between the
 two, packets take half a round trip each way, or never arrive
-(:mod:`holdfast.lab.testbed.wide_area`).
+(:mod:`holdfast_lab.testbed.wide_area`).
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import pandas as pd
 
 from benchmarks.common import Context
 from benchmarks.report import Bar, Result, Table, paragraph
-from holdfast.lab.studies.cloud_trials import run_cloud_trials
-from holdfast.lab.testbed.wide_area import Transport, why_no_wide_area
+from holdfast_lab.testbed.wide_area import Transport, why_no_wide_area
+from studies.cloud_trials import run_cloud_trials
 
 __all__ = ["far"]
 

@@ -16,10 +16,10 @@ from holdfast.arrays import FloatArray
 from holdfast.belief import Belief, estimate
 from holdfast.config.settings import PlanningSettings
 from holdfast.estimators import KernelEstimator, scaled
-from holdfast.lab.studies.cases import CASES
-from holdfast.lab.studies.trial_batches import problem_of
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Stream
+from studies.cases import CASES
+from studies.trial_batches import problem_of
 
 __all__ = ["horizon", "one_by_one"]
 

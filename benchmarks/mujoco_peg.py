@@ -17,10 +17,10 @@ from typing import Any
 
 from benchmarks import trial_table
 from holdfast.config.loader import load
-from holdfast.lab.studies.statistics import mean_interval
 from holdfast.planning import Planner
 from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.trial import run_trial
+from studies.statistics import mean_interval
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "mujoco_peg"
 NAMES = ("peg", "a_move_shows", "method")

@@ -24,10 +24,10 @@ from benchmarks.beliefs import recorded_trial, settings_for
 from holdfast.arrays import FloatArray
 from holdfast.belief import Belief
 from holdfast.config.settings import PlanningSettings, SelectorSettings
-from holdfast.lab.studies.cases import CASES
-from holdfast.lab.studies.trial_batches import problem_of
 from holdfast.planning import Planner, PlanningState
 from holdfast.problems.problem import Problem
+from studies.cases import CASES
+from studies.trial_batches import problem_of
 
 MANY = 4000
 WANTED = ("three plates", "tight hole", "passer-by", "busy room")

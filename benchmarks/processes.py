@@ -10,8 +10,8 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from holdfast.lab.testbed.driver import ServiceCommand
-from holdfast.lab.testbed.processes import HOLDFAST, Process, free_port
+from holdfast_lab.testbed.driver import ServiceCommand
+from holdfast_lab.testbed.processes import HOLDFAST, Process, free_port
 
 __all__ = [
     "EchoProcess",

@@ -32,8 +32,6 @@ from benchmarks.processes import (
 from benchmarks.report import Bar, Result, Table, milliseconds, paragraph
 from benchmarks.robots import Notebook, configuration_for, run_robot
 from benchmarks.turns import Asker, decided_in_process, recorded_turns
-from holdfast.lab.testbed.processes import free_port
-from holdfast.lab.testbed.proxy import Proxy
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner, digest, encode_checkpoint
 from holdfast.protocol.messages import DIGEST_SIZE, encode_floats
@@ -41,6 +39,8 @@ from holdfast.protocol.records import ActingRecord, PerformedRecord
 from holdfast.recording.journal import Journal
 from holdfast.robot.session_configuration import session_configuration_of
 from holdfast.robot.trial import run_trial
+from holdfast_lab.testbed.processes import free_port
+from holdfast_lab.testbed.proxy import Proxy
 
 __all__ = ["capacity", "offload", "paced", "robot_loop", "serve", "wire"]
 

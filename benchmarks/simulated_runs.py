@@ -8,9 +8,9 @@ from __future__ import annotations
 import sys
 import time
 
-from holdfast.lab.simulation.schedule_draws import draw_schedule
-from holdfast.lab.simulation.world import Simulator
 from holdfast.recording.machine import machines
+from holdfast_lab.simulation.schedule_draws import draw_schedule
+from holdfast_lab.simulation.world import Simulator
 
 # What is computed once stays in memory after these.
 _WARMING_SEEDS = range(1_000_000, 1_000_150)

@@ -22,11 +22,11 @@ import numpy as np
 from benchmarks import trial_table
 from holdfast.arrays import FloatArray
 from holdfast.config.loader import load
-from holdfast.lab.studies.statistics import mean_interval
 from holdfast.outcome import Ending
 from holdfast.planning import Planner
 from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.trial import run_trial
+from studies.statistics import mean_interval
 
 FILE = Path(__file__).parents[1] / "examples" / "taskboard" / "taskboard.yaml"
 NAMES = ("way",)

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from holdfast.lab.studies import statistics
-from holdfast.lab.studies.statistics import Interval
+from studies import statistics
+from studies.statistics import Interval
 
 __all__ = ["Cell", "compare", "main", "rate", "read", "run", "shown"]
 

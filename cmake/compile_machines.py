@@ -1,4 +1,4 @@
-"""Translate the state machines and their simulator into C, for CMake to compile.
+"""Translate the state machines into C, for CMake to compile.
 
 ``python cmake/compile_machines.py SOURCE OUTPUT`` is run by CMake with -DHOLDFAST_COMPILED=ON. It
 lets mypy's compiler translate the modules and leaves OUTPUT/modules.cmake: for each extension
@@ -11,24 +11,18 @@ import os
 import sys
 from pathlib import Path
 
-PACKAGES = ("protocol", "lab/simulation")
+PACKAGES = ("protocol",)
 
 INTERPRETED = {
     # Types with class keywords, which the compiler does not know.
     "protocol/messages.py",
     "protocol/records.py",
     "protocol/service_limits.py",
-    "lab/simulation/command.py",
-    "lab/simulation/exploration.py",
-    "lab/simulation/schedule.py",
-    "lab/simulation/schedule_draws.py",
     # Nothing in them takes time.
     "protocol/__init__.py",
-    "lab/simulation/__init__.py",
     "protocol/events.py",
     "protocol/status.py",
     "protocol/verification.py",
-    "lab/simulation/story.py",
 }
 
 

@@ -1,5 +1,5 @@
-# The state machines and their simulator as extension modules beside their sources; Python prefers
-# them. What is written in Python stays the one source: mypy's compiler makes C of it.
+# The state machines as extension modules beside their sources; Python prefers them. What is written
+# in Python stays the one source: mypy's compiler makes C of it.
 
 enable_language(C)
 

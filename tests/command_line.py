@@ -11,10 +11,11 @@ from typing import NamedTuple
 import pytest
 
 from holdfast.cli import main
+from holdfast.cli.added_commands import added_commands
 from holdfast.cli.application import COMMANDS
 from holdfast.runtime.command_line import Options
 
-__all__ = ["Said", "options_of", "run_here"]
+__all__ = ["Said", "commands", "options_of", "run_here"]
 
 
 class Said(NamedTuple):
@@ -55,9 +56,15 @@ def run_here(
     return Said(code, said.out, said.err)
 
 
+def commands() -> dict[str, str]:
+    """Return the modules of all commands by name, those of installed packages as well."""
+    own = {name: command.module for name, command in COMMANDS.items()}
+    return {**{name: each.value for name, each in added_commands().items()}, **own}
+
+
 def options_of(command: str) -> type[Options]:
     """Return the class of a command's options."""
-    found = vars(importlib.import_module(COMMANDS[command].module)).values()
+    found = vars(importlib.import_module(commands()[command])).values()
     (options,) = (
         each
         for each in found

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 
-from holdfast.lab.testbed.processes import Ports
+from holdfast_lab.testbed.processes import Ports
 
 FIRST, END = 10_000, 20_000
 """Linux chooses from 32768 on, unless it is told otherwise; chaos trials from 20000 on."""

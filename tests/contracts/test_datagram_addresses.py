@@ -23,12 +23,12 @@ from tests.contracts.test_datagram_links import (
 from tests.contracts.wires import Inbox, StreamWire, echo, until
 from tests.ports import free_port
 
-from holdfast.lab.testbed.bad_line import Impairment
-from holdfast.lab.testbed.proxy import Proxy
 from holdfast.protocol.events import ServiceAppeared, ServiceVanished
 from holdfast.transport.datagram_links import DatagramScheme, RobotDatagramLink
 from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.exchanges import ECHO
+from holdfast_lab.testbed.bad_line import Impairment
+from holdfast_lab.testbed.proxy import Proxy
 
 PROBE_BYTES = 34
 

@@ -18,8 +18,6 @@ from tests.contracts.wires import LEASE_MS, Inbox, Received, StreamWire, echo, u
 from tests.ports import free_port
 
 from holdfast.errors import TransportError
-from holdfast.lab.testbed.bad_line import Carrier, Direction, Impairment
-from holdfast.lab.testbed.proxy import Proxy
 from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared, ServiceVanished
 from holdfast.transport import datagram_cipher
 from holdfast.transport import datagram_links as datagram_links
@@ -30,6 +28,8 @@ from holdfast.transport.endpoints import ServiceAddress, TlsFiles
 from holdfast.transport.exchanges import MAX_PAYLOAD_BYTES
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.service_end import StreamServiceTransport
+from holdfast_lab.testbed.bad_line import Carrier, Direction, Impairment
+from holdfast_lab.testbed.proxy import Proxy
 
 
 @pytest.fixture

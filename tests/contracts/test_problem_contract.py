@@ -19,9 +19,9 @@ SEED = 11
 LEADING_SHAPES = [(), (1,), (13,), (3, 5), (2, 3, 4), (0,)]
 initial = partial(stream, SEED, 0, 0, Purpose.INITIAL_BELIEF)  # anew at each call
 OF_EXPERIMENTS = [
-    "holdfast.lab.studies.light_dark:LightDark",
-    "holdfast.lab.studies.busy_room:BusyRoom",
-    "holdfast.lab.studies.vdp_tag:VdpTag",
+    "studies.light_dark:LightDark",
+    "studies.busy_room:BusyRoom",
+    "studies.vdp_tag:VdpTag",
 ]
 motion = partial(stream, SEED, 0, 0, Purpose.PREDICTION)  # anew at each call
 

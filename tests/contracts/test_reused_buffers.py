@@ -20,7 +20,6 @@ from holdfast.config.settings import (
     PlanningSettings,
     SelectorSettings,
 )
-from holdfast.lab.simulation.peg_with_encoders import PegWithEncoders
 from holdfast.outcome import MoveResult
 from holdfast.planning import Planner
 from holdfast.problem_attributes import PARAMETERS
@@ -28,6 +27,7 @@ from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import run_trial
+from holdfast_lab.simulation.peg_with_encoders import PegWithEncoders
 
 
 class Varying(Line):

@@ -28,7 +28,6 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from tests.ports import free_port
 from tests.processes.faults import PATIENT
 
-from holdfast.lab.testbed.in_process import InProcessNetwork
 from holdfast.protocol.events import (
     CallEnded,
     ReplyReceived,
@@ -41,6 +40,7 @@ from holdfast.transport.contract import IncomingCall, RobotTransport, ServiceTra
 from holdfast.transport.endpoints import ServiceAddress, TlsFiles
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.service_end import StreamServiceTransport
+from holdfast_lab.testbed.in_process import InProcessNetwork
 
 PATIENCE_S = 30.0
 

@@ -37,7 +37,7 @@ from tests.processes.faults import (
     wait_until,
 )
 
-from holdfast.lab.testbed.namespace import NetworkNamespace
+from holdfast_lab.testbed.namespace import NetworkNamespace
 
 MAKE_PROFILES = Path(__file__).parents[2] / "deploy" / "vpn" / "make-profiles"
 TOOLS = {

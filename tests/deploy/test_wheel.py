@@ -106,6 +106,16 @@ def test_it_holds_the_package_and_nothing_else(wheel: Path) -> None:
     assert b"holdfast = holdfast.cli:main" in archive.read(f"{about}entry_points.txt")
 
 
+def test_the_laboratory_is_a_wheel_of_its_own(dist: Path) -> None:
+    (wheel,) = (dist / "lab").glob("*.whl")
+    archive = zipfile.ZipFile(wheel)
+    about = f"holdfast_lab-{holdfast.__version__}.dist-info/"
+    package = {name.removeprefix("lab/src/") for name in _tracked("lab/src")}
+    assert {name for name in archive.namelist() if not name.startswith(about)} == package
+    assert archive.read(f"{about}licenses/LICENSE") == (ROOT / "LICENSE").read_bytes()
+    assert b"[holdfast.commands]" in archive.read(f"{about}entry_points.txt")
+
+
 def test_the_sources_are_whole(dist: Path) -> None:
     """The wheel is built of them, so what they lack it would lack; and they have the tests."""
     (sources,) = dist.glob("*.tar.gz")
@@ -129,7 +139,7 @@ def test_it_runs_on_a_bare_machine(wheel: Path, engine: Engine) -> None:
         missing(f"{wheel.name} is not for the Python 3.11 of {BASE}")
     said = engine.docker(
         *("run", "--rm", "-v", f"{wheel.parent}:/dist:ro"),
-        *(f"-v={ROOT / name}:/tree/{name}:ro" for name in ("tests", "examples")),
+        *(f"-v={ROOT / name}:/tree/{name}:ro" for name in ("tests", "examples", "studies")),
         *("-e", "PIP_CERT=/etc/ssl/certs/ca-certificates.crt", "-e", "PYTHONDONTWRITEBYTECODE=1"),
         *(BASE, "sh", "-euc", _TRIAL),
         timeout=_BUILD_S,

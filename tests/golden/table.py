@@ -23,11 +23,11 @@ from typing import Any, NamedTuple, get_args, get_type_hints
 
 from holdfast.config.loader import Configuration, load
 from holdfast.config.settings import SelectorSettings
-from holdfast.lab.studies.cases import CASES
 from holdfast.outcome import TrialResult
 from holdfast.problems import registry
 from holdfast.recording.tables import SummaryBuilder
 from holdfast.robot.trials import run_trials
+from studies.cases import CASES
 
 ROOT = Path(__file__).parents[2]
 TABLE = Path(__file__).with_name("digests.csv")
@@ -157,7 +157,7 @@ def _resolutions() -> Iterator[Run]:
         PLAIN,
         4,
         states,
-        "holdfast.lab.studies.passer_by:PasserBy",
+        "studies.passer_by:PasserBy",
     )
 
 

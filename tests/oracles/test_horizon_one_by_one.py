@@ -23,12 +23,12 @@ from holdfast.config.settings import (
     PlanningSettings,
     SelectorSettings,
 )
-from holdfast.lab.studies.busy_room import BusyRoom
-from holdfast.lab.studies.light_dark import LightDark
 from holdfast.problems import registry
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.randomness import Purpose, Stream, stream
 from holdfast.sensing import choose_sensing_action
+from studies.busy_room import BusyRoom
+from studies.light_dark import LightDark
 
 PROBLEMS: dict[str, Callable[[], Any]] = {
     **{

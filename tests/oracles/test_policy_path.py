@@ -21,7 +21,6 @@ from holdfast.arrays import FloatArray, IntArray
 from holdfast.belief import Belief
 from holdfast.config.settings import PlanningSettings, SelectorSettings, check_settings
 from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.lab.studies.busy_room import BusyRoom
 from holdfast.policy_path import _followed, path_points
 from holdfast.problem_attributes import check_problem, has_own
 from holdfast.problems import registry
@@ -29,6 +28,7 @@ from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem
 from holdfast.randomness import NOISE_FREE, Purpose, Stream, stream
 from holdfast.sensing import SensingInfo, choose_sensing_action
+from studies.busy_room import BusyRoom
 
 Actions = Literal["commanded", "executed"]
 

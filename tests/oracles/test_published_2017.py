@@ -2,7 +2,7 @@
 
 The rows are those that the logs of 2017 end with: of 1,000 trials the number of successes, and the
 mean reward over the successful ones. Emulated are the filter's defects
-(:mod:`holdfast.lab.studies.emulation_2017`); the worlds and policies are holdfast's own.
+(:mod:`studies.emulation_2017`); the worlds and policies are holdfast's own.
 
 Two tests per row, both two-sided: Fisher's exact test of the numbers of successes, and a comparison
 of the mean rewards as normal variables. The table has no standard deviations, so that of 2017 is
@@ -84,10 +84,10 @@ import pytest
 from scipy import stats
 
 from holdfast.arrays import FloatArray
-from holdfast.lab.studies.emulation_2017 import drawn_particle, likelihoods, run_emulation
-from holdfast.lab.studies.published_2017 import PublishedRow, published_rows, series_of
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem
+from studies.emulation_2017 import drawn_particle, likelihoods, run_emulation
+from studies.published_2017 import PublishedRow, published_rows, series_of
 
 SEED = 2017
 FAMILY_WISE_LEVEL = 0.001

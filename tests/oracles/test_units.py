@@ -24,7 +24,6 @@ from holdfast.config.settings import (
     PlanningSettings,
     SelectorSettings,
 )
-from holdfast.lab.studies.light_dark import LightDark
 from holdfast.planning import Planner, PlanningState
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.multitier_peg_in_hole_2d import MultitierPegInHole2D
@@ -33,6 +32,7 @@ from holdfast.problems.peg_in_hole_3d import PegInHole3D
 from holdfast.problems.problem import ProblemBase
 from holdfast.randomness import Stream
 from holdfast.robot.environment import SimulatedEnvironment
+from studies.light_dark import LightDark
 
 PEG = PegInHole2D()
 

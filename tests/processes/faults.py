@@ -28,14 +28,14 @@ from tests.processes.world import Gate, World
 from tests.processes.world import Hook as Hook
 
 from holdfast.config.loader import load
-from holdfast.lab.testbed import processes as lab
-from holdfast.lab.testbed.driver import ServiceCommand
-from holdfast.lab.testbed.records import LogEvent, log_event_of
 from holdfast.outcome import TaskDecision
 from holdfast.problems.registry import BUILT_IN
 from holdfast.protocol.records import ActingRecord
 from holdfast.recording.compare import compare_runs
 from holdfast.recording.journal import Journal
+from holdfast_lab.testbed import processes as lab
+from holdfast_lab.testbed.driver import ServiceCommand
+from holdfast_lab.testbed.records import LogEvent, log_event_of
 
 HERE = Path(__file__).parent
 EXAMPLES = HERE.parents[1] / "examples"

@@ -78,17 +78,3 @@ def test_refusals(runs: Path, words: list[str], message: str) -> None:
     done = holdfast(runs, "compare", *words)
     assert done.returncode == 2
     assert message in done.stderr
-
-
-def test_without_scipy(runs: Path, tmp_path: Path) -> None:
-    (tmp_path / "scipy.py").write_text("raise ModuleNotFoundError('scipy', name='scipy')\n")
-    script = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from holdfast.cli import main; "
-    done = subprocess.run(
-        [sys.executable, "-c", f"{script}main()", "compare", "--outcomes", "first", "random"],
-        cwd=runs,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 2
-    assert "pip install 'holdfast[lab]'" in done.stderr

@@ -27,8 +27,8 @@ SEEDS = 300
 OUTCOMES = f"""
 import hashlib
 from holdfast.recording.machine import machines
-from holdfast.lab.simulation.schedule_draws import draw_schedule
-from holdfast.lab.simulation.world import Simulator
+from holdfast_lab.simulation.schedule_draws import draw_schedule
+from holdfast_lab.simulation.world import Simulator
 from holdfast.source_digest import core_version
 simulator, hashed = Simulator(), hashlib.sha256()
 for seed in range({SEEDS}):
@@ -58,9 +58,8 @@ def outcomes(directory: Path | None = None) -> list[str]:
 def test_the_same_happens_as_interpreted(tmp_path: Path) -> None:
     package = Path(holdfast.__file__).parent
     shutil.copytree(package, tmp_path / "holdfast")
-    for folder in ("protocol", "lab/simulation"):
-        for compiled in (tmp_path / "holdfast" / folder).glob("*.so"):
-            compiled.unlink()
+    for compiled in (tmp_path / "holdfast" / "protocol").glob("*.so"):
+        compiled.unlink()
     compiled_kind, *of_compiled = outcomes()
     interpreted_kind, *of_interpreted = outcomes(tmp_path)
     assert (compiled_kind, interpreted_kind) == ("compiled", "interpreted")

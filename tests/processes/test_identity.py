@@ -24,8 +24,8 @@ from tests.processes.faults import (
     wait_until,
 )
 
-from holdfast.lab.testbed.records import LogEvent
 from holdfast.transport.key_ring import alone_in, make_credentials, revoke_credentials
+from holdfast_lab.testbed.records import LogEvent
 
 PEG = "peg_in_hole_2d"
 

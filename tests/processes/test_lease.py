@@ -18,10 +18,10 @@ import pytest
 from tests.ports import free_port
 
 from holdfast.config.loader import load
-from holdfast.lab.testbed.proxy import Proxy
 from holdfast.robot.links import make_links
 from holdfast.runtime.events import NullEventLog
 from holdfast.transport.frames import FrameDecoder, decode_hello
+from holdfast_lab.testbed.proxy import Proxy
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "peg_in_hole_2d.yaml"

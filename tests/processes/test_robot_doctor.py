@@ -28,12 +28,12 @@ from tests.wire import CALL, LAST, frame_of, hello_of
 
 from holdfast.cli.doctor import _as_text
 from holdfast.config.settings import OffloadSettings
-from holdfast.lab.testbed.namespace import NetworkNamespace, why_no_namespace
 from holdfast.protocol.messages import NeedState, Refused, Reply, decode_request, encode
 from holdfast.robot.doctor import Examination, LayerFinding, State
 from holdfast.transport.endpoints import parse_endpoint
 from holdfast.transport.frames import FrameDecoder
 from holdfast.transport.key_ring import make_credentials, revoke_credentials
+from holdfast_lab.testbed.namespace import NetworkNamespace, why_no_namespace
 
 PEG = document_of("peg_in_hole_2d", max_steps=40)
 PLAIN = ["name", "route", "port", "tls", "protocol", "clock", "problem", "round trip"]

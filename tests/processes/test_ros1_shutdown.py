@@ -10,8 +10,8 @@ from tests.processes.faults import EXAMPLES, Site, wait_until
 from tests.unit.test_ros1_node import Master, master  # noqa: F401 - a fixture
 from tests.wire import RawClient
 
-from holdfast.lab.testbed.processes import HOLDFAST
 from holdfast.protocol.messages import SensingAnswer, encode
+from holdfast_lab.testbed.processes import HOLDFAST
 from ros1_master_guard.ros1_calls import CALLER
 
 NODE = "/cloud_active_sensing"

@@ -20,13 +20,13 @@ from tests.processes.faults import (
     sensing_steps,
 )
 
-from holdfast.lab.testbed.bad_line import Impairment
-from holdfast.lab.testbed.proxy import Proxy
 from holdfast.protocol.events import CallEnded, ServiceVanished
 from holdfast.transport.credentials import load_credentials
 from holdfast.transport.datagram_links import RobotDatagramLink
 from holdfast.transport.endpoints import ServiceAddress
 from holdfast.transport.robot_end import StreamRobotTransport
+from holdfast_lab.testbed.bad_line import Impairment
+from holdfast_lab.testbed.proxy import Proxy
 
 PEG = "peg_in_hole_2d"
 

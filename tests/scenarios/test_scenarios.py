@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from holdfast.lab.simulation.schedule import parse_schedule
-from holdfast.lab.simulation.story import RunOutcome, story_lines
-from holdfast.lab.simulation.world import Simulator
+from holdfast_lab.simulation.schedule import parse_schedule
+from holdfast_lab.simulation.story import RunOutcome, story_lines
+from holdfast_lab.simulation.world import Simulator
 
 STORIES = sorted(Path(__file__).parent.glob("*.story"))
 RULE = "----\n"

@@ -18,10 +18,6 @@ from typing import Any, NamedTuple
 from tests.simulation.edits import Change, Defect, Edit, Replacement, applied
 from tests.simulation.late_defects import LATE_DEFECTS
 
-from holdfast.lab.simulation import service_node
-from holdfast.lab.simulation.schedule import RunSettings, SimulationSchedule
-from holdfast.lab.simulation.schedule_draws import draw_schedule
-from holdfast.lab.simulation.world import Simulator
 from holdfast.protocol import requests, service
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.local_service import RestartPolicy
@@ -31,6 +27,10 @@ from holdfast.protocol.robot import Robot
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import Job
 from holdfast.protocol.service_sessions import SessionTable
+from holdfast_lab.simulation import service_node
+from holdfast_lab.simulation.schedule import RunSettings, SimulationSchedule
+from holdfast_lab.simulation.schedule_draws import draw_schedule
+from holdfast_lab.simulation.world import Simulator
 
 __all__ = ["DEFECTS", "LIMIT", "Finding", "seeds_needed", "violation_of", "without_faults"]
 

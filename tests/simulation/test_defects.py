@@ -4,10 +4,10 @@ import pytest
 from tests.simulation.defects import DEFECTS, seeds_needed, violation_of, without_faults
 from tests.simulation.edits import Defect, Edit, applied
 
-from holdfast.lab.simulation.schedule import parse_schedule
-from holdfast.lab.simulation.world import Simulator
 from holdfast.protocol import requests
 from holdfast.protocol.robot import Robot
+from holdfast_lab.simulation.schedule import parse_schedule
+from holdfast_lab.simulation.world import Simulator
 
 # The moments that it takes, as the simulator found them, made small.
 FOUND_AT_ONCE = [

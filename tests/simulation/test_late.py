@@ -6,13 +6,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from holdfast.lab.errors import Violation
-from holdfast.lab.simulation.checkers import WireChecker
-from holdfast.lab.simulation.environment_model import EnvironmentModel
-from holdfast.lab.simulation.peg_with_encoders import PegWithEncoders
-from holdfast.lab.simulation.schedule import RunSettings, SimulationSchedule, parse_schedule
-from holdfast.lab.simulation.schedule_draws import draw_schedule
-from holdfast.lab.simulation.world import Setup, Simulator
 from holdfast.protocol.records import (
     ActingRecord,
     LateRecord,
@@ -21,6 +14,13 @@ from holdfast.protocol.records import (
     Record,
 )
 from holdfast.randomness import Stream, stream
+from holdfast_lab.errors import Violation
+from holdfast_lab.simulation.checkers import WireChecker
+from holdfast_lab.simulation.environment_model import EnvironmentModel
+from holdfast_lab.simulation.peg_with_encoders import PegWithEncoders
+from holdfast_lab.simulation.schedule import RunSettings, SimulationSchedule, parse_schedule
+from holdfast_lab.simulation.schedule_draws import draw_schedule
+from holdfast_lab.simulation.world import Setup, Simulator
 
 MAX_STEPS = 40
 

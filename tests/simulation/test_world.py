@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from holdfast.lab.simulation.exploration import ExplorationTally, explore
-from holdfast.lab.simulation.schedule import (
+from holdfast_lab.simulation.exploration import ExplorationTally, explore
+from holdfast_lab.simulation.schedule import (
     NUM_TRIALS,
     Crash,
     Crowd,
@@ -16,9 +16,9 @@ from holdfast.lab.simulation.schedule import (
     Stop,
     parse_schedule,
 )
-from holdfast.lab.simulation.schedule_draws import draw_schedule
-from holdfast.lab.simulation.story import RunOutcome, story_lines
-from holdfast.lab.simulation.world import Simulator
+from holdfast_lab.simulation.schedule_draws import draw_schedule
+from holdfast_lab.simulation.story import RunOutcome, story_lines
+from holdfast_lab.simulation.world import Simulator
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from holdfast.cli import added_commands
+from holdfast.cli.application import run_application
+from holdfast.errors import OptionError
+
 GREET = """\
 import sys
 
@@ -87,6 +91,15 @@ def test_holdfasts_own_command_goes_first(packages: Path) -> None:
 def test_an_unknown_command_is_compared_with_all(packages: Path) -> None:
     done = holdfast(packages, "gret")
     assert done.stderr == "holdfast: error: 'gret' is no command; did you mean greet?\n"
+
+
+@pytest.mark.parametrize("command", ["demo", "chaos", "simulate"])
+def test_without_its_package_a_command_says_what_to_install(
+    command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(added_commands, "added_commands", dict)
+    with pytest.raises(OptionError, match=f"{command} is in .*: pip install holdfast-lab"):
+        run_application([command, "--quick"])
 
 
 def test_own_commands_read_no_metadata(packages: Path) -> None:

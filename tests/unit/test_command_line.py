@@ -6,10 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from tests.command_line import options_of
+from tests.command_line import commands, options_of
 
 from holdfast.cli import main
-from holdfast.cli.application import COMMANDS
 from holdfast.errors import OptionError
 from holdfast.runtime.command_line import (
     Options,
@@ -90,7 +89,7 @@ def test_events_as_json_are_wanted() -> None:
     assert not wants_json(["--log", "json", "--log=text"])
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", commands())
 def test_help_names_every_option_and_exit_code(
     command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -107,7 +106,7 @@ def test_help_names_every_option_and_exit_code(
     assert all(f"{code} " in codes for code in (0, 2, *options.exit_codes))
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", commands())
 def test_words_give_the_same_options_again(command: str) -> None:
     options = options_of(command)
     chosen = {

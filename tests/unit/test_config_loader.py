@@ -313,7 +313,7 @@ class TestResolution:
     ) -> None:
         (tmp_path / "without_state_resolution.py").write_text(
             "import numpy as np\n"
-            "from holdfast.lab.studies.passer_by import PasserBy\n"
+            "from studies.passer_by import PasserBy\n"
             "class Without(PasserBy):\n"
             "    resolution = np.array([0.1, 0.2])\n"
             "    state_resolution = None\n"

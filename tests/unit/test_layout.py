@@ -1,4 +1,4 @@
-"""The tree: each module of the product has its tests, and each folder its line in ARCHITECTURE."""
+"""The tree: each module has its tests, and each folder of the product its line in ARCHITECTURE."""
 
 from __future__ import annotations
 
@@ -17,6 +17,11 @@ PACKAGES = {
 """Packages whose modules have tests here, by what their modules are called here."""
 
 TESTS = {path.stem for path in (ROOT / "tests").rglob("test_*.py")}
+BESIDE = {
+    "lab": (ROOT / "lab" / "src" / "holdfast_lab", ROOT / "lab" / "tests"),
+    "studies": (ROOT / "studies", ROOT / "studies" / "tests"),
+}
+"""What is no part of the product, and its tests."""
 
 WITHOUT_TESTS = {
     "__main__": "one line, which every process test runs",
@@ -35,32 +40,107 @@ WITHOUT_TESTS = {
 }
 """Modules of the product that no test is named after, and why."""
 
+SIMULATED = "tests/simulation/test_world.py"
+PARTS = "lab/tests/test_parts.py"
+TASKS = "studies/tests/test_running.py"
+FIGURES = "studies/tests/test_command.py"
+ELSEWHERE = {
+    "lab": {
+        "chaos/series": "lab/tests/test_chaos_report.py",
+        "demo/narrator": "lab/tests/test_demo_timeline.py",
+        "demo/scenario": "lab/tests/test_demo_timeline.py",
+        "errors": PARTS,
+        "simulation/checked_memo": PARTS,
+        "simulation/checkers": PARTS,
+        "simulation/disk": PARTS,
+        "simulation/environment_model": PARTS,
+        "simulation/event_queue": PARTS,
+        "simulation/exploration": PARTS,
+        "simulation/network": SIMULATED,
+        "simulation/peg_with_encoders": "tests/simulation/test_late.py",
+        "simulation/reference_runs": PARTS,
+        "simulation/robot_node": SIMULATED,
+        "simulation/schedule_draws": "lab/tests/test_simulation_schedule.py",
+        "simulation/service_node": SIMULATED,
+        "simulation/story": "tests/scenarios/test_scenarios.py",
+        "simulation/world": SIMULATED,
+        "testbed/faults": "lab/tests/test_chaos_schedule.py",
+        "testbed/records": "tests/unit/test_timings.py",
+        "testbed/reference_run": "lab/tests/test_chaos_command.py",
+    },
+    "studies": {
+        "__main__": FIGURES,
+        "busy_room": "tests/contracts/test_problem_contract.py",
+        "cases": "studies/tests/test_selectors.py",
+        "cloud_trials": "studies/tests/test_thesis_chapter_6.py",
+        "corridor": "studies/tests/test_estimates.py",
+        "errors": TASKS,
+        "estimate_candidates": "studies/tests/test_estimates.py",
+        "exchange_times": "studies/tests/test_offload_break_even.py",
+        "executors": TASKS,
+        "judged_study": "studies/tests/test_selectors.py",
+        "light_dark": "tests/contracts/test_problem_contract.py",
+        "offload_figures": FIGURES,
+        "parameters": "studies/tests/test_selectors.py",
+        "passer_by": "tests/golden/test_golden.py",
+        "plots": "studies/tests/test_results_page.py",
+        "priced_problems": "studies/tests/test_sensing_price.py",
+        "published_2017": "tests/oracles/test_published_2017.py",
+        "ray_executor": "studies/tests/test_ray.py",
+        "selectors_figures": FIGURES,
+        "sensing_price_figures": FIGURES,
+        "sensing_times": "studies/tests/test_offload_break_even.py",
+        "study": TASKS,
+        "tasks": TASKS,
+        "thesis_figures": FIGURES,
+        "thesis_measurements": "studies/tests/test_thesis_chapter_6.py",
+        "thesis_picture": FIGURES,
+        "trial_batches": TASKS,
+        "trial_files": "studies/tests/test_selectors.py",
+        "vdp_trials": "studies/tests/test_vdp_tag.py",
+        "westward": "studies/tests/test_estimates.py",
+    },
+}
+"""Modules beside the product that another test tries, as a part of something."""
 
-def modules() -> list[str]:
+
+def modules(package: Path = PACKAGE) -> list[str]:
     return sorted(
-        f"{prefix}{path.relative_to(package).with_suffix('')}"
-        for prefix, package in PACKAGES.items()
+        str(path.relative_to(package).with_suffix(""))
         for path in package.rglob("*.py")
-        if path.name != "__init__.py" and path.relative_to(package).parts[0] != "lab"
+        if path.name != "__init__.py" and path.relative_to(package).parts[0] != "tests"
     )
 
 
-def is_tested(module: str) -> bool:
+MODULES = [f"{prefix}{each}" for prefix, package in PACKAGES.items() for each in modules(package)]
+
+
+def is_tested(module: str, known: list[str], tests: set[str]) -> bool:
     """Whether a test is named after it: test_NAME, or where names repeat test_FOLDER_NAME."""
     *folders, name = module.split("/")
-    repeats = sum(other.rpartition("/")[2] == name for other in modules()) > 1
+    repeats = sum(other.rpartition("/")[2] == name for other in known) > 1
     starts = range(len(folders) if repeats and folders else len(folders) + 1)
     wanted = {f"test_{'_'.join([*folders[start:], name.lstrip('_')])}" for start in starts}
-    return not wanted.isdisjoint(TESTS)
+    return not wanted.isdisjoint(tests)
 
 
-@pytest.mark.parametrize("module", modules())
+@pytest.mark.parametrize("module", MODULES)
 def test_a_test_is_named_after_it(module: str) -> None:
-    assert is_tested(module) != (module in WITHOUT_TESTS)
+    assert is_tested(module, MODULES, TESTS) != (module in WITHOUT_TESTS)
 
 
 def test_reasons_are_for_modules_that_exist() -> None:
-    assert set(WITHOUT_TESTS) <= set(modules())
+    assert set(WITHOUT_TESTS) <= set(MODULES)
+
+
+@pytest.mark.parametrize("name", BESIDE)
+def test_what_is_beside_the_product_has_its_tests_beside_it(name: str) -> None:
+    package, folder = BESIDE[name]
+    known, elsewhere = modules(package), ELSEWHERE[name]
+    tests = {path.stem for path in folder.glob("test_*.py")}
+    assert {each for each in known if not is_tested(each, known, tests)} == set(elsewhere)
+    for place in elsewhere.values():
+        assert (ROOT / place).is_file(), place
 
 
 def test_architecture_names_every_folder() -> None:
@@ -68,7 +148,7 @@ def test_architecture_names_every_folder() -> None:
     code_map = text[text.index("## Code map") : text.index("## Invariants")]
     named = set(re.findall(r"`([\w/]+)/`", code_map))
     folders = {path.parent.relative_to(PACKAGE).parts for path in PACKAGE.rglob("*.py")}
-    for folder in folders - {(), ("lab",)}:
+    for folder in folders - {()}:
         assert any("/".join(folder[: end + 1]) in named for end in range(len(folder))), folder
     for path in PACKAGE.glob("*.py"):
         if not path.name.startswith("__"):

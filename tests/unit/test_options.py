@@ -6,10 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from tests.command_line import options_of
+from tests.command_line import commands, options_of
 
 from holdfast.cli import main
-from holdfast.cli.application import COMMANDS
 
 NUMBERS = [
     ["run", "peg.yaml", "--trials"],
@@ -25,8 +24,6 @@ NUMBERS = [
     ["chaos", "--seed"],
     ["chaos", "--jobs"],
     ["chaos", "--first"],
-    ["experiment", "all", "--seed"],
-    ["experiment", "all", "--jobs"],
     ["simulate", "--jobs"],
     ["simulate", "--seeds"],
     ["keys", "mine", "--days"],
@@ -50,8 +47,6 @@ PATHS = [
     ["run", "peg.yaml", "--view-file"],
     ["demo", "--out"],
     ["chaos", "--out"],
-    ["experiment", "all", "--out"],
-    ["experiment", "selectors", "--from"],
     ["simulate", "--schedule"],
     ["doctor", "--tls"],
     ["compare"],
@@ -171,9 +166,7 @@ def test_other_misuse(
     assert reason in last_words(arguments, capsys, monkeypatch)
 
 
-@pytest.mark.parametrize(
-    "arguments", [[], ["run"], ["compare"], ["export"], ["view"], ["keys"], ["experiment"]]
-)
+@pytest.mark.parametrize("arguments", [[], ["run"], ["compare"], ["export"], ["view"], ["keys"]])
 def test_without_arguments_there_is_help(
     arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -185,7 +178,7 @@ def test_without_arguments_there_is_help(
     assert (said.out + said.err).startswith("usage: holdfast")
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", commands())
 def test_every_number_and_path_is_in_these_tables(command: str) -> None:
     """So that a new option gets a line above."""
     listed = {(words[0], words[-1]) for words in [*NUMBERS, *PATHS]}

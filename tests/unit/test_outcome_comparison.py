@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+from scipy import stats
 
+from holdfast.arrays import FloatArray
 from holdfast.errors import OutputError
 from holdfast.outcome import DecisionLog, TrialResult
+from holdfast.recording import outcome_comparison
 from holdfast.recording.journal import Journal
 from holdfast.recording.outcome_comparison import OutcomeEffect, compare_outcomes, effects_of
 
@@ -134,6 +138,30 @@ class TestEffects:
         found = by_measure(effects_of(*runs, step_limit=LIMIT, paired=True))
         assert set(found) == {"success_rate", "steps"}
         assert found["steps"].interval is None
+
+    @pytest.mark.parametrize("paired", [True, False])
+    def test_intervals_are_those_of_scipy(
+        self, paired: bool, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(outcome_comparison, "_NUMBERS_IN_MEMORY", 20_000)  # so, in batches
+        generator = np.random.default_rng(4)
+        values = [generator.normal(size=length) for length in (30, 30 if paired else 25)]
+
+        def difference(first: FloatArray, second: FloatArray, axis: int) -> Any:
+            return np.mean(second, axis) - np.mean(first, axis)
+
+        expected = stats.bootstrap(
+            values,
+            difference,
+            paired=paired,
+            vectorized=True,
+            n_resamples=outcome_comparison.RESAMPLES,
+            batch=20_000 // 30,
+            method="percentile",
+            random_state=np.random.default_rng(0),
+        ).confidence_interval
+        found = outcome_comparison._bootstrap(values, difference, paired=paired)
+        assert found == pytest.approx(tuple(expected), rel=1e-12)
 
     @pytest.mark.parametrize("paired", [True, False])
     def test_intervals_cover(self, paired: bool) -> None:

@@ -76,7 +76,7 @@ class TestMake:
         assert problem.model.peg_width == 0.5  # type: ignore[attr-defined]
 
     def test_a_class_of_ones_own(self) -> None:
-        problem = hf.make("holdfast.lab.studies.busy_room:BusyRoom")
+        problem = hf.make("studies.busy_room:BusyRoom")
         assert isinstance(problem, hf.Problem)
 
     @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ class TestMake:
             ),
             ("peg_in_hole_2d", {"width": 1}, InvalidValueError, "no setting .width."),
             (
-                "holdfast.lab.studies.busy_room:BusyRoom",
+                "studies.busy_room:BusyRoom",
                 {"width": 1},
                 ProblemError,
                 "BusyRoom cannot be built",

@@ -9,8 +9,8 @@ from typing import Literal, get_args, get_origin, get_type_hints
 import msgspec
 import pytest
 
-from holdfast.lab.simulation.schedule import RunSettings, SimulatedFault, line_of, parse_schedule
-from holdfast.lab.testbed.faults import FaultKind
+from holdfast_lab.simulation.schedule import RunSettings, SimulatedFault, line_of, parse_schedule
+from holdfast_lab.testbed.faults import FaultKind
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reliability.md").read_text(encoding="utf-8")
 SECTION = PAGE.partition("## The lines of a schedule\n")[2].partition("\n## ")[0]

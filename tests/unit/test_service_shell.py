@@ -16,7 +16,6 @@ import pytest
 from tests.unit.test_protocol_service import Robot, content, planning_of
 
 from holdfast.errors import MessageError
-from holdfast.lab.testbed.in_process import InProcessNetwork
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.problem import Problem
 from holdfast.protocol.events import (
@@ -46,6 +45,7 @@ from holdfast.protocol.service_limits import ServiceLimits
 from holdfast.service import shell
 from holdfast.service.problem_factory import ProblemFactory
 from holdfast.service.shell import ServiceShell
+from holdfast_lab.testbed.in_process import InProcessNetwork
 
 PATIENCE_S = 30.0
 LARGE = b"x" * (65 << 10)

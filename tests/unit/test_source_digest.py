@@ -128,8 +128,8 @@ class TestProblem:
             assert problem_sources(registry.problem_class(name)) == {}
 
     def test_problems_of_the_studies_are_not(self) -> None:
-        name = "holdfast.lab.studies.busy_room:BusyRoom"
-        assert "holdfast.lab.studies.busy_room" in problem_sources(registry.problem_class(name))
+        name = "studies.busy_room:BusyRoom"
+        assert "studies.busy_room" in problem_sources(registry.problem_class(name))
 
     def test_source_that_is_no_python_any_more(self, folder: Path) -> None:
         arm = arm_of(folder)

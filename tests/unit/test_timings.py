@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from holdfast.errors import OutputError
-from holdfast.lab.testbed.records import DecisionTable, time_of
 from holdfast.protocol.events import Timing, VerificationNoted
 from holdfast.recording.timings import (
     AnswerCounts,
@@ -17,6 +16,7 @@ from holdfast.recording.timings import (
     count_answers,
     count_verified,
 )
+from holdfast_lab.testbed.records import DecisionTable, time_of
 
 MOMENT_NS = 1_700_000_000_123_456_789
 

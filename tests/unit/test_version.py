@@ -1,4 +1,4 @@
-"""The version stands in four files for four kinds of reader; they must be told the same."""
+"""The version stands in five files for several kinds of reader; they must be told the same."""
 
 from __future__ import annotations
 
@@ -16,18 +16,26 @@ ROOT = Path(__file__).parents[2]
 
 def test_all_files_tell_the_same_version() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    lab = tomllib.loads((ROOT / "lab" / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     newest = re.search(r"^## (\S+)", changes, re.MULTILINE)
     assert newest is not None
     assert {
         "pyproject.toml": project["version"],
+        "lab/pyproject.toml": lab["version"],
         "CITATION.cff": str(citation["version"]),
         "CHANGELOG.md": newest[1],
         "installed": metadata.version("holdfast"),
+        "installed, the laboratory": metadata.version("holdfast-lab"),
     } == dict.fromkeys(
-        ("pyproject.toml", "CITATION.cff", "CHANGELOG.md", "installed"), holdfast.__version__
+        (
+            *("pyproject.toml", "lab/pyproject.toml", "CITATION.cff", "CHANGELOG.md"),
+            *("installed", "installed, the laboratory"),
+        ),
+        holdfast.__version__,
     )
+    assert lab["dependencies"] == [f"holdfast[figures,service]=={holdfast.__version__}"]
     assert re.fullmatch(r"\d+\.\d+\.\d+", holdfast.__version__)
     assert citation["license"] == project["license"]
 

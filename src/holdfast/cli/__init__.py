@@ -15,13 +15,24 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from collections.abc import Callable, Sequence
 from types import TracebackType
 
 __all__ = ["main"]
 
 
-def main() -> None:
-    """Run the command line and exit."""
+def _commands(arguments: Sequence[str]) -> int:
+    from holdfast.cli.application import run_application
+
+    return run_application(arguments)
+
+
+def main(application: Callable[[Sequence[str]], int] = _commands) -> None:
+    """Run the command line and exit.
+
+    ``application`` is run with the arguments instead of the commands of ``holdfast``; it returns
+    the exit code.
+    """
     if os.getpid() == 1:
         # The first process of a container does not get what it has no handler for.
         signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
@@ -41,13 +52,11 @@ def main() -> None:
     arguments = sys.argv[1:]
     try:
         allow_descriptors()
-        from holdfast.cli.application import run_application
-
         if arguments[:1] == ["serve"]:  # which goes on when nobody reads its output
-            sys.exit(run_application(arguments))
+            sys.exit(application(arguments))
         end_with_reader()
         try:
-            code = run_application(arguments)
+            code = application(arguments)
         finally:
             sys.stdout.flush()
         sys.exit(code)

@@ -19,7 +19,7 @@ __all__ = ["COMMANDS", "Command", "run_application"]
 
 
 class Command(NamedTuple):
-    """A command, and the name of its module: nothing outside the laboratory imports that."""
+    """A command, and the name of its module, which is imported when the command is run."""
 
     module: str
     summary: str
@@ -29,24 +29,19 @@ COMMANDS = {
     "run": Command("holdfast.cli.run", "Run the trials of a configuration."),
     "serve": Command("holdfast.service.process", "Decide for robots, as a service."),
     "doctor": Command("holdfast.cli.doctor", "Check each layer between a robot and a service."),
-    "demo": Command(
-        "holdfast.lab.demo.command", "See a cloud and a robot killed, and no decision change."
-    ),
-    "chaos": Command(
-        "holdfast.lab.chaos.command", "Inject real faults into real runs, and compare them."
-    ),
-    "experiment": Command("holdfast.lab.studies.command", "Regenerate the tables and figures."),
     "compare": Command("holdfast.cli.compare", "Compare the decisions of two runs."),
     "export": Command("holdfast.cli.export", "Write a run for RViz, Foxglove, or as tables."),
     "view": Command("holdfast.cli.view", "See a run in Rerun's viewer."),
-    "simulate": Command(
-        "holdfast.lab.simulation.command", "Search for faults that change a decision."
-    ),
     "keys": Command("holdfast.cli.keys", "Make keys for robots and services."),
 }
 
-_PACKAGES = {"demo": "holdfast-lab", "simulate": "holdfast-lab", "chaos": "holdfast-lab"}
-_PACKAGES |= {"ros1-guard": "holdfast-ros", "ros1-serve": "holdfast-ros"}
+_PACKAGES = {
+    "demo": "holdfast-lab",
+    "simulate": "holdfast-lab",
+    "chaos": "holdfast-lab",
+    "ros1-guard": "holdfast-ros",
+    "ros1-serve": "holdfast-ros",
+}
 """Which package of this project adds a command, for whoever has not installed it."""
 
 _HELP = """\

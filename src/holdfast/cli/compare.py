@@ -42,7 +42,7 @@ class CompareOptions(Options):
     )
     outcomes: bool = flag(
         help="Show which run is better: success, steps, rewards and decision times against the "
-        "first run's, with intervals (extra lab).",
+        "first run's, with intervals.",
     )
     unpaired: bool = flag(
         help="With --outcomes: take the runs as independent samples, as of other seeds.",

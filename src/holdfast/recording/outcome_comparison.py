@@ -4,8 +4,6 @@ In a simulated run, seed and trial name every random number, so trial 7 of two r
 and seed happens in the same world. Such trials are compared in pairs: the effect of a setting shows
 within a pair, and the differences between worlds cancel. An interval is the percentile bootstrap
 over trials; it needs no assumption about the distribution of steps, rewards or times.
-
-SciPy takes a second to import, so only this comparison imports it.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ import msgspec
 import numpy as np
 
 from holdfast.arrays import FloatArray
-from holdfast.errors import HoldfastError, OutputError
+from holdfast.errors import OutputError
 from holdfast.outcome import TrialResult
 from holdfast.recording.journal_reader import JournalReader
 from holdfast.recording.run_directory import (
@@ -161,15 +159,7 @@ def compare_outcomes(runs: Sequence[Path], *, paired: bool = True) -> OutcomeCom
     OutputError
         If one is no run, is damaged or in use, or if the runs cannot be compared: their problems,
         limits or (if paired) seeds differ, or they have too few trials.
-    HoldfastError
-        If SciPy is not installed.
     """
-    try:
-        import scipy  # noqa: F401
-    except ImportError as error:
-        raise HoldfastError(
-            "comparing outcomes needs scipy, not installed here: pip install 'holdfast[lab]'"
-        ) from error
     baseline, *others = map(_read, runs)
     for other in others:
         _require_comparable(baseline, other, paired=paired)
@@ -396,20 +386,20 @@ def _effect_of(
 def _bootstrap(
     values: Sequence[FloatArray], statistic: Callable[..., Any], *, paired: bool
 ) -> tuple[float, float]:
-    from scipy import stats
-
-    found = stats.bootstrap(
-        tuple(values),
-        statistic,
-        paired=paired,
-        vectorized=True,
-        n_resamples=RESAMPLES,
-        batch=max(1, _NUMBERS_IN_MEMORY // max(map(len, values))),
-        confidence_level=LEVEL,
-        method="percentile",
-        random_state=np.random.default_rng(_SEED),
-    ).confidence_interval
-    return float(found.low), float(found.high)
+    """Return the interval in which the statistic of resamples lies; pairs are drawn as pairs."""
+    generator = np.random.default_rng(_SEED)
+    lengths = [len(each) for each in (values[:1] if paired else values)]
+    batch = max(1, _NUMBERS_IN_MEMORY // max(lengths))
+    found = []
+    for first in range(0, RESAMPLES, batch):
+        rows = min(batch, RESAMPLES - first)
+        drawn = [generator.integers(0, length, (rows, length)) for length in lengths]
+        if paired:
+            drawn *= len(values)
+        resampled = (each[indices] for each, indices in zip(values, drawn, strict=True))
+        found.append(statistic(*resampled, axis=-1))
+    low, high = np.quantile(np.concatenate(found), [0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL])
+    return float(low), float(high)
 
 
 def _row(effect: OutcomeEffect) -> tuple[str, ...]:

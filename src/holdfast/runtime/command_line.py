@@ -176,10 +176,13 @@ class Options:
         what they mean in general.
     needs_arguments : bool
         Whether the command without any arguments shows its help.
+    program : str
+        What is typed before the command.
     """
 
     exit_codes: ClassVar[Mapping[int, str | None]] = {}
     needs_arguments: ClassVar[bool] = False
+    program: ClassVar[str] = "holdfast"
 
     def __init_subclass__(cls) -> None:
         for name, each in cls.table().items():
@@ -211,7 +214,8 @@ class Options:
         from holdfast.files import remember_directory
 
         remember_directory()
-        parser = _parser(cls, f"holdfast {command}")
+        program = f"{cls.program} {command}"
+        parser = _parser(cls, program)
         if cls.needs_arguments and not arguments:
             import sys
 
@@ -220,7 +224,7 @@ class Options:
         try:
             found, unknown = parser.parse_known_intermixed_args(_marked(arguments))
         except argparse.ArgumentError as error:
-            raise OptionError(_complaint(error, command, arguments)) from None
+            raise OptionError(_complaint(error, program, arguments)) from None
         if unknown:
             word = unknown[0].partition("=")[0]
             if not word.startswith("-"):
@@ -230,7 +234,7 @@ class Options:
 
             names = [name for each in cls.table().values() for name in each.names]
             hint = close_match(word, names)
-            raise OptionError(f"{word!r:.80} is no option of holdfast {command}{hint}")
+            raise OptionError(f"{word!r:.80} is no option of {program}{hint}")
         table = cls.table()
         values = {
             name: tuple(value) if table[name].many else value for name, value in vars(found).items()
@@ -338,7 +342,7 @@ def _help(each: Option) -> str:
     return f"{text} (default: {default})"
 
 
-def _complaint(error: argparse.ArgumentError, command: str, arguments: Sequence[str]) -> str:
+def _complaint(error: argparse.ArgumentError, program: str, arguments: Sequence[str]) -> str:
     """Return the message about an argument, with its long name."""
     name = (error.argument_name or "").split("/")[0]
     if error.message == "expected one argument":
@@ -347,7 +351,7 @@ def _complaint(error: argparse.ArgumentError, command: str, arguments: Sequence[
         value = error.message.partition("'")[2].removesuffix("'")
         # In -qx the letter is no value of -q.
         if any(re.fullmatch(rf"-\w+{re.escape(value)}", word) for word in arguments):
-            return f"'-{value[0]}' is no option of holdfast {command}"
+            return f"'-{value[0]}' is no option of {program}"
         return f"{name} takes no value"
     return f"{name} {error.message}"
 

@@ -1,0 +1,133 @@
+"""Pure functions are computed once.
+
+A decision, and a state that follows from another, are the same in every run of a trial, so what was
+computed in one run is taken over into the next. That they *are* pure is not taken on trust: of what
+is taken over, a share is computed again, and must come to the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from functools import partial
+from typing import Any, Generic, TypeVar
+
+from holdfast.config.settings import PlanningSettings
+from holdfast.planning import Decision, PlanningState, digest
+from holdfast.problems.problem import Problem
+from holdfast.protocol.service_jobs import Job, JobResult
+from holdfast.robot.memo_cache import MemoCache, MemoizingPlanner
+from holdfast_lab.errors import Violation
+
+__all__ = ["CheckedPlanner", "JobCache", "Memo"]
+
+_MOST = 20_000
+_COMPUTED_AGAIN = 61
+"""One of so many that are known is computed all the same."""
+
+Key = TypeVar("Key")
+Value = TypeVar("Value")
+Result = TypeVar("Result")
+
+
+class Memo(Generic[Key, Value]):
+    """Results by key. Once there are ``most`` of them, all are forgotten.
+
+    ``check`` gets a result that is taken over and, now and then, the same computed again.
+    """
+
+    def __init__(
+        self, most: int = _MOST, check: Callable[[Value, Value], None] | None = None
+    ) -> None:
+        self._most = most
+        self._check = check
+        self._known: dict[Key, Value] = {}
+        self._taken_over = 0
+
+    def get(self, key: Key, compute: Callable[[], Value]) -> Value:
+        """Return the result of a key, computed if it is not known."""
+        known = self._known.get(key)
+        if known is None:
+            if len(self._known) >= self._most:
+                self._known.clear()
+            result = self._known[key] = compute()
+            return result
+        if self._check is not None:
+            self._taken_over += 1
+            if self._taken_over % _COMPUTED_AGAIN == 0:
+                self._check(known, compute())
+        return known
+
+
+class JobCache:
+    """Outcomes of the services' jobs, by what the jobs were made with."""
+
+    def __init__(self) -> None:
+        self._outcomes: Memo[tuple[object, ...], tuple[str, JobResult]]
+        self._outcomes = Memo(check=_check_outcomes)
+        self._digests: Memo[int, tuple[PlanningState, bytes]] = Memo()
+
+    def outcome(self, job: Job) -> JobResult:
+        """Return the outcome of a job; another one than the last time is a Violation."""
+        if job.is_cancelled:
+            return job.run()  # its outcome follows from that, and not from what it was made with
+        state = job.state
+        known = None
+        if state is not None:
+            known = self._digests.get(id(state), lambda: (state, digest(state)))[1]
+        return self._outcomes.get((job.identity, known), lambda: (job.kind, job.run()))[1]
+
+
+def _check_outcomes(known: tuple[str, JobResult], now: tuple[str, JobResult]) -> None:
+    if _comparable(now[1]) != _comparable(known[1]):
+        raise Violation(f"a {now[0]} job came to another outcome than before")
+
+
+def _comparable(outcome: JobResult) -> tuple[object, ...]:
+    states = (outcome.state, outcome.ahead)
+    return (
+        *(None if state is None else digest(state) for state in states),
+        *outcome._replace(problem=None, state=None, ahead=None),
+    )
+
+
+class CheckedPlanner(MemoizingPlanner):
+    """The robot's planner, which knows the states and decisions that it has come to before."""
+
+    def __init__(self, problem: Problem, settings: PlanningSettings) -> None:
+        super().__init__(problem, settings, _CheckedCache())
+
+    def decide(self, state: PlanningState, max_actions: int) -> Decision:
+        """Decide all that can be decided before something is sensed again."""
+        key = ("decision", id(state))
+        return self._once(key, state, partial(super().decide, state, max_actions))
+
+
+class _CheckedCache(MemoCache):
+    """A cache that keeps more than the robot's, and checks a share of what it returns."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        # By the identity of a state, which is kept with the result and so stays the state's own.
+        self._kept: Memo[Hashable, tuple[PlanningState | None, Any]]
+        self._kept = Memo(5 * _MOST, _check_states)
+
+    def once(
+        self, key: Hashable, state: PlanningState | None, compute: Callable[[], Result]
+    ) -> Result:
+        """Return the result for a key, computed if it is not known."""
+        result: Result = self._kept.get(key, lambda: (state, compute()))[1]
+        return result
+
+
+def _check_states(
+    known: tuple[PlanningState | None, Any], now: tuple[PlanningState | None, Any]
+) -> None:
+    before, after = _state_of(known[1]), _state_of(now[1])
+    if before is not None and after is not None and digest(before) != digest(after):
+        raise Violation(f"the same events lead to another state of step {after.step} than before")
+
+
+def _state_of(result: Any) -> PlanningState | None:
+    """Return the state that a result is, or begins with."""
+    first = result[0] if type(result) is tuple else result
+    return first if isinstance(first, PlanningState) else None

@@ -1,0 +1,312 @@
+"""The parts of the simulated world, each by itself: one that lies would prove nothing."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from holdfast.arrays import FloatArray
+from holdfast.config.settings import PlanningSettings
+from holdfast.outcome import TrialResult
+from holdfast.planning import Planner
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.protocol.records import ActingRecord, PerformedRecord, TrialHistory
+from holdfast.randomness import Stream
+from holdfast_lab.errors import Violation
+from holdfast_lab.simulation.checked_memo import CheckedPlanner
+from holdfast_lab.simulation.checkers import StatusChecker, WireChecker, check_size
+from holdfast_lab.simulation.disk import Disk
+from holdfast_lab.simulation.environment_model import EnvironmentModel
+from holdfast_lab.simulation.event_queue import Clock, EventQueue
+from holdfast_lab.simulation.exploration import shrink
+from holdfast_lab.simulation.reference_runs import (
+    UNDISTURBED,
+    Circumstances,
+    ReferenceRun,
+    ReferenceRuns,
+    ReferenceStep,
+)
+from holdfast_lab.simulation.schedule import (
+    Crash,
+    MessageFault,
+    RunSettings,
+    SimulationSchedule,
+    Stop,
+)
+from holdfast_lab.simulation.schedule_draws import draw_schedule
+
+
+class TestEventQueue:
+    def test_order(self) -> None:
+        queue = EventQueue()
+        seen: list[str] = []
+        queue.after(2.0, seen.append, "c")
+        queue.after(1.0, seen.append, "a")
+        queue.at(1.0, seen.append, "b")
+        queue.at(-5.0, seen.append, "first")
+        while queue.step():
+            pass
+        assert seen == ["first", "a", "b", "c"]
+        assert queue.now == 2.0
+
+    def test_clocks(self) -> None:
+        queue = EventQueue()
+        clock = Clock(queue, 1e6, 0.97)
+        assert clock.now() == 1e6
+        due = clock.now() + 0.25
+        queue.after(clock.until(due), lambda: None)
+        queue.step()
+        assert clock.now() == pytest.approx(due, abs=1e-9)
+        assert clock.reached(due) >= due
+        assert clock.now() >= due, "a clock does not go back"
+        assert clock.until(due - 1.0) == 0.0
+
+
+class TestDisk:
+    def records(self, step: int) -> tuple[PerformedRecord, ActingRecord]:
+        return PerformedRecord(step, -1.0), ActingRecord(step + 1, b"8" * 24)
+
+    @pytest.mark.parametrize(("lost", "left"), [(0, 6), (1, 4), (2, 2), (100, 2)])
+    def test_a_power_cut_loses_a_tail(self, lost: int, left: int) -> None:
+        disk = Disk(forces_out=False)
+        disk.opened()
+        for step in range(3):
+            disk.append(5, self.records(step))  # the first of a process is forced out
+        disk.cut_power(lost)
+        disk.opened()
+        unfinished = disk.unfinished()
+        assert unfinished is not None
+        assert len(unfinished.records) == left
+        assert not unfinished.is_complete
+        disk.append(5, self.records(9))
+        disk.opened()
+        again = disk.unfinished()
+        assert again is not None
+        assert again.is_complete, "no power was cut since"
+
+
+def reference_run() -> ReferenceRun:
+    steps = tuple(
+        ReferenceStep(
+            0 if step == 0 else None,
+            np.zeros(1),
+            np.full(2, float(step)).tobytes(),
+            -1.0,
+            step == 2,
+        )
+        for step in range(3)
+    )
+    return ReferenceRun(steps, False, "digest")
+
+
+class OneReference(ReferenceRuns):
+    """A world in which whatever is sensed again leads to another end."""
+
+    def __init__(self) -> None:
+        pass
+
+    def get(
+        self, trial: int, max_steps: int, circumstances: Circumstances = UNDISTURBED
+    ) -> ReferenceRun:
+        return reference_run()._replace(digest=f"digest{circumstances.repeats or ''}")
+
+
+def environment(*, shows_the_same: bool = False) -> EnvironmentModel:
+    return EnvironmentModel(0, 3, OneReference(), shows_the_same=shows_the_same)
+
+
+def result(steps: int, digest: str) -> TrialResult:
+    return TrialResult(
+        trial=0,
+        seed=0,
+        success=True,
+        steps=steps,
+        reward=-3.0,
+        sensing_decisions=1,
+        mean_sensing_ms=0.0,
+        recoveries=0,
+        unexplained_observations=0,
+        digest=digest,
+        sensing_ms=(),
+    )
+
+
+class TestEnvironmentModel:
+    @pytest.mark.parametrize(
+        ("step", "value", "says"),
+        [
+            (0, 0.0, "performed again, where 1"),
+            (2, 2.0, "performed, where 1"),
+            (1, np.nextafter(1.0, 2.0), "the undisturbed run has"),
+        ],
+    )
+    def test_another_task_action(self, step: int, value: float, says: str) -> None:
+        world = environment()
+        world.act(0, np.zeros(2))
+        with pytest.raises(Violation, match=says):
+            world.act(step, np.full(2, value))
+
+    def test_another_sensing_action(self) -> None:
+        world = environment()
+        with pytest.raises(Violation, match="the undisturbed run has 0"):
+            world.sense(0, 1)
+        with pytest.raises(Violation, match="where 0 task actions"):
+            world.sense(1, 0)
+
+    @pytest.mark.parametrize(
+        ("shows_the_same", "ends"), [(True, "digest"), (False, "digest((0, 2),)")]
+    )
+    def test_what_is_sensed_again(self, shows_the_same: bool, ends: str) -> None:
+        world = environment(shows_the_same=shows_the_same)
+        for _ in range(3):
+            world.sense(0, 0)
+        for step in range(3):
+            world.act(step, np.full(2, float(step)))
+        world.check_end(result(3, ends), rewards_are_known=True)
+
+    def test_another_end(self) -> None:
+        world = environment()
+        with pytest.raises(Violation, match="ended after 3 steps, 0 of which"):
+            world.check_end(result(3, "digest"), rewards_are_known=True)
+        world.begin_again([np.full(2, float(step)) for step in range(3)])
+        with pytest.raises(Violation, match="digest of the decisions"):
+            world.check_end(result(3, "another"), rewards_are_known=True)
+        for changed in ({"success": False}, {"sensing_decisions": 2}, {"reward": -4.0}):
+            said = msgspec.structs.replace(result(3, "digest"), **changed)
+            with pytest.raises(Violation, match="the undisturbed run has"):
+                world.check_end(said, rewards_are_known=True)
+        world.check_end(said, rewards_are_known=False)
+        with pytest.raises(Violation, match="has ended before"):
+            world.act(3, np.zeros(2))
+
+
+def request(epoch: int) -> bytes:
+    return bytes(msgspec.msgpack.encode([2, b"s", epoch, 1])) + b"sum!"
+
+
+def reply(tag: int) -> bytes:
+    return bytes(msgspec.msgpack.encode([tag, 1])) + b"sum!"
+
+
+class TestWireChecker:
+    def test_a_stale_epoch_is_not_answered(self) -> None:
+        checker = WireChecker()
+        for call, epoch in ((1, 1), (2, 2)):
+            checker.requested(call, request(epoch))
+            checker.arrived("cloud-1", 1, call)
+            checker.taken("cloud-1", 1, call, request(epoch))
+        checker.replied("cloud-1", 1, 2, reply(1))
+        checker.replied("cloud-1", 1, 1, reply(6))  # to refuse it is right
+        with pytest.raises(Violation, match="of epoch 1, after one of epoch 2"):
+            checker.replied("cloud-1", 1, 1, reply(1))
+
+    def test_a_damaged_request_is_not_answered(self) -> None:
+        checker = WireChecker()
+        checker.requested(1, request(1))
+        checker.arrived("cloud-1", 1, 1)
+        checker.taken("cloud-1", 1, 1, request(3))
+        checker.replied("cloud-1", 1, 1, reply(6))
+        with pytest.raises(Violation, match="which was damaged"):
+            checker.replied("cloud-1", 1, 1, reply(2))
+
+    def test_an_end_is_the_end(self) -> None:
+        checker = WireChecker()
+        checker.requested(1, request(1))
+        checker.arrived("cloud-1", 1, 1)
+        checker.taken("cloud-1", 1, 1, request(1))
+        checker.ended("cloud-1", 1)
+        with pytest.raises(Violation, match="after its end"):
+            checker.replied("cloud-1", 1, 1, reply(1))
+        with pytest.raises(Violation, match="ends call 1 again"):
+            checker.ended("cloud-1", 1)
+
+    def test_calls_are_ended_and_few(self) -> None:
+        checker = WireChecker()
+        checker.open_calls(8)
+        with pytest.raises(Violation, match="9 calls open to one service: allowed are 8"):
+            checker.open_calls(9)
+        with pytest.raises(Violation, match="that it has not ended"):
+            for call in range(1000):
+                checker.requested(call, request(1))
+                checker.arrived("cloud-1", 1, call)
+                checker.taken("cloud-1", 1, call, request(1))
+
+    def test_other_robots_have_epochs_of_their_own(self) -> None:
+        checker = WireChecker()
+        other = bytes(msgspec.msgpack.encode([2, b"t", 1, 1])) + b"sum!"
+        for call, payload in ((1, request(7)), (2, other)):
+            checker.requested(call, payload)
+            checker.arrived("cloud-1", 1, call)
+            checker.taken("cloud-1", 1, call, payload)
+            checker.replied("cloud-1", 1, call, reply(1))
+
+
+def test_what_grows_is_found_wherever_it_is() -> None:
+    planner = Planner(PegInHole2D(), PlanningSettings())
+    history = TrialHistory(planner, 1, 0)
+    check_size("the robot", history)
+    history.sensing_ms += [1.0] * 600
+    with pytest.raises(Violation, match="the robot holds a list of 600 entries"):
+        check_size("the robot", [history])
+
+
+def test_statuses() -> None:
+    checker = StatusChecker()
+    checker.heard("cloud-1", reply(1))
+    checker.changed("standard", "local_recovery")
+    for service, tag in (("local", 1), ("cloud-1", 3)):
+        checker.heard(service, reply(tag))
+        with pytest.raises(Violation, match="no service of the cloud has answered"):
+            checker.changed("local_recovery", "keep_alive")
+    checker.heard("cloud-1", reply(2))
+    checker.changed("local_recovery", "keep_alive")
+    for before, after in (("keep_alive", "standard"), ("standard", "local_recovery")):
+        with pytest.raises(Violation, match="where the status was keep_alive"):
+            checker.changed(before, after)
+
+
+class TestMemory:
+    def test_an_impure_function_is_found(self) -> None:
+        class Impure(PegInHole2D):
+            calls = 0
+
+            def move(self, states: FloatArray, action: FloatArray, random: Stream) -> FloatArray:
+                self.calls += 1
+                return super().move(states, action + 0.01 * self.calls, random)
+
+        planner = CheckedPlanner(Impure(), PlanningSettings())
+        state = planner.init(1, 0)
+        with pytest.raises(Violation, match="another state"):
+            for _ in range(200):
+                planner.advance(state, np.zeros(3))
+
+
+class TestShrinking:
+    def test_what_has_nothing_to_do_with_it_is_left_out(self) -> None:
+        stop = Stop(node="robot", at=0.3, for_s=0.1)
+        crash = Crash(service="cloud-1", at=0.5)
+        noise = tuple(
+            MessageFault(service="cloud-2", direction="to", number=number, what="drop")
+            for number in range(40)
+        )
+        run = RunSettings(trial=9, replicas=3, deadline_ms=5.0, act_s=0.02)
+        schedule = SimulationSchedule(run, (*noise[:20], stop, *noise[20:], crash))
+        asked = []
+
+        def fails(candidate: SimulationSchedule) -> bool:
+            asked.append(candidate)
+            return {stop, crash} <= set(candidate.faults) and candidate.run.act_s == 0.02
+
+        assert shrink(schedule, fails) == SimulationSchedule(RunSettings(act_s=0.02), (stop, crash))
+        assert len(asked) < 500
+
+    def test_services_of_faults_are_kept(self) -> None:
+        drop = MessageFault(service="cloud-2", direction="to", number=0, what="drop")
+        schedule = SimulationSchedule(RunSettings(replicas=2), (drop,))
+        assert shrink(schedule, lambda candidate: drop in candidate.faults) == schedule
+
+    def test_it_ends(self) -> None:
+        left = iter(range(10**9))
+        assert shrink(draw_schedule(5), lambda _: next(left) % 2 == 0)
+        assert next(left) <= 2001

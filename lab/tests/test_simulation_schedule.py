@@ -1,0 +1,88 @@
+"""Schedules: what is drawn can be written down and read back, and what is none is refused."""
+
+from __future__ import annotations
+
+import pytest
+
+from holdfast_lab.errors import ScheduleError
+from holdfast_lab.simulation.schedule import (
+    Crash,
+    KillRobot,
+    MessageFault,
+    RunSettings,
+    SimulationSchedule,
+    parse_schedule,
+)
+from holdfast_lab.simulation.schedule_draws import draw_schedule
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_a_drawn_schedule_is_read_back_from_its_text(seed: int) -> None:
+    schedule = draw_schedule(seed)
+    assert parse_schedule(schedule.text()) == schedule
+    assert draw_schedule(seed) == schedule
+
+
+def test_all_kinds_of_faults_are_drawn() -> None:
+    kinds = {fault.kind for seed in range(300) for fault in draw_schedule(seed).faults}
+    assert kinds == {
+        "crash",
+        "crowd",
+        "cut",
+        "disk_stall",
+        "kill_robot",
+        "late",
+        "launch",
+        "message corrupt",
+        "message delay",
+        "message drop",
+        "message duplicate",
+        "message misroute",
+        "pause_robot",
+        "slow",
+        "stop",
+    }
+
+
+def test_text_is_as_short_as_it_can_be() -> None:
+    schedule = SimulationSchedule(
+        RunSettings(replicas=2, deadline_ms=15.0),
+        (
+            Crash(service="cloud-2", at=0.5),
+            KillRobot(boundary=7, power_cut=True),
+            MessageFault(service="local", direction="from", number=3, what="drop"),
+        ),
+    )
+    assert schedule.text() == (
+        "run replicas=2 deadline_ms=15.0\n"
+        "crash service=cloud-2 at=0.5\n"
+        "kill_robot boundary=7 power_cut=true\n"
+        "message service=local direction=from number=3 what=drop\n"
+    )
+    assert parse_schedule(f"\n# a comment\n{schedule.text()}") == schedule
+    assert parse_schedule("") == SimulationSchedule(RunSettings())
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("crush service=cloud-1 at=1", "'crush' is none of crash, crowd, cut, disk_stall, "),
+        ("crash service=cloud-1", "missing required field `at`"),
+        ("crash service=cloud-1 at=soon", "Expected `float`, got `str` - at `$.at`"),
+        ("crash service=cloud-1 at=-1", "Expected `float` >= 0.0 - at `$.at`"),
+        ("crash service=cloud-1 at", "'at' is not one value of the form key=value"),
+        ("crash at=1 at=2 service=local", "'at=2' is not one value"),
+        ("crash service=moon at=1", "at `$.service`"),
+        ("crash service=cloud-1 at=1 color=red", "unknown field `color`"),
+        ("crash service=cloud-3 at=1", "there is no cloud-3 in a run with 1 replicas"),
+        ("run trial=1\nrun trial=2", "2 lines begin with 'run': allowed is 1"),
+        (
+            "message service=local direction=to number=1 what=misroute",
+            "a misrouted message must be a reply",
+        ),
+    ],
+)
+def test_what_is_no_schedule_is_refused(line: str, says: str) -> None:
+    with pytest.raises(ScheduleError) as raised:
+        parse_schedule(line)
+    assert says in str(raised.value)

@@ -1,0 +1,325 @@
+"""The bad line: what it does to bytes, and what it never does. No time is asserted."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from holdfast_lab.testbed.bad_line import Impairment
+from holdfast_lab.testbed.processes import free_port
+from holdfast_lab.testbed.proxy import Proxy
+
+PATIENCE_S = 20.0
+BRIEFLY_S = 0.15
+"""Long enough for what comes through to come; if a machine is slower, a test only sees less."""
+
+
+class Echo:
+    """A service that sends back what it gets."""
+
+    def __init__(self) -> None:
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port: int = self._listener.getsockname()[1]
+        self.accepted: list[socket.socket] = []
+        self._threads = [threading.Thread(target=self._accept)]
+        self._threads[0].start()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                accepted, _ = self._listener.accept()
+                self.accepted.append(accepted)
+                self._threads.append(threading.Thread(target=self._serve, args=(accepted,)))
+                self._threads[-1].start()
+
+    @staticmethod
+    def _serve(accepted: socket.socket) -> None:
+        with contextlib.suppress(OSError), accepted:
+            while data := accepted.recv(65536):
+                accepted.sendall(data)
+
+    def close(self) -> None:
+        self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        for accepted in self.accepted:
+            with contextlib.suppress(OSError):
+                accepted.shutdown(socket.SHUT_RDWR)
+            accepted.close()
+        for thread in self._threads:
+            thread.join(PATIENCE_S)
+
+
+@pytest.fixture
+def echo() -> Iterator[Echo]:
+    with contextlib.closing(Echo()) as echo:
+        yield echo
+
+
+@pytest.fixture
+def proxy(echo: Echo) -> Iterator[tuple[Proxy, int]]:
+    port = free_port()
+    with Proxy(port, echo.port, "seed") as proxy:
+        yield proxy, port
+
+
+def connect(port: int) -> socket.socket:
+    connection = socket.create_connection(("127.0.0.1", port), PATIENCE_S)
+    connection.settimeout(PATIENCE_S)
+    return connection
+
+
+def received(connection: socket.socket, size: int) -> bytes:
+    data = b""
+    while len(data) < size and (piece := connection.recv(65536)):
+        data += piece
+    return data
+
+
+def comes_briefly(connection: socket.socket) -> bool:
+    """Tell whether something comes, if it comes soon."""
+    connection.settimeout(BRIEFLY_S)
+    try:
+        return bool(connection.recv(65536))
+    except TimeoutError:
+        return False
+    finally:
+        connection.settimeout(PATIENCE_S)
+
+
+def test_it_carries_all_bytes_in_order(proxy: tuple[Proxy, int]) -> None:
+    _, port = proxy
+    data = bytes(range(256)) * 20_000  # more than it holds at a time
+    with connect(port) as connection:
+        sender = threading.Thread(target=connection.sendall, args=(data,))
+        sender.start()
+        assert received(connection, len(data)) == data
+        sender.join()
+
+
+@pytest.mark.parametrize(
+    "impairment",
+    [
+        Impairment(latency_s=0.002, jitter_s=0.01),
+        Impairment(loss=0.05),
+        Impairment(direction="to_robot", jitter_s=0.02),
+    ],
+    ids=["jitter", "loss", "one way"],
+)
+def test_what_is_late_is_whole_and_in_order(
+    proxy: tuple[Proxy, int], impairment: Impairment
+) -> None:
+    line, port = proxy
+    heal = line.impair(impairment)
+    expected = b""
+    with connect(port) as connection:
+        for number in range(40):
+            piece = number.to_bytes(2, "big") * 50
+            connection.sendall(piece)
+            expected += piece
+        heal()
+        assert received(connection, len(expected)) == expected
+
+
+@pytest.mark.parametrize("direction", ["both", "to_service", "to_robot"])
+def test_silence_keeps_connections_and_loses_nothing(
+    proxy: tuple[Proxy, int], direction: str
+) -> None:
+    line, port = proxy
+    with connect(port) as connection:
+        connection.sendall(b"a")
+        assert received(connection, 1) == b"a"
+        heal = line.impair(Impairment(silent=True, direction=direction))  # type: ignore[arg-type]
+        connection.sendall(b"b")
+        assert not comes_briefly(connection)
+        connection.sendall(b"c")
+        heal()
+        assert received(connection, 2) == b"bc"
+
+
+def test_a_cut_resets_and_refuses_until_it_is_healed(proxy: tuple[Proxy, int]) -> None:
+    line, port = proxy
+    with connect(port) as connection:
+        connection.sendall(b"a")
+        assert received(connection, 1) == b"a"
+        heal = line.impair(Impairment(cut=True))
+        with pytest.raises(ConnectionResetError):
+            connection.recv(1)
+    for _ in range(3):
+        with pytest.raises(ConnectionRefusedError):
+            connect(port)
+    # Meanwhile nobody else can have the port.
+    with socket.socket() as other, pytest.raises(OSError, match="in use"):
+        other.bind(("127.0.0.1", port))
+    heal()
+    heal()  # may be repeated
+    with connect(port) as connection:
+        connection.sendall(b"b")
+        assert received(connection, 1) == b"b"
+
+
+def test_impairments_add_up(proxy: tuple[Proxy, int]) -> None:
+    line, port = proxy
+    cut, cut_again = line.impair(Impairment(cut=True)), line.impair(Impairment(cut=True))
+    silent = line.impair(Impairment(silent=True))
+    cut()
+    with pytest.raises(ConnectionRefusedError):
+        connect(port)
+    cut_again()
+    with connect(port) as connection:
+        connection.sendall(b"a")
+        assert not comes_briefly(connection)
+        silent()
+        assert received(connection, 1) == b"a"
+
+
+class DatagramEcho:
+    """A service that sends datagrams back to whoever sent them."""
+
+    def __init__(self) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self.port: int = self._socket.getsockname()[1]
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while True:
+            content, address = self._socket.recvfrom(65_536)
+            if not content:
+                return
+            self._socket.sendto(content, address)
+
+    def close(self) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as last:
+            last.sendto(b"", ("127.0.0.1", self.port))
+        self._thread.join(PATIENCE_S)
+        self._socket.close()
+
+
+@pytest.fixture
+def datagram_echo() -> Iterator[DatagramEcho]:
+    with contextlib.closing(DatagramEcho()) as echo:
+        yield echo
+
+
+def client_of(port: int) -> socket.socket:
+    client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    client.connect(("127.0.0.1", port))
+    client.settimeout(PATIENCE_S)
+    return client
+
+
+@contextlib.contextmanager
+def datagram_line(port: int, target: int, latency_s: float, loss: float) -> Iterator[Proxy]:
+    with Proxy(port, target, "seed", datagrams=True) as proxy:
+        proxy.impair(Impairment(latency_s=latency_s, loss=loss))
+        yield proxy
+
+
+class TestDatagrams:
+    def test_what_is_lost_is_lost_whole(self, datagram_echo: DatagramEcho) -> None:
+        port = free_port()
+        sent = [number.to_bytes(2, "big") * 300 for number in range(200)]
+        with (
+            datagram_line(port, datagram_echo.port, 0, 0.3),
+            client_of(port) as client,
+        ):
+            for content in sent:
+                client.send(content)
+                time.sleep(0.0005)  # no buffer of the system overflows
+            client.settimeout(0.5)
+            arrived = []
+            with contextlib.suppress(TimeoutError):
+                while True:
+                    arrived.append(client.recv(65_536))
+        # 98 expected, standard deviation 7.
+        assert 50 < len(arrived) < 150
+        assert set(arrived) <= set(sent)
+        assert arrived == sorted(arrived)
+
+    @pytest.mark.parametrize("direction", ["both", "to_service", "to_robot"])
+    def test_silence_swallows_them(self, datagram_echo: DatagramEcho, direction: Any) -> None:
+        port = free_port()
+        with (
+            datagram_line(port, datagram_echo.port, 0.0, 0.0) as proxy,
+            client_of(port) as client,
+        ):
+            heal = proxy.impair(Impairment(silent=True, direction=direction))
+            client.send(b"lost")
+            assert not comes_briefly(client)
+            heal()
+            client.send(b"heard")
+            assert client.recv(100) == b"heard"
+
+    def test_a_cut_refuses_them(self, datagram_echo: DatagramEcho) -> None:
+        port = free_port()
+        with (
+            datagram_line(port, datagram_echo.port, 0.0, 0.0) as proxy,
+            client_of(port) as client,
+        ):
+            client.send(b"one")
+            assert client.recv(100) == b"one"
+            heal = proxy.impair(Impairment(cut=True))
+            client.send(b"lost")
+            with pytest.raises(ConnectionRefusedError):
+                client.recv(100)
+            heal()
+            client.send(b"two")
+            assert client.recv(100) == b"two"
+
+    def test_streams_and_datagrams_are_cut_apart(self, datagram_echo: DatagramEcho) -> None:
+        port = free_port()
+        heard: list[tuple[str, str, bytes]] = []
+        proxy = Proxy(
+            port,
+            datagram_echo.port,
+            "seed",
+            datagrams=True,
+            overhear=lambda *each: heard.append(each),
+        )
+        with proxy, client_of(port) as client:
+            proxy.impair(Impairment(cut=True, carriers=("streams",)))
+            with pytest.raises(ConnectionRefusedError):
+                socket.create_connection(("127.0.0.1", port))
+            client.send(b"heard")
+            assert client.recv(100) == b"heard"
+            proxy.impair(Impairment(cut=True, carriers=("datagrams",)))
+            client.send(b"lost")
+            with pytest.raises(ConnectionRefusedError):
+                client.recv(100)
+        assert heard == [("datagrams", way, b"heard") for way in ("to_service", "to_robot")]
+
+    def test_they_come_twice_again_and_from_elsewhere(self) -> None:
+        port = free_port()
+        with (
+            socket.socket(type=socket.SOCK_DGRAM) as service,
+            datagram_line(port, bound_port(service), 0.0, 0.0) as proxy,
+            client_of(port) as client,
+        ):
+            heal = proxy.impair(Impairment(doubled=True))
+            client.send(b"one")
+            one, again = service.recvfrom(100), service.recvfrom(100)
+            assert one == again
+            heal()
+            proxy.replay()
+            content, stranger = service.recvfrom(100)
+            assert content == b"one"
+            proxy.change_address()
+            client.send(b"two")
+            content, moved = service.recvfrom(100)
+            assert content == b"two"
+            assert len({one[1], stranger, moved}) == 3
+            service.sendto(b"answer", moved)
+            assert client.recv(100) == b"answer"
+
+
+def bound_port(service: socket.socket) -> int:
+    service.settimeout(PATIENCE_S)
+    service.bind(("127.0.0.1", 0))
+    return int(service.getsockname()[1])

@@ -1,0 +1,350 @@
+"""How long it takes to choose a sensing action, on beliefs from the middle of a task.
+
+The time of a decision depends on the belief: few particles of a wide one survive a hypothetical
+observation, nearly all of a narrow one. So trials are run once with a moderate number of particles,
+and their history of observations and actions is replayed to beliefs of other sizes. All of these
+approximate the same posteriors; only their size differs.
+
+Numbers of threads are timed in turns, so that other load on the machine meets all of them. The time
+that a thread waited for a core is subtracted; the system counts it. A second thread that comes late
+cannot be corrected for, so the gain of threads is read from the fastest repetitions, and the load
+of other processes is recorded.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+import pandas as pd
+
+from holdfast import checked
+from holdfast.arrays import FloatArray
+from holdfast.config.settings import (
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+    SelectorSettings,
+)
+from holdfast.errors import InvalidValueError
+from holdfast.planning import Planner, PlanningState
+from holdfast.problems.problem import Problem
+from holdfast.robot.environment import SimulatedEnvironment
+from studies.cost_model import parallel_share
+from studies.trial_batches import problem_of
+
+__all__ = ["Measurement", "Sensed", "history_of", "measure_sensing", "state_in"]
+
+_HISTORY_PARTICLES = 500
+"""Particles of the trials whose history is replayed."""
+
+_MAX_STEPS = 200
+_MOST_REPETITIONS = 15
+_PLACES = (0.25, 0.5, 0.75)
+"""In a trial's sensing decisions, from which its belief is taken: one of each trial, so that all
+beliefs are independent."""
+
+_SCHEDULING = Path("/proc/thread-self/schedstat")
+
+_STEEPER_BY = 0.2
+"""A larger number of particles may cost this much more, as an exponent, than the last ones did."""
+
+_FIRST_EXPONENT = 1.0
+
+_FEWER = 2.0 / 3.0
+"""Of the beliefs, where there is no time for all: of nine six are left, enough for an interval."""
+
+
+class Measurement(msgspec.Struct, frozen=True, kw_only=True):
+    """What is timed: decisions of one kind, over numbers of particles.
+
+    Attributes
+    ----------
+    num_sensing_actions : int
+        J: the first so many of the problem's sensing actions.
+    num_observation_samples, horizon : int
+        M and H.
+    particles : tuple of int
+        Rising. It ends earlier if a number would take too long.
+    threads : tuple of int
+        Numbers of threads, 1 and at least one more.
+    num_trials : int
+        From each comes one belief.
+    repeat_s : float
+        Decisions of one number of particles are repeated for about this long.
+    least_repetitions : int
+        Of each decision, however long it takes.
+    limit_s : float
+        If so many take longer than this, fewer beliefs are taken; if that does not help, the number
+        of particles is left out, and all above it.
+    """
+
+    problem: str
+    num_sensing_actions: int
+    estimator: str = "nearest_neighbor"
+    num_observation_samples: int = 10
+    horizon: int = 1
+    particles: tuple[int, ...] = (100, 300, 1000)
+    threads: tuple[int, ...] = (1, 2)
+    num_trials: int = 9
+    seed: int = 0
+    repeat_s: float = 0.5
+    least_repetitions: int = 3
+    limit_s: float = 8.0
+
+
+class Sensed(NamedTuple):
+    """A sensing action and its observation."""
+
+    sensing_action: int
+    observation: FloatArray
+
+
+def measure_sensing(**measurement: Any) -> pd.DataFrame:
+    """Time decisions; the function of tasks of the kind ``sensing_times``.
+
+    It gets the fields of :class:`Measurement`.
+
+    Returns
+    -------
+    DataFrame
+        A row for each belief and number of threads. ``median_ms`` and ``fastest_ms`` are those of
+        so many ``repetitions``, less what they waited for cores that others had. ``share`` is the
+        part that is divided among threads, of the fastest ones: whatever else the machine does
+        delays several threads sooner than one. ``mapping_ms`` is what the policy and the predicted
+        observations of all particles take, which one thread does, and ``others_cores`` how many
+        cores other processes kept busy meanwhile.
+    """
+    wanted = msgspec.convert(measurement, Measurement)
+    problem = problem_of(wanted.problem)
+    problem.sensing_actions = problem.sensing_actions[: wanted.num_sensing_actions]
+    histories = [
+        history_of(problem, _settings(wanted, _HISTORY_PARTICLES, 0), wanted.seed, trial)
+        for trial in range(wanted.num_trials)
+    ]
+    tables = []
+    taken: list[tuple[int, float]] = []
+    for particles in wanted.particles:
+        # Of fewer beliefs, if need be.
+        expected_s = _FEWER * wanted.least_repetitions * _expected_s(taken, particles)
+        if expected_s > wanted.limit_s:
+            break
+        deciding = _Deciding(problem, wanted, particles)
+        states = [
+            state_in(problem, deciding.settings[1], wanted.seed, trial, history)
+            for trial, history in enumerate(histories)
+        ]
+        load = _Load()
+        states = deciding.few_enough(states)
+        if not states:
+            break
+        timed, round_s = deciding.timed(states)
+        tables.append(timed.assign(particles=particles, others_cores=load.of_others()))
+        taken.append((particles, round_s))
+    if not taken:
+        raise InvalidValueError(
+            f"particles {wanted.particles[0]}: a round of decisions takes longer than limit_s "
+            f"{wanted.limit_s:g}"
+        )
+    return pd.concat(tables, ignore_index=True)
+
+
+def history_of(
+    problem: Problem, settings: PlanningSettings, seed: int, trial: int
+) -> list[Sensed | FloatArray]:
+    """Run a trial; return its observations and actions, in order."""
+    planner = Planner(problem, settings)
+    state = planner.init(seed, trial)
+    environment = SimulatedEnvironment(problem, seed, trial)
+    history: list[Sensed | FloatArray] = []
+    while not environment.is_done() and state.step < _MAX_STEPS:
+        if planner.needs_sensing(state):
+            sensing_action, _ = planner.choose_sensing_action(state)
+            observation = environment.perform_sensing(sensing_action)
+            history.append(Sensed(sensing_action, observation))
+            state, _ = planner.observe(state, sensing_action, observation)
+        action, _ = planner.choose_task_action(state)
+        environment.perform(action)
+        history.append(action)
+        state = planner.advance(state, action)
+    return history
+
+
+def state_in(
+    problem: Problem,
+    settings: PlanningSettings,
+    seed: int,
+    trial: int,
+    history: Sequence[Sensed | FloatArray],
+) -> PlanningState:
+    """Replay a trial's history to another belief; return its state before one sensing decision.
+
+    By the trial's number it is a quarter, half or three quarters through: neither the first belief,
+    which nothing has narrowed yet, nor the last.
+    """
+    decisions = sum(isinstance(event, Sensed) for event in history)
+    left = int(_PLACES[trial % len(_PLACES)] * decisions)
+    planner = Planner(problem, settings)
+    state = planner.init(seed, trial)
+    for event in history:
+        if not isinstance(event, Sensed):
+            state = planner.advance(state, event)
+            continue
+        if left == 0:
+            break
+        state, _ = planner.observe(state, *event)
+        left -= 1
+    return state
+
+
+def _settings(wanted: Measurement, particles: int, threads: int) -> PlanningSettings:
+    return PlanningSettings(
+        particle_filter=ParticleFilterSettings(num_particles=particles),
+        active_sensing=ActiveSensingSettings(
+            num_observation_samples=wanted.num_observation_samples,
+            horizon=wanted.horizon,
+            num_cores=threads,
+        ),
+        selector=msgspec.convert(
+            {"method": "action_entropy", "estimator": wanted.estimator}, SelectorSettings
+        ),
+    )
+
+
+def _expected_s(taken: Sequence[tuple[int, float]], particles: int) -> float:
+    """Return about how long a round will take, from those before; 0 if there were none."""
+    if not taken:
+        return 0.0
+    last, seconds = taken[-1]
+    exponent = _FIRST_EXPONENT
+    if len(taken) > 1:
+        before, earlier = taken[-2]
+        exponent = max(1.0, np.log(seconds / earlier) / np.log(last / before)) + _STEEPER_BY
+    return float(seconds * (particles / last) ** exponent)
+
+
+class _Deciding:
+    """Decisions with one number of particles, on each number of threads."""
+
+    def __init__(self, problem: Problem, wanted: Measurement, particles: int) -> None:
+        self._problem = problem
+        self._wanted = wanted
+        self.settings = {
+            threads: _settings(wanted, particles, threads) for threads in wanted.threads
+        }
+
+    def few_enough(self, states: list[PlanningState]) -> list[PlanningState]:
+        """Return as many of the beliefs as there is time for: all, fewer, or none."""
+        middle = states[len(states) // 2]
+        one_s = sum(self._decision_s(threads, middle) for threads in self.settings)
+        for some in (states, states[: round(_FEWER * len(states))]):
+            if self._wanted.least_repetitions * one_s * len(some) <= self._wanted.limit_s:
+                return some
+        return []
+
+    def timed(self, states: Sequence[PlanningState]) -> tuple[pd.DataFrame, float]:
+        """Return the rows of some beliefs, and what a round of all of them takes in seconds."""
+        taken: list[dict[int, list[float]]] = [{p: [] for p in self.settings} for _ in states]
+        round_s = 0.0
+        repetitions = 1
+        repetition = 0
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            while repetition < repetitions:
+                order = list(self.settings)[:: 1 if repetition % 2 == 0 else -1]
+                for state, times in zip(states, taken, strict=True):
+                    for threads in order:
+                        times[threads].append(self._decision_s(threads, state))
+                repetition += 1
+                if repetition == 1:
+                    round_s = sum(seconds for times in taken for (seconds,) in times.values())
+                    affordable = min(int(self._wanted.repeat_s / round_s), _MOST_REPETITIONS)
+                    repetitions = max(affordable, self._wanted.least_repetitions)
+        finally:
+            if collects:
+                gc.enable()
+        rows = [
+            {
+                "belief": belief,
+                "step": state.step,
+                "threads": threads,
+                "median_ms": 1e3 * float(np.median(seconds)),
+                "fastest_ms": 1e3 * min(seconds),
+                "repetitions": repetitions,
+            }
+            for belief, (state, times) in enumerate(zip(states, taken, strict=True))
+            for threads, seconds in times.items()
+        ]
+        of_beliefs = [
+            {
+                "belief": belief,
+                "share": parallel_share({each: min(seconds) for each, seconds in times.items()}),
+                "mapping_ms": 1e3 * _mapping_s(self._problem, state),
+            }
+            for belief, (state, times) in enumerate(zip(states, taken, strict=True))
+        ]
+        return pd.DataFrame(rows).merge(pd.DataFrame(of_beliefs), on="belief"), round_s
+
+    def _decision_s(self, threads: int, state: PlanningState) -> float:
+        """Return what a decision takes, less what its thread waited for a core others had."""
+        delayed_ns = _delayed_ns()
+        start = time.perf_counter()
+        Planner(self._problem, self.settings[threads]).choose_sensing_action(state)
+        elapsed_s = time.perf_counter() - start
+        return max(elapsed_s - 1e-9 * (_delayed_ns() - delayed_ns), 1e-9)
+
+
+def _delayed_ns() -> int:
+    """Return how long this thread could have run but had no core (Linux; 0 elsewhere)."""
+    try:
+        return int(_SCHEDULING.read_bytes().split()[1])
+    except (OSError, IndexError, ValueError):
+        return 0
+
+
+def _mapping_s(problem: Problem, state: PlanningState) -> float:
+    """Return what mapping all particles to actions and to expected observations takes."""
+    states = state.belief.states
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        checked.policy(problem, states, state.stage)
+        for sensing_action in range(len(problem.sensing_actions)):
+            checked.prediction(problem, states, sensing_action)
+        seconds.append(time.perf_counter() - start)
+    return float(np.median(seconds))
+
+
+class _Load:
+    """How busy other processes keep this machine, from now on (Linux)."""
+
+    _STATISTICS = Path("/proc/stat")
+
+    def __init__(self) -> None:
+        self._began = self._now()
+
+    def of_others(self) -> float:
+        """Return how many cores they kept busy on average; NaN if it cannot be known."""
+        began, now = self._began, self._now()
+        if began is None or now is None or now[0] <= began[0]:
+            return math.nan
+        return max(0.0, (now[1] - began[1]) / (now[0] - began[0]))
+
+    def _now(self) -> tuple[float, float] | None:
+        try:
+            fields = self._STATISTICS.read_text().split("\n", 1)[0].split()[1:]
+        except OSError:
+            return None
+        user, nice, system, _, _, interrupts, soft_interrupts, stolen = map(int, fields[:8])
+        ticks = user + nice + system + interrupts + soft_interrupts + stolen
+        own = os.times()
+        busy = ticks / os.sysconf("SC_CLK_TCK") - own.user - own.system
+        return time.monotonic(), busy

@@ -1,0 +1,109 @@
+"""What a decision would take on other cores: known parts come back, and crossings are found."""
+
+import numpy as np
+import pytest
+
+from studies.cost_model import (
+    Curve,
+    Scaling,
+    break_even,
+    busy_cores,
+    parallel_share,
+)
+
+
+def scaling(share: float = 0.9, pieces: int | None = None) -> Scaling:
+    """Return times of N / 1,000 ms, with 10 % to each side, of which a share is divided."""
+    particles = np.array([100.0, 1000.0, 10_000.0, 100_000.0])
+    shares = np.array([share, share - 0.1, min(share + 0.1, 1.0)])
+    return Scaling(
+        particles,
+        np.outer([1.0, 0.9, 1.1], particles / 1000),
+        np.tile(shares[:, np.newaxis], particles.size),
+        pieces,
+    )
+
+
+def curve(particles: list[float], values: list[float]) -> Curve:
+    return Curve(np.array(particles), np.array(values))
+
+
+class TestShare:
+    @pytest.mark.parametrize("serial", [0.0, 0.3, 5.0])
+    @pytest.mark.parametrize("threads", [(1, 2), (1, 2, 4, 8)])
+    def test_known_parts_come_back(self, serial: float, threads: tuple[int, ...]) -> None:
+        divided = 2.0
+        times = {number: serial + divided / number for number in threads}
+        assert parallel_share(times) == pytest.approx(divided / (serial + divided))
+
+    def test_it_stays_a_share(self) -> None:
+        assert parallel_share({1: 1.0, 2: 1.2}) == 0.0
+        assert parallel_share({1: 1.0, 2: 0.4}) == 1.0
+
+
+def test_pieces_bound_the_gain() -> None:
+    assert busy_cores(8, 9) == 4.5
+    assert busy_cores(8, 16) == 8.0
+    assert busy_cores(36, 30) == 30.0
+    assert busy_cores(36, None) == 36.0
+    assert busy_cores(1, 30) == 1.0
+
+
+class TestScaling:
+    def test_cores_shorten_their_part(self) -> None:
+        assert scaling().on_cores(1).values == pytest.approx([0.1, 1.0, 10.0, 100.0])
+        assert scaling().on_cores(9).values == pytest.approx([0.02, 0.2, 2.0, 20.0])
+        assert scaling(pieces=10).on_cores(9).values[1] == pytest.approx(0.1 + 0.9 / 5.0)
+
+    def test_the_band_holds_the_line(self) -> None:
+        least, most = scaling(pieces=10).band(9)
+        line = scaling(pieces=10).on_cores(9)
+        assert least.values == pytest.approx([n / 9000 for n in line.particles])
+        assert most.values == pytest.approx([n / 1000 * (0.2 + 0.8 / 5) for n in line.particles])
+        assert all(low < x < high for low, x, high in zip(least[1], line[1], most[1], strict=True))
+
+    def test_the_break_even_of_known_curves(self) -> None:
+        # 0.9 (1 - 1/9) N / 1,000 ms are saved, so 20 ms at 25,000 particles.
+        assert break_even(scaling().saved_ms(1, 9), 20.0).particles == pytest.approx(25_000, 1e-3)
+        # With 2 cores against 18: 0.9 (1/2 - 1/18).
+        found = break_even(scaling().saved_ms(2, 18), 20.0)
+        assert found.particles == pytest.approx(50_000, 1e-3)
+        ends = [break_even(each.saved_ms(1, 9), 20.0).particles for each in scaling().bounds()]
+        assert ends == pytest.approx(
+            [20 / (0.9 * 0.8 * 8 / 9) * 1e3, 20 / (1.1 * 8 / 9) * 1e3, 20 / (8 / 9) * 1e3], 1e-3
+        )
+
+    def test_deciding_ahead_hides_what_fits(self) -> None:
+        # Elsewhere it always fits into 50 ms; here it takes N / 1,000 - 50 ms longer.
+        found = break_even(scaling().saved_ms(1, 9, ahead_ms=50.0), 20.0)
+        assert found.particles == pytest.approx(70_000, 2e-3)
+        assert scaling().saved_ms(1, 9, ahead_ms=101.0) is None
+        assert break_even(None, 20.0).particles is None
+
+
+class TestBreakEven:
+    def test_no_crossing_is_said(self) -> None:
+        below = curve([100.0, 1000.0], [1.0, 5.0])
+        found = break_even(below, 20.0)
+        assert found.particles is None
+        assert found.words == "not up to 1,000 particles, where 5 ms are saved and 20 ms paid"
+        assert break_even(None, 20.0) == (
+            None,
+            "not within what was measured: nothing is saved there",
+        )
+
+    def test_it_can_be_before_the_first(self) -> None:
+        above = curve([100.0, 1000.0], [30.0, 500.0])
+        assert break_even(above, 20.0) == (100.0, "at 100 particles or fewer")
+
+    def test_the_last_crossing_counts(self) -> None:
+        crossing = curve([100.0, 1000.0, 10_000.0, 100_000.0], [1.0, 100.0, 1.0, 100.0])
+        found = break_even(crossing, 10.0)
+        assert found.particles == pytest.approx(10**4.5)
+        assert found.words == "from 32,000 particles on"
+
+
+def test_a_curve_ends_where_it_was_measured() -> None:
+    crossing = curve([100.0, 10_000.0], [1.0, 100.0])
+    found = crossing.at(np.array([50.0, 100.0, 1000.0, 10_000.0, 20_000.0]))
+    np.testing.assert_allclose(found, [np.nan, 1.0, 10.0, 100.0, np.nan])

@@ -1,0 +1,143 @@
+"""Batches of trials, run in process: what most studies are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from holdfast.config.problem_builder import build_problem
+from holdfast.config.settings import PlanningSettings
+from holdfast.errors import HoldfastError
+from holdfast.outcome import TrialResult
+from holdfast.planning import Planner
+from holdfast.problems.problem import Problem
+from holdfast.problems.registry import problem_class
+from holdfast.robot.trial import run_trial
+from studies.errors import TaskError
+from studies.tasks import Task
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["COLUMNS", "TrialSeries", "problem_of", "run_trials_of", "trial_tasks"]
+
+COLUMNS = (
+    "trial",
+    "success",
+    "steps",
+    "reward",
+    "sensing_decisions",
+    "mean_sensing_ms",
+    "unexplained_observations",
+    "digest",
+    "step_limit",
+    "steps_to_goal",
+)
+"""Of the table of a batch: a row for each trial.
+
+``step_limit`` is the limit of a trial with which it is continued, if it is, and ``steps_to_goal``
+the steps that it took within that limit; None if it did not reach the goal.
+"""
+
+_DIGEST_CHARACTERS = 16
+"""Enough to tell that two runs decided the same, at a quarter of the size."""
+
+
+class TrialSeries(msgspec.Struct, frozen=True, kw_only=True):
+    """Trials that differ in their number alone.
+
+    Attributes
+    ----------
+    problem : str
+        Its name.
+    model : dict
+        Its section; what is left out has its default.
+    continued_trials : int
+        The first ones, which are continued where they are cut off at ``max_steps``, to see whether
+        they are slow or stuck. Nothing but ``steps_to_goal`` depends on it.
+    continued_to : int
+        Up to how many steps.
+    """
+
+    problem: str
+    model: dict[str, Any] = msgspec.field(default_factory=dict)
+    planning: PlanningSettings = msgspec.field(default_factory=PlanningSettings)
+    max_steps: int = 500
+    seed: int = 0
+    num_trials: int = 1000
+    continued_trials: int = 0
+    continued_to: int = 10_000
+
+
+def trial_tasks(series: TrialSeries, trials_in_each: int, kind: str = "trials") -> Iterator[Task]:
+    """Yield the tasks of a series, in the order of its trials.
+
+    Parameters
+    ----------
+    trials_in_each : int
+        Trials of a task: what is lost when a process is killed, and what is done twice when a
+        series is made longer.
+    kind : str
+        Of a function with the parameters of :func:`run_trials_of`.
+    """
+    common = msgspec.to_builtins(series)
+    del common["num_trials"]
+    for first in range(0, series.num_trials, trials_in_each):
+        count = min(trials_in_each, series.num_trials - first)
+        parameters = {**common, "first_trial": first, "num_trials": count}
+        yield Task(kind=kind, parameters=parameters, units=count)
+
+
+def run_trials_of(
+    first_trial: int, planner_class: type[Planner] = Planner, **series: Any
+) -> pd.DataFrame:
+    """Run some trials of a series in this process; the function of tasks of the kind ``trials``.
+
+    It gets the fields of :class:`TrialSeries`, and returns a table with the columns of
+    :data:`COLUMNS`. All but the times are the same wherever it is run.
+    """
+    import pandas as pd  # here, so that problems and cases can be had without it
+
+    wanted = msgspec.convert(series, TrialSeries)
+    problem = problem_of(wanted.problem, wanted.model)
+    longest = max(wanted.continued_to, wanted.max_steps)
+
+    def run(trial: int, max_steps: int) -> TrialResult:
+        try:
+            planner = planner_class(problem, wanted.planning)
+            return run_trial(planner, wanted.seed, trial, max_steps=max_steps)
+        except HoldfastError as error:
+            raise TaskError(
+                f"trial {trial} (seed {wanted.seed}) of {wanted.problem}: {error}"
+            ) from error
+
+    rows = []
+    for trial in range(first_trial, first_trial + wanted.num_trials):
+        result = whole = run(trial, wanted.max_steps)
+        continued = trial < wanted.continued_trials
+        if continued and not result.success and not result.failed:
+            # From its beginning: every random draw is named by its step, so the trial goes through
+            # the same states as before.
+            whole = run(trial, longest)
+        rows.append(
+            (
+                trial,
+                result.success,
+                result.steps,
+                result.reward,
+                result.sensing_decisions,
+                result.mean_sensing_ms,
+                result.unexplained_observations,
+                result.digest[:_DIGEST_CHARACTERS],
+                longest if continued else wanted.max_steps,
+                whole.steps if whole.success else None,
+            )
+        )
+    return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+def problem_of(name: str, model: Mapping[str, Any] | None = None) -> Problem:
+    """Build a problem from plain data; HoldfastError if there is none, or the data does not fit."""
+    return build_problem(name, problem_class(name), model or {}, {})
