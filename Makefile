@@ -78,8 +78,8 @@ test-ros1: $(INSTALLED_DEV) ## those of them that need Debian's ROS 1 alone, but
 	ROS1=$(ROS1) $(BIN)/pytest -q -m "ros and not slow" -n 2 --dist worksteal \
 	    tests/ros/test_ros1_*.py tests/ros/test_master_guard.py
 
-fuzz: $(INSTALLED_DEV) ## 1,000,000 hostile messages to a live service; some 15 minutes
-	$(BIN)/python -m tests.fuzz.live --messages 1000000 --seed 1
+fuzz: $(INSTALLED_DEV) ## a live service is attacked in all ways, 5 minutes over each wire
+	for wire in tcp tls udp; do $(BIN)/python -m tests.fuzz.attacker --minutes 5 --transport $$wire || exit; done
 
 soak: $(INSTALLED_DEV) ## sessions come and go for 10 minutes, and nothing may grow
 	$(BIN)/python -m tests.fuzz.soak --minutes 10 --seed 1
@@ -166,8 +166,8 @@ $(INSTALLED_FIGURES): $(INSTALLED_KERNEL)
 	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[figures,service]"
 	@touch $@
 
-$(INSTALLED_DEV): $(INSTALLED_KERNEL)
-	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[dev]"
+$(INSTALLED_DEV): $(INSTALLED_KERNEL) $(wildcard ros/*/setup.py)
+	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[dev]" -e ros/ros1_master_guard -e ros/holdfast_ros
 	@touch $(INSTALLED_FIGURES) $@
 
 # The sources are copied into it, so whatever of them changes is installed again.

@@ -75,8 +75,8 @@ for line in sys.stdin:
 
 OURS = """
 import json, sys, time
-from holdfast.ros.active_sensing import DecisionRequest, RequestKind
-from holdfast.ros.ros1_client import Ros1Client
+from holdfast_ros.active_sensing import DecisionRequest, RequestKind
+from holdfast_ros.ros1_client import Ros1Client
 
 began, known = 0.0, None
 

@@ -13,7 +13,6 @@ import pytest
 from holdfast.cli import main
 from holdfast.cli.application import COMMANDS
 from holdfast.runtime.command_line import Options
-from holdfast.service.options import ServeOptions
 
 __all__ = ["Said", "options_of", "run_here"]
 
@@ -58,8 +57,6 @@ def run_here(
 
 def options_of(command: str) -> type[Options]:
     """Return the class of a command's options."""
-    if command == "serve":
-        return ServeOptions
     found = vars(importlib.import_module(COMMANDS[command].module)).values()
     (options,) = (
         each

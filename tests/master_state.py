@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from holdfast.ros.master.process import MasterState
+from ros1_master_guard.process import MasterState
 
 ARM, BASE, LIDAR = "http://robot:1/", "http://robot:2/", "http://robot:3/"
 

@@ -43,7 +43,6 @@ from holdfast.protocol.events import (
     Sensed,
     ServiceAppeared,
     ServiceVanished,
-    Timing,
     VerificationNoted,
     WriteRecords,
 )
@@ -196,7 +195,6 @@ class World:
         *,
         services: tuple[str, ...] = ("cloud",),
         launch: str = "on_failure",
-        deadline_ms: float | None = None,
         rate_hz: float | None = None,
         planning: PlanningSettings = PLANNING,
         simulator: SimulatorSettings = SIMULATOR,
@@ -206,9 +204,7 @@ class World:
     ) -> None:
         self.now = 0.0
         self.lost = LostSettings(on_lost=on_lost)
-        self.offload = OffloadSettings(
-            services=services, decision_deadline_ms=deadline_ms, verify_share=verify_share
-        )
+        self.offload = OffloadSettings(services=services, verify_share=verify_share)
         self.services = {name: SmallService() for name in (*services, LOCAL)}
         self.services[LOCAL].up = False
         self.launchable = True
@@ -243,7 +239,6 @@ class World:
         self.ended = False
         self.acted: list[tuple[int, np.ndarray]] = []
         self.on_act: Callable[[int], None] = lambda _: None
-        self.on_the_way: Callable[[int, bytes], bytes] = lambda _, payload: payload
 
     # -- faults ----------------------------------------------------------------------------------
 
@@ -403,8 +398,7 @@ class World:
         name = self.calls.get(call)
         if name is None or not self.services[name].up:
             return []
-        payload = self.on_the_way(call, encode(reply))
-        return self.robot.handle(ReplyReceived(call, payload), self.now)
+        return self.robot.handle(ReplyReceived(call, encode(reply)), self.now)
 
     def end(self, call: int) -> list[RobotEffect]:
         if self.calls.pop(call, None) is None:
@@ -416,15 +410,14 @@ class World:
     def reports(self, name: str) -> list[dict[str, object]]:
         return [e.fields for _, e in self.trace if isinstance(e, LogEvent) and e.name == name]
 
-    def report_times(self, name: str) -> list[float]:
-        """Return when an event was logged."""
-        return [at for at, e in self.trace if isinstance(e, LogEvent) and e.name == name]
-
     def statuses(self) -> list[object]:
         return [fields["to"] for fields in self.reports("status")]
 
-    def longest_wait_ms(self) -> float:
-        return max(e.waited_ms for _, e in self.trace if isinstance(e, Timing))
+    def complete(self) -> None:
+        """Run from the start to the end, and compare with the run without faults."""
+        self.start()
+        self.run()
+        self.assert_same_as_without_faults()
 
     def assert_same_as_without_faults(self) -> None:
         assert len(self.results) == self.simulator.num_trials

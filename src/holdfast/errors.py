@@ -158,23 +158,12 @@ class DecidedOtherwiseError(RecordError):
         self.kind = kind
 
 
-class EndOfRecordsError(RecordError):
-    """The records end before the trial is finished."""
-
-    def __init__(self, trial: int) -> None:
-        super().__init__(f"trial {trial}: its records end before it is finished")
-
-
 class WorkerDiedError(HoldfastError):
     """A worker process ended unexpectedly."""
 
 
 class TrialCrashError(RuntimeError):
     """An unexpected error in a worker process; the message holds its traceback."""
-
-
-class GuardError(HoldfastError):
-    """The guard cannot guard the ROS 1 master; the message says why."""
 
 
 class MissingRosbagsError(HoldfastError):
@@ -211,18 +200,6 @@ class CredentialsGoneError(CredentialsError):
 
 class FrameError(TransportError):
     """Received bytes are no valid frame; the message completes a sentence about the sender."""
-
-
-class CallError(HoldfastError):
-    """No usable answer came."""
-
-
-class SilentError(CallError):
-    """No answer came in time."""
-
-
-class GoneError(CallError):
-    """Nothing listens at the endpoint: its process has ended."""
 
 
 class KeysExhaustedError(TransportError):

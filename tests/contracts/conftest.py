@@ -53,13 +53,9 @@ def wire(
             return InProcessWire()
         case "robot_listens":
             return StreamWire("unix", socket_directory, robot_listens=True)
-        case "tls" | "udp" | "robot_listens_tls":
+        case "tls" | "udp":
             return StreamWire(
-                "udp" if request.param == "udp" else "tls",
-                socket_directory,
-                robot_tls=robot_tls,
-                service_tls=service_tls,
-                robot_listens=request.param == "robot_listens_tls",
+                request.param, socket_directory, robot_tls=robot_tls, service_tls=service_tls
             )
         case protocol:
             return StreamWire(protocol, socket_directory)

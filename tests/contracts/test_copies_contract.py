@@ -223,7 +223,6 @@ def test_a_recorded_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     [
         errors.MessageError("refused", "too long"),
         errors.DecidedOtherwiseError(1, 2, "task"),
-        errors.EndOfRecordsError(3),
         errors.RunError(errors.TrialError("trial 1"), "holdfast run"),
         errors.InvalidValueError("seed -1"),
     ],

@@ -531,17 +531,6 @@ class TestWhatGoesTogether:
         await robot.close()
 
     @pytest.mark.parametrize("end", ["robot", "service"])
-    def test_robots_do_not_listen_over_udp(
-        self, end: str, robot_tls: TlsFiles, service_tls: TlsFiles
-    ) -> None:
-        place = "udp/127.0.0.1:7447"
-        with pytest.raises(TransportError, match=f"{place}: over udp it is the service that liste"):
-            if end == "robot":
-                StreamRobotTransport({"cloud": ServiceAddress(place, True)}, tls=robot_tls)
-            else:
-                StreamServiceTransport("cloud", incarnation="b1", connect=[place], tls=service_tls)
-
-    @pytest.mark.parametrize("end", ["robot", "service"])
     def test_without_the_package_it_is_said_how_to_get_it(
         self,
         end: str,

@@ -23,7 +23,7 @@ from holdfast.protocol.events import (
     ReplyReceived,
     ServiceAppeared,
 )
-from holdfast.transport import frames, links, listener, robot_end, service_end
+from holdfast.transport import frames, links, listener, service_end
 from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.tls import TlsStream, client_context
 
@@ -192,16 +192,6 @@ class TestManyFromOneAddress:
                         stream.send(HELLO)
                         await robot.say(stream.take())
         assert heard.startswith(frames.MAGIC)
-
-    async def test_a_service_that_is_slow_is_not_hung_up_on(self, tls: StreamWire) -> None:
-        tls.robot_listens = True
-        tls.robot("cloud").start(Inbox())
-        with contextlib.ExitStack() as stack:
-            service = stack.enter_context(Visitor(tls.endpoint("cloud")))
-            await service.connect()
-            others = self.flood(stack, tls.endpoint("cloud"), b"")
-            await self.until_closed(others, self.MANY - robot_end._MAX_WITHOUT_HELLO)
-            assert self.is_open(service.socket)
 
     def test_an_owner_of_many_addresses_of_ipv6_is_one(self) -> None:
         def network(address: str) -> bytes:

@@ -8,7 +8,6 @@ import ssl
 from pathlib import Path
 
 import pytest
-from cryptography import x509
 from cryptography.x509 import oid
 from tests.contracts.wires import (
     HELLO,
@@ -23,7 +22,6 @@ from tests.contracts.wires import (
     until,
 )
 
-from holdfast.errors import TransportError
 from holdfast.protocol.events import (
     CallEnded,
     ReplyReceived,
@@ -34,7 +32,6 @@ from holdfast.transport import service_end
 from holdfast.transport.contract import IncomingCall
 from holdfast.transport.endpoints import ServiceAddress, TlsFiles
 from holdfast.transport.robot_end import StreamRobotTransport
-from holdfast.transport.service_end import StreamServiceTransport
 from holdfast.transport.tls import client_context
 
 
@@ -112,26 +109,6 @@ class TestCertificates:
         assert received == [b"friend"]
         assert {"shows no certificate"} < set(tls.reasons())
 
-    async def test_a_robot_does_not_believe_a_service_of_another_authority(
-        self, tls: StreamWire, tmp_path: Path
-    ) -> None:
-        usage = oid.ExtendedKeyUsageOID.SERVER_AUTH
-        tls.service_tls = Authority(tmp_path / "foreign").issue("service", usage)
-        await self.assert_refused(tls, "has a certificate that was not signed by the authority")
-
-    async def test_a_robot_s_certificate_does_not_make_a_service(
-        self, tls: StreamWire, robot_tls: TlsFiles
-    ) -> None:
-        tls.service_tls = robot_tls
-        await self.assert_refused(tls, "has a certificate that is not for a service")
-
-    async def test_a_service_s_certificate_does_not_make_a_robot(
-        self, tls: StreamWire, service_tls: TlsFiles
-    ) -> None:
-        tls.robot_tls = service_tls
-        await self.assert_refused(tls, "refuses this end's certificate")
-        assert tls.reasons()[0] == "has a certificate that is not for a robot"
-
     async def test_a_robot_has_the_name_of_its_certificate_or_tells_none(
         self, tls: StreamWire
     ) -> None:
@@ -146,23 +123,6 @@ class TestCertificates:
         reason = "says that it is another, and shows the certificate of robot"
         assert tls.refusals[0] == ("cloud", f"refuses this end, which {reason}")
         assert tls.reasons()[0] == reason
-
-    async def test_a_certificate_must_name_the_host(
-        self, tls: StreamWire, authority: Authority
-    ) -> None:
-        await tls.service("cloud", "b1").start(echo)
-        place = tls.endpoint("cloud").replace("127.0.0.1", "127.0.0.2")
-        listening = StreamServiceTransport(
-            "cloud", incarnation="b1", listen=[place], tls=tls.service_tls
-        )
-        tls.ends.append(listening)
-        await listening.start(echo)
-        tls._endpoints["cloud"] = place
-        robot, inbox = tls.robot("cloud"), Inbox()
-        robot.start(inbox)
-        await until(lambda: bool(tls.refusals))
-        assert "does not name this host" in tls.refusals[0][1]
-        assert inbox.events == []
 
     async def test_an_old_version_of_tls_is_refused(self, tls: StreamWire) -> None:
         await tls.service("cloud", "b1").start(echo)
@@ -184,17 +144,6 @@ class TestCertificates:
         host, _, port = tls.endpoint("cloud").removeprefix("tls/").rpartition(":")
         with pytest.raises(ssl.SSLError, match="HANDSHAKE_FAILURE"):
             await asyncio.open_connection(host, int(port), ssl=context)
-
-    @staticmethod
-    async def assert_refused(tls: StreamWire, reason: str) -> None:
-        await tls.service("cloud", "b1").start(echo)
-        robot, inbox = tls.robot("cloud"), Inbox()
-        robot.start(inbox)
-        await until(lambda: bool(tls.refusals))
-        assert reason in tls.refusals[0][1]
-        robot.call("cloud", 1, b"")
-        assert await inbox.of_call(1) == [CallEnded(1)]
-        assert inbox.events == [CallEnded(1)]
 
     async def test_a_call_names_the_robot_s_certificate(
         self, tls: StreamWire, tcp: StreamWire
@@ -225,60 +174,6 @@ class TestCertificates:
         other.call("cloud", 1, b"question")
         assert await other_inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
         assert ServiceVanished("cloud", "b1") not in other_inbox
-
-    async def test_links_of_some_certificates_can_be_ended(
-        self, tls: StreamWire, authority: Authority
-    ) -> None:
-        robot, inbox, service = await connected(tls)
-        assert isinstance(service, StreamServiceTransport)
-        tls.robot_tls = authority.issue("other", oid.ExtendedKeyUsageOID.CLIENT_AUTH)
-        other, other_inbox = tls.robot("cloud"), Inbox()
-        other.start(other_inbox)
-        await other_inbox.wait_for(ServiceAppeared("cloud", "b1"))
-        shown = x509.load_pem_x509_certificate(tls.robot_tls.certificate.read_bytes())
-        assert (
-            service.end_links(lambda peer: "is revoked" if peer.serial_number == 1 else None) == 0
-        )
-        assert (
-            service.end_links(
-                lambda peer: (
-                    "is revoked"
-                    if peer.serial_number == shown.serial_number
-                    and peer.name == "other"
-                    and peer.expires_at == shown.not_valid_after_utc.timestamp()
-                    else None
-                ),
-            )
-            == 1
-        )
-        await other_inbox.wait_for(ServiceVanished("cloud", "b1"))
-        assert tls.refusals == [("cloud", "refuses this end, which is revoked")]
-        robot.call("cloud", 1, b"question")
-        assert await inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
-
-    async def test_credentials_are_read_anew_for_links_to_come(
-        self, tls: StreamWire, authority: Authority, tmp_path: Path
-    ) -> None:
-        usage = oid.ExtendedKeyUsageOID.SERVER_AUTH
-        tls.service_tls = files = authority.issue("renewed", usage)
-        robot, inbox, service = await connected(tls)
-        assert isinstance(service, StreamServiceTransport)
-        foreign = Authority(tmp_path / "foreign").issue("service", usage)
-        files.certificate.write_bytes(b"nonsense")
-        with pytest.raises(TransportError, match=r"certificate\.pem: is no certificate"):
-            service.reload_credentials()
-        again, again_inbox = tls.robot("cloud"), Inbox()
-        again.start(again_inbox)
-        await again_inbox.wait_for(ServiceAppeared("cloud", "b1"))
-        files.certificate.write_bytes(foreign.certificate.read_bytes())
-        files.key.write_bytes(foreign.key.read_bytes())
-        service.reload_credentials()
-        late, late_inbox = tls.robot("cloud"), Inbox()
-        late.start(late_inbox)
-        await until(lambda: bool(tls.refusals))
-        assert late_inbox.events == []
-        robot.call("cloud", 1, b"question")
-        assert await inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
 
     async def test_a_robot_can_be_closed_amid_a_handshake(self, tls: StreamWire) -> None:
         host, _, port = tls.endpoint("cloud").removeprefix("tls/").rpartition(":")

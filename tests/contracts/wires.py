@@ -162,7 +162,7 @@ class InProcessWire:
 
 
 class StreamWire:
-    """One endpoint for each name; either the services listen at it or the robot does."""
+    """One endpoint for each name; the services listen at it or, at a local socket, the robot."""
 
     def __init__(
         self,
@@ -302,7 +302,7 @@ class Authority:
         return builder.sign(self._key, hashes.SHA256())
 
 
-WIRES = ["in_process", "tcp", "tls", "udp", "unix", "robot_listens", "robot_listens_tls"]
+WIRES = ["in_process", "tcp", "tls", "udp", "unix", "robot_listens"]
 
 
 def echo(call: IncomingCall) -> None:

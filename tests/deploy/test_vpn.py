@@ -9,17 +9,13 @@ where systemd's units look for them, each end with an /etc of its own, and ``ope
 from __future__ import annotations
 
 import contextlib
-import csv
 import ctypes
 import os
 import shutil
 import signal
 import socket
-import statistics
 import subprocess
-import time
 from collections.abc import Iterator, Sequence
-from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -675,82 +671,3 @@ def _contents(directory: Path) -> dict[str, bytes | None]:
     return {
         str(path): path.read_bytes() if path.is_file() else None for path in directory.rglob("*")
     }
-
-
-# -- figures -------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_figures(
-    tmp_path: Path, references: References, keys: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Print how long a decision and a return take over each way; nothing is asserted of it."""
-    lines = ["task actions asked of the cloud, less what it computed, in ms (medians of 3 runs)"]
-    for kind in (None, *KINDS):
-        trips: dict[str, list[float]] = {"tcp": [], "tls": [], "udp": []}
-        for number in range(3):
-            for wire, found in trips.items():
-                directory = tmp_path / f"{kind}-{wire}-{number}"
-                found.append(statistics.median(_round_trips_ms(directory, kind, wire, keys)))
-        figures = ", ".join(f"{wire} {statistics.median(of):.2f}" for wire, of in trips.items())
-        lines.append(f"{kind or 'no tunnel':>10}: {figures}")
-    lines.append("from the way's restoring until the cloud decides again, in ms")
-    for kind in (None, *KINDS):
-        for away_s in (0.0, 20.0):
-            directory = tmp_path / f"{kind}-back-{away_s}"
-            after_ms = _return_ms(directory, kind, references, keys, away_s)
-            lines.append(f"{kind or 'no tunnel':>10}, away for {away_s:g} s more: {after_ms:.0f}")
-    with capsys.disabled():
-        print("", *lines, sep="\n")
-
-
-def _round_trips_ms(directory: Path, kind: str | None, wire: str, keys: Path) -> list[float]:
-    directory.mkdir()
-    with contextlib.ExitStack() as stack:
-        internet = Internet(stack)
-        if kind is not None:
-            Tunnel(internet, kind, directory / "tunnel", stack).up()
-        site = stack.enter_context(Site(directory))
-        host = CLOUD if kind is None else INSIDE
-        secret = wire != "tcp"
-        with internet.cloud.entered():
-            cloud = site.service(
-                *(("--tls", str(keys / "service")) if secret else ("--insecure",)),
-                endpoint=f"{wire}/{host}:{PORT}",
-            ).start()
-        file = site.configure(document_of("peg_in_hole_2d", trials=10))
-        with internet.robot.entered():
-            options = ("--tls", str(keys / "robot")) if secret else ()
-            robot = site.run(file, *options, "--rate", "300", services=[cloud])
-            robot.finish()
-        with (robot.out / "timings.csv").open() as table:
-            return [
-                float(row["round_trip_ms"]) - float(row["computed_ms"])
-                for row in csv.DictReader(table)
-                if row["kind"] == "task" and row["service"] == cloud.endpoint
-            ]
-
-
-def _return_ms(
-    directory: Path, kind: str | None, references: References, keys: Path, away_s: float
-) -> float:
-    directory.mkdir()
-    restored_at: list[float] = []
-    with contextlib.ExitStack() as stack:
-        internet = Internet(stack)
-        if kind is not None:
-            Tunnel(internet, kind, directory / "tunnel", stack).up()
-        site = stack.enter_context(Site(directory))
-        run = Run(internet, site, references, keys, "tls", CLOUD if kind is None else INSIDE)
-        run.story.at("sense", run.steps[1], internet.cut)
-        run.story.at(
-            "perform",
-            run.steps[2],
-            lambda: time.sleep(away_s),
-            internet.restore,
-            lambda: restored_at.append(time.time()),
-            run.story.status(KEEP_ALIVE),
-        )
-        robot = run.finish()
-        told = robot.matching("status", to=KEEP_ALIVE)[0]["time"]
-        return 1e3 * (datetime.fromisoformat(told).timestamp() - restored_at[0])

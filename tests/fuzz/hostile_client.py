@@ -1,50 +1,32 @@
-"""A client that means harm: it speaks the wire, and says whatever it likes.
-
-    python -m tests.fuzz.hostile_client ENDPOINT --messages 10000 --seed 1
-
-What it sends is drawn by seed; when each message arrives is not. It reports as one line of JSON.
-With ``--deaf`` it now and then stops reading what it is sent.
-"""
+"""What a client says that means harm and speaks the wire; drawn by seed, for the attacker."""
 
 from __future__ import annotations
 
-import argparse
 import collections
-import contextlib
 import itertools
-import json
 import random
-import socket
-import threading
-import time
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import msgspec
 from tests.fuzz import corpus
 from tests.fuzz.mutations import Mutator
-from tests.wire import CALL, END, LAST, REPLY, Frame, RawClient, frame_of, hello_of
+from tests.wire import frame_of, hello_of
 
 from holdfast.config.settings import ActiveSensingSettings, ParticleFilterSettings, PlanningSettings
-from holdfast.errors import MessageError
 from holdfast.protocol.messages import (
     MAX_INPUTS,
     Observed,
-    Refused,
     Request,
-    decode_reply,
     encode,
     with_checksum,
 )
 
-__all__ = ["HostileMessages", "Message", "main"]
+__all__ = ["HostileMessages", "Message"]
 
 _OWN_SESSIONS = 60
 _COSTLY_SHARE = 0.0002
 _FRAMES_SHARE = 0.01
-_PATIENCE_S = 30.0
-_TIMEOUT_S = 10.0
-_ROOM_S = 1.0
 _WORDS = (0, 1, 2, 3, 7, 64, 2**16, 2**31, 2**32 - 1)
 
 
@@ -213,150 +195,3 @@ class HostileMessages:
                 return size.to_bytes(4, "little") + frame_of(kind, call, content)[4:]
             case _:
                 return chance.randbytes(chance.choice((1, 9, 500)))
-
-
-class _Client:
-    """Sends messages, so many at a time, and counts what comes back.
-
-    Parameters
-    ----------
-    outstanding : int
-        Calls that may be open at a time.
-    deaf_s : float
-        Now and then nothing is read for this long.
-    """
-
-    def __init__(self, endpoint: str, outstanding: int, deaf_s: float, seed: int) -> None:
-        self._outstanding = outstanding
-        self._endpoint = endpoint
-        self._deaf_s = deaf_s
-        self._chance = random.Random(seed)
-        self._link: RawClient | None = None
-        self._open: set[int] = set()
-        self._changed = threading.Condition()
-        self._numbers = itertools.count(1)
-        self.kinds: collections.Counter[str] = collections.Counter()
-        self.replies: collections.Counter[str] = collections.Counter()
-        self.ended = 0
-        self.links = 0
-
-    def connect(self) -> None:
-        """Connect, as often as it takes."""
-        self.close()
-        deadline = time.monotonic() + _PATIENCE_S
-        while True:
-            try:
-                link = RawClient(self._endpoint)
-                break
-            except (OSError, AssertionError):
-                assert time.monotonic() < deadline, "no service is there"
-                time.sleep(0.05)
-        self.links += 1
-        with self._changed:
-            self._link = link
-            self._open = set()
-        threading.Thread(target=self._read, args=(link, self._open), daemon=True).start()
-
-    def close(self) -> None:
-        """Hang up; what was asked stays without an answer."""
-        with self._changed:
-            link, self._link = self._link, None
-        if link is not None:
-            with contextlib.suppress(OSError):
-                link.socket.shutdown(socket.SHUT_RDWR)
-            link.close()
-
-    def send(self, message: Message) -> None:
-        """Send a message, once there is room for its call."""
-        with self._changed:
-            has_room = self._changed.wait_for(
-                lambda: self._link is None or len(self._open) < self._outstanding, _ROOM_S
-            )
-            lost = self._link is None
-        if lost or not has_room:
-            # What was asked behind a frame that is too long is never answered.
-            self.replies["link lost" if lost else "link given up"] += 1
-            self.connect()
-        self.kinds[message.kind] += 1
-        link = self._link
-        if link is None:
-            return  # it was lost at once, and the next message finds out
-        try:
-            if message.is_call:
-                number = next(self._numbers) % 2**32
-                with self._changed:
-                    self._open.add(number)
-                link.send(CALL, number, message.payload)
-            else:
-                link.say(message.payload)
-        except OSError:
-            self.close()
-
-    def wait(self) -> None:
-        """Wait for the calls that are open."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._link is None or not self._open, _TIMEOUT_S + 5.0)
-
-    def _read(self, link: RawClient, calls: set[int]) -> None:
-        with contextlib.suppress(OSError, ValueError):
-            for frame in link.until_the_end(3600.0):
-                self._take(frame, calls)
-                if self._deaf_s and self._chance.random() < 0.01:
-                    time.sleep(self._deaf_s)
-        with self._changed:
-            if self._link is link:
-                self._link = None
-            self._changed.notify_all()
-
-    def _take(self, frame: Frame, calls: set[int]) -> None:
-        if frame.kind in (REPLY, LAST):
-            try:
-                decoded = decode_reply(frame.payload)
-                what = type(decoded).__name__
-                if isinstance(decoded, Refused):
-                    what = f"Refused {decoded.code}"
-            except MessageError:
-                what = "MALFORMED REPLY"
-            self.replies[what] += 1
-        if frame.kind in (LAST, END):
-            self.ended += 1
-            with self._changed:
-                calls.discard(frame.call)
-                self._changed.notify_all()
-
-
-def main() -> None:
-    """Send messages to a service and report what came of them."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("endpoint")
-    parser.add_argument("--messages", type=int, default=10_000)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--outstanding", type=int, default=48)
-    parser.add_argument("--deaf", type=float, default=0.0, metavar="SECONDS")
-    options = parser.parse_args()
-    client = _Client(options.endpoint, options.outstanding, options.deaf, options.seed)
-    began = time.monotonic()
-    client.connect()
-    messages = iter(HostileMessages(options.seed))
-    for number in range(1, options.messages + 1):
-        client.send(next(messages))
-        if number % 1000 == 0:
-            print(json.dumps({"sent": number}), flush=True)
-        if number % 50_000 == 0:
-            client.connect()  # comes and goes
-    client.wait()
-    client.close()
-    report = {
-        "seed": options.seed,
-        "sent": sum(client.kinds.values()),
-        "ended": client.ended,
-        "links": client.links,
-        "seconds": round(time.monotonic() - began, 1),
-        "kinds": dict(client.kinds.most_common()),
-        "replies": dict(client.replies.most_common()),
-    }
-    print(json.dumps(report), flush=True)
-
-
-if __name__ == "__main__":
-    main()

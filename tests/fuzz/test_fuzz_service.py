@@ -37,6 +37,7 @@ from holdfast.protocol.messages import (
 from holdfast.protocol.request_queue import RequestQueue
 from holdfast.protocol.service_sessions import (
     BRIEF,
+    FIRST,
     LONG,
     MEDIUM,
     NEW,
@@ -259,7 +260,7 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     waiting = [task for task in tasks if not task.running]
     assert statistics.running == len(running) == len(bench.jobs)
     fewer = max(1, bench.workers - 1)
-    most = {NEW: fewer, BRIEF: bench.workers, MEDIUM: fewer, LONG: fewer}
+    most = {NEW: fewer, FIRST: fewer, BRIEF: bench.workers, MEDIUM: fewer, LONG: fewer}
     assert all(lanes[number].num_running <= most[number] for number in most)
     assert statistics.waiting == len(waiting)
     for lane in lanes:
@@ -268,7 +269,7 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
         requested = [
             task for task in waiting if task.request is not None and queue._of(task) is lane
         ]
-        room = limits["max_waiting"] if number != NEW else (limits["max_waiting"] + 1) // 2
+        room = limits["max_waiting"] if number > FIRST else (limits["max_waiting"] + 1) // 2
         # One owner finds room, if another has taken that of all.
         assert len(requested) <= max(room, 2 * bench.workers) + 2 * bench.workers
     for session in kept:
@@ -287,6 +288,7 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     # Problems.
     pool = service._problems._idle
     assert len(pool) <= 32
+    assert len(service._problems._costs) <= 128 * 32
     assert sum(map(len, pool.values())) <= 32 * bench.workers
 
 

@@ -6,12 +6,16 @@ fault at a step, not after a time.
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import select
 import signal
+import subprocess
 import sys
 import time
+import urllib.error
+import urllib.request
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -145,12 +149,13 @@ class Service(ServiceCommand):
         self._site = site
         self.options = tuple(options)
         self.command: tuple[str, ...] = lab.HOLDFAST
+        self.verb = "serve"
         self.variables: dict[str, str] = {}
 
     def _start_process(self) -> Process:
         return self._site.process(
             *self.command,
-            *("serve", "--listen", self.endpoint, "--log", "json"),
+            *(self.verb, "--listen", self.endpoint, "--log", "json"),
             *self.options,
             variables=self.variables,
         )
@@ -205,6 +210,42 @@ def events_of(run: Path) -> list[dict[str, Any]]:
     """Return the events that the directory of a run tells of."""
     path = run / "events.jsonl"
     return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def summary_of(run: Path) -> dict[str, Any]:
+    """Return the summary in the directory of a run."""
+    found: dict[str, Any] = json.loads((run / "summary.json").read_text())
+    return found
+
+
+def rows_of(run: Path, name: str = "trials.csv") -> list[dict[str, str]]:
+    """Return the rows of a table in the directory of a run."""
+    with (run / name).open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def holdfast(
+    directory: Path, *arguments: str, command: Sequence[str] = COMMAND
+) -> subprocess.CompletedProcess[str]:
+    """Run a command in a directory to its end."""
+    return subprocess.run(
+        [*command, *arguments],
+        cwd=directory,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+
+
+def page(address: str, path: str) -> tuple[int, str]:
+    """Return what is answered by HTTP: the status and the text."""
+    try:
+        with urllib.request.urlopen(f"http://{address}{path}", timeout=PATIENCE_S) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
 
 
 class Site:

@@ -289,51 +289,6 @@ def test_nothing_is_left_of_it_even_if_it_is_killed(tmp_path: Path, started: lis
     chaos.wait_until("", present=False)
 
 
-@pytest.mark.slow
-def test_its_robots_end_at_once_if_it_is_killed(tmp_path: Path, started: list[Chaos]) -> None:
-    """And do not act on, for the rest of their runs, in a world that nobody watches."""
-    chaos = Chaos(tmp_path, "--trials", "2", "--jobs", "2", *only([FaultKind.LINK_DELAYED]))
-    started.append(chaos)
-    worlds = [chaos.out / f"trial-{n:05}" / "performed-disturbed.txt" for n in range(2)]
-    deadline = time.monotonic() + PATIENCE_S
-    while not all(world.exists() and world.stat().st_size for world in worlds):
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
-    chaos.process.kill()
-    chaos.end()
-    chaos.wait_until("", present=False)
-    for world in worlds:
-        undisturbed = world.with_name("performed-undisturbed.txt")
-        assert 0 < len(list(performances(world))) < len(list(performances(undisturbed)))
-        assert not (world.parent / "disturbed" / "summary.json").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("numbers", [(signal.SIGINT,), (signal.SIGINT, signal.SIGTERM)])
-def test_a_storm_of_signals_is_one(
-    tmp_path: Path, started: list[Chaos], numbers: tuple[signal.Signals, ...]
-) -> None:
-    """Whoever holds Ctrl-C down does not keep it from ending its processes and its account."""
-    options = ["--trials", "4", "--jobs", "2", *only([FaultKind.CLOUD_STOPPED])]
-    chaos = Chaos(tmp_path, *options)
-    started.append(chaos)
-    chaos.wait_until("holdfast run", present=True)
-    number = 0
-    while chaos.process.poll() is None:
-        chaos.process.send_signal(numbers[number % len(numbers)])
-        number += 1
-        time.sleep(0.005)
-    _, errors = chaos.end()
-    assert chaos.process.returncode == 130
-    assert number > 1
-    assert chaos.others() == []
-    assert "Interrupted; all processes are ended. 0 of 4 trials are finished" in errors
-    assert "Traceback" not in errors
-    assert re.search(r"Go on with: (holdfast chaos .*)", errors)
-    assert not list(chaos.out.glob("trial-*"))
-    assert (chaos.out / "summary.json").exists()
-
-
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [

@@ -8,22 +8,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.processes.faults import holdfast
 
 CONFIGURATION = """\
 problem: peg_in_hole_2d
 particle_filter: {num_particles: 30}
 simulator: {num_trials: 6, max_steps: 40, seed: 3}
 """
-
-
-def holdfast(directory: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "holdfast", *words],
-        cwd=directory,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
 
 
 @pytest.fixture(scope="module")

@@ -10,17 +10,13 @@ import os
 import shutil
 import signal
 import sys
-import threading
-import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from tests.processes.faults import (
     COMMAND,
     HERE,
     KEEP_ALIVE,
-    LOCAL_RECOVERY,
     LOST,
     LOST_AGAIN,
     PATIENT,
@@ -32,7 +28,6 @@ from tests.processes.faults import (
     Site,
     Story,
     document_of,
-    events_of,
     sensing_steps,
     services_in_order,
     wait_for_end,
@@ -49,7 +44,8 @@ GATED = {
     "problem": "gated_problem:GatedPeg",
     "problem_directory": str(HERE),
 }
-SIMULATOR = GATED["simulator"]
+
+
 SERVES_GATED = ("--problem", "gated_problem:GatedPeg", "--problem-directory", str(HERE))
 
 
@@ -115,43 +111,10 @@ class TestCloud:
         assert robot.statuses()[:2] == [LOST, RESTORED]
 
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
-    @pytest.mark.slow
-    def test_stopped_for_shorter_than_the_timeout(
-        self, problem: str, site: Site, references: References
-    ) -> None:
-        document = document_of(problem)
-        cloud = site.service().start()
-        story = Story(site, references, document)
-        timers: list[threading.Timer] = []
-
-        def stop_for_a_while() -> None:
-            cloud.stop()
-            timers.append(threading.Timer(0.4, cloud.resume))
-            timers[-1].start()
-
-        for struck in sensing_steps(document)[1:4]:
-            story.at("sense", struck, stop_for_a_while)
-        robot = story.run(cloud)
-        for timer in timers:
-            timer.join()
-        assert robot.statuses() == []
-        assert not robot.matching("service_suspected")
-        assert not robot.matching("launch")
-
-    @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     def test_never_there(self, problem: str, site: Site, references: References) -> None:
         story = Story(site, references, document_of(problem), offload={"startup_timeout_ms": 200.0})
         robot = story.run(site.service())
         assert robot.statuses() == [LOST]
-
-    def test_late_but_within_the_time_for_starting(
-        self, site: Site, references: References
-    ) -> None:
-        story = Story(site, references, document_of(PEG))
-        cloud = site.service()
-        story.at("begin", 0, cloud.start)
-        robot = story.run(cloud)
-        assert robot.statuses() == []
 
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     def test_killed_before_the_first_request(
@@ -191,76 +154,6 @@ class TestCloud:
         assert robot.statuses() == [LOST]
         assert not robot.matching("refused")
 
-    @pytest.mark.slow  # at a gate, and so for certain: the test above
-    @pytest.mark.parametrize("problem", PROBLEMS)
-    def test_killed_during_a_long_computation(
-        self, problem: str, site: Site, references: References
-    ) -> None:
-        """Without a gate: decisions long enough for a kill to strike the middle of one."""
-        document = document_of(problem, particles=1500, max_steps=36)
-        document["active_sensing"]["num_observation_samples"] = 100
-        cloud = site.service().start()
-        story = Story(site, references, document)
-        first = sensing_steps(document)[1]
-        # The first move after sensing: the task actions are known, the next sensing is computed.
-        story.at("perform", first, cloud.kill)
-        robot = story.run(cloud)
-        assert robot.statuses() == [LOST]
-
-    @pytest.mark.slow
-    def test_hung_while_it_shows_progress(self, site: Site, references: References) -> None:
-        gate = site.gate(9)
-        cloud = site.service(*SERVES_GATED)
-        cloud.variables["HOLDFAST_TEST_GATE"] = str(gate.port)
-        cloud.start()
-        offload = {"detection_timeout_ms": 1500.0, "decision_timeout_ms": 1500.0}
-        story = Story(site, references, GATED, offload=offload)
-        robot = story.run(cloud)
-        assert robot.statuses()[0] == LOST
-        reason = robot.matching("service_suspected")[0]["reason"]
-        assert reason == "a decision took longer than 1500 ms"
-
-    @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
-    def test_killed_again_after_it_was_used_again(
-        self, problem: str, site: Site, references: References
-    ) -> None:
-        document = document_of(problem)
-        steps = sensing_steps(document)
-        cloud = site.service().start()
-        story = Story(site, references, document)
-        story.at("sense", steps[1], cloud.kill)
-        story.at("perform", steps[2], cloud.start, story.status(KEEP_ALIVE, 1))
-        # This time while it moves, and found before anything is asked.
-        story.at("perform", steps[3] + 1, cloud.kill, story.status(LOCAL_RECOVERY, 2))
-        story.at("perform", steps[4], cloud.start, story.status(KEEP_ALIVE, 2))
-        story.at("sense", steps[5], cloud.kill)
-        robot = story.run(cloud)
-        assert robot.statuses() == [LOST, RESTORED, LOST_AGAIN, RESTORED, LOST_AGAIN]
-        # The local service stays ready: it is launched once.
-        assert len(robot.matching("launch")) == 1
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("problem", PROBLEMS)
-    @pytest.mark.parametrize("seed", range(4))
-    def test_killed_and_stopped_at_random(
-        self, problem: str, seed: int, site: Site, references: References
-    ) -> None:
-        document = document_of(problem, trials=2)
-        random = np.random.default_rng([seed, PROBLEMS.index(problem)])
-        cloud = site.service(lease_ms=QUICK["lease_ms"]).start()
-        story = Story(site, references, document, offload=QUICK)
-        for trial in range(2):
-            steps = np.sort(random.choice(np.arange(1, 55), 6, replace=False)).tolist()
-            for struck, later in zip(steps[::2], steps[1::2], strict=True):
-                if random.random() < 0.5:
-                    story.at("perform", struck, cloud.kill, trial=trial)
-                    story.at("perform", later, cloud.start, trial=trial)
-                else:
-                    story.at("perform", struck, cloud.stop, trial=trial)
-                    story.at("perform", later, cloud.resume, trial=trial)
-        robot = story.run(cloud)
-        assert set(robot.statuses()) <= {LOST, RESTORED, LOST_AGAIN}
-
 
 class TestRecovery:
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
@@ -285,53 +178,6 @@ class TestRecovery:
         robot = story.run(cloud)
         assert robot.statuses() == [LOST, RESTORED, LOST_AGAIN, RESTORED]
         assert len(robot.matching("launched")) == 2
-
-    @pytest.mark.slow
-    def test_killed_while_the_cloud_is_away(self, site: Site, references: References) -> None:
-        document = document_of(PEG)
-        steps = sensing_steps(document)
-        cloud = site.service().start()
-        story = Story(site, references, document)
-
-        def kill_recovery() -> None:
-            pid = story.running.recovery_pid()
-            os.kill(pid, signal.SIGKILL)
-            wait_for_end(pid)
-
-        story.at("sense", steps[1], cloud.kill)
-        for step in steps[2:5]:
-            story.at("sense", step, kill_recovery)
-        robot = story.run(cloud)
-        assert robot.statuses() == [LOST]
-        assert len(robot.matching("launched")) == 4
-
-    @pytest.mark.slow
-    def test_stopped_while_the_cloud_is_away(self, site: Site, references: References) -> None:
-        """It hangs, so another one takes its place."""
-        document = document_of(PEG)
-        steps = sensing_steps(document)
-        cloud = site.service().start()
-        story = Story(site, references, document, offload=QUICK)
-        story.at("sense", steps[1], cloud.kill)
-        story.at("sense", steps[3], lambda: os.kill(story.running.recovery_pid(), signal.SIGSTOP))
-        robot = story.run(cloud)
-        assert robot.statuses() == [LOST]
-        assert len(robot.matching("launched")) == 2
-
-    @pytest.mark.slow
-    def test_at_start_it_is_ready_before_it_is_needed(
-        self, site: Site, references: References
-    ) -> None:
-        document = document_of(PEG)
-        cloud = site.service().start()
-        story = Story(site, references, document, recovery={"launch": "at_start"})
-        story.at("begin", 0, lambda: story.running.wait_for("launched"))
-        story.at("sense", sensing_steps(document)[2], cloud.kill)
-        robot = story.run(cloud)
-        assert robot.statuses() == [LOST]
-        names = [event["event"] for event in events_of(robot.out)]
-        assert names.index("launched") < names.index("status")
-        assert "holding" not in names
 
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     def test_never_holds_until_the_cloud_is_back(
@@ -418,99 +264,6 @@ def installation_in(directory: Path) -> Path:
     return python
 
 
-@pytest.mark.slow
-class TestDeadline:
-    def test_a_late_decision_is_taken_from_the_local_service(
-        self, site: Site, references: References
-    ) -> None:
-        gate = site.gate(12)
-        cloud = site.service(*SERVES_GATED)
-        cloud.variables["HOLDFAST_TEST_GATE"] = str(gate.port)
-        cloud.start()
-        story = Story(
-            site,
-            references,
-            GATED,
-            offload={"decision_deadline_ms": 500.0, "max_hedged_share": 1.0},
-            recovery={"launch": "at_start"},
-        )
-        story.at("begin", 0, lambda: story.running.wait_for("launched"))
-        robot = story.run(cloud)
-        # The cloud computes and says so: nothing is wrong with it but its pace.
-        assert robot.statuses() == []
-        assert robot.matching("hedge")[0]["waited_ms"] >= 500.0
-        services = {
-            line.split(",")[3] for line in (robot.out / "timings.csv").read_text().splitlines()[1:]
-        }
-        assert services == {cloud.endpoint, RECOVERY}
-
-
-@pytest.mark.slow
-class TestAnotherService:
-    """In the place of the service that was lost comes one that does not know the problem."""
-
-    def test_the_local_service_decides_until_the_right_one_comes(
-        self, site: Site, references: References
-    ) -> None:
-        cloud = site.service(*SERVES_GATED).start()
-        # Something is asked at each step.
-        story = Story(
-            site, references, GATED | {"simulator": {**SIMULATOR, "sensing_intervals": 0}}
-        )
-        last = SIMULATOR["max_steps"] - 10
-
-        def start_without_the_problem() -> None:
-            cloud.options = tuple(each for each in cloud.options if each not in SERVES_GATED)
-            cloud.start()
-            story.running.wait_for("service_appeared", 2, service=cloud.endpoint)
-
-        def give_time() -> None:
-            # Who just started may ask for patience, and is then asked with a later question.
-            if not story.running.matching("refused", service=cloud.endpoint):
-                time.sleep(0.1)
-
-        def start_the_right_one() -> None:
-            cloud.kill()
-            cloud.options = (*cloud.options, *SERVES_GATED)
-            cloud.start()
-
-        # The next decision is awaited as soon as the robot has sensed.
-        story.at("sense", 1, cloud.kill, start_without_the_problem)
-        for step in range(2, last):
-            story.at("perform", step, give_time)
-        story.at("perform", last, start_the_right_one, story.status(KEEP_ALIVE))
-        robot = story.run(cloud)
-        assert robot.statuses() == [LOST, RESTORED]
-        told = robot.matching("refused", service=cloud.endpoint)
-        assert told, robot.account()
-        assert all("gated_problem:GatedPeg" in event["reason"] for event in told)
-
-    def test_without_a_local_service_the_run_ends_says_why_and_can_go_on(
-        self, site: Site, references: References
-    ) -> None:
-        cloud = site.service(*SERVES_GATED).start()
-        steps = sensing_steps(GATED)
-        story = Story(site, references, GATED, recovery={"launch": "never"})
-
-        def start_without_the_problem() -> None:
-            cloud.options = tuple(each for each in cloud.options if each not in SERVES_GATED)
-            cloud.start()
-            story.running.wait_for("service_appeared", 2, service=cloud.endpoint)
-
-        story.at("sense", steps[1], cloud.kill, start_without_the_problem)
-        robot = site.run(story.file, services=[cloud])
-        assert robot.wait() == 2
-        (told,) = robot.matching("error")
-        assert told["reason"].startswith(f"no service will decide: {cloud.endpoint}: ")
-        assert "problem gated_problem:GatedPeg: is not known to this service" in told["reason"]
-        assert "(--problem)" in told["reason"]
-        assert story.world.step == steps[1]
-        cloud.kill()
-        cloud.options = (*cloud.options, *SERVES_GATED)
-        cloud.start()
-        story.finish(site.run(story.file, services=[cloud], resume=True))
-
-
 class TestReplicas:
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     def test_killed_in_turn(self, problem: str, site: Site, references: References) -> None:
@@ -530,29 +283,3 @@ class TestReplicas:
         assert not robot.matching("launch")
         deciding = services_in_order(robot)
         assert deciding == [first.endpoint, second.endpoint, first.endpoint, second.endpoint]
-
-    @pytest.mark.slow  # one after the other: the test above; together: the simulator
-    def test_both_at_once(self, site: Site, references: References) -> None:
-        document = document_of(PEG)
-        steps = sensing_steps(document)
-        first, second = site.service().start(), site.service().start()
-        story = Story(site, references, document)
-        story.at("begin", 0, story.seen(first), story.seen(second))
-        story.at("sense", steps[1], first.kill, second.kill)
-        story.at("perform", steps[3], second.start, story.status(KEEP_ALIVE))
-        robot = story.run(first, second)
-        assert robot.statuses() == [LOST, RESTORED]
-        assert services_in_order(robot)[-1] == second.endpoint
-
-    def test_the_preferred_one_is_only_stopped(self, site: Site, references: References) -> None:
-        document = document_of(PEG)
-        steps = sensing_steps(document)
-        first, second = site.service().start(), site.service().start()
-        story = Story(site, references, document, offload=QUICK)
-        # Nobody takes the place of one that is not there yet but the local service.
-        story.at("begin", 0, story.seen(first), story.seen(second))
-        story.at("sense", steps[1], first.stop)
-        story.at("perform", steps[3], first.resume)
-        robot = story.run(first, second)
-        assert robot.statuses() == []
-        assert second.endpoint in services_in_order(robot)

@@ -7,28 +7,16 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import json
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from tests.ports import free_port
-from tests.processes.faults import COMMAND
+from tests.processes.faults import COMMAND, holdfast, summary_of
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PROBLEM = "corridor_doors:CorridorDoors"
-
-
-def holdfast(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*COMMAND, *arguments],
-        cwd=directory,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
 
 
 @contextlib.contextmanager
@@ -63,10 +51,7 @@ def test_it_runs_everywhere_and_decides_the_same(tmp_path: Path) -> None:
         ):
             done = holdfast(tmp_path, *command, *options, "--out", name)
             assert done.returncode == 0, f"{name}: {done.stderr}"
-    found = {
-        name: json.loads((tmp_path / name / "summary.json").read_text())
-        for name in ("batch", "robot", "offloaded")
-    }
+    found = {name: summary_of(tmp_path / name) for name in ("batch", "robot", "offloaded")}
     assert found["batch"]["successes"] == 3
     assert found["batch"]["digest"] == found["robot"]["digest"] == found["offloaded"]["digest"]
     for name in ("robot", "offloaded"):

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import signal
-import subprocess
 from pathlib import Path
 
 import pytest
-from tests.processes.faults import COMMAND, PATIENCE_S, events_of
+from tests.processes.faults import events_of, holdfast, rows_of, summary_of
 
 import holdfast as hf
 from holdfast.recording.journal import Journal
@@ -26,17 +23,6 @@ def off(environment, task_action):
 """
 
 
-def run(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*COMMAND, *arguments],
-        cwd=directory,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
-
-
 def test_a_crash_is_a_failure_in_every_table_and_truncated_is_neither(tmp_path: Path) -> None:
     pytest.importorskip("Box2D", reason="there is no wheel of Box2D for this Python")
     text = (EXAMPLES / "lunar_lander.yaml").read_text()
@@ -47,14 +33,11 @@ def test_a_crash_is_a_failure_in_every_table_and_truncated_is_neither(tmp_path: 
     assert crash != text != cut
     for name, configuration in (("crash", crash), ("cut", cut)):
         (tmp_path / f"{name}.yaml").write_text(configuration)
-        ended = run(tmp_path, "run", f"{name}.yaml", "--trials", "4", "--out", name)
+        ended = holdfast(tmp_path, "run", f"{name}.yaml", "--trials", "4", "--out", name)
         assert ended.returncode == 0, ended.stderr
         (tmp_path / f"{name}.txt").write_text(ended.stdout)
 
-    with (tmp_path / "crash" / "trials.csv").open() as file:
-        crashed = list(csv.DictReader(file))
-    with (tmp_path / "cut" / "trials.csv").open() as file:
-        truncated = list(csv.DictReader(file))
+    crashed, truncated = (rows_of(tmp_path / name) for name in ("crash", "cut"))
     assert {row["outcome"] for row in crashed} == {"failed"}
     assert {row["outcome"] for row in truncated} == {"truncated"}
     assert all(row["reason"].startswith("crashed at vx ") for row in crashed)
@@ -64,7 +47,7 @@ def test_a_crash_is_a_failure_in_every_table_and_truncated_is_neither(tmp_path: 
     assert "failed        4 of 4 trials" in said["crash"]
     assert "failed" not in said["cut"]
     for name, successes, failures in (("crash", 0, 4), ("cut", 0, 0)):
-        summary = json.loads((tmp_path / name / "summary.json").read_text())
+        summary = summary_of(tmp_path / name)
         assert (summary["successes"], summary["failures"]) == (successes, failures)
     told = [each for each in events_of(tmp_path / "crash") if each["event"] == "trial"]
     assert [each["outcome"] for each in told] == ["failed"] * 4
@@ -73,7 +56,7 @@ def test_a_crash_is_a_failure_in_every_table_and_truncated_is_neither(tmp_path: 
     opened = hf.open_run(tmp_path / "crash", problem_directory=tmp_path)
     assert opened.results["outcome"].tolist() == ["failed"] * 4
     assert opened.results["reason"].tolist() == [row["reason"] for row in crashed]
-    refused = run(tmp_path, "compare", "--outcomes", "cut", "crash")
+    refused = holdfast(tmp_path, "compare", "--outcomes", "cut", "crash")
     assert refused.returncode == 2
     assert "env_arguments.max_episode_steps is not given here and 20 there" in refused.stderr
     # As if both had had the same world.
@@ -81,7 +64,7 @@ def test_a_crash_is_a_failure_in_every_table_and_truncated_is_neither(tmp_path: 
     journals[0].set_meta("configuration", journals[1].meta()["configuration"])
     for journal in journals:
         journal.close()
-    compared = run(tmp_path, "compare", "--outcomes", "cut", "crash")
+    compared = holdfast(tmp_path, "compare", "--outcomes", "cut", "crash")
     (line,) = (line for line in compared.stdout.splitlines() if line.startswith("  failed"))
     assert line.split()[1:4] == ["0.0%", "100.0%", "+100.0"]
 
@@ -150,16 +133,14 @@ def test_after_a_kill_the_episode_is_where_it_was(tmp_path: Path) -> None:
     """It has died with the process, and its task actions are performed again."""
     (tmp_path / "car.py").write_text(CAR_MODULE)
     (tmp_path / "car.yaml").write_text(CAR)
-    calm = run(tmp_path, "run", "car.yaml", "--out", "calm")
+    calm = holdfast(tmp_path, "run", "car.yaml", "--out", "calm")
     assert calm.returncode == 0, calm.stderr
     (tmp_path / "kills").touch()
-    ended = run(tmp_path, "run", "car.yaml", "--out", "killed")
+    ended = holdfast(tmp_path, "run", "car.yaml", "--out", "killed")
     for _ in range(2):
         assert ended.returncode == -signal.SIGKILL, ended.stderr
-        ended = run(tmp_path, "run", "car.yaml", "--out", "killed", "--resume")
+        ended = holdfast(tmp_path, "run", "car.yaml", "--out", "killed", "--resume")
     assert ended.returncode == 0, ended.stderr
-    found = [
-        json.loads((tmp_path / name / "summary.json").read_text()) for name in ("calm", "killed")
-    ]
+    found = [summary_of(tmp_path / name) for name in ("calm", "killed")]
     for key in ("digest", "successes", "mean_reward", "mean_steps"):
         assert found[0][key] == found[1][key], key

@@ -5,10 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import urllib.error
-import urllib.request
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -17,13 +14,13 @@ from tests.ports import free_port
 from tests.processes.faults import (
     LOCAL_RECOVERY,
     LOST,
-    PATIENCE_S,
     References,
     Service,
     Site,
     Story,
     document_of,
     events_of,
+    page,
     wait_until,
 )
 
@@ -112,28 +109,6 @@ def test_a_revoked_robot_is_cut_off_and_no_other(
     assert "has a certificate that has been revoked" in told
     (ended,) = cloud.process.matching("robot_disconnected", robot="anna")
     assert ended["reason"] == "has a certificate that has been revoked"
-
-
-@pytest.mark.slow  # without a run, both ends: unit/test_stream_credentials.py
-def test_a_robot_whose_certificate_expires_is_cut_off_and_no_other(
-    home: Path, site: Site, elsewhere: Site, references: References
-) -> None:
-    cloud = cloud_of(site, home).start()
-
-    def happens(story: Story) -> None:
-        expiring(home, "anna", seconds=8.0)
-        story.at("perform", 20, story.status(LOCAL_RECOVERY))
-
-    statuses, out = robot_beside(home, cloud, site, elsewhere, references, happens)
-    assert statuses == [LOST]
-    told = " ".join(str(each.get("reason")) for each in events_of(out))
-    assert "has a certificate that has expired" in told
-
-
-def expiring(home: Path, name: str, seconds: float) -> None:
-    """Give a robot a certificate that expires soon."""
-    end = datetime.now(UTC) + timedelta(seconds=seconds)
-    make_credentials(home, robots=[name], rotate=True, days=1, now=end - timedelta(days=1))
 
 
 def test_a_rotated_service_goes_on_with_the_links_that_it_has(
@@ -288,17 +263,6 @@ def test_what_is_renewed_where_it_is_mounted_is_read_without_a_signal(
     assert len(cloud.process.matching("credentials_reloaded")) == 2 * processes
 
 
-def page(cloud: Service, path: str) -> tuple[int, str]:
-    """Ask a service how it is."""
-    address = cloud.process.matching("ready")[0]["health"]
-    try:
-        with urllib.request.urlopen(f"http://{address}{path}", timeout=PATIENCE_S) as answer:
-            return answer.status, answer.read().decode()
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code, error.read().decode()
-
-
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root mounts")
 @pytest.mark.parametrize("processes", [1, 2])
 def test_where_keys_are_mounted_a_rotation_and_then_a_revocation_take_effect(
@@ -315,7 +279,7 @@ def test_where_keys_are_mounted_a_rotation_and_then_a_revocation_take_effect(
     binding = f'mount --bind {home / "cloud"} {mount}; exec "$@"'
     cloud.command = ("unshare", "--mount", "sh", "-c", binding, "sh", *cloud.command)
     cloud.start()
-    assert page(cloud, "/readyz") == (200, "ok\n")
+    assert page(address, "/readyz") == (200, "ok\n")
     story = Story(site, references, document_of(PEG))
 
     def rotate() -> None:
@@ -332,8 +296,8 @@ def test_where_keys_are_mounted_a_rotation_and_then_a_revocation_take_effect(
     story.at("perform", 20, revoke, story.status(LOCAL_RECOVERY))
     robot = story.run(cloud, options=("--tls", str(home / "anna")))
     assert robot.statuses() == [LOST]
-    assert page(cloud, "/readyz") == (200, "ok\n")
-    assert "\nholdfast_credentials_stale 0.0\n" in page(cloud, "/metrics")[1]
+    assert page(address, "/readyz") == (200, "ok\n")
+    assert "\nholdfast_credentials_stale 0.0\n" in page(address, "/metrics")[1]
 
     # A list that is gone would let her in again.
     (home / "cloud" / "revoked.pem").unlink()
@@ -341,14 +305,14 @@ def test_where_keys_are_mounted_a_rotation_and_then_a_revocation_take_effect(
     told = cloud.process.wait_for("credentials", processes)
     assert "revoked.pem: lacks 1 of the 1 certificates that it revoked" in told["reason"]
     metric = f"\nholdfast_credentials_stale {processes}.0\n"
-    wait_until(lambda: metric in page(cloud, "/metrics")[1], "the metric")
-    assert page(cloud, "/readyz") == (200, "ok\n")
+    wait_until(lambda: metric in page(address, "/metrics")[1], "the metric")
+    assert page(address, "/readyz") == (200, "ok\n")
 
     for file in (home / "cloud").iterdir():
         file.unlink()
     cloud.process.signal(signal.SIGHUP)
     gone = (503, f"{mount}/authority.pem: cannot be read: No such file or directory")
-    wait_until(lambda: page(cloud, "/readyz")[0] == gone[0], "the service to be not ready")
-    assert page(cloud, "/readyz")[1].startswith(gone[1])
-    assert page(cloud, "/livez") == (200, "ok\n")
-    assert "\nholdfast_ready 0.0\n" in page(cloud, "/metrics")[1]
+    wait_until(lambda: page(address, "/readyz")[0] == gone[0], "the service to be not ready")
+    assert page(address, "/readyz")[1].startswith(gone[1])
+    assert page(address, "/livez") == (200, "ok\n")
+    assert "\nholdfast_ready 0.0\n" in page(address, "/metrics")[1]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import signal
 import subprocess
 from pathlib import Path
 
 import pytest
 from tests.ports import free_port
-from tests.processes.faults import COMMAND, PATIENCE_S
+from tests.processes.faults import COMMAND, PATIENCE_S, holdfast, rows_of
 
 pytest.importorskip("mujoco")
 
@@ -20,15 +19,8 @@ PROBLEMS = {"2d": "contact_peg:ContactPeg2D", "3d": "contact_peg:ContactPeg3D"}
 @pytest.mark.parametrize("peg", PROBLEMS)
 def test_the_cloud_is_killed_and_nothing_is_decided_otherwise(peg: str, tmp_path: Path) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    run = [*COMMAND, "run", str(EXAMPLE / f"peg_{peg}.yaml"), "--trials", "4", "--seed", "3"]
-    undisturbed = subprocess.run(
-        [*run, "--out", "undisturbed"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
+    run = ["run", str(EXAMPLE / f"peg_{peg}.yaml"), "--trials", "4", "--seed", "3"]
+    undisturbed = holdfast(tmp_path, *run, "--out", "undisturbed")
     assert undisturbed.returncode == 0, undisturbed.stderr
     cloud = subprocess.Popen(
         [
@@ -43,7 +35,7 @@ def test_the_cloud_is_killed_and_nothing_is_decided_otherwise(peg: str, tmp_path
         assert endpoint in cloud.stdout.readline()
         # A hundred steps a second: the run goes on for seconds after its first trial.
         robot = subprocess.Popen(
-            [*run, "--service", endpoint, "--rate", "100", "--out", "disturbed"],
+            [*COMMAND, *run, "--service", endpoint, "--rate", "100", "--out", "disturbed"],
             cwd=tmp_path,
             stderr=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
@@ -60,16 +52,8 @@ def test_the_cloud_is_killed_and_nothing_is_decided_otherwise(peg: str, tmp_path
     finally:
         cloud.kill()
         cloud.communicate()
-    with (tmp_path / "disturbed" / "trials.csv").open(newline="") as rows:
-        trials = list(csv.DictReader(rows))
+    trials = rows_of(tmp_path / "disturbed")
     assert sum(int(trial["recoveries"]) for trial in trials) >= 1
     assert {trial["outcome"] for trial in trials} <= {"succeeded", "failed"}
-    compared = subprocess.run(
-        [*COMMAND, "compare", "undisturbed", "disturbed"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
+    compared = holdfast(tmp_path, "compare", "undisturbed", "disturbed")
     assert compared.returncode == 0, compared.stdout + compared.stderr

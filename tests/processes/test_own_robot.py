@@ -9,13 +9,10 @@ from __future__ import annotations
 import asyncio
 import importlib.util
 import json
-import os
-import signal
 import socket
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -24,19 +21,15 @@ import numpy as np
 import pytest
 from tests.ports import free_port
 
-from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration, load
-from holdfast.outcome import Done, MoveResult
 from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.events import (
-    Acted,
     EnvironmentEvent,
     EnvironmentFailed,
     EnvironmentReady,
     Sensed,
 )
-from holdfast.robot.environment import Environment, Later
 from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
 from holdfast.robot.environment_runner import EnvironmentRunner, make_runner
 from holdfast.robot.trial import run_trial
@@ -220,73 +213,7 @@ class TestController:
         second.close()
 
 
-class Meddling:
-    """An environment in whose steps something is done to the controller."""
-
-    def __init__(self, environment: Environment, controller: Controller) -> None:
-        self._environment = environment
-        self._controller = controller
-        self._step = 0
-
-    def perform_sensing(self, sensing_action: int) -> FloatArray | Later | None:
-        return self._environment.perform_sensing(sensing_action)
-
-    def perform(self, task_action: FloatArray) -> float | MoveResult | None:
-        self._step += 1
-        if self._step == 10:  # between two moves
-            self._controller.kill()
-            self._controller.start("--delay-ms", "300")
-        if self._step == 11:  # in the middle of one, if the machine is not too busy for that
-            thread = threading.Timer(0.1, self._restart)
-            thread.start()
-            reward = self._environment.perform(task_action)
-            thread.join(PATIENCE_S)
-            return reward
-        return self._environment.perform(task_action)
-
-    def _restart(self) -> None:
-        self._controller.kill()
-        self._controller.start()
-
-    def is_done(self) -> Done:
-        return self._environment.is_done()
-
-
 class TestTrial:
-    def test_it_succeeds_and_a_restarted_controller_changes_nothing(
-        self, controller: Controller
-    ) -> None:
-        controller.start()
-        configuration = configuration_for(controller)
-        planner = Planner(configuration.problem, configuration.planning)
-        maker = load_environment(configuration)
-        quiet: Any = maker(2)
-        expected = run_trial(
-            planner,
-            configuration.simulator.seed,
-            2,
-            max_steps=configuration.simulator.max_steps,
-            environment=quiet,
-        )
-        quiet.close()
-        assert expected.success
-        moves = controller.moves()
-        assert len(moves) == expected.steps
-        (controller.directory / "performed.log").unlink()
-
-        robot: Any = maker(2)
-        result = run_trial(
-            planner,
-            configuration.simulator.seed,
-            2,
-            max_steps=configuration.simulator.max_steps,
-            environment=Meddling(robot, controller),
-        )
-        robot.close()
-        assert result.digest == expected.digest
-        assert result.reward == expected.reward
-        assert controller.moves() == moves
-
     def test_the_simulation_has_the_same_file(self) -> None:
         """Without the name of the class, the same configuration is simulated."""
         configuration = load(EXAMPLE / "own_robot.yaml")
@@ -347,45 +274,6 @@ class Watched:
 
 
 class TestFailures:
-    @pytest.mark.slow
-    def test_a_silent_controller_stops_the_robot_and_the_count_settles_it(
-        self, controller: Controller
-    ) -> None:
-        controller.start("--silent-at", "2", "--silent-s", "3")
-        maker = load_environment(configuration_for(controller, timeout_ms=1000.0))
-        first = Watched(maker)
-        assert first.begin() == EnvironmentReady(None, None)
-        assert isinstance(first.perform(0), Acted)
-        assert isinstance(first.perform(1), Acted)
-        failed = first.perform(2)
-        assert failed == EnvironmentFailed(
-            2,
-            "perform",
-            "environment:SocketRobot: perform has not returned within 1000 ms, which is "
-            "environment.timeout_ms",
-            True,
-        )
-        # A new process of the robot would do this; the controller answers once it speaks again.
-        patient = load_environment(configuration_for(controller))
-        again = Watched(patient, resumed=True)
-        assert again.begin() == EnvironmentReady(None, 3)
-        assert isinstance(again.perform(3), Acted)
-        assert [move["step"] for move in controller.moves()] == [0, 1, 2, 3]
-        assert not [move for move in controller.moves() if "error" in move]
-        first.close()
-        again.close()
-
-    def test_no_controller_at_all(self, controller: Controller) -> None:
-        controller.port = free_port()
-        maker = load_environment(configuration_for(controller, {"connect_timeout_s": 0.2}))
-        watched = Watched(maker)
-        failed = watched.begin()
-        assert isinstance(failed, EnvironmentFailed)
-        assert failed.text.startswith("environment:SocketRobot raised ConnectionRefusedError")
-        assert f'File "{EXAMPLE / "environment.py"}", line ' in failed.text
-        assert not failed.action_in_doubt
-        watched.close()
-
     def test_a_controller_in_another_trial_is_not_resumed(self, controller: Controller) -> None:
         controller.start()
         maker = load_environment(configuration_for(controller))
@@ -397,100 +285,6 @@ class TestFailures:
         assert isinstance(failed, EnvironmentFailed)
         assert "RuntimeError: the controller is in trial 0, not in 1" in failed.text
         other.close()
-
-
-ROBOT = """\
-import asyncio
-import sys
-
-import numpy as np
-
-from holdfast.config.loader import load
-from holdfast.robot.environment_maker import load_environment
-from holdfast.robot.environment_runner import make_runner
-
-file, port, timeout_ms, steps = sys.argv[1:]
-configuration = load(file, overrides={
-    "environment.object": "environment:SocketRobot",
-    "environment.arguments": {"port": int(port)},
-    "environment.timeout_ms": float(timeout_ms),
-})
-
-
-async def main():
-    events = asyncio.Queue()
-    runner = make_runner(
-        load_environment(configuration), 0, lambda event, _: events.put_nowait(event)
-    )
-    runner.begin()
-    print(await events.get(), flush=True)
-    for step in range(int(steps)):
-        runner.perform(step, np.array([-0.1, 0.0, 0.0]))
-        print("performing", flush=True)
-        print(await events.get(), flush=True)
-    runner.close()
-
-
-asyncio.run(main())
-"""
-
-
-@pytest.mark.slow
-class TestProcesses:
-    """The robot's own process meets its signals while the robot moves."""
-
-    @staticmethod
-    def robot(controller: Controller, timeout_ms: float, steps: int) -> subprocess.Popen[str]:
-        return subprocess.Popen(
-            [
-                *(sys.executable, "-c", ROBOT, str(EXAMPLE / "own_robot.yaml")),
-                *map(str, (controller.port, timeout_ms, steps)),
-            ],
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-
-    @staticmethod
-    def lines(process: subprocess.Popen[str], count: int) -> Sequence[str]:
-        assert process.stdout is not None
-        return [process.stdout.readline().rstrip() for _ in range(count)]
-
-    def test_killed_while_the_robot_moves(self, controller: Controller) -> None:
-        controller.start("--delay-ms", "500")
-        with self.robot(controller, 60000.0, 1) as process:
-            assert self.lines(process, 2)[1] == "performing"
-            process.kill()
-        again = Watched(load_environment(configuration_for(controller)), resumed=True)
-        begun = again.begin()
-        assert isinstance(begun, EnvironmentReady)
-        # The controller counts a motion that goes on as what it becomes, and nothing is lost.
-        assert begun.steps_performed == len(controller.moves())
-        for step in range(len(controller.moves()), 3):
-            assert isinstance(again.perform(step), Acted)
-        assert [move["step"] for move in controller.moves()] == [0, 1, 2]
-        assert not [move for move in controller.moves() if "error" in move]
-        again.close()
-
-    def test_stopped_for_longer_than_the_timeout(self, controller: Controller) -> None:
-        """A robot that was stopped itself does not blame its controller for the time."""
-        controller.start("--delay-ms", "300")
-        with self.robot(controller, 1000.0, 2) as process:
-            assert self.lines(process, 2)[1] == "performing"
-            os.kill(process.pid, signal.SIGSTOP)
-            assert not wait_for_exit(process, 2.0)
-            os.kill(process.pid, signal.SIGCONT)
-            answers = self.lines(process, 3)
-            assert process.wait(PATIENCE_S) == 0
-        assert answers[0].startswith("Acted(step=0")
-        assert answers[2].startswith("Acted(step=1")
-
-
-def wait_for_exit(process: subprocess.Popen[str], timeout_s: float) -> bool:
-    try:
-        process.wait(timeout_s)
-    except subprocess.TimeoutExpired:
-        return False
-    return True
 
 
 def test_sensing_through_the_runner(controller: Controller) -> None:

@@ -132,23 +132,6 @@ def test_controller_killed_and_started_again(
 
 
 @pytest.mark.slow
-def test_controller_killed_together_with_the_robot(
-    controller: Controller, site: Site, undisturbed: Undisturbed
-) -> None:
-    controller.start("--delay-ms", "3")
-    file = configuration_for(controller, site)
-    robot = site.run(file)
-    for number in (12, 30):
-        wait_for_move(controller, number)
-        controller.kill()
-        robot.kill()
-        controller.start("--delay-ms", "3")
-        robot = site.run(file, resume=True)
-    robot.finish()
-    undisturbed.assert_same(robot.out, controller)
-
-
-@pytest.mark.slow
 def test_controller_that_falls_silent(
     controller: Controller, site: Site, undisturbed: Undisturbed
 ) -> None:
@@ -164,27 +147,3 @@ def test_controller_that_falls_silent(
     robot.finish()
     assert robot.matching("performed_unseen", step=20)
     undisturbed.assert_same(robot.out, controller)
-
-
-@pytest.mark.slow
-def test_two_commands_say_whether_they_decided_the_same(
-    controller: Controller, site: Site, undisturbed: Undisturbed
-) -> None:
-    controller.start()
-    cloud = site.service().start()
-    robot = site.run(configuration_for(controller, site), services=[cloud])
-    wait_for_move(controller, 15)
-    cloud.kill()
-    robot.finish()
-    same = site.holdfast("compare", undisturbed.out, robot.out)
-    assert same.process.returncode == 0, same.account()
-    assert same.output.startswith("identical: 1 trial, ")
-    # Another world, and so another run.
-    controller.kill()
-    (controller.directory / "performed.log").unlink()
-    controller.start("--seed", "1")
-    other = site.run(configuration_for(controller, site), out="other")
-    other.finish()
-    differ = site.holdfast("compare", undisturbed.out, other.out)
-    assert differ.process.returncode == 1
-    assert differ.output.startswith("different: trial 0, step 0, ")

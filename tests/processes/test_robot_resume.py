@@ -5,33 +5,27 @@ Whatever was performed is performed once: the world, which outlives the robot, h
 
 from __future__ import annotations
 
-import contextlib
 import os
 import pty
 import shlex
 import shutil
 import signal
-import subprocess
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from tests.processes import gated_problem
 from tests.processes.faults import (
     COMMAND,
     HERE,
-    KEEP_ALIVE,
     LOCAL_RECOVERY,
     PATIENT,
     PROBLEMS,
-    Hook,
     References,
     Site,
     Story,
     assert_identical,
     document_of,
-    events_of,
     sensing_steps,
     unfinished_steps,
     wait_for_end,
@@ -71,24 +65,6 @@ class TestKilled:
         # Each robot came with a higher epoch, so the cloud has taken the session over.
         assert len(cloud.process.matching("session_taken_over")) >= 1
 
-    @pytest.mark.parametrize("world", ["PlainWorldClient", "WorldClient"])
-    @pytest.mark.parametrize("shown", [False, True])
-    @pytest.mark.slow
-    def test_while_it_senses(
-        self, world: str, shown: bool, site: Site, references: References
-    ) -> None:
-        """Sensing moves nothing, so it may be done again by a robot that cannot count its steps."""
-        document = document_of(PEG)
-        steps = sensing_steps(document)
-        cloud = site.service().start()
-        story = Story(site, references, document, environment={"object": f"world_client:{world}"})
-        for step in (steps[0], steps[2], steps[5]):
-            story.at("sense", step, site.kill_robot, afterwards=shown)
-        assert story.run_and_resume(cloud) == 3
-        said = site.holdfast("compare", story.reference, story.running.out)
-        assert said.process.returncode == 0, said.account()
-        assert "identical: 1 trial, " in said.output
-
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     @pytest.mark.slow
     def test_where_trials_begin_and_end(
@@ -105,23 +81,6 @@ class TestKilled:
         story.at("perform", 0, site.kill_robot, trial=1, afterwards=True)
         story.at("perform", 29, site.kill_robot, trial=2)
         assert story.run_and_resume(cloud) == 7
-
-    @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
-    @pytest.mark.slow
-    def test_together_with_the_cloud(
-        self, problem: str, site: Site, references: References
-    ) -> None:
-        document = document_of(problem)
-        steps = sensing_steps(document)
-        cloud = site.service().start()
-        story = Story(site, references, document, offload={"startup_timeout_ms": 500.0})
-        # Up again before the next robot is there; not up, and the local service decides; and both
-        # at once while that one does.
-        story.at("sense", steps[1], cloud.kill, site.kill_robot, cloud.start)
-        story.at("perform", steps[2], cloud.kill, site.kill_robot)
-        story.at("perform", steps[4], cloud.start, story.status(KEEP_ALIVE))
-        story.at("perform", steps[4] + 2, site.kill_robot, cloud.kill)
-        assert story.run_and_resume(cloud) == 3
 
     def test_its_local_service_ends_with_it(self, site: Site, references: References) -> None:
         document = document_of(PEG)
@@ -157,50 +116,6 @@ class TestKilled:
         for step in (1, 20, 21, 40):
             story.at("perform", step, site.kill_robot, afterwards=step % 2 == 0)
         assert story.run_and_resume() == 4
-
-    @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
-    @pytest.mark.slow
-    def test_in_a_simulated_world(self, problem: str, site: Site, references: References) -> None:
-        """That world dies with the robot, and is made again from the journal."""
-        document = document_of(problem, trials=2)
-        reference = references(document)
-        file = site.configure(document)
-        cloud = site.service().start()
-        random = np.random.default_rng(5)
-        robot = site.run(file, "--rate", "400", services=[cloud])
-        for rows in np.cumsum(random.integers(3, 9, 4)).tolist():
-            # These moments are nobody's choice: between two steps, or within one.
-            out = robot.out
-            wait_until(lambda: len(rows_of(out)) >= rows, f"{rows} decisions")  # noqa: B023
-            time.sleep(random.uniform(0.0, 0.02))
-            robot.kill()
-            steps = unfinished_steps(robot.out)
-            assert steps == list(range(len(steps)))
-            robot = site.run(file, "--rate", "400", services=[cloud], resume=True)
-        robot.finish()
-        assert_identical(robot.out, reference)
-        assert len([each for each in events_of(robot.out) if each["event"] == "resumed_trial"]) > 0
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("problem", PROBLEMS)
-    @pytest.mark.parametrize("seed", range(3))
-    def test_at_random_with_and_without_the_cloud(
-        self, problem: str, seed: int, site: Site, references: References
-    ) -> None:
-        document = document_of(problem, max_steps=60, trials=2)
-        random = np.random.default_rng([7, seed, PROBLEMS.index(problem)])
-        cloud = site.service().start()
-        story = Story(site, references, document)
-        for trial in range(2):
-            for step in random.choice(np.arange(60), 6, replace=False).tolist():
-                faults: list[list[Hook]] = [
-                    [site.kill_robot],
-                    [cloud.kill, site.kill_robot, cloud.start],
-                    [cloud.kill, cloud.start],
-                ]
-                hooks = faults[random.integers(3)]
-                story.at("perform", step, *hooks, trial=trial, afterwards=bool(random.integers(2)))
-        story.run_and_resume(cloud)
 
 
 class TestProblem:
@@ -308,30 +223,6 @@ class TestEndedInOrder:
         assert_identical(robot.out, story.reference)
         story.world.assert_each_once(story.reference)
 
-    @pytest.mark.slow
-    def test_by_a_second_signal_while_the_robot_does_not_answer(
-        self, site: Site, references: References
-    ) -> None:
-        document = document_of(PEG)
-        cloud = site.service().start()
-        story = Story(site, references, document)
-
-        def press_until_it_ends() -> None:
-            pressed = story.running
-            deadline = time.monotonic() + 30.0
-            while pressed.process.poll() is None:
-                assert time.monotonic() < deadline
-                pressed.signal(signal.SIGINT)
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    pressed.process.wait(1.5)
-
-        story.at("perform", 30, press_until_it_ends)
-        robot = site.run(story.file, services=[cloud])
-        # The latter if it was pressed once more while it was ending already.
-        assert robot.wait() in (128 + signal.SIGINT, -signal.SIGINT)
-        assert story.world.step == 30
-        story.finish(site.run(story.file, services=[cloud], resume=True))
-
     @pytest.mark.parametrize(
         "number",
         # Its handler is that of SIGTERM, above; of Ctrl-C at a batch: test_run_command.py.
@@ -371,23 +262,6 @@ class TestEndedInOrder:
 
 
 class TestWorld:
-    @pytest.mark.parametrize("performed", [False, True])
-    @pytest.mark.slow
-    def test_a_robot_that_stalls_holds_and_is_resumed(
-        self, performed: bool, site: Site, references: References
-    ) -> None:
-        document = document_of(PEG)
-        cloud = site.service().start()
-        story = Story(site, references, document, environment={"timeout_ms": 1500.0})
-        story.at("perform", 22, lambda: story.running.wait(), afterwards=performed)
-        robot = site.run(story.file, services=[cloud])
-        assert robot.wait() == 2
-        assert "the robot holds still in trial 0, step 22" in robot.output
-        assert "perform has not returned within 1500 ms" in robot.output
-        assert "whether its task action was performed is not known" in robot.output
-        assert "Go on with: holdfast run" in robot.output
-        story.finish(site.run(story.file, services=[cloud], resume=True))
-
     def test_two_that_do_not_belong_together(self, site: Site, references: References) -> None:
         """The world has done more than the journal knows: nothing is performed."""
         document = document_of(PEG)
@@ -472,30 +346,6 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 class TestDamagedJournal:
-    @pytest.mark.parametrize("name", ["journal.sqlite", "journal.sqlite-wal"])
-    @pytest.mark.parametrize(
-        "permille",
-        [
-            pytest.param(permille, marks=[pytest.mark.slow] if number % 6 else [])
-            for number, permille in enumerate(range(0, 1000, 41))
-        ],
-    )
-    def test_cut_off(
-        self, name: str, permille: int, killed: Path, site: Site, references: References
-    ) -> None:
-        shutil.copytree(killed, site.directory / "out")
-        path = site.directory / "out" / name
-        os.truncate(path, permille * path.stat().st_size // 1000)
-        # Without --rate the trials would be run as a batch, anew from where each began.
-        robot = site.run(site.configure(SHORT), "--rate", "10000", resume=True)
-        if robot.wait() == 0:
-            assert_identical(robot.out, references(SHORT))
-        else:
-            assert robot.process.returncode == 2, robot.account()
-            assert f"{site.directory / 'out' / 'journal.sqlite'}: " in robot.output
-            assert "--out" in robot.output
-            assert "Traceback" not in robot.output
-
     def test_as_it_was_left(self, killed: Path, site: Site, references: References) -> None:
         shutil.copytree(killed, site.directory / "out")
         robot = site.run(site.configure(SHORT), "--rate", "10000", resume=True)

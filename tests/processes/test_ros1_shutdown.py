@@ -12,10 +12,10 @@ from tests.wire import RawClient
 
 from holdfast.lab.testbed.processes import HOLDFAST
 from holdfast.protocol.messages import SensingAnswer, encode
-from holdfast.transport.ros1_calls import CALLER
+from ros1_master_guard.ros1_calls import CALLER
 
 NODE = "/cloud_active_sensing"
-OPTIONS = ("--ros1", "--configuration", str(EXAMPLES / "peg_in_hole_2d.yaml"))
+OPTIONS = ("--configuration", str(EXAMPLES / "peg_in_hole_2d.yaml"))
 
 
 def shut_down(uri: str) -> None:
@@ -49,6 +49,7 @@ def answers(endpoint: str) -> bool:
 def test_what_is_served_beside_ros_goes_on(tmp_path: Path, master: Master) -> None:  # noqa: F811
     with Site(tmp_path) as site:
         service = site.service(*OPTIONS)
+        service.verb = "ros1-serve"
         service.variables = environment(master)
         service.start()
         wait_until(lambda: NODE in master.nodes, "the node's registration")
@@ -68,7 +69,7 @@ def test_what_is_served_beside_ros_goes_on(tmp_path: Path, master: Master) -> No
 def test_a_node_that_serves_nothing_else_ends(tmp_path: Path, master: Master) -> None:  # noqa: F811
     with Site(tmp_path) as site:
         process = site.process(
-            *(*HOLDFAST, "serve", "--log", "json", *OPTIONS), variables=environment(master)
+            *(*HOLDFAST, "ros1-serve", "--log", "json", *OPTIONS), variables=environment(master)
         )
         wait_until(lambda: NODE in master.nodes, "the node's registration")
         shut_down(master.nodes[NODE])

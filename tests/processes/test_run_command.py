@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import json
 import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
 from tests.ports import free_port
-from tests.processes.faults import COMMAND
+from tests.processes.faults import COMMAND, holdfast, rows_of, summary_of, wait_until
 
 from holdfast.recording.machine import machines
 from holdfast.source_digest import core_version
@@ -80,32 +78,12 @@ simulator: {num_trials: 16, max_steps: 10, seed: 3}
 """
 
 
-def holdfast(
-    directory: Path, *arguments: str, command: Sequence[str] = COMMAND
-) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*command, *arguments],
-        cwd=directory,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-
-
 def decided(directory: Path) -> list[tuple[str, ...]]:
     """The table of trials, without the times."""
-    with (directory / "trials.csv").open() as file:
-        return [
-            tuple(value for key, value in row.items() if key != "mean_sensing_ms")
-            for row in csv.DictReader(file)
-        ]
-
-
-def summary(directory: Path) -> dict[str, object]:
-    content = json.loads((directory / "summary.json").read_text())
-    assert isinstance(content, dict)
-    return content
+    return [
+        tuple(value for key, value in row.items() if key != "mean_sensing_ms")
+        for row in rows_of(directory)
+    ]
 
 
 @pytest.fixture
@@ -114,14 +92,6 @@ def workplace(tmp_path: Path) -> Path:
     (tmp_path / "held.yaml").write_text(HELD_CONFIGURATION)
     (tmp_path / "held_problem.py").write_text(HELD.replace("FREELY", str(FREELY)))
     return tmp_path
-
-
-def wait_until(condition: Callable[[], bool], what: str) -> None:
-    """Wait for something that other processes do; generous, because machines can be busy."""
-    deadline = time.monotonic() + 60.0
-    while not condition():
-        assert time.monotonic() < deadline, f"waited in vain for {what}"
-        time.sleep(0.02)
 
 
 class HeldRun:
@@ -197,7 +167,7 @@ class TestOutput:
         assert "success" in done.stdout
         assert done.stderr.splitlines() == ["peg_in_hole_2d, 6 trials, seed 3; results in out"]
         assert [row[0] for row in decided(workplace / "out")] == ["0", "1", "2", "3", "4", "5"]
-        assert summary(workplace / "out")["finished"] == 6
+        assert summary_of(workplace / "out")["finished"] == 6
 
     def test_with_log_json_the_standard_error_has_nothing_else(self, workplace: Path) -> None:
         service = f"tcp/127.0.0.1:{free_port()}"
@@ -212,7 +182,7 @@ class TestOutput:
         assert status["reason"] == f"{service} has not appeared"
         notes = [event["reason"] for event in events if event["event"] == "note"]
         assert f"{service} decided nothing: connection refused" in notes
-        found = summary(workplace / "out")
+        found = summary_of(workplace / "out")
         decided = found["sensing_decisions_by_service"]
         assert decided == {"cloud_active_sensing_recovery": found["sensing_decisions"]}
         assert "decided by" in done.stdout
@@ -241,7 +211,7 @@ class TestOutput:
             )
         assert done.returncode == 0
         assert "digest" in done.stdout
-        assert summary(workplace / "out")["finished"] == 1
+        assert summary_of(workplace / "out")["finished"] == 1
 
     def test_nor_a_reader_that_has_ended(self, workplace: Path) -> None:
         reading, writing = os.pipe()
@@ -252,17 +222,10 @@ class TestOutput:
                 command, cwd=workplace, stdout=subprocess.DEVNULL, stderr=pipe, check=False
             )
         assert done.returncode == 0
-        assert summary(workplace / "out")["finished"] == 1
+        assert summary_of(workplace / "out")["finished"] == 1
 
     def test_as_a_module(self, workplace: Path) -> None:
-        done = subprocess.run(
-            [sys.executable, "-m", "holdfast", "run", "--help"],
-            cwd=workplace,
-            capture_output=True,
-            text=True,
-            timeout=120,
-            check=False,
-        )
+        done = holdfast(workplace, "run", "--help", command=[sys.executable, "-m", "holdfast"])
         assert done.returncode == 0
         assert done.stdout.startswith("usage: holdfast run ")
         assert "<bool>" not in done.stdout
@@ -290,7 +253,7 @@ class TestInterruption:
         )
         kept = decided(workplace / "out")
         assert 0 < len(kept) < 16
-        assert summary(workplace / "out")["finished"] == len(kept)
+        assert summary_of(workplace / "out")["finished"] == len(kept)
 
         held_run.let_go()
         resumed = holdfast(workplace, "run", "held.yaml", "--out", "out", "--resume")
@@ -327,7 +290,7 @@ class TestInterruption:
         )
         kept = len(decided(workplace / "out"))
         assert 0 < kept < 16
-        assert summary(workplace / "out")["finished"] == kept
+        assert summary_of(workplace / "out")["finished"] == kept
 
     def test_a_killed_worker_is_reported_with_its_trial(
         self, workplace: Path, held_run: HeldRun
@@ -343,7 +306,7 @@ class TestInterruption:
         held_run.let_go()
         resumed = holdfast(workplace, "run", "held.yaml", "--out", "out", "--resume")
         assert resumed.returncode == 0, resumed.stderr
-        assert summary(workplace / "out")["finished"] == 16
+        assert summary_of(workplace / "out")["finished"] == 16
 
     def test_a_killed_parent_leaves_a_run_that_can_go_on(
         self, workplace: Path, held_run: HeldRun
@@ -358,7 +321,7 @@ class TestInterruption:
         resumed = holdfast(workplace, "run", "held.yaml", "--out", "out", "--resume")
         assert resumed.returncode == 0, resumed.stderr
         assert "finished before" in resumed.stderr
-        assert summary(workplace / "out")["finished"] == 16
+        assert summary_of(workplace / "out")["finished"] == 16
 
 
 class TestErrors:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import csv
 import json
 import os
-import platform
 import subprocess
 import sys
 from collections.abc import Callable
@@ -198,22 +197,6 @@ def test_instruction_sets(run: Run, usual: Report, simd: str) -> None:
     report = report_of(finished)
     assert report["simd"] == simd
     assert report["digests"] == usual["digests"]
-
-
-@pytest.mark.slow  # test_all_at_once has none, too
-@pytest.mark.skipif(not numpy_features(), reason="NumPy makes no choices by processor here")
-def test_numpy_without_its_instruction_sets(run: Run, usual: Report) -> None:
-    report = report_of(run(NPY_DISABLE_CPU_FEATURES=" ".join(numpy_features())))
-    assert usual["numpy"] == numpy_features()
-    assert report["numpy"] == []
-    assert report["digests"] == usual["digests"]
-
-
-@pytest.mark.slow  # test_all_at_once has one of them, too
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="names of x86 processors")
-@pytest.mark.parametrize("core", ["Prescott", "Haswell"])
-def test_openblas_for_another_processor(run: Run, usual: Report, core: str) -> None:
-    assert report_of(run(OPENBLAS_CORETYPE=core))["digests"] == usual["digests"]
 
 
 @pytest.mark.skipif(not numpy_features(), reason="NumPy makes no choices by processor here")

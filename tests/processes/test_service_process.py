@@ -22,7 +22,7 @@ from typing import Any
 import msgspec
 import pytest
 from tests.processes.faults import PATIENT
-from tests.unit.test_protocol_service import Robot, content, planning_of
+from tests.unit.test_protocol_service import Robot, content
 
 from holdfast.protocol.events import (
     CallEnded,
@@ -33,7 +33,6 @@ from holdfast.protocol.events import (
 )
 from holdfast.protocol.messages import (
     PROTOCOL_VERSION,
-    NeedState,
     Progress,
     Refused,
     Reply,
@@ -42,9 +41,7 @@ from holdfast.protocol.messages import (
     encode,
     with_checksum,
 )
-from holdfast.transport.credentials import load_credentials
 from holdfast.transport.endpoints import ServiceAddress, TlsFiles
-from holdfast.transport.key_ring import make_credentials
 from holdfast.transport.private_socket import PrivateSocket
 from holdfast.transport.robot_end import StreamRobotTransport
 
@@ -262,21 +259,6 @@ def resident_kb(pid: int) -> int:
 
 
 class TestServing:
-    def test_decides_as_the_planner_does(self) -> None:
-        with served(*ANYWHERE) as service:
-            assert service.ready_line.startswith(
-                "cloud_active_sensing is listening on tcp/127.0.0.1:"
-            )
-            with robots_end(service.endpoint, name="cloud_active_sensing") as end:
-                end.appeared()
-                run_turns(end, Robot("peg_in_hole_2d"), 4)
-                assert isinstance(end.ask(with_checksum(b"rubbish"))[0], Refused)
-                run_turns(end, Robot("peg_in_hole_3d", key=2), 3)
-            code, log = service.end()
-        assert code == 0
-        assert "stopping" in log
-        assert "Traceback" not in log
-
     def test_a_large_message_that_is_no_request_disturbs_nobody(self) -> None:
         hostile = with_checksum(
             b"\xdd" + (10**7).to_bytes(4, "big") + bytes([PROTOCOL_VERSION]) + b"\x90" * 10**7
@@ -298,38 +280,6 @@ class TestServing:
             # As lists of lists these would be 640 MB; the message itself comes in parts.
             assert resident_kb(service.process.pid) - size_kb < 100_000
             run_turns(end, Robot(key=3), 1)
-
-    def test_restarted_after_a_kill_on_the_same_port(self) -> None:
-        robot = Robot()
-        with served(*ANYWHERE) as service, robots_end(service.endpoint) as end:
-            incarnation = end.appeared()
-            run_turns(end, robot, 2)
-            service.end(signal.SIGKILL)
-            assert end.events.get(timeout=PATIENCE_S) == ServiceVanished("service", incarnation)
-            with served("--listen", service.endpoint):
-                assert end.appeared() != incarnation
-                request = robot.request(session_configuration=False)
-                assert end.ask(encode(request)) == [NeedState(request.number, differs=False)]
-                assert content(end.ask(encode(robot.restore()))) == robot.right_answer()
-
-    def test_killed_while_it_computes(self, tmp_path: Path) -> None:
-        robot = robot_of_busy(tmp_path)
-        with (
-            served(*ANYWHERE, "--problem", "busy_problem:Busy", directory=tmp_path) as service,
-            robots_end(service.endpoint) as end,
-        ):
-            end.appeared()
-            end.send(encode(robot.request()))
-            # Signs of progress come, although the problem keeps the interpreter to itself.
-            for _ in range(3):
-                event = end.events.get(timeout=PATIENCE_S)
-                assert isinstance(event, ReplyReceived)
-                assert isinstance(decode_reply(event.payload), Progress)
-            service.end(signal.SIGKILL)
-            ended = [end.events.get(timeout=PATIENCE_S) for _ in range(2)]
-            while isinstance(ended[0], ReplyReceived):
-                ended = [ended[1], end.events.get(timeout=PATIENCE_S)]
-            assert {type(event) for event in ended} == {ServiceVanished, CallEnded}
 
     def test_stops_in_order_while_it_computes(self, tmp_path: Path) -> None:
         robot = robot_of_busy(tmp_path)
@@ -400,27 +350,6 @@ class TestServing:
             assert reply.code == "unknown_problem"
             assert "--problem" in reply.text
             run_turns(end, Robot(key=2), 2)
-
-    def test_many_robots_at_once(self) -> None:
-        with served(*ANYWHERE, "--workers", "3") as service, contextlib.ExitStack() as stack:
-            ends = [stack.enter_context(robots_end(service.endpoint)) for _ in range(6)]
-            robots = [Robot(key=key, seed=key) for key in range(1, 7)]
-            for end in ends:
-                end.appeared()
-            for _ in range(4):
-                for end, robot in zip(ends, robots, strict=True):
-                    end.send(encode(robot.request()))
-                for end, robot in zip(ends, robots, strict=True):
-                    assert content(end.collect()) == robot.right_answer()
-                    robot.act_until_sensing()
-                    robot.sense()
-
-    def test_state_of_many_particles(self) -> None:
-        robot = Robot(planning=planning_of(particles=20_000))
-        with served(*ANYWHERE) as service, robots_end(service.endpoint) as end:
-            end.appeared()
-            replies = end.ask(encode(robot.restore()))
-            assert content(replies) == robot.right_answer()
 
     def test_two_names_on_two_endpoints(self) -> None:
         with served(
@@ -526,17 +455,6 @@ class TestRefusing:
         assert "standard input has ended" in done.stderr
 
 
-class TestTls:
-    def test_robot_with_credentials(self, tmp_path: Path) -> None:
-        make_credentials(tmp_path)
-        tls = load_credentials(tmp_path / "robot", "robot").files
-        with served("--listen", "tls/127.0.0.1:0", "--tls", str(tmp_path / "service")) as service:
-            with robots_end(service.endpoint, tls=tls) as end:
-                end.appeared()
-                run_turns(end, Robot(), 2)
-            assert service.end()[0] == 0
-
-
 class TestTelling:
     def test_json(self) -> None:
         with served(*ANYWHERE, "--log", "json", "--max-sessions", "1") as service:
@@ -591,14 +509,6 @@ class TestTelling:
             taken.listen()
             port = str(taken.getsockname()[1])
             assert port in refused_to_start(*ANYWHERE, "--metrics", port)
-
-    def test_help(self) -> None:
-        done = subprocess.run(
-            [*COMMAND, "--help"], capture_output=True, text=True, timeout=PATIENCE_S
-        )
-        assert done.returncode == 0
-        for option in ("--listen", "--connect", "--tls", "--insecure", "--until-stdin-closes"):
-            assert option in done.stdout
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="where there are such arenas")

@@ -5,13 +5,12 @@ The decisions are those of a run in process that nothing disturbs.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import yaml
-from tests.processes.faults import LOST, Service, Site, assert_identical, events_of
+from tests.processes.faults import LOST, Service, Site, assert_identical, events_of, summary_of
 from tests.processes.rover import NO_READING, NOT_LATE_EITHER
 
 from holdfast.recording.reading import open_run
@@ -73,7 +72,7 @@ def test_in_process(reference: Path) -> None:
         assert trial.result.missing_observations == len(without)
     told = [event for event in events_of(reference) if event["event"] == "no_reading"]
     assert [event.get("taken", event["step"]) for event in told] == [6, 12, 15, 21] * 2
-    assert json.loads((reference / "summary.json").read_text())["missing_observations"] == 10
+    assert summary_of(reference)["missing_observations"] == 10
 
 
 def test_through_a_service(site: Site, reference: Path) -> None:

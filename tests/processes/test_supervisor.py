@@ -8,8 +8,6 @@ import os
 import signal
 import socket
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,6 +24,7 @@ from tests.processes.faults import (
     document_of,
     events_of,
     in_order,
+    page,
     wait_for_end,
     wait_until,
 )
@@ -67,21 +66,14 @@ def several(
     return service.start()
 
 
-def page(service: Service, path: str) -> tuple[int, str]:
+def health_of(service: Service, path: str) -> tuple[int, str]:
     (ready,) = service.process.matching("ready")
-    try:
-        with urllib.request.urlopen(
-            f"http://{ready['health']}{path}", timeout=PATIENCE_S
-        ) as answer:
-            return answer.status, answer.read().decode()
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code, error.read().decode()
+    return page(ready["health"], path)
 
 
 def metrics(service: Service) -> dict[str, float]:
     """Return all counts, each kind of a metric by itself."""
-    status, text = page(service, "/metrics")
+    status, text = health_of(service, "/metrics")
     assert status == 200
     return {
         f"{sample.name}{sorted(sample.labels.items())}": sample.value
@@ -230,8 +222,8 @@ class TestEnding:
 class TestHealth:
     def test_ready_alive_and_counted(self, site: Site) -> None:
         cloud = several(site)
-        assert page(cloud, "/livez") == (200, "ok\n")
-        assert page(cloud, "/readyz") == (200, "ok\n")
+        assert health_of(cloud, "/livez") == (200, "ok\n")
+        assert health_of(cloud, "/readyz") == (200, "ok\n")
 
     def test_a_process_that_cannot_be_started_again(self, site: Site) -> None:
         """Each time it is started a little later; as soon as it can serve, it does."""
@@ -247,14 +239,14 @@ class TestHealth:
         assert delays == sorted(delays)
         assert delays[0] == 0.0 < delays[-1]
         # The other one serves.
-        assert page(cloud, "/readyz") == (200, "ok\n")
+        assert health_of(cloud, "/readyz") == (200, "ok\n")
         os.kill(second, signal.SIGKILL)
         cloud.process.wait_for("process_ended", 1, pid=second)
-        assert page(cloud, "/readyz") == (503, "starting\n")
-        assert page(cloud, "/livez") == (200, "ok\n")
+        assert health_of(cloud, "/readyz") == (503, "starting\n")
+        assert health_of(cloud, "/livez") == (200, "ok\n")
         (site.directory / "die").unlink()
         cloud.process.wait_for("process_started", 2)
-        assert page(cloud, "/readyz") == (200, "ok\n")
+        assert health_of(cloud, "/readyz") == (200, "ok\n")
 
     @pytest.mark.slow  # when one counts as stuck: unit/test_supervised_process.py
     def test_a_process_that_stands_still(self, site: Site) -> None:
@@ -267,7 +259,7 @@ class TestHealth:
         pid = children(cloud)[1]
         manager.wait_for("WATCHDOG=1")
         os.kill(pid, signal.SIGSTOP)
-        wait_until(lambda: page(cloud, "/livez")[0] == 503, "the silence to be seen")
+        wait_until(lambda: health_of(cloud, "/livez")[0] == 503, "the silence to be seen")
         manager.wait(
             lambda lines: any(f"process {pid} has said nothing" in line for line in lines),
             "the silence to be told",
@@ -275,11 +267,11 @@ class TestHealth:
         beats = manager.count("WATCHDOG=1")
         time.sleep(1.0)
         assert manager.count("WATCHDOG=1") == beats
-        assert f"process {pid} has said nothing" in page(cloud, "/livez")[1]
-        assert page(cloud, "/readyz") == (200, "ok\n")
+        assert f"process {pid} has said nothing" in health_of(cloud, "/livez")[1]
+        assert health_of(cloud, "/readyz") == (200, "ok\n")
         assert metrics(cloud)["holdfast_process_restarts_total[]"] == 0
         os.kill(pid, signal.SIGCONT)
-        wait_until(lambda: page(cloud, "/livez")[0] == 200, "it to be heard again")
+        wait_until(lambda: health_of(cloud, "/livez")[0] == 200, "it to be heard again")
         manager.wait_for("WATCHDOG=1", beats + 1)
 
 

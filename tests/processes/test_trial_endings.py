@@ -1,20 +1,17 @@
 """How trials end with a robot of one's own: in success, in failure, or out of steps.
 
-The commands are real, and so are the signals: the world's class sends them to its own process,
-right after the step that ends a trial.
+The commands are real; what a robot remembers that is killed in the step that ends a trial is in
+unit/test_protocol_robot.py.
 """
 
 from __future__ import annotations
 
-import csv
-import json
 import shutil
 import signal
 import subprocess
 from pathlib import Path
-from typing import Any
 
-from tests.processes.faults import COMMAND, PATIENCE_S, events_of
+from tests.processes.faults import events_of, holdfast, rows_of, summary_of
 
 from holdfast import __version__
 from holdfast.outcome import DONE_VALUES
@@ -28,9 +25,6 @@ AS_BEFORE = "c8620a9f2dab01e3b944d3e864944901548b38b9229c531cbe512fff9a22123f"
 
 # What was moved is in a file, which outlives the process, as a real robot does.
 LANDER = """
-import os
-import signal
-import time
 from pathlib import Path
 
 import numpy as np
@@ -57,48 +51,6 @@ class Lander:
 
     def steps_performed(self):
         return len(self.moves.read_text())
-
-
-class Crashing(Lander):
-    # The robot's process is killed once, right after the step that ended the trial.
-    def is_done(self):
-        done = super().is_done()
-        killed = Path(f"killed-{self.trial}")
-        if done and not killed.exists():
-            killed.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return done
-
-
-class Forgetful(Lander):
-    # Is asked to end during the last step, and does not know of it any more later on.
-    landed = False
-
-    def perform(self, task_action):
-        reward = super().perform(task_action)
-        if self.trial == 1 and self.steps_performed() == 6:
-            before = signal.getsignal(signal.SIGTERM)
-            os.kill(os.getpid(), signal.SIGTERM)
-            # Until it was heard; only what happens next may wake the one that hears it.
-            for _ in range(6000):
-                if signal.getsignal(signal.SIGTERM) is not before:
-                    break
-                time.sleep(0.005)
-        self.landed = self.steps_performed() == 6
-        return reward
-
-    def is_done(self):
-        return self.ending.get(self.trial, False) if self.landed else False
-
-
-class Killed(Lander):
-    # The robot's process is killed once in each trial, in the step in which it is found lost.
-    def perform(self, task_action):
-        killed = Path(f"killed-{self.trial}")
-        if self.steps_performed() == 4 and not killed.exists():
-            killed.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return super().perform(task_action)
 
 
 class Wrong(Lander):
@@ -137,31 +89,16 @@ class Command:
         self._arguments = ("run", "lander.yaml", "-e", f"lander:{name}", "--out", "run")
 
     def run(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [*COMMAND, *self._arguments, *arguments],
-            cwd=self.directory,
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE_S,
-            check=False,
-        )
-
-    def rows(self) -> list[dict[str, str]]:
-        with (self.out / "trials.csv").open() as file:
-            return list(csv.DictReader(file))
-
-    def summary(self) -> dict[str, Any]:
-        read: dict[str, Any] = json.loads((self.out / "summary.json").read_text())
-        return read
+        return holdfast(self.directory, *self._arguments, *arguments)
 
     def assert_ended(self, ended: subprocess.CompletedProcess[str]) -> None:
         """Make sure that all three trials ended as they should."""
         assert ended.returncode == 0, ended.stderr
-        rows = self.rows()
+        rows = rows_of(self.out)
         assert [row["outcome"] for row in rows] == ["succeeded", "failed", "truncated"]
         assert [row["success"] for row in rows] == ["1", "0", "0"]
         assert [row["steps"] for row in rows] == ["6", "6", "9"]
-        summary = self.summary()
+        summary = summary_of(self.out)
         assert (summary["successes"], summary["failures"], summary["finished"]) == (1, 1, 3)
         assert "failed        1 of 3 trials" in ended.stdout
         told = [event for event in events_of(self.out) if event["event"] == "trial"]
@@ -179,24 +116,7 @@ def test_nobody_speaks_of_failures_where_there_are_none(tmp_path: Path) -> None:
     ended = command.run("--trials", "1")
     assert ended.returncode == 0, ended.stderr
     assert "failed" not in ended.stdout
-    assert command.summary()["failures"] == 0
-
-
-def test_killed_right_after_the_step_that_ended_the_trial(tmp_path: Path) -> None:
-    command = Command(tmp_path, "Crashing")
-    ended = command.run()
-    for _ in range(2):
-        assert ended.returncode == -signal.SIGKILL
-        ended = command.run("--resume")
-    command.assert_ended(ended)
-
-
-def test_asked_to_end_in_the_step_that_ended_the_trial(tmp_path: Path) -> None:
-    command = Command(tmp_path, "Forgetful")
-    ended = command.run()
-    assert ended.returncode == 128 + signal.SIGTERM, ended.stderr
-    assert [row["outcome"] for row in command.rows()] == ["succeeded", "failed"]
-    command.assert_ended(command.run("--resume"))
+    assert summary_of(command.out)["failures"] == 0
 
 
 def test_anything_else_is_an_error_that_names_it(tmp_path: Path) -> None:
@@ -211,7 +131,7 @@ def test_a_filter_that_has_lost_the_robot_is_told(tmp_path: Path) -> None:
     command = Command(tmp_path, "Lander", shown=1000.0)
     ended = command.run()
     assert ended.returncode == 0, ended.stderr
-    rows = command.rows()
+    rows = rows_of(command.out)
     for trial, row in enumerate(rows):
         assert row["unexplained_observations"] == row["sensing_decisions"] == row["steps"]
         told = [event for event in events_of(command.out) if event.get("trial") == trial]
@@ -221,32 +141,10 @@ def test_a_filter_that_has_lost_the_robot_is_told(tmp_path: Path) -> None:
         (lost,) = [event for event in told if event["event"] == "lost"]
         assert lost["step"] == 4
         assert row["lost"] == "1"
-    assert command.summary()["unexplained_observations"] == 21
+    assert summary_of(command.out)["unexplained_observations"] == 21
     assert "unexplained" in ended.stdout
     assert "21 of 21 observations" in ended.stdout
     assert ended.stderr.count("lost") == 3
-
-
-def test_a_lost_robot_that_is_killed_begins_its_belief_anew_at_the_same_step(
-    tmp_path: Path,
-) -> None:
-    anew = ("--set", "lost.on_lost=reinitialise")
-    (tmp_path / "a").mkdir()
-    whole = Command(tmp_path / "a", "Lander", shown=1000.0)
-    assert whole.run(*anew).returncode == 0
-    (tmp_path / "b").mkdir()
-    command = Command(tmp_path / "b", "Killed", shown=1000.0)
-    assert command.run(*anew).returncode == -signal.SIGKILL
-    codes = [command.run(*anew, "--resume").returncode for _ in range(3)]
-    assert codes == [-signal.SIGKILL, -signal.SIGKILL, 0]
-    assert [row["digest"] for row in command.rows()] == [row["digest"] for row in whole.rows()]
-    again = [each for each in events_of(command.out) if each["event"] == "reinitialised"]
-    assert [(each["trial"], each["step"]) for each in again] == [(0, 4), (1, 4), (2, 4)]
-    # Whoever replays the record comes to the same beliefs.
-    exported = subprocess.run(
-        [*COMMAND, "export", str(command.out), "--csv", str(tmp_path / "csv")], check=False
-    )
-    assert exported.returncode == 0
 
 
 def test_a_lost_robot_that_holds_still_goes_on_as_it_is_told(tmp_path: Path) -> None:
@@ -258,6 +156,9 @@ def test_a_lost_robot_that_holds_still_goes_on_as_it_is_told(tmp_path: Path) -> 
     assert command.run("--resume", "--set", "lost.on_lost=reinitialise").returncode == 0
     again = [each for each in events_of(command.out) if each["event"] == "reinitialised"]
     assert [(each["trial"], each["step"]) for each in again] == [(0, 4), (1, 4), (2, 4)]
+    # Whoever replays the record comes to the same beliefs.
+    exported = holdfast(tmp_path, "export", "run", "--csv", "csv")
+    assert exported.returncode == 0
 
 
 def test_a_run_from_before_trials_could_fail_goes_on(tmp_path: Path) -> None:
@@ -269,18 +170,11 @@ def test_a_run_from_before_trials_could_fail_goes_on(tmp_path: Path) -> None:
         (tmp_path / "old.yaml").write_text(journal.meta()["configuration"])
         # Another version's runs are not gone on with; this is about another form of results alone.
         journal.set_meta("holdfast_version", __version__)
-    ended = subprocess.run(
-        # It does not know the boot in which its robot moved.
-        [*COMMAND, "run", "old.yaml", "--rate=1000", "--out=run", "--resume", "--after-reboot"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
+    # It does not know the boot in which its robot moved.
+    options = ("--rate=1000", "--out=run", "--resume", "--after-reboot")
+    ended = holdfast(tmp_path, "run", "old.yaml", *options)
     assert ended.returncode == 0, ended.stderr
-    with (out / "trials.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(out)
     assert [row["outcome"] for row in rows] == ["truncated", "succeeded", "truncated"]
     assert [row["success"] for row in rows] == ["0", "1", "0"]
     assert rows[2]["digest"] == AS_BEFORE
@@ -300,7 +194,6 @@ def test_an_answer_that_is_none_after_a_move_is_mended_and_the_move_is_not_made_
     done = command.run("--resume")
     assert done.returncode == 0, done.stderr
     assert [len((tmp_path / f"moves-{trial}").read_text()) for trial in range(3)] == [6, 6, 9]
-    with (command.out / "trials.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(command.out)
     assert [row["outcome"] for row in rows] == ["succeeded", "failed", "truncated"]
     assert [float(row["reward"]) for row in rows] == [-6.0, -6.0, -9.0]

@@ -120,20 +120,6 @@ def test_a_robot_whose_address_changes(
     assert len(cloud.process.matching("session_opened")) == 1
 
 
-@pytest.mark.slow  # without a run: contracts/test_datagram_links.py
-def test_where_no_datagram_gets_through(
-    site: Site, references: References, cloud: Service, credentials: tuple[str, str]
-) -> None:
-    entry = free_port()
-    story = Story(site, references, document_of(PEG))
-    story.at("perform", 20, lambda: story.running.wait_for("no_datagrams"))
-    with Proxy(entry, port_of(cloud), "filtered"):
-        robot = story.run(f"udp/127.0.0.1:{entry}", options=credentials)
-    assert robot.statuses() == []
-    (told,) = robot.matching("no_datagrams")
-    assert told["service"] == f"udp/127.0.0.1:{entry}"
-
-
 async def test_a_killed_service_is_known_by_its_closed_port(site: Site, keys: Path) -> None:
     """The end of its stream gets lost, and the first datagram to its port is enough."""
     target, entry = free_port(), free_port()

@@ -10,7 +10,6 @@ import shutil
 import signal
 import tempfile
 import time
-import urllib.error
 import urllib.request
 from pathlib import Path
 
@@ -29,6 +28,7 @@ from tests.processes.faults import (
     Story,
     assert_identical,
     document_of,
+    page,
     sensing_steps,
     services_in_order,
     wait_until,
@@ -63,15 +63,9 @@ class Stuck(CapsuleRobot):
 """
 
 
-def page(process: Process, path: str) -> tuple[int, str]:
+def health_of(robot: Process, path: str) -> tuple[int, str]:
     """Ask a robot how it is."""
-    address = process.wait_for("offers")["health"]
-    try:
-        with urllib.request.urlopen(f"http://{address}{path}", timeout=PATIENCE_S) as answer:
-            return answer.status, answer.read().decode()
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code, error.read().decode()
+    return page(robot.wait_for("offers")["health"], path)
 
 
 def variables_of(pid: int) -> set[str]:
@@ -232,8 +226,8 @@ class TestHealth:
         seen = []
 
         def look() -> None:
-            assert page(story.running, "/livez") == (200, "ok\n")
-            seen.append(page(story.running, "/readyz"))
+            assert health_of(story.running, "/livez") == (200, "ok\n")
+            seen.append(health_of(story.running, "/readyz"))
 
         story.at("perform", steps[1], look, cloud.kill)
         story.at("perform", steps[3], look, lambda: story.running.signal(signal.SIGTERM))
@@ -258,7 +252,7 @@ class TestHealth:
 
         def is_said(status: int, word: str) -> None:
             expected = (status, f"{word}\n")
-            wait_until(lambda: page(story.running, "/readyz") == expected, word)
+            wait_until(lambda: health_of(story.running, "/readyz") == expected, word)
 
         story.at("perform", steps[1], lambda: is_said(200, STANDARD), cloud.kill)
         story.at("perform", steps[3], lambda: is_said(200, LOCAL_RECOVERY), cloud.start)
@@ -283,7 +277,7 @@ class TestHealth:
         seen: list[str] = []
 
         def look() -> None:
-            assert page(story.running, "/readyz") == (200, f"{STANDARD}\n")
+            assert health_of(story.running, "/readyz") == (200, f"{STANDARD}\n")
             with urllib.request.urlopen(f"http://{address}/metrics", timeout=PATIENCE_S) as answer:
                 assert answer.headers["Content-Type"].startswith("text/plain; version=0.0.4")
                 seen.append(answer.read().decode())

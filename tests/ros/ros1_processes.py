@@ -126,7 +126,7 @@ class Ros1(AtMaster):
         """Start a typed service, and wait until the master knows it."""
         before = self.service_uri(name)
         process = self.start(
-            *(HOLDFAST, "serve", "--ros1", "--ros1-name", name),
+            *(HOLDFAST, "ros1-serve", "--ros1-name", name),
             *("--configuration", str(configuration), *more),
         )
         wait_for(lambda: self.service_uri(name) not in (None, before), f"the master knows {name}")

@@ -17,8 +17,8 @@ from tests.ros.conftest import PATIENCE_S
 from tests.ros.graph import Graph, keeps_on, replaced, settled, start_everything, topic_tool
 from tests.ros.ros1_processes import SYSTEM_PYTHON, wait_for
 
-from holdfast.errors import GuardError
-from holdfast.ros.master.settings import MasterAddress
+from ros1_master_guard.errors import GuardError
+from ros1_master_guard.settings import MasterAddress
 
 GUARD = (sys.executable, "-m", "holdfast", "ros1-guard")
 KILLS = 10
@@ -31,29 +31,6 @@ def graph(tmp_path: Path, ros1: dict[str, str]) -> Iterator[Graph]:
 
 
 class TestItsOwnMaster:
-    # (test_ros1_runs.py does so in the midst of a run.)
-    @pytest.mark.slow
-    def test_killed_ten_times(self, graph: Graph) -> None:
-        guard = graph.guard()
-        caller, listener = start_everything(graph)
-        before, registered = settled(graph), graph.registered()
-        assert "/mux/select" in before["rosservice list"]
-        assert "/work" in before["rosservice list"]
-        for _ in range(KILLS):
-            pid = graph.kill_master()
-            assert graph.listed() == before
-            assert graph.registered() == registered
-            assert graph.master_pid() != pid
-            graph.newcomer("/relayed", "/more_work")
-            keeps_on(caller)
-            keeps_on(listener)
-        assert caller.process.poll() is None, caller.account()
-        numbers = [int(line) for line in listener.lines]
-        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
-        assert len(graph.events(guard, "master_lost")) == KILLS
-        times = [round(event["duration_ms"]) for event in graph.events(guard, "master_started")]
-        print(f"from the death until everything is listed, ms: {times[1:]}")
-
     def test_nobody_loses_a_publisher(self, graph: Graph) -> None:
         # A roscpp node gives up the publishers that it is not told of, and numbers what is new.
         graph.guard()
@@ -145,20 +122,6 @@ class TestItsOwnMaster:
         assert [event["gone"] for event in graph.events(guard, "nodes_gone")] == [["/stopped_a"]]
         os.kill(stopped[1].process.pid, signal.SIGCONT)
         graph.run("rosservice", "call", "/work_b")
-
-    @pytest.mark.slow
-    def test_while_nodes_start(self, graph: Graph) -> None:
-        graph.guard("--no-rosout")
-        names = [f"/work_{number}" for number in range(100)]
-        servers = [graph.node("server", f"/server_{each}", *names[each::4]) for each in range(4)]
-        kills = 0
-        while not all(server.lines for server in servers):
-            replaced(graph, graph.kill_master())
-            kills += 1
-        assert kills > 0
-        wait_for(lambda: set(names) <= graph.registered()["services"].keys())
-        replaced(graph, graph.kill_master())
-        assert set(names) <= graph.registered()["services"].keys()
 
     def test_who_watches_a_parameter_still_does(self, graph: Graph) -> None:
         graph.guard("--no-rosout")
@@ -384,7 +347,7 @@ class TestAMasterOfOthers:
         graph.start("rosmaster", "--core", "-p", str(graph.port))
         wait_for(graph.master_pid)
         guard = graph.guard("--no-rosout")
-        directory = graph.directory / "run" / "holdfast"
+        directory = graph.directory / "run" / "ros1_master_guard"
         shutil.rmtree(directory)
         directory.touch()
         graph.run("rosparam", "set", "/speed", "1")
@@ -400,35 +363,13 @@ class TestAMasterOfOthers:
         graph.start("rosmaster", "--core", "-p", str(graph.port))
         wait_for(graph.master_pid)
         guard = graph.guard("--no-rosout")
-        directory = graph.directory / "run" / "holdfast"
+        directory = graph.directory / "run" / "ros1_master_guard"
         shutil.rmtree(directory)
         directory.touch()
         wait_for(lambda: graph.events(guard, "journal_failed"))
         directory.unlink()
         wait_for(lambda: graph.events(guard, "journal_written"))
         assert list(directory.glob("*.journal"))
-
-    def test_what_cannot_be_written_down_at_the_start_is_said(self, graph: Graph) -> None:
-        graph.start("rosmaster", "--core", "-p", str(graph.port))
-        wait_for(graph.master_pid)
-        # Nothing can be put at the place of a directory.
-        journal = graph.directory / f"master-{graph.port}.journal"
-        journal.mkdir()
-        guard = graph.start(*GUARD, "--directory", str(graph.directory))
-        assert guard.process.wait(PATIENCE_S) == 2
-        assert f"{journal}: what the master knows cannot be written down" in guard.errors
-        assert "no ROS 1 master" not in guard.errors
-
-    def test_one_that_is_stopped_is_replaced(self, graph: Graph) -> None:
-        master = graph.start("rosmaster", "--core", "-p", str(graph.port))
-        wait_for(graph.master_pid)
-        graph.guard("--silent-s", "1", "--no-rosout")
-        server = graph.node("server", "/server", "/work")
-        wait_for(lambda: server.lines)
-        time.sleep(1.0)  # it is asked four times a second
-        os.kill(master.process.pid, signal.SIGSTOP)
-        assert master.process.wait(PATIENCE_S) == -signal.SIGKILL
-        wait_for(lambda: "/work" in graph.registered()["services"])
 
     def test_roscore(self, graph: Graph) -> None:
         roscore = graph.start("roscore", "-p", str(graph.port))
@@ -519,7 +460,7 @@ os._exit(0)
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
 def test_it_is_the_stock_master(seed: int, graph: Graph, tmp_path: Path) -> None:
-    from holdfast.ros.master import process as master_process
+    from ros1_master_guard import process as master_process
 
     script = str(Path(str(master_process.__file__)))
     journal = str(tmp_path / "journal")

@@ -12,9 +12,9 @@ import pytest
 from tests.ros.conftest import ROOT, left_out
 from tests.ros.ros1_processes import SYSTEM_PYTHON, Ros1, ros1_in
 
-from holdfast.ros.active_sensing import DecisionRequest, RequestKind
-from holdfast.ros.ros1_client import Ros1Service
-from holdfast.transport.tcpros import RosEnvironment
+from holdfast_ros.active_sensing import DecisionRequest, RequestKind
+from holdfast_ros.ros1_client import Ros1Service
+from holdfast_ros.tcpros import RosEnvironment
 
 EXAMPLE = ROOT / "examples" / "peg_in_hole_2d.yaml"
 CLOUD = "cloud_active_sensing"

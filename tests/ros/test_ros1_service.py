@@ -23,17 +23,18 @@ from tests.unit.test_ros_client import in_process
 
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import TransportError
-from holdfast.ros.active_sensing import (
+from holdfast_ros.active_sensing import (
     ActiveSensing,
     DecisionAnswer,
     DecisionRequest,
     ErrorCode,
     RequestKind,
 )
-from holdfast.ros.messages import md5_sum
-from holdfast.ros.ros1_client import Ros1Client, Ros1Service
-from holdfast.ros.ros1_service import MAX_WAITING, Ros1Server
-from holdfast.transport.tcpros import RosEnvironment, decode_header, encode_header
+from holdfast_ros.messages import md5_sum
+from holdfast_ros.ros1_client import Ros1Client, Ros1Service
+from holdfast_ros.ros1_service import MAX_WAITING, Ros1Server
+from holdfast_ros.tcpros import RosEnvironment
+from ros1_master_guard.headers import decode_header, encode_header
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
 CLOUD, RECOVERY = "cloud_active_sensing", "cloud_active_sensing_recovery"
@@ -121,8 +122,8 @@ ROBOT = """
 import json, sys, time
 import rospy
 from holdfast.config.loader import load
-from holdfast.ros.active_sensing import DecisionRequest, RequestKind
-from holdfast.ros.ros1_client import Ros1Client
+from holdfast_ros.active_sensing import DecisionRequest, RequestKind
+from holdfast_ros.ros1_client import Ros1Client
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.protocol.status import Status
 
@@ -342,7 +343,7 @@ class TestTheMasterDies:
         around.master.wait()
         around.start(
             # The system's Python, as the robot has it.
-            *(around.python, "-m", "holdfast", "serve", "--ros1", "--configuration", str(EXAMPLE)),
+            *(around.python, "-m", "holdfast", "ros1-serve", "--configuration", str(EXAMPLE)),
         )
         around.start_master()
         wait_for(lambda: around.service_uri(CLOUD), "the service is listed")

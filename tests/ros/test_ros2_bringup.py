@@ -30,11 +30,11 @@ class BringUp:
     """What the launch file starts, process by process."""
 
     def __init__(self, ros2: Ros2, domain: int, directory: Path) -> None:
-        prefixes = ros2.environment["AMENT_PREFIX_PATH"].split(":")
-        found = [Path(prefix) for prefix in prefixes if prefix.endswith(PACKAGE)]
-        if not found:
+        prefixes = map(Path, ros2.environment["AMENT_PREFIX_PATH"].split(":"))
+        self.prefixes = {prefix.name: prefix for prefix in prefixes}
+        if not {PACKAGE, "holdfast_ros"} <= self.prefixes.keys():
             left_out("the packages of ros/ are older than this checkout: make test-ros builds them")
-        self.prefix = found[0]
+        self.prefix = self.prefixes[PACKAGE]
         self.share = self.prefix / "share" / PACKAGE
         self.configuration = self.share / "config" / "peg_in_hole_2d.yaml"
         self.directory = directory
@@ -48,9 +48,9 @@ class BringUp:
         self._started.append(process)
         return process
 
-    def executable(self, name: str, **more: Any) -> Process:
+    def executable(self, package: str, name: str, **more: Any) -> Process:
         command = [
-            str(self.prefix / "lib" / PACKAGE / name),
+            str(self.prefixes[package] / "lib" / package / name),
             "--ros-args",
             "--params-file",
             str(self.share / "config" / "holdfast.yaml"),
@@ -64,7 +64,8 @@ class BringUp:
     def node(self, **more: Any) -> Process:
         services = json.dumps([f"tcp/127.0.0.1:{self.port}"])
         return self.executable(
-            "holdfast_node",
+            "holdfast_ros",
+            "node",
             **{
                 "autostart": "true",
                 "run_directory": self.directory / "run",
@@ -75,7 +76,8 @@ class BringUp:
         )
 
     def robot(self, **more: Any) -> Process:
-        return self.executable("simulated_robot", log=self.directory / "performed.json", **more)
+        log = self.directory / "performed.json"
+        return self.executable(PACKAGE, "simulated_robot", log=log, **more)
 
     def service(self) -> Process:
         holdfast = self._ros2.python.with_name("holdfast")
@@ -153,10 +155,10 @@ def test_the_launch_file_names_what_is_installed(bring_up: BringUp) -> None:
         for call in ast.walk(tree)
         if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "Node"
     ]
-    ours = {node["executable"] for node in nodes if "package" not in node}
-    assert ours == {"holdfast_node", "simulated_robot"}
-    for name in ours:
-        assert os.access(bring_up.prefix / "lib" / PACKAGE / name, os.X_OK)
+    ours = {(node.get("package", PACKAGE), node["executable"]) for node in nodes}
+    assert ours == {("holdfast_ros", "node"), (PACKAGE, "simulated_robot"), ("rviz2", "rviz2")}
+    for package, name in ours - {("rviz2", "rviz2")}:
+        assert os.access(bring_up.prefixes[package] / "lib" / package / name, os.X_OK)
     files = [
         [part.value for part in call.args if isinstance(part, ast.Constant)]
         for call in ast.walk(tree)

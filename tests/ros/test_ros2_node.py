@@ -106,7 +106,7 @@ class Ros:
             **{key.replace("__", "."): value for key, value in parameters.items()},
         }
         words = [word for key, value in values.items() for word in ("-p", f"{key}:={value}")]
-        command = [str(self._ros2.python), "-m", "holdfast.ros.ros2", "--ros-args", *words]
+        command = [str(self._ros2.python), "-m", "holdfast_ros.ros2", "--ros-args", *words]
         node = ObservedProcess(command, self.environment, self.directory)
         self.started.append(node)
         if wait:

@@ -5,30 +5,14 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from tests.late_world import LateWorld
 
-from holdfast import tracking
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import LostSettings
 from holdfast.lab.errors import Violation
 from holdfast.lab.simulation.checkers import WireChecker
 from holdfast.lab.simulation.environment_model import EnvironmentModel
 from holdfast.lab.simulation.peg_with_encoders import PegWithEncoders
-from holdfast.lab.simulation.reference_runs import (
-    BEFORE_CHOOSING,
-    BEFORE_MOVING,
-    BEFORE_SENSING,
-    KIDNAPPED_AT,
-    KIDNAPPED_TO,
-    Circumstances,
-    Delivery,
-    ReferenceRun,
-)
 from holdfast.lab.simulation.schedule import RunSettings, SimulationSchedule, parse_schedule
 from holdfast.lab.simulation.schedule_draws import draw_schedule
 from holdfast.lab.simulation.world import Setup, Simulator
-from holdfast.lost import LostTest
-from holdfast.outcome import MoveResult
 from holdfast.protocol.records import (
     ActingRecord,
     LateRecord,
@@ -37,122 +21,16 @@ from holdfast.protocol.records import (
     Record,
 )
 from holdfast.randomness import Stream, stream
-from holdfast.robot.trial import run_trial
 
 MAX_STEPS = 40
-SENSED = range(0, MAX_STEPS, 9)
+
+
 SETUPS = [(False, False), (True, False), (False, True), (True, True)]
 
 
 @pytest.fixture(scope="module")
 def simulator() -> Simulator:
     return Simulator()
-
-
-@pytest.fixture(scope="module", params=SETUPS, ids=["plain", "shows", "optional", "both"])
-def setup(request: pytest.FixtureRequest) -> Setup:
-    return Setup(*request.param)
-
-
-def decisions(run: ReferenceRun) -> list[tuple[int | None, bytes]]:
-    return [(step.sensing_action, step.action) for step in run.steps]
-
-
-class ShowsSometimes(LateWorld):
-    """Leaves out of what a move shows the same as the reference runs, and is carried away then."""
-
-    kidnapped = False
-
-    def perform(self, task_action: FloatArray) -> float | MoveResult | None:
-        step = self.step
-        shown = super().perform(task_action)
-        if self.kidnapped and self.step == KIDNAPPED_AT:
-            self.state = self.state + KIDNAPPED_TO
-        if not isinstance(shown, MoveResult):
-            return shown
-        return MoveResult(
-            shown.reward,
-            None if step % 3 == 1 else shown.motion,
-            None if step % 4 == 2 else shown.observation,
-        )
-
-
-class TestReferenceRuns:
-    """They have code of their own, and come to what the in-process loop comes to."""
-
-    @pytest.mark.parametrize("reinitialises", [False, True])
-    @pytest.mark.parametrize("moves", [0, 1, 3, 9, 10, 25])
-    def test_the_digest_is_the_one_of_a_trial_in_process(
-        self, setup: Setup, moves: int, reinitialises: bool, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        planner, seed = setup.planner, Simulator().seed
-        lost = LostSettings()
-        if reinitialises:
-            lost = LostSettings(on_lost="reinitialise")
-            monkeypatch.setattr(tracking, "LostTest", lambda _rate: LostTest(1.0))
-        for trial in range(1, 3):
-            world = ShowsSometimes(planner.problem, seed, trial, moves)
-            world.kidnapped = reinitialises
-            result = run_trial(
-                planner,
-                seed,
-                trial,
-                max_steps=MAX_STEPS,
-                environment=world,
-                lost=lost,
-            )
-            circumstances = Circumstances(
-                late=tuple(SENSED) if moves else (),
-                deliveries=tuple(Delivery(at + moves, BEFORE_SENSING, at) for at in SENSED),
-                reinitialises=reinitialises,
-            )
-            run = setup.references.get(trial, MAX_STEPS, circumstances)
-            assert run.digest == result.digest
-            assert run.unexplained == result.unexplained_observations
-            if reinitialises:
-                assert run.lost == result.lost
-
-    def test_in_time_for_the_next_decision_is_as_if_at_once(self, setup: Setup) -> None:
-        at_once = setup.references.get(2, MAX_STEPS)
-        late = Circumstances(
-            late=tuple(SENSED), deliveries=tuple(Delivery(at, BEFORE_CHOOSING, at) for at in SENSED)
-        )
-        assert decisions(setup.references.get(2, MAX_STEPS, late)) == decisions(at_once)
-        never = setup.references.get(2, MAX_STEPS, Circumstances(late=tuple(SENSED)))
-        assert decisions(never) != decisions(at_once)
-
-    def test_before_the_move_it_does_not_change_the_action(self, setup: Setup) -> None:
-        runs = [
-            setup.references.get(
-                2, MAX_STEPS, Circumstances(late=(9,), deliveries=(Delivery(step, moment, 9),))
-            )
-            for step, moment in ((12, BEFORE_MOVING), (13, BEFORE_SENSING))
-        ]
-        assert decisions(runs[0]) == decisions(runs[1])
-        # The moment is noted all the same.
-        assert runs[0].digest != runs[1].digest
-
-    def test_what_nobody_awaits_changes_nothing(self, setup: Setup) -> None:
-        deliveries = (Delivery(12, BEFORE_SENSING, 9), Delivery(3, BEFORE_SENSING, 2))
-        run = setup.references.get(2, MAX_STEPS, Circumstances(deliveries=deliveries))
-        assert run.digest == setup.references.get(2, MAX_STEPS).digest
-
-    def test_some_are_lost(self) -> None:
-        """Those that were carried away, once they sense that."""
-        references = Setup(False, False).references
-        runs = [
-            references.get(trial, MAX_STEPS, Circumstances(reinitialises=True))
-            for trial in range(4)
-        ]
-        assert sum(run.lost > 0 for run in runs) >= 3
-        assert references.get(0, MAX_STEPS).lost == 0
-
-    def test_a_move_that_nobody_saw(self) -> None:
-        setup = Setup(True, False)
-        unseen = setup.references.get(1, MAX_STEPS, Circumstances(unseen=(3,)))
-        seen = setup.references.get(1, MAX_STEPS)
-        assert decisions(unseen)[:4] == decisions(seen)[:4]
-        assert unseen.digest != seen.digest
 
 
 def observed(step: int, sensing_action: int, shown: bytes = b"") -> ObservedRecord:
@@ -192,33 +70,12 @@ class Body:
 
 
 class TestEnvironmentModel:
-    def test_it_comes_when_it_is_due(self) -> None:
-        body = Body(3)
-        assert body.go_to(2) == []
-        assert body.go_to(3) == [0]
-        assert body.go_to(6) == []
-
-    def test_at_the_earliest_it_comes_with_the_next_move(self) -> None:
-        assert Body(0).go_to(1) == [0]
-
-    def test_never(self) -> None:
-        assert Body(None).go_to(20) == []
-
     def test_once_more_it_must_not_be_used(self) -> None:
         body = Body(2, 4)
         assert body.go_to(5) == [0, 0]
         body.world.is_useless(0)
         with pytest.raises(Violation, match="step 0 has come late and is not used"):
             body.world.is_useless(0)
-
-    def test_what_was_written_down_stays(self) -> None:
-        body = Body(2)
-        body.go_to(2)
-        body.journal.append(LateRecord(2, 0, bytes(8), bytes(32)))
-        body.go_to(4)
-        deliveries = list(body.world._deliveries)
-        assert body.resume() == []
-        assert body.world._deliveries == deliveries == [Delivery(2, BEFORE_SENSING, 0)]
 
     def test_what_was_not_written_down_and_acted_on(self) -> None:
         body = Body(2)
@@ -233,33 +90,6 @@ class TestEnvironmentModel:
         body.journal.append(LateRecord(4, 0, bytes(8), bytes(32)))
         with pytest.raises(Violation, match="step 0, which never came"):
             body.resume()
-
-    @pytest.mark.parametrize("remembers", [False, True])
-    def test_what_was_told_to_a_dying_process(self, remembers: bool) -> None:
-        body = Body(4, remembers=remembers)
-        assert body.go_to(4) == [0]
-        assert body.resume() == ([0] if remembers else [])
-        assert len(body.world._deliveries) == remembers
-
-    @pytest.mark.parametrize(
-        ("pending", "moment"), [(False, BEFORE_SENSING), (True, BEFORE_MOVING)]
-    )
-    def test_what_is_sensed_meanwhile(self, pending: bool, moment: int) -> None:
-        body = Body(30, senses_on=True)
-        body.go_to(4)
-        if pending:
-            body.journal.append(ActingRecord(4, bytes(24)))
-        assert body.resume() == [0]
-        assert body.world._deliveries == [Delivery(4, moment, 0)]
-
-    def test_a_simulated_world_forgets_it(self) -> None:
-        body = Body(8, shows_the_same=True)
-        body.go_to(4)
-        assert body.resume() == []
-        body.world.begin_again(
-            [np.frombuffer(step.action) for step in body.world._reference.steps[:4]]
-        )
-        assert body.go_to(12) == []
 
 
 def test_encoders_show_how_the_peg_has_moved() -> None:

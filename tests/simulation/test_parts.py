@@ -67,17 +67,6 @@ class TestDisk:
     def records(self, step: int) -> tuple[PerformedRecord, ActingRecord]:
         return PerformedRecord(step, -1.0), ActingRecord(step + 1, b"8" * 24)
 
-    def test_the_end_of_a_process_loses_nothing(self) -> None:
-        disk = Disk(forces_out=False)
-        assert disk.opened() == 1
-        for step in range(3):
-            disk.append(5, self.records(step))
-        assert disk.opened() == 2
-        unfinished = disk.unfinished()
-        assert unfinished is not None
-        assert (unfinished.trial, len(unfinished.records)) == (5, 6)
-        assert unfinished.is_complete
-
     @pytest.mark.parametrize(("lost", "left"), [(0, 6), (1, 4), (2, 2), (100, 2)])
     def test_a_power_cut_loses_a_tail(self, lost: int, left: int) -> None:
         disk = Disk(forces_out=False)
@@ -95,17 +84,6 @@ class TestDisk:
         again = disk.unfinished()
         assert again is not None
         assert again.is_complete, "no power was cut since"
-
-    def test_nothing_is_lost_that_was_forced_out(self) -> None:
-        disk = Disk(forces_out=True)
-        disk.opened()
-        for step in range(3):
-            disk.append(5, self.records(step))
-        disk.cut_power(100)
-        unfinished = disk.unfinished()
-        assert unfinished is not None
-        assert len(unfinished.records) == 6
-        assert unfinished.is_complete
 
 
 def reference_run() -> ReferenceRun:
@@ -155,15 +133,6 @@ def result(steps: int, digest: str) -> TrialResult:
 
 
 class TestEnvironmentModel:
-    def test_all_as_it_should_be(self) -> None:
-        world = environment()
-        world.sense(0, 0)
-        for step in range(3):
-            assert not world.done
-            world.act(step, np.full(2, float(step)))
-        assert world.done
-        world.check_end(result(3, "digest"), rewards_are_known=True)
-
     @pytest.mark.parametrize(
         ("step", "value", "says"),
         [
@@ -311,14 +280,6 @@ class TestMemory:
         with pytest.raises(Violation, match="another state"):
             for _ in range(200):
                 planner.advance(state, np.zeros(3))
-
-    def test_the_same_is_not_computed_again(self) -> None:
-        planner = CheckedPlanner(PegInHole2D(), PlanningSettings())
-        state = planner.init(1, 0)
-        assert planner.init(1, 0) is state
-        after = planner.advance(state, np.zeros(3))
-        assert planner.advance(state, np.zeros(3)) is after
-        assert planner.advance(state, np.full(3, 0.1)) is not after
 
 
 class TestShrinking:

@@ -83,15 +83,6 @@ def compared() -> Iterator[Report]:
         yield report_on(study, SCALE, trial)
 
 
-def test_every_cell_is_there(compared: Report) -> None:
-    summary = compared.summary["selectors"]
-    assert len(summary) == len(CASES) * len(selectors.INTERVALS) * len(selectors.WAYS)
-    assert compared.trials is not None
-    rows = summary["trials"].sum()
-    assert (compared.trials["purpose"] == CLAIM).sum() == rows
-    assert (compared.trials["purpose"] == CHOICE).sum() == rows / 2
-
-
 def test_a_known_ratio_is_found(compared: Report) -> None:
     for row in compared.summary["relative_steps"].to_dict("records"):
         expected = {"fixed": 3.0}.get(str(row["way"]), 1.0)
@@ -141,21 +132,6 @@ def test_random_is_a_rival_of_the_default_in_success(compared: Report) -> None:
     assert numbers["busy room, the default against random"] == 0.0
 
 
-def test_how_each_problem_is_posed(compared: Report) -> None:
-    rows = list(compared.summary["cases"].to_dict("records"))
-    assert [row["problem"] for row in rows] == [case.name for case in CASES]
-    assert rows[1]["model"] == "hole_tolerance 0.05"
-    assert {row["M"] for row in rows} == {10}
-    assert [row["trials"] for row in rows] == [round(case.share * 40) for case in CASES]
-
-
-def test_groups_of_problems() -> None:
-    groups = selectors.GROUPS
-    assert len(groups["all problems"]) == len(CASES)
-    missing = set(groups["all problems"]) - set(groups["without distractions"])
-    assert missing == {"busy room", "passer-by"}
-
-
 def test_costs_of_looks(compared: Report) -> None:
     costs = compared.summary["costs_of_looks"]
     free = [row for row in costs.to_dict("records") if row["cost_of_a_look"] == 0.0]
@@ -166,50 +142,6 @@ def test_costs_of_looks(compared: Report) -> None:
         # Other trials choose the interval, so all of these judge it.
         case = next(case for case in CASES if case.name == cheap["problem"])
         assert cheap["trials"] == round(case.share * 40)
-
-
-def begins_in_the_goal(task: Task, number: int) -> bool:
-    return number == 3 and task.parameters["model"] == {"hole_tolerance": 0.05}
-
-
-@pytest.mark.usefixtures("_few_cells")
-def test_a_trial_that_begins_in_the_goal_says_nothing_of_steps(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """It takes no step, whatever is sensed; every other trial is compared as ever."""
-
-    def trial(task: Task, number: int) -> tuple[bool, int, float]:
-        steps = round(10_000 * math.exp(0.3 * noise(task, number, ["problem", "planning"])))
-        return True, 0 if begins_in_the_goal(task, number) else steps, 0.0
-
-    def without_it(task: Task, number: int) -> tuple[bool, int, float]:
-        success, steps, reward = trial(task, number)
-        return success, steps or 10_000, reward
-
-    for study, names in (
-        (selectors.Selectors(), ("selectors", "relative_steps", "rivals")),
-        (parameters.Parameters(), ("parameters", "together")),
-    ):
-        monkeypatch.setattr(type(study), "num_trials", NUM_TRIALS)
-        report, other = (report_on(study, SCALE, each) for each in (trial, without_it))
-        for name in names:
-            both = (each.summary[name].to_dict("records") for each in (report, other))
-            rows = zip(*both, strict=True)
-            for row, whole in rows:
-                ratio = float(row["steps_ratio"])
-                assert math.isfinite(ratio), row
-                levels = [float(row[each]) for each in row if each.endswith("p_value")]
-                assert all(0.0 <= level <= 1.0 for level in levels), row
-                if "problem" in row and row["problem"] not in (*selectors.GROUPS, "tight hole"):
-                    assert ratio == whole["steps_ratio"]
-        assert "nan" not in "".join(map(str, report.numbers))
-        if name == "rivals":
-            assert {row["trials"] for row in report.summary[name].to_dict("records")} == {
-                19,
-                20,
-                39,
-                40,
-            }
 
 
 def test_what_a_parameter_does(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -428,23 +360,6 @@ def test_who_is_stuck_for_good(decided: Report) -> None:
         assert float(row["stuck_share_low"]) <= float(row["stuck_share"])
         path = row["problem"] == "tight hole" and row["way"] == PATH
         assert row["stuck_beyond_random"] == (-0.5 if path else 0.0) or not fails
-
-
-def test_problems_as_a_random_effect(decided: Report) -> None:
-    rows = {
-        (row["measure"], row["way"], row["rival"]): row
-        for row in decided.summary["over_problems"].to_dict("records")
-    }
-    assert len(rows) == 2 * 55
-    row = rows["steps_ratio", PATH, "random"]
-    assert row["mean"] == pytest.approx(0.8 * (1.5 / 0.8) ** (1 / 32), rel=0.02)
-    # One problem of eight differs, by a factor of 1.17.
-    assert float(row["expected_low"]) < 0.82 < float(row["expected_high"])
-    assert float(row["new_problem_low"]) < 0.75
-    assert float(row["new_problem_high"]) > 0.9
-    row = rows["success_gain", PATH, "random"]
-    assert row["mean"] == pytest.approx(0.5 / 8)
-    assert float(row["expected_low"]) < 0.0 < float(row["expected_high"])
 
 
 def columns_of(report: Report) -> dict[str, str]:

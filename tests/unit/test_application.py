@@ -26,7 +26,7 @@ def test_a_service_does_not_wait_for_the_command_line() -> None:
     program = """
 import sys, types
 
-def main(arguments, make_extension):
+def main(arguments):
     heavy = {"rich", "yaml", "matplotlib", "importlib.metadata"}
     print(arguments, sorted(heavy & sys.modules.keys()))
     return 7

@@ -56,7 +56,7 @@ class TestARecordedRun:
     def test_as_a_file(self, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
         said = done(run_here(capsys, here, "view", "run", "--save", "run.rrd"))
         assert said.stdout.startswith("run.rrd  ")
-        assert "every step takes 0.1 s (--rate)" in said.stderr
+        assert "every step takes 0.1 s" in said.stderr
         begun = [line for line in log_of(here / "run.rrd") if line.endswith("begins")]
         assert begun == [f"trial {trial} begins" for trial in range(3)]
         assert sorted(path.name for path in here.iterdir()) == ["run", "run.rrd", "run.yaml"]

@@ -888,13 +888,6 @@ class TestEnvironment:
         [
             ("{object: 3}", "line 2: environment.object is 3; expected text"),
             ("{object: ''}", 'environment.object is ""; expected text of at least 1'),
-            ("{object: 'a:'}", 'environment.object is "a:"; expected module:Class or the name of'),
-            ("{object: 'a-b:C'}", 'object is "a-b:C"; expected module:Class or the name of an'),
-            (
-                "\n  object: absent_robot:Robot",
-                'line 3: environment.object is "absent_robot:Robot"; there is no module'
-                " absent_robot beside run.yaml",
-            ),
             (
                 "\n  object: own_robot:Robot\n  directory: absent",
                 'line 4: environment.directory is "absent", where there is no directory',

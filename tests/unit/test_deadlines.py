@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from holdfast.ros.deadlines import Absence, Deadline
+from holdfast_ros.deadlines import Absence, Deadline
 
 
 class ManualClock:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from concurrent.futures import Future
 
-from holdfast.ros.decision_thread import DecisionThread
+from holdfast_ros.decision_thread import DecisionThread
 
 PATIENCE_S = 30.0
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import itertools
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,9 @@ from rich.console import Console
 from holdfast.errors import OutputError
 from holdfast.files import claim_directory
 from holdfast.lab.demo.command import account
-from holdfast.lab.demo.narrator import Activity, Change, DemoState, Line, Mark
+from holdfast.lab.demo.narrator import Activity, Change, DemoState, Mark
 from holdfast.lab.demo.scenario import Findings
-from holdfast.lab.demo.timeline import ASCII, UNICODE, legend, plain_line, timeline
+from holdfast.lab.demo.timeline import ASCII, UNICODE, legend, timeline
 from holdfast.lab.testbed.fault_times import FaultTimes
 from holdfast.recording.compare import Comparison, Difference
 
@@ -69,23 +68,6 @@ def test_bars() -> None:
     ]
 
 
-def test_they_grow() -> None:
-    before = drawn(0.0, 80)
-    for tenths in range(1, 100):
-        now = drawn(tenths / 10, 80)
-        assert all(len(line) <= 79 for line in now)
-        assert all(
-            len(line) >= len(earlier) for line, earlier in zip(now[1:], before[1:], strict=True)
-        )
-        before = now
-
-
-@pytest.mark.parametrize("now_s", [11.0, 60.0, 4000.0])
-def test_a_demo_that_takes_longer_still_fits(now_s: float) -> None:
-    lines = drawn(now_s, 80)
-    assert all(40 < len(line) <= 79 for line in lines)
-
-
 @pytest.mark.parametrize("expected_s", [1.0, 10.0, 1000.0])
 def test_no_kill_and_no_start_is_lost(expected_s: float) -> None:
     """However many there are within one cell."""
@@ -110,11 +92,6 @@ def test_characters_say_as_much_as_colours() -> None:
         for activity in activities:
             assert characters[activity] in said
     assert legend(ASCII).plain.isascii()
-
-
-def test_lines_are_aligned() -> None:
-    lines = [plain_line(Line(at_s, who, "|")) for at_s, who in ((0.0, "demo"), (123.4, "robot"))]
-    assert lines == ["  0.00 s  demo   |", "123.40 s  robot  |"]
 
 
 def times(kind: str, **measured: float) -> FaultTimes:
@@ -201,14 +178,3 @@ class TestDirectory:
                 claim_directory(out, tmp_path, "demo")
         with pytest.raises(OutputError, match="cannot be made"):
             claim_directory(None, tmp_path / "file", "demo")
-
-
-def test_states_change_where_they_should() -> None:
-    """Whoever is drawn as deciding is the one whose letter the robot shows."""
-    _, cloud, local, robot = (line.ljust(60) for line in drawn(9.8, 60))
-    for cells in itertools.islice(zip(cloud, local, robot, strict=True), 8, None):
-        if cells[2] == "C" and cells[0] not in "^X.":
-            assert cells[0] == "#"
-            assert cells[1] in " -"
-        if cells[2] == "L":
-            assert cells[1] in "#."

@@ -75,7 +75,10 @@ def test_an_endpoint_is_read_and_written(text: str, expected: Endpoint) -> None:
         (f"tcp/[fe80::1%{'a' * 16}]:7447", "'a{16}' is no name of .* at most 15"),
         ("tcp/localhost:7447#iface=eth0", "options after"),
         ("tcp/localhost:7447?rel=0", "options after"),
-        ("ros1/cloud", r"ros1 is not allowed \(sessions go over tcp/HOST:PORT; in ROS 1 .* --ros1"),
+        (
+            "ros1/cloud",
+            r"ros1 is not allowed \(sessions go over tcp/HOST:PORT; .* ros1-serve",
+        ),
         ("unix/", "has no path"),
         ("unix//", "has no path"),
         ("unix//" + "x" * 107, "a path of 108 bytes; .* at most 107"),

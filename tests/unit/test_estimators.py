@@ -42,57 +42,6 @@ def draw(count: int, seed: int = 1, dimension: int = 3) -> tuple[FloatArray, Flo
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("name", ESTIMATORS)
 class TestWhatMakesNoDifference:
-    def test_scale_of_the_weights(self, name: str, count: int) -> None:
-        points, weights = draw(count)
-        expected = entropy(points, weights, ESTIMATORS[name])
-        for scale in (1e-290, 1e-3, 1e290):
-            found = entropy(points, weights * scale, ESTIMATORS[name])
-            assert abs(found - expected) < TOLERANCE
-
-    def test_order_of_the_points(self, name: str, count: int) -> None:
-        points, weights = draw(count)
-        expected = entropy(points, weights, ESTIMATORS[name])
-        order = np.random.default_rng(2).permutation(count)
-        found = entropy(points[order], weights[order], ESTIMATORS[name])
-        assert abs(found - expected) < TOLERANCE
-
-    def test_translation(self, name: str, count: int) -> None:
-        points, weights = draw(count)
-        expected = entropy(points, weights, ESTIMATORS[name])
-        # By powers of two not much larger than the points, so that differences keep their digits.
-        found = entropy(points + np.array([64.0, -8.0, 0.0]), weights, ESTIMATORS[name])
-        assert abs(found - expected) < TOLERANCE
-
-    def test_rotation(self, name: str, count: int) -> None:
-        points, weights = draw(count)
-        expected = entropy(points, weights, ESTIMATORS[name])
-        rotation, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
-        found = entropy(points @ rotation, weights, ESTIMATORS[name])
-        assert abs(found - expected) < TOLERANCE
-
-    def test_points_of_weight_zero(self, name: str, count: int) -> None:
-        """They may be among the others or on top of them: they are not there."""
-        points, weights = draw(count)
-        expected = entropy(points, weights, ESTIMATORS[name])
-        rng = np.random.default_rng(4)
-        order = rng.permutation(4 * count)
-        more = np.concatenate([points, points, rng.normal(size=(2 * count, 3))])[order]
-        more_weights = np.concatenate([weights, np.zeros(3 * count)])[order]
-        assert abs(entropy(more, more_weights, ESTIMATORS[name]) - expected) < TOLERANCE
-
-    def test_company_of_other_posteriors(self, name: str, count: int) -> None:
-        """One of many weightings of the same points has the entropy that it has alone."""
-        points, _ = draw(count)
-        rng = np.random.default_rng(5)
-        weights = rng.exponential(size=(70, count))
-        weights[rng.random(weights.shape) < 0.3] = 0.0
-        weights[:, 0] = 1.0
-        together = estimation.entropy(points, weights, ESTIMATORS[name])
-        assert isinstance(together, np.ndarray)
-        for row in (0, 31, 32, 69):
-            alone = entropy(points, weights[row], ESTIMATORS[name])
-            assert abs(together[row] - alone) < TOLERANCE
-
     def test_threads(self, name: str, count: int) -> None:
         """Here to the last bit."""
         points, _ = draw(count)
@@ -111,32 +60,6 @@ class TestWhatMakesNoDifference:
         for array in (points, weights):
             array.setflags(write=False)
         assert entropy(points, weights, ESTIMATORS[name]) == expected
-
-
-class TestScaling:
-    """Stretching space by s adds d log s, if the resolution or the noise is stretched too."""
-
-    @pytest.mark.parametrize("scale", [2.0**-20, 0.3, 8.0, 1e6])
-    @pytest.mark.parametrize("count", COUNTS)
-    @pytest.mark.parametrize("ties", [False, True])
-    def test_nearest_neighbor(self, count: int, scale: float, ties: bool) -> None:
-        for dimension in (1, 2, 3, 6):
-            points, weights = draw(count, dimension=dimension)
-            if ties:
-                points = np.round(points, 1)
-            expected = entropy(points, weights, NearestNeighbor(5, 0.2)) + dimension * np.log(scale)
-            found = entropy(points * scale, weights, NearestNeighbor(5, 0.2 * scale))
-            assert abs(found - expected) < TOLERANCE
-
-    @pytest.mark.parametrize("upper", [True, False])
-    @pytest.mark.parametrize("count", COUNTS)
-    def test_gaussian_mixture(self, count: int, upper: bool) -> None:
-        """Each direction on its own, as the noise may have another size in each."""
-        points, weights = draw(count)
-        scale, variance = np.array([0.01, 3.0, 1e3]), np.array([0.1, 0.2, 0.3])
-        expected = entropy(points, weights, GaussianMixture(variance, upper)) + np.log(scale).sum()
-        found = entropy(points * scale, weights, GaussianMixture(variance * scale**2, upper))
-        assert abs(found - expected) < TOLERANCE
 
 
 class TestResolutionOfEachCoordinate:

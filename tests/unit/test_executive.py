@@ -12,7 +12,7 @@ import pytest
 from holdfast.errors import EnvironmentFailedError
 from holdfast.problems.registry import problem_class
 from holdfast.robot.environment import MissingReadings
-from holdfast.ros.executive import DecideCode, DecideRequest, DecisionHandover, ExecutiveEnvironment
+from holdfast_ros.executive import DecideCode, DecideRequest, DecisionHandover, ExecutiveEnvironment
 
 FOREVER_S = 60.0
 
@@ -200,8 +200,3 @@ def test_a_run_that_ends_lets_all_go(robot: Robot) -> None:
     assert meeting.call(DecideRequest(0, 1, observation()), FOREVER_S).code == DecideCode.ENDED
     assert wait() is not None
     assert asked.is_set()
-
-
-def test_the_command_says_that_it_cannot_drive_such_a_run() -> None:
-    with pytest.raises(EnvironmentFailedError, match=r"holdfast\.ros\.ros2"):
-        ExecutiveEnvironment()

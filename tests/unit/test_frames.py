@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import msgspec
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from holdfast.errors import FrameError
 from holdfast.transport.frames import (
@@ -13,11 +11,9 @@ from holdfast.transport.frames import (
     END,
     GOODBYE,
     HELLO,
-    LAST,
     MAGIC,
     MAX_HELLO_BYTES,
     PING,
-    REPLY,
     WIRE_VERSION,
     Frame,
     FrameDecoder,
@@ -31,50 +27,6 @@ from holdfast.transport.frames import (
 
 MAX_BYTES = 300
 GREETING = encode_hello("robot", "r", "i1", 400.0)
-FRAMES = st.lists(
-    st.one_of(
-        st.tuples(
-            st.sampled_from((CALL, REPLY, LAST)),
-            st.integers(0, 2**32 - 1),
-            st.binary(max_size=2 * MAX_BYTES),
-        ),
-        st.tuples(st.sampled_from((END, PING)), st.integers(0, 2**32 - 1), st.just(b"")),
-    ),
-    max_size=8,
-)
-
-
-@given(st.data(), FRAMES)
-def test_a_stream_gives_the_same_frames_however_it_is_cut(
-    data: st.DataObject, sent: list[tuple[int, int, bytes]]
-) -> None:
-    stream = GREETING + b"".join(encode_frame(*each) for each in sent)
-    cuts = data.draw(st.lists(st.integers(0, len(stream)), max_size=8).map(sorted))
-    decoder = FrameDecoder(MAX_BYTES)
-    came: list[Frame] = []
-    for start, end in zip([0, *cuts], [*cuts, len(stream)], strict=True):
-        came += decoder.feed(stream[start:end])
-        # What is too large is not kept, and the rest of a frame only until it is whole.
-        assert decoder.held_bytes <= len(GREETING) + MAX_BYTES
-    assert decoder.error is None
-    assert decoder.held_bytes == 0
-    assert came[0].kind == HELLO
-    expected = [
-        Frame(kind, call, payload, 0)
-        if len(payload) <= MAX_BYTES
-        else Frame(kind, call, b"", len(payload))
-        for kind, call, payload in sent
-    ]
-    assert came[1:] == expected
-
-
-@given(st.binary(max_size=64), st.booleans())
-def test_any_bytes_are_frames_or_an_error(noise: bytes, greeted: bool) -> None:
-    decoder = FrameDecoder(MAX_BYTES)
-    decoder.feed((GREETING if greeted else b"") + noise)
-    if decoder.error is not None:
-        assert str(decoder.error)
-        assert str(decoder.error).isprintable()
 
 
 @pytest.mark.parametrize("size", range(1, len(MAGIC) + 1))

@@ -181,28 +181,6 @@ class TestHowItEnds:
         environment.perform(RIGHT)
         assert environment.is_done() == hf.Ending("failed", "fell over")
 
-    def test_time_limits_of_gymnasium_are_neither(self) -> None:
-        environment = car(env_arguments={"max_episode_steps": 2}, success="terminated")
-        for _ in range(2):
-            environment.perform(RIGHT)
-        assert environment.is_done() == hf.Ending("truncated", f"{CAR} truncated after 2 steps")
-
-    def test_a_pole_that_falls_is_a_failure(self) -> None:
-        environment = hf.GymnasiumEnvironment("CartPole-v1", sensing=[[0], [2]])
-        while not environment.is_done():
-            environment.perform(np.array([1.0]))
-        done = environment.is_done()
-        assert isinstance(done, hf.Ending)
-        assert done.outcome == "failed"
-
-    def test_a_car_on_the_hill_has_succeeded(self) -> None:
-        environment = car(success="terminated")
-        while not environment.is_done():  # pushed the way that it rolls, it gains height
-            push = 1.0 if environment.perform_sensing(1)[0] >= 0.0 else -1.0
-            environment.perform(np.array([push]))
-        assert environment.is_done() == hf.Ending("succeeded")
-        assert environment.steps_performed() < 200
-
 
 class TestActions:
     @pytest.mark.parametrize(

@@ -561,16 +561,6 @@ class TestDamage:
             # What began the trial is in the journal itself.
             assert set(numbers) == {2, 5, 8, 11, 14}
 
-    @pytest.mark.parametrize("name", ["journal.sqlite", "journal.sqlite-wal"])
-    def test_a_flipped_bit_anywhere(self, killed: Path, memory_path: Path, name: str) -> None:
-        whole = killed.with_name(name).read_bytes()
-        for number, offset in enumerate(range(0, len(whole), 67 if name.endswith("-wal") else 23)):
-            path = copy_of(killed, memory_path)
-            flipped = bytearray(whole)
-            flipped[offset] ^= 1 << number % 8
-            path.with_name(name).write_bytes(flipped)
-            self.check(path, read=bool(number % 2), where=f"{name} flipped at {offset}")
-
     def test_a_flipped_bit_of_a_record_is_named(self, killed: Path, tmp_path: Path) -> None:
         path = copy_of(killed, tmp_path)
         Journal.open(path).close()  # all is in the one file now
@@ -625,37 +615,6 @@ class TestDamage:
             connection.execute("DELETE FROM steps WHERE sequence = ?", (sequence,))
         with pytest.raises(OutputError, match=f"record {sequence} .* is missing"):
             unfinished_of(path)
-
-    @pytest.mark.parametrize("value", [5, 2.5, b"\x00\xff", None], ids=repr)
-    def test_a_value_of_another_type_is_damage(
-        self, killed: Path, tmp_path: Path, value: object
-    ) -> None:
-        """SQLite keeps a type with each value: a flipped bit can make it any."""
-        path = copy_of(killed, tmp_path)
-        with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as connection:
-            made = connection.execute("SELECT sql, name FROM sqlite_schema").fetchall()
-            connection.execute("PRAGMA writable_schema = ON")
-            # As it is after damage: no constraint and no affinity has seen the value.
-            for declared in ("value TEXT NOT NULL", "trial INTEGER NOT NULL"):
-                name = declared.split()[0]
-                connection.execute(
-                    "UPDATE sqlite_schema SET sql = replace(sql, ?, ?)", (declared, f"{name} BLOB")
-                )
-        with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as connection:
-            connection.execute("UPDATE meta SET value = ? WHERE key = 'epoch'", (value,))
-            connection.execute("UPDATE steps SET trial = ?", (value,))
-            connection.execute("PRAGMA writable_schema = ON")
-            connection.executemany("UPDATE sqlite_schema SET sql = ? WHERE name = ?", made)
-        with Journal.open(path, check=False) as journal:
-            with pytest.raises(OutputError, match="its note 'epoch' has a wrong checksum"):
-                journal.meta()
-            with pytest.raises(OutputError, match=r"journal is damaged .*its session|its note"):
-                journal.session()
-            if not isinstance(value, int):
-                with pytest.raises(OutputError, match=r"its unfinished trial is .*, no number"):
-                    journal.unfinished_trial()
-            with pytest.raises(OutputError, match="record 0 of the unfinished trial"):
-                journal.unfinished()
 
     def test_a_log_without_its_journal_is_nobodys(self, killed: Path, tmp_path: Path) -> None:
         """A new journal beside it would get the pages of the old one."""

@@ -96,26 +96,12 @@ class TestJournal:
             history = replay(planner, 2, unfinished.trial, unfinished.records)
             assert (unfinished.trial, history.state.step) == (2, 21)
 
-    def test_closing_leaves_one_file(self, tmp_path: Path) -> None:
-        with Journal.create(tmp_path / "journal.sqlite", {}) as journal:
-            journal.add(result_of(0))
-        assert [entry.name for entry in tmp_path.iterdir()] == ["journal.sqlite"]
-
     def test_a_trial_is_kept_once(self, tmp_path: Path) -> None:
         with Journal.create(tmp_path / "journal.sqlite", {}) as journal:
             journal.add(result_of(0, reward=-1.0))
             with pytest.raises(OutputError, match="UNIQUE"):
                 journal.add(result_of(0, reward=-2.0))
             assert [result.reward for result in journal.results()] == [-1.0]
-
-    def test_it_belongs_to_one_process_at_a_time(self, tmp_path: Path) -> None:
-        path = tmp_path / "journal.sqlite"
-        with (
-            Journal.create(path, {}),
-            pytest.raises(OutputError, match="another process is using this run"),
-        ):
-            Journal.open(path)
-        Journal.open(path).close()
 
     def test_a_trial_that_is_not_there_is_named(self, tmp_path: Path) -> None:
         with (

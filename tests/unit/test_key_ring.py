@@ -79,7 +79,6 @@ class TestWhatIsMade:
             ("service", "service", home / "service"),
             ("robot", "robot", home / "robot"),
         ]
-        assert ring.authority_is_new
         assert ring.authority_key == home / "authority" / "authority.key"
 
     def test_each_role_has_its_own_usage(self, tmp_path: Path) -> None:
@@ -137,7 +136,6 @@ class TestWhatIsMade:
         make_credentials(tmp_path)
         before = contents_of(tmp_path)
         ring = make_credentials(tmp_path, robots=["left", "right"], services=["cloud-2.lab"])
-        assert not ring.authority_is_new
         assert [made.name for made in ring.made] == ["cloud-2.lab", "left", "right"]
         after = contents_of(tmp_path)
         record = before.pop("authority/issued.csv")

@@ -16,6 +16,7 @@ from tests.unit.test_protocol_service import (
 )
 
 from holdfast.config.settings import PlanningSettings
+from holdfast.interruption import check
 from holdfast.problems.problem import Problem
 from holdfast.protocol.decision_cost import cost_of_sensing
 from holdfast.protocol.messages import Busy, Refused, SessionConfiguration
@@ -180,6 +181,17 @@ def overrun(bench: Bench, index: int = -1) -> None:
     bench.run(index)
 
 
+def test_a_robot_with_a_known_problem_does_not_wait_for_new_ones() -> None:
+    bench, known, other = Bench(), Robot(key=1), Robot(key=2)
+    bench.ask(known.request())
+    bench.send(Robot("peg_in_hole_2d", key=3).request())
+    assert len(bench.jobs) == 1, "of a problem that nobody has brought before"
+    call = bench.send(other.request())
+    bench.run(-1)
+    assert content(bench.replies[call]) == other.right_answer()
+    assert len(bench.jobs) == 1
+
+
 class TestTheEstimateIsFarTooLow:
     def test_a_job_ends_once_it_has_used_up_its_time(self) -> None:
         bench = Bench()
@@ -191,17 +203,20 @@ class TestTheEstimateIsFarTooLow:
         bench.run_all()
         assert content(bench.replies[call]) == slow.right_answer()
 
-    def test_building_a_problem_does_not_count(self) -> None:
-        """It would have to be built again."""
+    def test_a_problem_that_takes_long_to_build_leaves_the_lane_of_new_ones(self) -> None:
+        """A long one may take its time to build, or it would be built for ever."""
 
         def slowly_made(configuration: SessionConfiguration) -> Problem:
             began = time.thread_time()
             while time.thread_time() < began + 6 * ServiceLimits().max_brief_s:
-                pass
+                check()
             return make_problem(configuration)
 
         bench, robot = Bench(slowly_made), Robot()
         call = bench.send(robot.request())
+        bench.run()
+        assert not bench.replies[call]
+        assert bench.jobs[0]._most is None
         bench.run()
         assert content(bench.replies[call]) == robot.right_answer()
 

@@ -9,12 +9,21 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "src" / "holdfast"
+PACKAGES = {
+    "": PACKAGE,
+    "ros/": ROOT / "ros" / "holdfast_ros" / "holdfast_ros",
+    "master/": ROOT / "ros" / "ros1_master_guard" / "ros1_master_guard",
+}
+"""Packages whose modules have tests here, by what their modules are called here."""
+
 TESTS = {path.stem for path in (ROOT / "tests").rglob("test_*.py")}
 
 WITHOUT_TESTS = {
     "__main__": "one line, which every process test runs",
     "cli/doctor": "options and printing; tests/processes/test_robot_doctor.py runs it",
     "errors": "types without behaviour",
+    "master/__main__": "one line, which calls the command",
+    "master/errors": "types without behaviour",
     "protocol/events": "types without behaviour",
     "recording/facts": "types without behaviour",
     "recording/live_messages": "types without behaviour",
@@ -29,9 +38,10 @@ WITHOUT_TESTS = {
 
 def modules() -> list[str]:
     return sorted(
-        str(path.relative_to(PACKAGE).with_suffix(""))
-        for path in PACKAGE.rglob("*.py")
-        if path.name != "__init__.py" and path.relative_to(PACKAGE).parts[0] != "lab"
+        f"{prefix}{path.relative_to(package).with_suffix('')}"
+        for prefix, package in PACKAGES.items()
+        for path in package.rglob("*.py")
+        if path.name != "__init__.py" and path.relative_to(package).parts[0] != "lab"
     )
 
 

@@ -34,7 +34,6 @@ class TestTargets:
         log = EventLog(stream, component="robot")
         stream.close()
         log.event("status", **CHANGE)
-        assert log.lost == 1
 
     def test_a_reader_that_went_away_costs_the_lines_alone(self) -> None:
         reading, writing = os.pipe()
@@ -44,7 +43,6 @@ class TestTargets:
         for _ in range(3):
             log.event("status", **CHANGE)
         log.close()
-        assert log.lost == 3
         with contextlib.suppress(BrokenPipeError):
             stream.close()
 
@@ -55,7 +53,6 @@ class TestTargets:
         for _ in range(2_000):  # more than a pipe holds
             log.event("status", **CHANGE)
         log.close()
-        assert 0 < log.lost < 2_000
         os.close(reading)
         with contextlib.suppress(OSError):
             stream.close()
@@ -64,7 +61,6 @@ class TestTargets:
     def test_a_full_disk_costs_the_line_alone(self) -> None:
         with EventLog("/dev/full", component="robot") as log:
             log.event("status", **CHANGE)
-            assert log.lost == 1
 
     def test_a_terminal_without_the_letters_gets_escapes(self) -> None:
         raw = io.BytesIO()
@@ -93,7 +89,6 @@ class TestTargets:
             log.close()
             log.close()
             log.event("late")
-            assert log.lost == 0
         assert not stream.closed
         assert stream.getvalue() == path.read_text() == ""
 
@@ -145,7 +140,7 @@ class TestTargets:
             sys.stdin.readline()
             log.event("after")
             log.close()
-            print("alive", log.lost)
+            print("alive")
         """)
         leader, follower = os.openpty()
         # Unbuffered: of what stays in a buffer, Python itself complains at the end (status 120).
@@ -160,7 +155,7 @@ class TestTargets:
             assert b"before" in os.read(leader, 200)
             os.close(leader)
             output, _ = process.communicate("\n", timeout=60)
-        assert output == "alive 1\n"
+        assert output == "alive\n"
         assert process.returncode == 0
 
     def test_it_imports_nothing_heavy(self) -> None:

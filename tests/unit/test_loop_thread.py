@@ -8,7 +8,7 @@ import threading
 import pytest
 
 from holdfast.errors import TransportError
-from holdfast.ros.loop_thread import LoopThread
+from holdfast_ros.loop_thread import LoopThread
 
 PATIENCE_S = 30.0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tests.master_state import ARM, BASE, LIDAR, known
 
-from holdfast.ros.master.plan import (
+from ros1_master_guard.plan import (
     NodeAnswer,
     NodeReport,
     lookups_of,
@@ -12,7 +12,7 @@ from holdfast.ros.master.plan import (
     state_of_snapshot,
     unregistrations,
 )
-from holdfast.ros.master.process import (
+from ros1_master_guard.process import (
     MasterState,
 )
 

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.master_state import known
 
-from holdfast.ros.master.process import (
+from ros1_master_guard.process import (
     MasterJournal,
     MasterState,
     parameter_names,

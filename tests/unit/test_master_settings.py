@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from holdfast.errors import GuardError
-from holdfast.ros.master.settings import GuardLock, MasterAddress
+from ros1_master_guard.errors import GuardError
+from ros1_master_guard.settings import GuardLock, MasterAddress
 
 
 class TestLock:

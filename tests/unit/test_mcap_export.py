@@ -11,7 +11,7 @@ from rosbags.highlevel import AnyReader
 from holdfast.belief import Belief
 from holdfast.config.loader import load
 from holdfast.recording.facts import EventFact, TrialBeginFact, TrialEndFact
-from holdfast.ros.mcap_export import McapSink
+from holdfast.recording.mcap_export import McapSink
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
 

@@ -12,7 +12,7 @@ from tests.planning_settings import SEED, STEPS, TRIAL, planning_settings
 
 from holdfast import planning
 from holdfast.arrays import FloatArray, IntArray
-from holdfast.belief import Belief, estimate, resample, update
+from holdfast.belief import Belief
 from holdfast.config.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
@@ -24,9 +24,8 @@ from holdfast.planning import Planner, PlanningState, decode_checkpoint, digest,
 from holdfast.problems import registry
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Purpose, Stream, stream
+from holdfast.randomness import Stream
 from holdfast.robot.environment import SimulatedEnvironment
-from holdfast.sensing import choose_sensing_action
 
 
 @pytest.fixture(scope="module", params=registry.names())
@@ -176,15 +175,6 @@ class TestPurity:
 
 
 class TestFunctions:
-    def test_initial_state(self, problem: Problem) -> None:
-        configured = planning_settings()
-        state = Planner(problem, configured).init(SEED, TRIAL)
-        assert state[:5] == (SEED, TRIAL, 0, 0, False)
-        assert state.belief.states.shape == (40, problem.state_size)
-        assert state.belief.weights.tolist() == [1.0 / 40.0] * 40
-        draws = stream(SEED, TRIAL, 0, Purpose.INITIAL_BELIEF)
-        assert state.belief.states.tobytes() == problem.initial_states(draws, 40).tobytes()
-
     @pytest.mark.parametrize(
         ("interval", "expected"), [(0, [0, 1, 2, 3, 4, 5, 6]), (1, [0, 2, 4, 6]), (4, [0, 5])]
     )
@@ -200,23 +190,6 @@ class TestFunctions:
         assert senses == expected
         for step in range(7):
             assert not planning.needs_sensing(configured, state._replace(step=step, sensed=True))
-
-    def test_observe(self, peg: Problem) -> None:
-        state = Planner(peg, planning_settings()).init(SEED, TRIAL)
-        for threshold in (0.0, 0.3, 1.0):
-            configured = planning_settings(resampling_threshold=threshold)
-            after, info = Planner(peg, configured).observe(state, 1, [2.5])
-            assert after[:4] == state[:4]
-            assert after.sensed
-            assert info.explained
-            assert 1.0 <= info.effective_sample_size <= 40.0
-            assert info.resampled == (info.effective_sample_size <= threshold * 40)
-            equal = after.belief.weights.tolist() == [1.0 / 40.0] * 40
-            assert equal == info.resampled
-            if not info.resampled:
-                assert after.belief.states.tobytes() == state.belief.states.tobytes()
-            # The belief about the height is now near what was seen.
-            assert abs(estimate(after.belief)[1] - 2.5) < 0.3
 
     def test_observe_at_threshold_one_always_resamples(self, peg: Problem) -> None:
         """Even where rounding puts the effective size of equal weights above their number."""
@@ -242,17 +215,6 @@ class TestFunctions:
                 action, _ = planner.choose_task_action(after)
                 assert np.isfinite(action).all()
 
-    def test_task_action(self, problem: Problem) -> None:
-        configured = planning_settings()
-        planner = Planner(problem, configured)
-        state = planner.init(SEED, TRIAL)
-        action, info = planner.choose_task_action(state)
-        mean = estimate(state.belief)
-        assert info.estimate.tolist() == mean.tolist()
-        assert info.stage == int(problem.next_stage(mean, state.stage))
-        assert info.commanded.tolist() == problem.policy(mean, info.stage).tolist()
-        assert action.tolist() == problem.execute(info.commanded).tolist()
-
     def test_task_action_of_the_most_likely_particle(self, problem: Problem) -> None:
         configured = msgspec.structs.replace(
             planning_settings(),
@@ -273,56 +235,6 @@ class TestFunctions:
         # Of equals the first.
         _, info = planner.choose_task_action(state)
         assert info.estimate.tolist() == state.belief.states[0].tolist()
-
-    def test_advance(self, problem: Problem) -> None:
-        configured = planning_settings()
-        planner = Planner(problem, configured)
-        state = planner.init(SEED, TRIAL)
-        weighted = state._replace(
-            sensed=True, belief=Belief.weighted(state.belief.states, np.arange(1.0, 41.0))
-        )
-        action, info = planner.choose_task_action(weighted)
-        after = planner.advance(weighted, action)
-        assert after[:5] == (SEED, TRIAL, 1, info.stage, False)
-        assert after.belief.weights.tolist() == weighted.belief.weights.tolist()
-        draws = stream(SEED, TRIAL, 0, Purpose.PREDICTION)
-        moved = problem.move(weighted.belief.states, action, draws)
-        assert after.belief.states.tobytes() == moved.tobytes()
-
-    def test_random_numbers_are_named_by_the_state(self, problem: Problem) -> None:
-        """Seed, trial, step and purpose, and nothing else."""
-        configured = planning_settings()
-        planner = Planner(problem, configured)
-        start = planner.init(SEED, TRIAL)
-        state = start._replace(step=8)
-
-        def named(purpose: Purpose) -> Stream:
-            return stream(SEED, TRIAL, 8, purpose)
-
-        index, info = planner.choose_sensing_action(state)
-        hypotheses, selection = named(Purpose.HYPOTHESES), named(Purpose.SELECTION)
-        expected_index, expected = choose_sensing_action(
-            problem, configured, state.belief, 0, hypotheses, selection
-        )
-        assert info.samples is not None
-        assert expected.samples is not None
-        assert (index, info.samples.tobytes()) == (expected_index, expected.samples.tobytes())
-
-        observation = problem.observation_mean(state.belief.states, index)[0]
-        after, _ = planner.observe(state, index, observation)
-        updated, _ = update(problem, state.belief, index, observation)
-        resampled = resample(updated, named(Purpose.RESAMPLING))
-        assert after.belief.states.tobytes() == resampled.states.tobytes()
-
-        action = problem.execute(np.full(problem.action_size, 0.02))
-        moved = problem.move(state.belief.states, action, named(Purpose.PREDICTION))
-        advanced = planner.advance(state, action)
-        assert advanced.belief.states.tobytes() == moved.tobytes()
-
-        random = msgspec.structs.replace(configured, selector=SelectorSettings(method="random"))
-        chosen, _ = Planner(problem, random).choose_sensing_action(state)
-        count = len(problem.sensing_actions)
-        assert chosen == int(float(selection.uniform()) * count)
 
     def test_stages_advance_once_a_step(self) -> None:
         """By the estimate, and one at a time, however far it is already."""

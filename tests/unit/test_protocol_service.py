@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import random
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -16,8 +15,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from tests.questions import received, request_of
 
 from holdfast.config.settings import (
@@ -925,38 +922,6 @@ class TestRefusals:
         reply = refused(bench.ask(robot.request(version=99)))
         assert reply.code == "version"
 
-    @settings(max_examples=300, deadline=None, derandomize=True)
-    @given(data=st.data())
-    def test_any_bytes(self, data: st.DataObject) -> None:
-        """Whatever comes gets an answer and an end, and harms no other robot."""
-        bench, robot, hostile = Bench(max_steps=20), Robot(), Robot(key=2)
-        hostile.sense()
-        good = data.draw(
-            st.sampled_from(
-                [hostile.request(), hostile.restore(), hostile.request(session_configuration=False)]
-            )
-        )
-        payload = bytearray(encode(good))
-        for _ in range(data.draw(st.integers(1, 4))):
-            at = data.draw(st.integers(0, len(payload) - 1))
-            match data.draw(st.sampled_from(["change", "cut", "insert"])):
-                case "change":
-                    payload[at] = data.draw(st.integers(0, 255))
-                case "cut":
-                    del payload[at : at + data.draw(st.integers(1, 20))]
-                case _:
-                    payload[at:at] = data.draw(st.binary(min_size=1, max_size=8))
-            if not payload:
-                break
-        bench.ask(robot.request())
-        replies = bench.ask(bytes(payload))
-        assert replies
-        assert all(not isinstance(reply, Busy) for reply in replies)
-        robot.sense()
-        assert (
-            content(bench.ask(robot.request(session_configuration=False))) == robot.right_answer()
-        )
-
 
 class TestCapacity:
     def test_beyond_the_longest_line(self) -> None:
@@ -1019,20 +984,6 @@ class TestCapacity:
         bench.run_all()
         assert content(bench.replies[call]) == right
 
-    def test_newcomers_have_half_of_the_room(self) -> None:
-        bench = Bench(max_sessions=10, max_waiting=12)
-        known = [Robot(key=key) for key in range(1, 4)]
-        for robot in known:
-            bench.ask(robot.request())
-            robot.sense()
-        for key in range(4, 60):
-            bench.send(Robot(key=key).request())
-        calls = [bench.send(robot.request(session_configuration=False)) for robot in known]
-        assert all(not bench.replies[call] for call in calls), "neither forgotten nor turned away"
-        bench.run_all()
-        for robot, call in zip(known, calls, strict=True):
-            assert content(bench.replies[call]) == robot.right_answer()
-
     def test_newcomers_have_their_turn(self) -> None:
         bench = Bench(max_wait_ms=100.0)
         known = [Robot(key=key) for key in range(1, 6)]
@@ -1048,23 +999,6 @@ class TestCapacity:
             bench.run()
         bench.run_all()
         assert set(calls) <= bench.ended
-
-    def test_a_robot_that_was_served_waits_for_no_newcomer(self) -> None:
-        """However many there are, and however long they have waited."""
-        bench = Bench(max_wait_ms=100.0)
-        (known,) = bench.known(1)
-        for key in range(2, 60):
-            bench.send(Robot(key=key).request())
-        bench.now += 10.0
-        for _ in range(3):
-            right = known.right_answer()
-            call = bench.send(known.request())
-            assert len(bench.jobs) == 2, "a newcomer, and this one beside it"
-            while call not in bench.ended:
-                bench.run(-1)
-            assert content(bench.replies[call]) == right
-            known.act_until_sensing()
-            known.sense()
 
     def test_nor_for_states_from_outside(self) -> None:
         """A checkpoint may hold anything; its request begins with those of newcomers."""
@@ -1299,24 +1233,6 @@ class TestProgress:
         assert bench.replies[running] == [Progress(robot.number, waiting=False)] * 3
         assert bench.replies[waiting] == [Progress(other.number, waiting=True)] * 3
 
-    def test_an_answer_is_a_sign(self) -> None:
-        bench, robot = Bench(progress_interval_ms=50.0), Robot()
-        robot.sense()
-        bench.send(robot.request())
-        bench.now += 0.04
-        bench.run()
-        assert bench.service.next_wakeup() == pytest.approx(bench.now + 0.05)
-
-    def test_calls_that_are_nearly_due_go_together(self) -> None:
-        bench = Bench(progress_interval_ms=50.0)
-        for key in range(1, 6):
-            bench.send(Robot(key=key).request())
-            bench.now += 0.001
-        due = bench.service.next_wakeup()
-        assert due is not None
-        bench.apply(bench.service.tick(due))
-        assert all(len(replies) == 1 for replies in bench.replies.values())
-
     @pytest.mark.parametrize(("count", "interval_s"), [(64, 0.05), (96, 0.075), (300, 0.1)])
     def test_where_many_wait_each_is_told_less_often(self, count: int, interval_s: float) -> None:
         bench = Bench(progress_interval_ms=50.0, max_wait_ms=1e6)
@@ -1332,64 +1248,6 @@ class TestProgress:
 
 
 class TestAnyOrder:
-    @pytest.mark.parametrize("seed", range(12))
-    def test_many_robots_and_any_order_of_events(self, seed: int) -> None:
-        """Retries, duplicates, restarts, eviction, and jobs that end in any order."""
-        chance = random.Random(seed)
-        bench = Bench(
-            workers=3,
-            max_sessions=chance.choice([3, 100]),
-            max_waiting=chance.choice([3, 100]),
-            max_state_bytes=chance.choice([2000, 1 << 20]),
-            answers_per_session=chance.choice([1, 2, 8]),
-            max_calls_per_request=2,
-        )
-        robots = [Robot(key=key, planning=planning_of(2, 12)) for key in range(1, 7)]
-        open_calls: dict[int, tuple[Robot, list[tuple[Any, ...]], bytes]] = {}
-        turns = dict.fromkeys(range(6), 0)
-        seen: list[bytes] = []
-        for _ in range(900):
-            index = chance.randrange(6)
-            robot = robots[index]
-            match chance.choice(["ask", "ask", "run", "run", "run", "tick", "again"]):
-                case "ask":
-                    whole = chance.random() < 0.3
-                    request = robot.restore() if whole else robot.request()
-                    seen.append(encode(request))
-                    call = bench.send(request)
-                    open_calls[call] = (robot, robot.right_answer(), request.digest)
-                case "again" if seen:
-                    bench.send(chance.choice(seen))
-                case "run" if bench.jobs:
-                    bench.now += chance.choice([0.0, 0.001, 0.05])
-                    bench.run(chance.randrange(len(bench.jobs)))
-                case "tick":
-                    due = bench.service.next_wakeup()
-                    if due is not None:
-                        bench.now = max(bench.now, due)
-                        bench.apply(bench.service.tick(bench.now))
-                case _:
-                    pass
-            for call in sorted(set(open_calls) & bench.ended):
-                asker, right, _ = open_calls.pop(call)
-                given_answer = content(bench.replies[call])
-                if given_answer and not isinstance(given_answer[0][0], str):
-                    assert isinstance(given_answer[0][0], Busy | NeedState)
-                    continue
-                # What was said is right, even where it was not all.
-                assert given_answer == right[: len(given_answer)]
-                if given_answer == right and right == asker.right_answer():
-                    turns[robots.index(asker)] += 1
-                    asker.act_until_sensing()
-                    asker.sense()
-        while bench.jobs:
-            bench.run()
-        statistics = bench.service.statistics
-        assert (statistics.waiting, statistics.running, statistics.calls) == (0, 0, 0)
-        assert min(turns.values()) >= 1
-        for robot in robots:
-            assert content(bench.ask(robot.restore())) == robot.right_answer()
-
     def test_with_no_worker_there_is_no_service(self) -> None:
         with pytest.raises(ValueError, match="workers 0"):
             Service(make_problem, 0)

@@ -24,7 +24,6 @@ from holdfast.protocol.records import (
     decode_record,
     encode_record,
     has_shown,
-    reinitialised_after,
     replay,
 )
 from holdfast.tracking import LateObservation
@@ -101,21 +100,6 @@ def test_what_came_late_may_stand_between_an_action_and_its_performance() -> Non
             replay(planner, 11, 4, [*records[:2], record])
 
 
-def test_when_a_belief_was_begun_anew_is_in_the_records() -> None:
-    """As in the log of decisions, where moves that have shown nothing are no inputs."""
-    records: list[Record] = [
-        first_record(),
-        ActingRecord(0, encode_floats(np.zeros(3))),
-        PerformedRecord(0, None),
-        PerformedRecord(1, None, encode_floats(np.zeros(3))),
-        ReinitialisedRecord(2, bytes(32)),
-        LocalTookOverRecord(1),
-        LateRecord(2, 0, encode_floats(np.zeros(1)), bytes(32)),
-        ReinitialisedRecord(2, bytes(32)),
-    ]
-    assert reinitialised_after(records) == {2, 4}
-
-
 def test_a_lost_robot_stays_lost_when_an_explained_observation_comes_late() -> None:
     """It held still, or was killed, before the new belief was written down."""
     history = TrialHistory(Planner(PROBLEM, PLANNING_EACH_STEP), 5, 0, 1.0)
@@ -181,7 +165,3 @@ def test_what_a_record_has_shown() -> None:
     assert has_shown(PerformedRecord(0, None, b"", shown))
     assert has_shown(LateRecord(2, 0, shown, bytes(32)))
     assert not has_shown(first_record())
-    anew = ReinitialisedRecord(2, bytes(32))
-    for moved in (PerformedRecord(1, None, shown), PerformedRecord(1, None, b"", shown)):
-        assert reinitialised_after([first_record(), moved, anew]) == {2}
-    assert reinitialised_after([first_record(), PerformedRecord(0, None), anew]) == {1}

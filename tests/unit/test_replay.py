@@ -66,7 +66,7 @@ def test_facts_are_those_of_the_run(tmp_path: Path) -> None:
     sink, also = Collected(), Collected()
     with RecordedRun(path) as run:
         assert (run.trials, run.unfinished, run.has_times) == ((0, 1), None, False)
-        assert list(run.replay([1], [sink, also], rate_hz=10.0)) == [1]
+        assert list(run.replay([1], [sink, also])) == [1]
     assert sink.facts == also.facts
     begin, *between, end = sink.facts
     assert isinstance(begin, TrialBeginFact)
@@ -101,7 +101,7 @@ def test_another_decision_than_the_recorded_one_is_refused(tmp_path: Path) -> No
         RecordedRun(path) as run,
         pytest.raises(HoldfastError, match=r"trial 0: the decision of step 0 differs .*--trials"),
     ):
-        list(run.replay([0, 1], [Collected()], rate_hz=10.0))
+        list(run.replay([0, 1], [Collected()]))
 
 
 def test_what_is_no_run_is_refused_with_its_purpose(tmp_path: Path) -> None:
@@ -117,7 +117,7 @@ def test_tables_have_one_clock(tmp_path: Path) -> None:
         RecordedRun(path) as run,
         CsvSink(tmp_path / "tables", run.configuration.problem) as tables,
     ):
-        list(run.replay(run.trials, [tables], rate_hz=10.0))
+        list(run.replay(run.trials, [tables]))
     head, *rows = (tmp_path / "tables" / "trials.csv").read_text().splitlines()
     assert head.startswith("trial,began,ended,")
     times = [float(cell) for row in rows for cell in row.split(",")[1:3]]

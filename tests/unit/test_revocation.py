@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import shutil
-import ssl
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from holdfast.errors import CredentialsError, TransportError
 from holdfast.transport.credentials import load_credentials
 from holdfast.transport.endpoints import REVOKED_FILE, Role
 from holdfast.transport.key_ring import list_credentials, make_credentials, revoke_credentials
-from holdfast.transport.revocation import refuse_revoked, revoked_serials
+from holdfast.transport.revocation import revoked_serials
 
 NOW = datetime.now(UTC)
 DAY = timedelta(days=1)
@@ -220,56 +219,6 @@ class TestListing:
         }
         assert {serial for serial, (_, _, at) in told.items() if at is not None} == {first, 77}
         assert told[serial_of(home / "cloud")][1] == "service"
-
-
-def shake_hands(robot: Path, service: Path) -> None:
-    """Let a robot and a service shake hands in memory, each with the list that it has."""
-    contexts = []
-    for protocol, place in (
-        (ssl.PROTOCOL_TLS_CLIENT, robot),
-        (ssl.PROTOCOL_TLS_SERVER, service),
-    ):
-        context = ssl.SSLContext(protocol)
-        context.minimum_version = ssl.TLSVersion.TLSv1_3
-        context.check_hostname = False
-        context.verify_mode = ssl.CERT_REQUIRED
-        context.load_verify_locations(cafile=place / "authority.pem")
-        context.load_cert_chain(place / "certificate.pem", place / "key.pem")
-        refuse_revoked(context, place)
-        contexts.append(context)
-    up, down = ssl.MemoryBIO(), ssl.MemoryBIO()
-    ends = [
-        contexts[0].wrap_bio(down, up, server_side=False),
-        contexts[1].wrap_bio(up, down, server_side=True),
-    ]
-    for _ in range(4):
-        for end in ends:
-            try:
-                end.do_handshake()
-            except ssl.SSLWantReadError:
-                continue
-
-
-class TestHandshakes:
-    def test_a_service_refuses_a_revoked_robot_and_no_other(self, home: Path) -> None:
-        revoke_credentials(home, names=["anna"])
-        shake_hands(home / "berta", home / "cloud")
-        with pytest.raises(ssl.SSLCertVerificationError, match="revoked"):
-            shake_hands(home / "anna", home / "cloud")
-        (home / "cloud" / REVOKED_FILE).unlink()
-        shake_hands(home / "anna", home / "cloud")
-
-    def test_a_robot_refuses_a_revoked_service(self, home: Path) -> None:
-        make_credentials(home, services=["spare"])
-        revoke_credentials(home, names=["cloud"])
-        shake_hands(home / "anna", home / "spare")
-        with pytest.raises(ssl.SSLCertVerificationError, match="revoked"):
-            shake_hands(home / "anna", home / "cloud")
-
-    def test_a_rotated_robot_is_let_in(self, home: Path) -> None:
-        revoke_credentials(home, names=["anna"])
-        make_credentials(home, robots=["anna"], rotate=True)
-        shake_hands(home / "anna", home / "cloud")
 
 
 class TestLoading:

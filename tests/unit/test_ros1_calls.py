@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 from tests.ports import free_port
 
-from holdfast.errors import CallError, GoneError, SilentError
-from holdfast.transport.ros1_calls import CALLER, Connection, call, decoded, offers_service
+from ros1_master_guard.errors import CallError, GoneError, SilentError
+from ros1_master_guard.ros1_calls import CALLER, Connection, call, decoded, offers_service
 
 PATIENCE_S = 20.0
 SHORT_S = 0.05

@@ -13,9 +13,10 @@ from tests.ports import free_port
 
 from holdfast.errors import TransportError
 from holdfast.protocol.status import Status
-from holdfast.ros.active_sensing import DecisionRequest, RequestKind
-from holdfast.ros.ros1_client import STATUS_WORDS, Ros1Service, service_type
-from holdfast.transport.tcpros import RosEnvironment, decode_header, encode_header
+from holdfast_ros.active_sensing import DecisionRequest, RequestKind
+from holdfast_ros.ros1_client import STATUS_WORDS, Ros1Service, service_type
+from holdfast_ros.tcpros import RosEnvironment
+from ros1_master_guard.headers import decode_header, encode_header
 
 BEGIN = DecisionRequest(RequestKind.INITIALIZE, seed=1)
 PATIENCE_S = 30.0

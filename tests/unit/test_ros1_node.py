@@ -16,10 +16,11 @@ from typing import Any, cast
 import pytest
 from tests.ports import free_port
 
-from holdfast.transport import ros1_node
-from holdfast.transport.ros1_calls import Connection, HttpHead
-from holdfast.transport.ros1_node import RosNode
-from holdfast.transport.tcpros import RosEnvironment, ServiceType, encode_header
+from holdfast_ros import ros1_node
+from holdfast_ros.ros1_node import RosNode
+from holdfast_ros.tcpros import RosEnvironment, ServiceType
+from ros1_master_guard.headers import encode_header
+from ros1_master_guard.ros1_calls import Connection, HttpHead
 
 PATIENCE_S = 30.0
 TYPE = ServiceType("std_srvs/Trigger", "937c9679a518e3a18d831e57125ea522")

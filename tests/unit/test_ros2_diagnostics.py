@@ -8,8 +8,8 @@ import pytest
 
 from holdfast.config.settings import RecoverySettings
 from holdfast.robot.health import Condition
-from holdfast.ros.ros2.diagnostics import Diagnostics, Level, RobotDiagnosis
-from holdfast.ros.ros2.run_segment import Ending, SegmentResult
+from holdfast_ros.ros2.diagnostics import Diagnostics, Level, RobotDiagnosis
+from holdfast_ros.ros2.run_segment import Ending, SegmentResult
 
 
 class Running:

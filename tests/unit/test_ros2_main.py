@@ -6,8 +6,8 @@ import importlib.util
 
 import pytest
 
-from holdfast.ros.ros2.main import main, usage
-from holdfast.ros.ros2.parameters import OWN
+from holdfast_ros.ros2.main import main, usage
+from holdfast_ros.ros2.parameters import OWN
 
 
 def test_help_names_every_parameter(capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from holdfast.errors import HoldfastError
-from holdfast.ros.ros2.main import main
-from holdfast.ros.ros2.parameters import (
+from holdfast_ros.ros2.main import main
+from holdfast_ros.ros2.parameters import (
     OWN,
     OWN_DEFAULTS,
     NodeParameters,

@@ -16,8 +16,8 @@ from holdfast.recording import journal_file
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
 from holdfast.robot.trial import run_trial
-from holdfast.ros.ros2.run_segment import Ending, RunSegment, SegmentResult, World
 from holdfast.runtime.events import NullEventLog
+from holdfast_ros.ros2.run_segment import Ending, RunSegment, SegmentResult, World
 
 PATIENCE_S = 60.0
 
@@ -204,7 +204,7 @@ def test_a_defect_is_told_whole(segments: Segments, monkeypatch: pytest.MonkeyPa
     def break_down(*_: object, **__: object) -> None:
         raise RuntimeError("a defect")
 
-    monkeypatch.setattr("holdfast.ros.ros2.run_segment.perform_trials", break_down)
+    monkeypatch.setattr("holdfast_ros.ros2.run_segment.perform_trials", break_down)
     outcome = segments.run()
     assert outcome.ending == Ending.FAILED
     assert "Traceback" in outcome.message

@@ -12,8 +12,8 @@ from holdfast.config.loader import Configuration, load
 from holdfast.planning import Planner, PlanningState
 from holdfast.protocol.events import Act, Sense, Timing
 from holdfast.robot.links import RECOVERY_SERVICE
-from holdfast.ros.ros2 import telemetry as module
-from holdfast.ros.ros2.telemetry import PublishedDecision, Telemetry
+from holdfast_ros.ros2 import telemetry as module
+from holdfast_ros.ros2.telemetry import PublishedDecision, Telemetry
 
 CONFIGURATION = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
 LONG_S = 60.0

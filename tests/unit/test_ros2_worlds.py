@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from holdfast.ros.executive import DecideCode, DecideRequest, ExecutiveEnvironment
-from holdfast.ros.ros2.parameters import NodeParameters, read_parameters
-from holdfast.ros.ros2.run_segment import World, make_world
+from holdfast_ros.executive import DecideCode, DecideRequest, ExecutiveEnvironment
+from holdfast_ros.ros2.parameters import NodeParameters, read_parameters
+from holdfast_ros.ros2.run_segment import World, make_world
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
 

@@ -15,14 +15,14 @@ from holdfast.planning import Planner
 from holdfast.protocol.status import Status
 from holdfast.robot.environment import Environment, SimulatedEnvironment
 from holdfast.robot.trial import run_trial
-from holdfast.ros.active_sensing import (
+from holdfast_ros.active_sensing import (
     ActiveSensing,
     DecisionAnswer,
     DecisionRequest,
     ErrorCode,
     RequestKind,
 )
-from holdfast.ros.client import ActiveSensingClient
+from holdfast_ros.client import ActiveSensingClient
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
 

@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from holdfast.belief import Belief
 from holdfast.errors import CheckpointError, HoldfastError, InvalidValueError
 from holdfast.planning import PlanningState
-from holdfast.ros.active_sensing import DecisionAnswer, DecisionRequest, ErrorCode, RequestKind
-from holdfast.ros.messages import (
+from holdfast_ros.active_sensing import DecisionAnswer, DecisionRequest, ErrorCode, RequestKind
+from holdfast_ros.messages import (
     SERVICE,
     decode_answer,
     decode_request,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from holdfast.ros.master.roscore import how_it_ended, restart_delay_s
+from ros1_master_guard.roscore import how_it_ended, restart_delay_s
 
 
 def test_the_pause_doubles_up_to_a_second() -> None:

@@ -377,7 +377,7 @@ def test_nothing_to_resume(workplace: Workplace) -> None:
     ("name", "text", "expected"),
     [
         ("my_robot:Robot", "class MyRobot: pass\n", "did you mean MyRobot?"),
-        ("my_robt:MyRobot", "class MyRobot: pass\n", "there is no module my_robt"),
+        ("my_robt:MyRobot", "class MyRobot: pass\n", "No module named 'my_robt'"),
         ("my_robot:MyRobot", "import no_such_library\n", "No module named 'no_such_library'"),
         ("my_robot:MyRobot", "import math\nmath.sqrt(-1)\n", 'my_robot.py", line 2'),
         ("my_robot:MyRobot", "import sys\nsys.exit(0)\n", "raised SystemExit: 0"),
@@ -424,8 +424,8 @@ def test_a_service_in_the_file_that_cannot_be_one_is_named_with_its_key(
         (["run", "missing.yaml"], "missing.yaml: there is no such file"),
         (["run", "peg.yaml", "--trials", "x"], "--trials is 'x'; allowed are"),
         (
-            ["run", "peg.yaml", "--environment", "my_robt:MyRobot"],
-            "environment.object, given instead of",
+            ["run", "peg.yaml", "--recovery", "sometimes"],
+            "recovery.launch, given instead of",
         ),
         (["run", "peg.yaml"], "--log json needs --service, --environment or --rate"),
         (["serve", "--listen", "tcp/nowhere"], "--listen: endpoint 'tcp/nowhere'"),

@@ -1,6 +1,6 @@
 """The figure of trial 0, which is run again where this process did not run it.
 
-Where the trial is first decided otherwise then, and which service was wrong.
+Where the trial is first decided otherwise then, and which service had decided.
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ import pytest
 from tests.command_line import run_here
 from tests.recordings import configuration_of, record_trial
 
-from holdfast.cli.run_figure import Deviation, Repetition, repeat, wrong_service
-from holdfast.outcome import Decisions
+from holdfast.cli.run_figure import Deviation, repeat, service_that_decided
+from holdfast.outcome import TrialResult
+from holdfast.planning import Planner
 from holdfast.protocol.events import Timing
 from holdfast.protocol.question import OWN_PLANNER
+from holdfast.recording.recorder import Recorder
 from holdfast.recording.timings import EventTable
 
 PEG = """
@@ -49,16 +51,20 @@ def test_without_matplotlib_a_note_says_so(
     assert "note: no figure, because matplotlib is not installed" in said.stderr
 
 
-def decisions_of(tmp_path: Path) -> Decisions:
+def result_of(tmp_path: Path) -> TrialResult:
     result = record_trial(configuration_of(tmp_path)).record.result
     assert result is not None
-    assert result.decisions is not None
-    return result.decisions
+    return result
+
+
+def repeated(tmp_path: Path, result: TrialResult) -> Deviation | None:
+    configuration = configuration_of(tmp_path)
+    planner = Planner(configuration.problem, configuration.planning)
+    return repeat(configuration, result, None, Recorder(1, planner))
 
 
 def test_the_same_trial_has_no_deviation(tmp_path: Path) -> None:
-    kept = decisions_of(tmp_path)
-    assert repeat(configuration_of(tmp_path), kept, 1, None) == Repetition(kept, None)
+    assert repeated(tmp_path, result_of(tmp_path)) is None
 
 
 @pytest.mark.parametrize(
@@ -71,33 +77,21 @@ def test_the_same_trial_has_no_deviation(tmp_path: Path) -> None:
     ],
 )
 def test_the_first_deviation_is_found(byte: int, deviation: Deviation, tmp_path: Path) -> None:
-    log = bytearray(decisions_of(tmp_path).log)
+    result = result_of(tmp_path)
+    assert result.decisions is not None
+    log = bytearray(result.decisions.log)
     log[byte] ^= 1
-    kept = msgspec.structs.replace(decisions_of(tmp_path), log=bytes(log))
-    assert repeat(configuration_of(tmp_path), kept, 1, None).deviation == deviation
+    kept = msgspec.structs.replace(result.decisions, log=bytes(log))
+    assert repeated(tmp_path, msgspec.structs.replace(result, decisions=kept)) == deviation
 
 
-class TestWrongService:
-    @staticmethod
-    def timings_of(tmp_path: Path, service: str) -> Path:
-        path = tmp_path / "timings.csv"
-        table = EventTable(path, Timing)
-        table.add(Timing(1, 0, "task", service, "standard", 1.0, 1.0, 1.0))
-        table.close()
-        return path
-
-    @pytest.mark.parametrize(
-        ("service", "again", "wrong"),
-        [
-            ("tcp/cloud:7447", Repetition(None, Deviation(3, "task")), "tcp/cloud:7447"),
-            ("tcp/cloud:7447", Repetition(None, Deviation(4, "task")), None),
-            (OWN_PLANNER, Repetition(None, Deviation(3, "task")), None),
-        ],
-    )
-    def test_one_that_decided_what_the_planner_does_not(
-        self, service: str, again: Repetition, wrong: str | None, tmp_path: Path
-    ) -> None:
-        """An answer has the task actions up to the next sensing step: that of step 0 has step 3."""
-        first = Repetition(None, Deviation(3, "task"))
-        timings = self.timings_of(tmp_path, service)
-        assert wrong_service(first, lambda: again, timings, 1) == wrong
+@pytest.mark.parametrize(
+    ("service", "named"), [("tcp/cloud:7447", "tcp/cloud:7447"), (OWN_PLANNER, None)]
+)
+def test_the_service_that_decided_is_named(service: str, named: str | None, tmp_path: Path) -> None:
+    """An answer has the task actions up to the next sensing step: that of step 0 has step 3."""
+    table = EventTable(tmp_path / "timings.csv", Timing)
+    table.add(Timing(1, 0, "task", service, "standard", 1.0, 1.0, 1.0))
+    table.close()
+    assert service_that_decided(Deviation(3, "task"), tmp_path / "timings.csv", 1) == named
+    assert service_that_decided(Deviation(3, None), tmp_path / "timings.csv", 1) is None

@@ -27,11 +27,11 @@ def test_each_is_implemented_by_a_class_with_the_same_methods(name: str) -> None
 def test_who_may_listen(name: str) -> None:
     endpoint = str(Endpoint(name, "there", 0))
     check_endpoint(endpoint, "service", listens=True)
-    if SCHEMES[name].services_listen:
-        with pytest.raises(TransportError, match=f"endpoint {name}/there.*service"):
-            check_endpoint(endpoint, "robot", listens=True)
-    else:
+    if SCHEMES[name].place == "path":
         check_endpoint(endpoint, "robot", listens=True)
+    else:
+        with pytest.raises(TransportError, match=f"endpoint {name}/there.*the service listens"):
+            check_endpoint(endpoint, "robot", listens=True)
 
 
 def test_what_no_endpoint_uses_is_not_imported() -> None:

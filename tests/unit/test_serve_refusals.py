@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
 from tests.command_line import run_here
 
-from holdfast.ros import messages
 from holdfast.transport.key_ring import make_credentials
 
 
@@ -19,11 +17,12 @@ from holdfast.transport.key_ring import make_credentials
             (["--listen", f"tcp/{address}"], [f"tcp/{address}", "--tls", "--insecure"])
             for address in ("0.0.0.0:0", "[::]:0", "192.0.2.1:7447")
         ),
-        (["--connect", "tcp/192.0.2.1:7447"], ["--insecure"]),
         (["--listen", "tls/127.0.0.1:0"], ["--tls DIR"]),
         (["--listen", "tcp/127.0.0.1:0", "--tls", "keys/service"], ["tcp does not use the cred"]),
         (["--listen", "quic/127.0.0.1:0"], ["quic"]),
         (["--listen", "tcp/127.0.0.1"], ["no port"]),
+        (["--wokers", "2"], ["'--wokers' is no option of holdfast serve; did you mean --workers?"]),
+        (["--ros1"], ["'--ros1' is no option of holdfast serve"]),
         (["--lease-ms", "1"], ["from 50 to 60000"]),
         (["--lease-ms", "nan"], ["from 50 to 60000"]),
         (["--workers", "0"], ["from 1 to 256"]),
@@ -35,10 +34,7 @@ from holdfast.transport.key_ring import make_credentials
         (["--lis", "tcp/127.0.0.1:0"], ["--lis"]),
         (["--processes", "2", "--connect", "tcp/127.0.0.1:1"], ["--connect"]),
         (["--processes", "2", "--until-stdin-closes"], ["--until-stdin-closes"]),
-        (["--processes", "2", "--ros1", "--configuration", "x.yaml"], ["--ros1: goes with one"]),
-        (["--listen", "ros1/cloud"], ["--listen", "ros1 is not allowed", "serve --ros1"]),
-        (["--ros1"], ["--ros1: --configuration is missing"]),
-        (["--ros1-name", "planner"], ["--ros1-name: goes with --ros1 only"]),
+        (["--listen", "ros1/cloud"], ["--listen", "ros1 is not allowed", "ros1-serve"]),
         (["--processes", "2", "--health", "here"], ["here"]),
         *(
             (
@@ -51,8 +47,6 @@ from holdfast.transport.key_ring import make_credentials
                 ("[::1]", "[::]", "--health"),
             )
         ),
-        (["--configuration", "plan.yaml"], ["--configuration: goes with --ros1 only"]),
-        (["--ros1", "--configuration", "none.yaml"], ["none.yaml"]),
         (["--health", "7447", "--processes", "2"], ["--health 127.0.0.1:7447", "same port"]),
         *(
             ([*options, f"{'b' * 70}.example:7447"], ["b" * 70, "at most 63"])
@@ -76,16 +70,3 @@ def test_it_says_why(
     assert said.stderr.startswith("holdfast: error: ")
     for text in texts:
         assert text in said.stderr
-
-
-def test_a_service_in_ros_says_what_it_lacks(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    example = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
-    messages.typestore.cache_clear()
-    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
-    monkeypatch.setenv("ROS_HOSTNAME", "127.0.0.1")
-    said = run_here(capsys, tmp_path, "serve", "--ros1", "--configuration", str(example))
-    assert (said.code, said.stdout) == (2, "")
-    assert said.stderr.startswith("holdfast: error: ")
-    assert "ROS messages need rosbags: pip install 'holdfast[ros]'" in said.stderr

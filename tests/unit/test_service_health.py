@@ -13,7 +13,7 @@ import pytest
 
 from holdfast.errors import HealthError
 from holdfast.service import health
-from holdfast.service.health import HttpAddress, HttpServer, Page
+from holdfast.service.health import HttpAddress, MonitoringServers, Page
 from holdfast.service.options import http_address
 
 PATIENCE_S = 30.0
@@ -29,11 +29,13 @@ async def draining() -> Page:
 
 @contextlib.asynccontextmanager
 async def serving(host: str = "127.0.0.1", port: int = 0) -> AsyncIterator[HttpAddress]:
-    server = HttpServer(HttpAddress(host, port), {"/livez": ready, "/readyz": draining})
+    servers = MonitoringServers()
+    pages = {"/livez": ready, "/readyz": draining}
     try:
-        yield await server.start()
+        offered = await servers.start({"health": (HttpAddress(host, port), pages)})
+        yield http_address(offered["health"])
     finally:
-        await server.close()
+        await servers.close()
 
 
 async def exchange(address: HttpAddress, request: bytes) -> bytes:

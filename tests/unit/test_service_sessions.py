@@ -5,15 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import msgspec
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.questions import received
-from tests.unit.test_protocol_service import Bench, Robot, content, only, refused
+from tests.unit.test_protocol_service import Bench, Robot, content, refused
 
 from holdfast.problems.problem import Problem
 from holdfast.protocol.expected_time import ExpectedTime
-from holdfast.protocol.messages import NeedState, Request, SessionConfiguration, encode
+from holdfast.protocol.messages import Request, SessionConfiguration, encode
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect, StartJob
 from holdfast.protocol.service_limits import ServiceLimits
@@ -52,81 +51,6 @@ def test_the_owner_with_the_most_loses_its_oldest() -> None:
 
 
 OWNERS = ("anna", "berta", None)
-
-
-@pytest.mark.parametrize("other", ["berta", None])
-class TestAnotherOwner:
-    def test_sees_a_session_as_one_that_is_not_there(self, other: str | None) -> None:
-        bench, robot = Bench(), Robot()
-        bench.ask(robot.request(), "anna")
-        unknown = Robot(key=77)
-        for epoch in (0, 1, 2**32 - 1):
-            shown = only(bench.ask(robot.request(session_configuration=False, epoch=epoch), other))
-            never = only(
-                bench.ask(unknown.request(session_configuration=False, epoch=epoch), other)
-            )
-            assert isinstance(shown, NeedState)
-            assert isinstance(never, NeedState)
-            assert shown.differs == never.differs
-
-    def test_cannot_end_a_session_by_its_epoch(self, other: str | None) -> None:
-        bench, robot = Bench(), Robot()
-        bench.ask(robot.request(), "anna")
-        bench.ask(robot.request(epoch=2**32 - 1), other)
-        robot.sense()
-        answer = bench.ask(robot.request(session_configuration=False), "anna")
-        assert content(answer) == robot.right_answer()
-        assert bench.service.statistics.sessions_taken_over == 0
-        # Nor one that is forgotten by now.
-        bench.apply(bench.service.tick(bench.now + 10_000.0))
-        assert bench.service.statistics.sessions == 0
-        assert content(bench.ask(robot.request(), "anna")) == robot.right_answer()
-
-    def test_cannot_supersede_what_is_in_work(self, other: str | None) -> None:
-        bench, robot = Bench(), Robot()
-        robot.sense()
-        call = bench.send(robot.request(), "anna")
-        theirs = Robot()
-        for number in (1, 5, 2**32 - 1):
-            bench.send(theirs.request(number=number, epoch=3), other)
-        assert call not in bench.ended
-        bench.run_all()
-        assert content(bench.replies[call]) == robot.right_answer()
-
-    def test_gets_no_answer_that_was_computed_for_another(self, other: str | None) -> None:
-        bench, robot = Bench(), Robot()
-        bench.ask(robot.request(), "anna")
-        before = bench.service.statistics.sensing_parts
-        call = bench.send(robot.request(), other)
-        assert bench.replies[call] == []
-        bench.run_all()
-        assert content(bench.replies[call]) == robot.right_answer()
-        assert bench.service.statistics.sensing_parts == before + 1
-        assert bench.service.statistics.cache_hits == 0
-        assert bench.service.statistics.sessions == 2
-
-    def test_does_not_join_what_another_waits_for(self, other: str | None) -> None:
-        bench, robot = Bench(max_calls_per_request=1), Robot()
-        call = bench.send(robot.request(), "anna")
-        for _ in range(3):
-            bench.send(robot.request(), other)
-        assert call not in bench.ended
-        bench.run_all()
-        assert content(bench.replies[call]) == robot.right_answer()
-
-    def test_cannot_replace_the_settings(self, other: str | None) -> None:
-        bench, robot = Bench(), Robot()
-        bench.ask(robot.request(), "anna")
-        theirs = msgspec.structs.replace(
-            robot.session_configuration, seed=robot.session_configuration.seed + 1
-        )
-        bench.ask(robot.request(epoch=9, session_configuration=False), other)
-        bench.ask(
-            msgspec.structs.replace(robot.request(), session_configuration=theirs, epoch=9), other
-        )
-        robot.sense()
-        answer = bench.ask(robot.request(session_configuration=False), "anna")
-        assert content(answer) == robot.right_answer()
 
 
 def test_an_owners_replaced_process_stays_replaced() -> None:
@@ -169,37 +93,6 @@ class TestTurns:
         assert ended.index(mine) <= 2
         assert sorted(ended) == sorted([*order, mine])
         assert [call for call in ended if call != mine] == order, "her own as they came"
-
-    def test_robots_that_were_served_go_by_turns_too(self) -> None:
-        bench = Bench(max_wait_ms=1e9)
-        annas = [Robot(key=100 + number) for number in range(8)]
-        berta = Robot(key=1)
-        for robot in annas:
-            bench.ask(robot.request(), "anna")
-        bench.ask(berta.request(), "berta")
-        for robot in (*annas, berta):
-            robot.sense()
-        calls = [bench.send(robot.request(), "anna") for robot in annas]
-        mine = bench.send(berta.request(), "berta")
-        bench.run_all()
-        tasks = [call for name, call in bench.trace if name == "TaskAnswer"]
-        assert tasks.index(mine) <= 2
-        assert [call for call in tasks if call in calls] == calls
-
-    def test_owners_with_one_robot_each_go_as_they_came(self) -> None:
-        bench = Bench(max_wait_ms=1e9)
-        calls = [bench.send(Robot(key=1).request(), f"robot-{number}") for number in range(6)]
-        bench.run_all()
-        assert [call for name, call in bench.trace if name == "SensingAnswer"] == calls
-
-    def test_those_without_a_certificate_have_one_turn(self) -> None:
-        bench = Bench(max_wait_ms=1e9)
-        for number in range(12):
-            bench.send(Robot(key=100 + number).request())
-        mine = bench.send(Robot(key=1).request(), "berta")
-        bench.run_all()
-        ended = [call for name, call in bench.trace if name == "SensingAnswer"]
-        assert ended.index(mine) <= 2
 
     def test_old_works_of_one_owner_do_not_starve_prefetches_of_another(self) -> None:
         bench = Bench(max_wait_ms=1e9, prefetch_patience_ms=20.0)
@@ -254,30 +147,6 @@ class TestTurns:
         bench.run_all()
         assert content(bench.replies[mine]) == berta.right_answer()
 
-    def test_half_of_the_bytes_that_wait(self) -> None:
-        """Also of robots that were served before."""
-        berta = Robot(key=1)
-        size = len(encode(berta.restore()))
-        bench = Bench(max_waiting_bytes=6 * size, max_wait_ms=1e9)
-        annas = [Robot(key=100 + number) for number in range(12)]
-        for robot in annas:
-            bench.ask(robot.request(), "anna")
-            robot.sense()
-        calls = [bench.send(robot.restore(), "anna") for robot in annas]
-        taken = [call for call in calls if bench.kinds(call) == []]
-        # One runs, and the lane of what comes from outside has half of the room.
-        assert 1 + 1 <= len(taken) <= 1 + 2
-        assert bench.kinds(bench.send(berta.restore(), "berta")) == []
-
-    def test_new_robots_of_one_certificate_have_one_turn(self) -> None:
-        bench = Bench(max_wait_ms=1e9)
-        for number in range(6):
-            bench.send(Robot(key=100 + number).request(), "anna")
-        mine = bench.send(Robot(key=1).request(), "berta")
-        bench.run_all()
-        told = [call for name, call in bench.trace if name == "SensingAnswer"]
-        assert told.index(mine) <= 2
-
 
 class TestRoom:
     def test_one_owner_does_not_push_out_another(self) -> None:
@@ -292,69 +161,11 @@ class TestRoom:
             == berta.right_answer()
         )
 
-    def test_nor_one_that_was_never_served(self) -> None:
-        bench, berta = Bench(max_sessions=6, max_wait_ms=1e9), Robot(key=1)
-        for number in range(30):
-            bench.ask(Robot(key=100 + number).request(), "anna")
-        call = bench.send(berta.request(), "berta")
-        for number in range(30):
-            bench.send(Robot(key=200 + number).request(), "anna")
-        bench.run_all()
-        assert content(bench.replies[call]) == berta.right_answer()
-
-    def test_among_equals_the_one_unused_the_longest_goes(self) -> None:
-        bench = Bench(max_sessions=3)
-        robots = {name: Robot(key=1) for name in ("a", "b", "c", "d")}
-        for name in ("a", "b", "c"):
-            bench.ask(robots[name].request(), name)
-        bench.ask(robots["a"].request(), "a")
-        bench.ask(robots["d"].request(), "d")
-        held = [
-            name for name in robots if bench.service._sessions.get((name, robots[name].session))
-        ]
-        assert held == ["a", "c", "d"]
-
-    def test_most_sessions_of_one_robot(self) -> None:
-        bench = Bench(max_sessions_per_robot=2)
-        for owner in ("anna", None):
-            for number in range(4):
-                bench.ask(Robot(key=100 + number).request(), owner)
-        # Those that have proved nothing are not one robot.
-        assert bench.service.statistics.sessions == 2 + 4
-        held = [
-            number
-            for number in range(4)
-            if bench.service._sessions.get(("anna", (100 + number).to_bytes(16, "big")))
-        ]
-        assert held == [2, 3]
-
     def test_most_sessions_of_one_robot_that_are_all_in_use(self) -> None:
         bench = Bench(max_sessions_per_robot=2, max_wait_ms=1e9)
         calls = [bench.send(Robot(key=100 + number).request(), "anna") for number in range(3)]
         assert [bench.kinds(call) for call in calls] == [[], [], ["Busy"]]
         assert bench.kinds(bench.send(Robot(key=1).request(), "berta")) == []
-
-    def test_bytes_of_states(self) -> None:
-        berta = Robot(key=1)
-        size = berta.state.belief.states.nbytes + berta.state.belief.weights.nbytes
-        bench = Bench(max_state_bytes=6 * size)
-        bench.ask(berta.request(), "berta")
-        for number in range(20):
-            bench.ask(Robot(key=100 + number).request(), "anna")
-        assert bench.service._sessions.get(("berta", berta.session)) is not None
-        assert bench.service.statistics.state_bytes <= 6 * size
-
-    def test_bytes_of_openings(self) -> None:
-        berta = Robot(key=1)
-        bench = Bench()
-        bench.ask(berta.request(), "berta")
-        size = bench.service._sessions.configuration_bytes
-        bench = Bench(max_configuration_bytes=5 * size)
-        bench.ask(berta.request(), "berta")
-        for number in range(20):
-            bench.ask(Robot(key=100 + number).request(), "anna")
-        assert bench.service._sessions.get(("berta", berta.session)) is not None
-        assert bench.service._sessions.configuration_bytes <= 5 * size
 
 
 class _Split:
@@ -467,10 +278,6 @@ def session_of(number: int, owner: str | None = "anna") -> Session:
         ExpectedTime(),
         ExpectedTime(),
     )
-
-
-def held(table: SessionTable, *sessions: Session) -> list[bool]:
-    return [table.get(session.key) is session for session in sessions]
 
 
 class TestTheTable:

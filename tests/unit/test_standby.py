@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from holdfast.errors import GuardError
-from holdfast.ros.master.settings import GuardSettings, MasterAddress
-from holdfast.ros.master.standby import DetachedProcess, MasterProcess
+from ros1_master_guard.errors import GuardError
+from ros1_master_guard.settings import GuardSettings, MasterAddress
+from ros1_master_guard.standby import DetachedProcess, MasterProcess
 
 
 def test_an_exit_code_is_known_and_an_end_may_be_repeated() -> None:

@@ -370,6 +370,27 @@ def test_credentials_that_cannot_be_read_leave_those_of_before(tmp_path: Path) -
     asyncio.run(run())
 
 
+def test_files_of_a_robot_that_do_not_belong_together_leave_those_of_before(
+    tmp_path: Path,
+) -> None:
+    make_credentials(tmp_path, robots=["anna", "berta"], services=["cloud"])
+
+    async def run() -> None:
+        cloud = Cloud(tmp_path / "cloud")
+        anna = Robot(tmp_path / "anna", await cloud.start())
+        await anna.connected()
+        (tmp_path / "anna" / "key.pem").write_bytes((tmp_path / "berta" / "key.pem").read_bytes())
+        cloud.transport.end_links(lambda _: "is to come again")
+        await until(lambda: len(anna.boots) == 2, (anna.events, anna.refusals))
+        (told,) = [each for each in anna.refusals if "key.pem: is not the key of " in each]
+        assert told.endswith("certificate.pem; the previous ones stay in use")
+        assert await anna.ask(1) == [b"anna"]
+        for end in (anna.transport, cloud.transport):
+            await end.close()
+
+    asyncio.run(run())
+
+
 def short_lived(directory: Path, seconds: float, **names: list[str]) -> None:
     """Make credentials that expire in a few seconds."""
     end = datetime.now(UTC) + timedelta(seconds=seconds)

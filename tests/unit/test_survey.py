@@ -11,10 +11,10 @@ from xmlrpc.server import SimpleXMLRPCServer
 import pytest
 from tests.ports import free_port
 
-from holdfast.errors import CallError
-from holdfast.ros.master.plan import NodeReport, ask_everyone, process_of, snapshot
-from holdfast.ros.master.process import MasterState
-from holdfast.transport.ros1_calls import Connection
+from ros1_master_guard.errors import CallError
+from ros1_master_guard.plan import NodeReport, ask_everyone, process_of, snapshot
+from ros1_master_guard.process import MasterState
+from ros1_master_guard.ros1_calls import Connection
 
 
 class Stock:

@@ -1,18 +1,13 @@
-"""ROS 1's headers, names and surroundings, as bytes and text."""
+"""ROS 1's answers, names and surroundings, as bytes and text."""
 
 from __future__ import annotations
-
-import struct
 
 import pytest
 
 from holdfast.errors import TransportError
-from holdfast.transport.tcpros import (
+from holdfast_ros.tcpros import (
     RosEnvironment,
-    decode_header,
     encode_answer,
-    encode_header,
-    encode_message,
     encode_refusal,
     place_of_service,
 )
@@ -20,28 +15,7 @@ from holdfast.transport.tcpros import (
 HERE = RosEnvironment("http://localhost:11311", "localhost", "127.0.0.1", "/")
 
 
-def test_a_header_is_read_as_it_was_written() -> None:
-    fields = {"callerid": "/robot", "message_definition": "a=b\nstring c", "empty": ""}
-    written = encode_header(fields)
-    (size,) = struct.unpack_from("<I", written)
-    assert size == len(written) - 4
-    assert decode_header(written[4:]) == fields
-
-
-def test_a_header_has_the_bytes_that_ros_documents() -> None:
-    assert encode_header({"md5sum": "*"}) == b"\x0c\0\0\0\x08\0\0\0md5sum=*"
-
-
-@pytest.mark.parametrize(
-    "data", [b"\1", b"\4\0\0\0abc", b"\3\0\0\0abc", b"\xff\xff\xff\xff", b"\0\0\0\0"]
-)
-def test_what_is_no_header_is_refused(data: bytes) -> None:
-    with pytest.raises(TransportError, match=r"has sent .* connection header"):
-        decode_header(data)
-
-
 def test_requests_and_answers() -> None:
-    assert encode_message(b"abc") == b"\3\0\0\0abc"
     assert encode_answer(b"abc") == b"\1\3\0\0\0abc"
     assert encode_refusal("no") == b"\0\2\0\0\0no"
 
@@ -92,11 +66,3 @@ def test_names() -> None:
 def test_what_is_no_name_is_refused(name: str) -> None:
     with pytest.raises(TransportError, match="is no name in ROS 1"):
         HERE.resolved(name)
-
-
-def test_a_header_has_a_bounded_number_of_fields() -> None:
-    fields = {f"f{number}": "" for number in range(65)}
-    with pytest.raises(TransportError, match="more than 64 fields"):
-        decode_header(encode_header(fields)[4:])
-    del fields["f64"]
-    assert decode_header(encode_header(fields)[4:]) == fields

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from holdfast.errors import InvalidValueError
 from holdfast.protocol.events import (
     CallEnded,
-    ReplyReceived,
     ServiceAppeared,
     ServiceVanished,
     TransportEvent,
@@ -31,29 +29,6 @@ class Table:
 @pytest.fixture
 def table() -> Table:
     return Table()
-
-
-def test_replies_come_in_order_and_nothing_after_the_end(table: Table) -> None:
-    call = table.begin(1)
-    table.calls.replied(call, b"a")
-    table.calls.replied(call, b"b")
-    table.calls.ended(call)
-    table.calls.ended(call)
-    table.calls.replied(call, b"late")
-    assert table.events == [ReplyReceived(1, b"a"), ReplyReceived(1, b"b"), CallEnded(1)]
-
-
-def test_a_number_is_free_again_once_its_call_is_abandoned(table: Table) -> None:
-    first = table.begin(1)
-    with pytest.raises(InvalidValueError, match="call 1 is in flight already"):
-        table.calls.begin(1, "peer")
-    assert table.calls.abandon(1) is first
-    assert table.calls.abandon(1) is None
-    second = table.begin(1)
-    table.calls.replied(first, b"of the abandoned one")
-    table.calls.ended(first)
-    assert table.calls.is_pending(second)
-    assert table.events == []
 
 
 def test_a_service_that_vanishes_ends_its_own_calls_after_that(table: Table) -> None:
@@ -85,16 +60,6 @@ def test_a_call_begun_while_the_loss_is_reported_belongs_to_the_next_process() -
     calls.begin(1, "a")
     calls.vanished("cloud", "i1", "a")
     assert events == [ServiceVanished("cloud", "i1")]
-
-
-def test_a_closed_table_takes_and_delivers_nothing(table: Table) -> None:
-    call = table.begin(1)
-    table.calls.close()
-    table.calls.replied(call, b"late")
-    table.calls.ended(call)
-    table.calls.vanished("cloud", "i1", "peer")
-    assert table.calls.begin(2, "peer") is None
-    assert table.events == []
 
 
 def test_a_request_that_is_too_large_is_refused_with_both_sizes() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -31,6 +32,17 @@ LEASE_MS = 30_000.0
 NOW = datetime.now(UTC)
 DAY = timedelta(days=1)
 FILES = {"authority.pem", "certificate.pem", "key.pem"}
+TRUST = (Path(__file__).parents[2] / "docs" / "trust.md").read_text(encoding="utf-8")
+SENTENCES = [
+    sentence
+    for row in re.findall(r"^\|.*", TRUST, re.MULTILINE)
+    for sentence in re.findall(r"`([^`]{20,})`", row)
+]
+"""What docs/trust.md says that a robot's log has of each refusal."""
+
+
+def assert_documented(said: str) -> None:
+    assert any(sentence in said for sentence in SENTENCES), said
 
 
 def certificate_of(directory: Path, name: str = "certificate.pem") -> x509.Certificate:
@@ -123,8 +135,10 @@ class TestLoading:
     def test_bad_ones_are_found_before_a_link_is_opened(
         self, keys: Path, name: str, role: Role, reason: str
     ) -> None:
-        with pytest.raises(CredentialsError, match=reason):
+        with pytest.raises(CredentialsError, match=reason) as refused:
             load_credentials(keys / name, role)
+        if role == "robot" and name.partition("_")[0] in ("expired", "future", "foreign"):
+            assert_documented(str(refused.value))
 
     @pytest.mark.parametrize("name", sorted(FILES))
     def test_a_file_that_is_missing_or_broken_is_named(
@@ -318,6 +332,8 @@ class TestOnRealLinks:
         (refusal,) = await ends.ask(name, endpoint)
         assert isinstance(refusal, str)
         assert reason in refusal
+        if "names" not in reason:
+            assert_documented(refusal)
         assert await ends.ask("robot", endpoint) == [ReplyReceived(1, b"robot: cba"), CallEnded(1)]
 
     @pytest.mark.parametrize(
@@ -337,6 +353,8 @@ class TestOnRealLinks:
         (refusal,) = await ends.ask("robot", await ends.service(name))
         assert isinstance(refusal, str)
         assert refusal.startswith(f"has a certificate that {reason}")
+        if "names" not in reason:
+            assert_documented(refusal)
 
     async def test_a_robot_believes_a_service_only_at_its_own_hosts(self, ends: Ends) -> None:
         # Everything in 127/8 is this machine, but the certificate is for 127.0.0.1 alone.
@@ -344,6 +362,7 @@ class TestOnRealLinks:
         (refusal,) = await ends.ask("robot", endpoint.replace("0.0.0.0", "127.0.0.2"))
         assert isinstance(refusal, str)
         assert "does not name this host" in refusal
+        assert_documented(refusal)
         assert "--renew --service NAME --host HOST" in refusal
         assert "127.0.0.2" in refusal
         right = await ends.ask("robot", endpoint.replace("0.0.0.0", "127.0.0.1"))

@@ -11,7 +11,8 @@ import pytest
 from holdfast import planning
 from holdfast.cli import main
 from holdfast.config.loader import load
-from holdfast.config.user_code import is_users_file
+from holdfast.config.user_code import find_class, is_users_file
+from holdfast.errors import ConfigurationError
 from holdfast.robot.trials import run_trials
 
 
@@ -228,3 +229,14 @@ class TestWhateverItRaises:
         monkeypatch.setattr(configuration.problem, "policy", policy)
         with pytest.raises(KeyboardInterrupt):
             run_trials(configuration, 1, (), lambda _: None)
+
+
+def test_a_module_of_the_ros_package_under_its_old_name_is_named_anew() -> None:
+    with pytest.raises(ConfigurationError, match=r"holdfast\.ros is the package holdfast_ros now"):
+        find_class(
+            "holdfast.ros.executive:ExecutiveEnvironment",
+            what="environment.object",
+            group="holdfast.environments",
+            search_directory=None,
+            error_type=ConfigurationError,
+        )

@@ -30,3 +30,17 @@ def test_all_files_tell_the_same_version() -> None:
     )
     assert re.fullmatch(r"\d+\.\d+\.\d+", holdfast.__version__)
     assert citation["license"] == project["license"]
+
+
+def test_the_packages_for_ros_have_it_too() -> None:
+    files = [*(ROOT / "ros").glob("*/package.xml"), *(ROOT / "ros").glob("*/setup.py")]
+    told = {
+        path.relative_to(ROOT).as_posix(): re.findall(
+            r"""(?:<version>|^    version=["'])([\d.]+)""",
+            path.read_text(encoding="utf-8"),
+            re.MULTILINE,
+        )
+        for path in files
+    }
+    assert len(told) == 6
+    assert told == {path: [holdfast.__version__] for path in told}

@@ -47,8 +47,8 @@ def generate_launch_description():
             argument("listen", "tcp/127.0.0.1:7447", "where that service is reached"),
             argument("rviz", "false", "show the belief"),
             Node(
-                package=PACKAGE,
-                executable="holdfast_node",
+                package="holdfast_ros",
+                executable="node",
                 name="holdfast",
                 parameters=[
                     parameters,

@@ -1,7 +1,8 @@
 """All commands together, as ``holdfast --help`` lists them.
 
 A command is a module with ``main(arguments)``, which returns the exit code. Only the module of the
-command that is run is imported.
+command that is run is imported. Other packages add commands
+(:mod:`holdfast.cli.added_commands`).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class Command(NamedTuple):
 
 COMMANDS = {
     "run": Command("holdfast.cli.run", "Run the trials of a configuration."),
-    "serve": Command("holdfast.cli.serve", "Decide for robots, as a service."),
+    "serve": Command("holdfast.service.process", "Decide for robots, as a service."),
     "doctor": Command("holdfast.cli.doctor", "Check each layer between a robot and a service."),
     "demo": Command(
         "holdfast.lab.demo.command", "See a cloud and a robot killed, and no decision change."
@@ -42,8 +43,11 @@ COMMANDS = {
         "holdfast.lab.simulation.command", "Search for faults that change a decision."
     ),
     "keys": Command("holdfast.cli.keys", "Make keys for robots and services."),
-    "ros1-guard": Command("holdfast.cli.ros1_guard", "Keep a ROS 1 master alive."),
 }
+
+_PACKAGES = {"demo": "holdfast-lab", "simulate": "holdfast-lab", "chaos": "holdfast-lab"}
+_PACKAGES |= {"ros1-guard": "holdfast-ros", "ros1-serve": "holdfast-ros"}
+"""Which package of this project adds a command, for whoever has not installed it."""
 
 _HELP = """\
 usage: holdfast [-h] [--version] COMMAND [ARGS]...
@@ -56,7 +60,7 @@ options:
   --version   show the version and exit
 
 commands (holdfast COMMAND --help says more):
-{commands}
+{commands}{added}
 Start with: holdfast run examples/peg_in_hole_2d.yaml
 """
 
@@ -76,8 +80,7 @@ def run_application(arguments: Sequence[str]) -> int:
         code: int = importlib.import_module(COMMANDS[first].module).main(arguments[1:])
         return code
     if first in ("", "-h", "--help"):
-        lines = [f"  {name:<11} {command.summary}\n" for name, command in COMMANDS.items()]
-        (sys.stdout if first else sys.stderr).write(_HELP.format(commands="".join(lines)))
+        (sys.stdout if first else sys.stderr).write(_help())
         return 0 if first else EXIT_ERROR
     if first == "--version":
         from holdfast.recording.machine import machines
@@ -90,9 +93,36 @@ def run_application(arguments: Sequence[str]) -> int:
 
         command = shlex.join(["holdfast", "run", *arguments])
         raise OptionError(f"{first} is no command; did you mean: {command}")
+    from holdfast.cli.added_commands import added_commands, load_command
+
+    added = added_commands()
+    if first in added:
+        added_code: int = load_command(added[first]).main(arguments[1:])
+        return added_code
+    if first in _PACKAGES:
+        package = _PACKAGES[first]
+        raise OptionError(
+            f"the command {first} is in the package {package}, not installed here: pip install "
+            f"{package}"
+        )
     from holdfast.config.validation import close_match
 
     what = "option of holdfast" if first.startswith("-") else "command"
-    known = [*COMMANDS, "--help", "--version"]
-    hint = close_match(first, known) or f"; commands are {', '.join(COMMANDS)}"
+    names = [*COMMANDS, *added]
+    hint = close_match(first, [*names, "--help", "--version"])
+    hint = hint or f"; commands are {', '.join(names)}"
     raise OptionError(f"{first!r:.80} is no {what}{hint}")
+
+
+def _help() -> str:
+    from holdfast.cli.added_commands import added_commands, summary_of
+
+    own = {name: command.summary for name, command in COMMANDS.items()}
+    added = {name: summary_of(each) for name, each in added_commands().items() if name not in own}
+    lines, more = (
+        "".join(f"  {name:<11} {summary}\n" for name, summary in each.items())
+        for each in (own, added)
+    )
+    return _HELP.format(
+        commands=lines, added=f"\ncommands of other packages:\n{more}" if more else ""
+    )

@@ -59,7 +59,7 @@ def print_error(error: HoldfastError, arguments: Sequence[str]) -> None:
         fields["details"] = details
     if isinstance(error, RunError) and error.command:
         fields["resume_command"] = error.command
-    component = "service" if arguments[0] == "serve" else "robot"
+    component = "service" if arguments[0].endswith("serve") else "robot"
     write_event(component, "error", **fields)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,6 @@ from holdfast.runtime.command_line import (
     bad_value,
     flag,
     location,
-    number,
     option,
 )
 
@@ -31,19 +30,15 @@ if TYPE_CHECKING:
     from holdfast.recording.replay import RecordedRun
 
 __all__ = [
-    "MAX_RATE_HZ",
-    "MIN_RATE_HZ",
     "chosen_trials",
     "main",
     "notes_about",
+    "print_written",
     "problem_directory_option",
-    "rate_option",
     "replay_trials",
-    "size_of",
     "trials_option",
 ]
 
-MIN_RATE_HZ, MAX_RATE_HZ = 0.001, 10_000.0
 _NOTE = "decided as recorded"
 """The note of the progress bar."""
 
@@ -70,16 +65,6 @@ def trials_option() -> Any:
     )
 
 
-def rate_option() -> Any:
-    """Declare how long a step takes where no times were recorded."""
-    return option(
-        metavar="HZ",
-        read=number(MIN_RATE_HZ, MAX_RATE_HZ, "Hz"),
-        default=10.0,
-        help="Steps a second, for a run that was recorded without times.",
-    )
-
-
 def problem_directory_option() -> Any:
     """Declare where the module of a run's own problem lies."""
     return option(
@@ -96,7 +81,7 @@ class ExportOptions(Options):
     Beliefs are not recorded, but computed again from the recorded seed and observations. Every
     decision on the way must be the recorded one, bit for bit; otherwise nothing is written.
 
-    Times are the robot's own where the run has them (timings.csv), otherwise steps of 1/HZ.
+    Times are the robot's own where the run has them (timings.csv), otherwise steps of 0.1 s.
     """
 
     needs_arguments = True
@@ -106,7 +91,7 @@ class ExportOptions(Options):
         metavar="FILE",
         read=location,
         help="Write FILE: standard ROS 2 messages, for RViz, Foxglove, PlotJuggler and ros2 bag "
-        "(extra ros).",
+        "(extra mcap).",
     )
     tables: Path | None = option(
         "--csv",
@@ -116,7 +101,6 @@ class ExportOptions(Options):
     )
     trials: range | None = trials_option()
     problem_directory: Path | None = problem_directory_option()
-    rate: float = rate_option()
     quiet: bool = flag("-q", help="Show no progress.")
 
 
@@ -133,7 +117,7 @@ def main(arguments: Sequence[str]) -> int:
 def _export(options: ExportOptions) -> None:
     path, mcap, tables, wanted = options.run, options.mcap, options.tables, options.trials
     if mcap is not None:
-        from holdfast.ros.mcap_export import require_rosbags
+        from holdfast.recording.mcap_export import require_rosbags
 
         require_rosbags()
         require_free(mcap, "--mcap", directory=False)
@@ -146,12 +130,7 @@ def _export(options: ExportOptions) -> None:
     with RecordedRun(path, problem_directory=options.problem_directory) as recorded:
         trials = chosen_trials(recorded, wanted)
         notes = _write(recorded, trials, options)
-    for note in () if options.quiet else notes:
-        sys.stderr.write(f"note: {printable(note)}\n")
-    for place in (mcap, tables):
-        if place is not None:
-            sys.stdout.write(printable(f"{shown_path(place)}  {size_of(place)}\n"))
-    sys.stdout.flush()
+    print_written([] if options.quiet else notes, mcap, tables)
 
 
 def chosen_trials(recorded: RecordedRun, wanted: range | None) -> list[int]:
@@ -175,18 +154,18 @@ def _write(recorded: RecordedRun, trials: Sequence[int], options: ExportOptions)
     """Write all of it beside its places, and move it there when all is whole; return notes."""
     from holdfast.recording.csv_export import CsvSink
 
-    mcap, tables, rate_hz = options.mcap, options.tables, options.rate
-    notes = notes_about(recorded, trials, rate_hz)
+    mcap, tables = options.mcap, options.tables
+    notes = notes_about(recorded, trials)
     with contextlib.ExitStack() as stack:
         made: list[tuple[Path, Path]] = []
         sinks: list[FactSink] = []
         # What closes the files stands on a stack of its own: it comes before they are moved.
         with contextlib.ExitStack() as files:
             if mcap is not None:
-                from holdfast.ros.mcap_export import McapSink
+                from holdfast.recording.mcap_export import McapSink
 
                 bag = stack.enter_context(directory_beside(mcap)) / mcap.stem
-                about = _about(recorded, rate_hz)
+                about = _about(recorded)
                 sink = files.enter_context(McapSink(bag, recorded.configuration, about))
                 if not sink.has_poses:
                     notes.append(
@@ -203,7 +182,7 @@ def _write(recorded: RecordedRun, trials: Sequence[int], options: ExportOptions)
                     files.enter_context(CsvSink(directory, recorded.configuration.problem))
                 )
                 made.append((directory, tables))
-            replay_trials(recorded, trials, sinks, rate_hz, quiet=options.quiet)
+            replay_trials(recorded, trials, sinks, quiet=options.quiet)
         for here, there in made:
             move_into_place(here, there)
     return notes
@@ -213,17 +192,14 @@ def replay_trials(
     recorded: RecordedRun,
     trials: Sequence[int],
     sinks: Sequence[FactSink],
-    rate_hz: float,
     *,
     quiet: bool,
-    after_each: Callable[[], None] = lambda: None,
 ) -> None:
     """Write the facts of trials to sinks, and show the progress."""
     line = progress_line(len(trials), quiet=quiet)
     line.start(f"{counted(len(trials), 'trial')} of {shown_path(recorded.path)}", 0, _NOTE)
     try:
-        for finished, _ in enumerate(recorded.replay(trials, sinks, rate_hz), start=1):
-            after_each()
+        for finished, _ in enumerate(recorded.replay(trials, sinks), start=1):
             line.show(finished, _NOTE)
     except (HoldfastError, KeyboardInterrupt):
         raise
@@ -238,9 +214,10 @@ def replay_trials(
     recorded.require_unchanged()
 
 
-def notes_about(recorded: RecordedRun, trials: Sequence[int], rate_hz: float) -> list[str]:
+def notes_about(recorded: RecordedRun, trials: Sequence[int]) -> list[str]:
     """Return what a reader of the facts should know."""
     from holdfast.recording.run_directory import TIMINGS_NAME
+    from holdfast.recording.step_times import UNTIMED_STEP_S
 
     notes = []
     if not recorded.has_times:
@@ -248,7 +225,7 @@ def notes_about(recorded: RecordedRun, trials: Sequence[int], rate_hz: float) ->
         if untimed := recorded.untimed:
             lacking = counted(len(untimed), "trial")
             why = f"{TIMINGS_NAME} lacks {lacking} from {untimed[0]} on; all have one clock"
-        notes.append(f"{why}, so every step takes {1.0 / rate_hz:g} s (--rate)")
+        notes.append(f"{why}, so every step takes {UNTIMED_STEP_S:g} s")
     else:
         notes += recorded.clock_notes
     blind = [trial for trial in trials if not recorded.beliefs_known(trial)]
@@ -264,20 +241,31 @@ def notes_about(recorded: RecordedRun, trials: Sequence[int], rate_hz: float) ->
     return notes
 
 
-def _about(recorded: RecordedRun, rate_hz: float) -> dict[str, str]:
+def _about(recorded: RecordedRun) -> dict[str, str]:
     """Return the metadata of a file about its run."""
+    from holdfast.recording.step_times import UNTIMED_STEP_S
     from holdfast.source_digest import core_version
 
     configuration = recorded.configuration
+    times = "recorded" if recorded.has_times else f"{1.0 / UNTIMED_STEP_S:g} steps a second"
     return {
         "holdfast_problem": configuration.problem_name,
         "holdfast_seed": str(configuration.simulator.seed),
         "holdfast_version": core_version(),
-        "holdfast_times": "recorded" if recorded.has_times else f"{rate_hz:g} steps a second",
+        "holdfast_times": times,
     }
 
 
-def size_of(place: Path) -> str:
+def print_written(notes: Sequence[str], *places: Path | None) -> None:
+    """Print notes, and the places that were written with their sizes."""
+    for note in notes:
+        sys.stderr.write(f"note: {printable(note)}\n")
+    for place in filter(None, places):
+        sys.stdout.write(printable(f"{shown_path(place)}  {_size_of(place)}\n"))
+    sys.stdout.flush()
+
+
+def _size_of(place: Path) -> str:
     """Return the size of a file or directory, for people."""
     files = sorted(place.iterdir()) if place.is_dir() else [place]
     size = sum(file.stat().st_size for file in files)

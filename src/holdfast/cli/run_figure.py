@@ -1,10 +1,8 @@
 """The figure of a run's first trial, drawn after the run.
 
 A trial that ran elsewhere (in a worker, in an earlier process, as a robot's) is run again for the
-figure. If it is then decided otherwise, something is wrong, and it is run once more. If this
-process decides the same twice, and not what the service decided, the problem is deterministic and
-the service was wrong, because it has the same code. If this process decides otherwise each time,
-the problem is not deterministic, and nothing is known about the service.
+figure. If it is then decided otherwise, the problem is not deterministic, or the service that had
+decided was wrong.
 """
 
 from __future__ import annotations
@@ -12,9 +10,11 @@ from __future__ import annotations
 import contextlib
 import csv
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
+
+import msgspec
 
 from holdfast.cli.exit_codes import EXIT_WRONG_ANSWER
 from holdfast.cli.terminal import duration
@@ -22,19 +22,18 @@ from holdfast.errors import DecidedOtherwiseError
 
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
-    from holdfast.outcome import Decisions, TrialResult
+    from holdfast.outcome import TrialResult
+    from holdfast.protocol.records import Record
     from holdfast.recording.recorder import Recorder
     from holdfast.recording.run_directory import RunDirectory
-    from holdfast.robot.environment import Environment
 
 __all__ = [
     "Deviation",
     "Remark",
-    "Repetition",
     "draw_figure",
     "own_backend",
     "repeat",
-    "wrong_service",
+    "service_that_decided",
 ]
 
 _LONGEST_REPETITION_S = 30.0
@@ -55,27 +54,12 @@ class Deviation(NamedTuple):
     ----------
     kind : {"sensing", "task"} or None
         Of the decision; None if only the state after an observation differs, or the trial's end.
+    error : DecidedOtherwiseError or None
+        Raised by the recorded world, which has no answer to another action.
     """
 
     step: int | None
     kind: str | None
-
-
-class Repetition(NamedTuple):
-    """The result of running a trial again.
-
-    Attributes
-    ----------
-    decisions : Decisions or None
-        None if another action was performed than its world has recorded.
-    deviation : Deviation or None
-        From the trial as it was; None if there is none.
-    error : DecidedOtherwiseError or None
-        Raised by the recorded world.
-    """
-
-    decisions: Decisions | None
-    deviation: Deviation | None
     error: DecidedOtherwiseError | None = None
 
 
@@ -108,14 +92,14 @@ def _drawn(
     from holdfast.recording.run_directory import FIGURE_NAME
 
     trial, path = recorder.trial, directory.path / FIGURE_NAME
-    make_world = None
+    records = None
     if recorder.record.result is None:
         result = next(each for each in directory.journal.results() if each.trial == trial)
         if configuration.environment.object is not None:
             if path.exists():
                 return
-            make_world = _recorded_world(directory, result)
-            if make_world is None:
+            records = directory.journal.kept_steps(trial) if result.steps else []
+            if records is None:
                 yield Remark(
                     f"no figure, because trial {trial} ended in an earlier part of the run, which "
                     "did not keep its observations"
@@ -139,13 +123,13 @@ def _drawn(
 
     if recorder.record.result is None:
         kept = directory.journal.decisions(trial)
-        world = None if make_world is None else make_world()
-        found = repeat(configuration, kept, trial, world, recorder=recorder)
-        if found.deviation is not None:
-            yield _remark_on(found, configuration, directory, kept, trial, make_world)
-        if found.error is not None:
-            return
-        if make_world is not None:
+        whole = msgspec.structs.replace(result, decisions=kept)
+        deviation = repeat(configuration, whole, records, recorder)
+        if deviation is not None:
+            yield _remark_on(deviation, configuration, directory, trial)
+            if deviation.error is not None:
+                return
+        if records is not None:
             recorder.record.result = result  # it alone has the reward of the last step
     trial_figure(configuration, recorder.record, path)
 
@@ -161,45 +145,23 @@ def own_backend() -> Iterator[None]:
             os.environ["MPLBACKEND"] = named
 
 
-def _recorded_world(
-    directory: RunDirectory, result: TrialResult
-) -> Callable[[], Environment] | None:
-    """Return what makes the world of the user's as it was in a trial, None if that is not known."""
-    from holdfast.recording.recorded_environment import RecordedEnvironment
-
-    records = directory.journal.kept_steps(result.trial)
-    if records is None and result.steps:
-        return None
-    return lambda: RecordedEnvironment(result.trial, records or [], result)
-
-
 def _remark_on(
-    found: Repetition,
-    configuration: Configuration,
-    directory: RunDirectory,
-    kept: Decisions,
-    trial: int,
-    make_world: Callable[[], Environment] | None,
+    deviation: Deviation, configuration: Configuration, directory: RunDirectory, trial: int
 ) -> Remark:
     """Name the cause of other decisions when a trial was run again."""
     from holdfast.recording.run_directory import TIMINGS_NAME
 
-    def again() -> Repetition:
-        world = None if make_world is None else make_world()
-        return repeat(configuration, kept, trial, world, anew=True)
-
-    assert found.deviation is not None
-    service = wrong_service(found, again, directory.path / TIMINGS_NAME, trial)
-    missing = "the figure: " if found.error is None else "no figure, because "
+    service = service_that_decided(deviation, directory.path / TIMINGS_NAME, trial)
+    missing = "the figure: " if deviation.error is None else "no figure, because "
     if service is not None:
         return Remark(
-            f"{missing}trial {trial} was run again for it by the robot's own planner, twice, and "
-            f"came to other decisions, both times to the same: {service} answered with another "
-            f"{found.deviation.kind} action at step {found.deviation.step}",
+            f"{missing}trial {trial} was run again for it by the robot's own planner, and came to "
+            f"other decisions: {service} answered with another {deviation.kind} action at step "
+            f"{deviation.step}, or the problem {configuration.problem_name} is not deterministic",
             EXIT_WRONG_ANSWER,
         )
-    if found.error is not None:
-        return Remark(f"no figure, because {found.error}")
+    if deviation.error is not None:
+        return Remark(f"no figure, because {deviation.error}")
     return Remark(
         f"trial {trial} decided otherwise when it was run again for the figure, "
         f"so the problem {configuration.problem_name} is not deterministic"
@@ -208,69 +170,52 @@ def _remark_on(
 
 def repeat(
     configuration: Configuration,
-    kept: Decisions,
-    trial: int,
-    world: Environment | None,
-    *,
-    anew: bool = False,
-    recorder: Recorder | None = None,
-) -> Repetition:
-    """Run a trial again with the planner in this process.
+    result: TrialResult,
+    records: Sequence[Record] | None,
+    recorder: Recorder,
+) -> Deviation | None:
+    """Run a trial again with the planner in this process, and return where it first differs.
 
-    Parameters
-    ----------
-    kept : Decisions
-        As they were.
-    world : Environment or None
-        The recorded one; None for a simulated one.
-    anew : bool
-        Whether to build the problem anew, as a service does.
+    ``result`` has its decisions; the ``records`` are None for a simulated world.
     """
     from holdfast.planning import Planner
     from holdfast.recording.compare import difference_of_decisions
-    from holdfast.robot.trial import NULL_OBSERVER, run_trial
+    from holdfast.robot.recorded_trial import run_recorded_trial
+    from holdfast.robot.trial import run_trial
 
-    if anew:
-        configuration = type(configuration).from_plain(configuration.plain())
+    planner = Planner(configuration.problem, configuration.planning)
+    seed, trial, kept = configuration.simulator.seed, result.trial, result.decisions
+    assert kept is not None
     try:
-        decisions = run_trial(
-            Planner(configuration.problem, configuration.planning),
-            configuration.simulator.seed,
-            trial,
-            max_steps=configuration.simulator.max_steps,
-            environment=world,
-            observer=NULL_OBSERVER if recorder is None else recorder,
-            reinitialised_after=kept.reinitialised_after(),
-        ).decisions
+        again = (
+            run_trial(
+                planner,
+                seed,
+                trial,
+                max_steps=configuration.simulator.max_steps,
+                observer=recorder,
+                reinitialised_after=kept.reinitialised_after(),
+            )
+            if records is None
+            else run_recorded_trial(planner, seed, trial, records, recorder, result)
+        )
     except DecidedOtherwiseError as error:
-        return Repetition(None, Deviation(error.step, error.kind), error)
-    assert decisions is not None
-    found = difference_of_decisions(kept, decisions, trial)
+        return Deviation(error.step, error.kind, error)
+    assert again is not None
+    assert again.decisions is not None
+    found = difference_of_decisions(kept, again.decisions, trial)
     if found is None:
-        return Repetition(decisions, None)
+        return None
     kind = found.what.partition(" action")[0]
-    return Repetition(
-        decisions, Deviation(found.step, kind if kind in ("sensing", "task") else None)
-    )
+    return Deviation(found.step, kind if kind in ("sensing", "task") else None)
 
 
-def wrong_service(
-    first: Repetition, again: Callable[[], Repetition], timings: Path, trial: int
-) -> str | None:
-    """Return the service that decided otherwise than this process does, if one certainly did.
-
-    ``again`` runs the trial once more; it is not called where no service decided.
-
-    Returns
-    -------
-    str or None
-        None if the decision was the robot's own, or the trial comes out otherwise each time.
-    """
+def service_that_decided(deviation: Deviation, timings: Path, trial: int) -> str | None:
+    """Return the service whose decision differs, None if it was the robot's own."""
     from holdfast.protocol.question import OWN_PLANNER
     from holdfast.recording.timings import read_timings
 
-    assert first.deviation is not None
-    step, kind = first.deviation
+    step, kind, _ = deviation
     if step is None or kind is None:
         return None
     decided: dict[int, str] = {}
@@ -283,8 +228,4 @@ def wrong_service(
             if row.trial == trial and row.kind == kind and row.step <= step
         }
     service = decided[max(decided)] if decided else None
-    if service in (None, OWN_PLANNER):
-        return None
-    second = again()
-    same = (second.decisions, second.deviation) == (first.decisions, first.deviation)
-    return service if same else None
+    return None if service == OWN_PLANNER else service

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.cli.overrides import Override, combined, parse_assignment
 from holdfast.errors import InvalidValueError
@@ -32,28 +32,20 @@ if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
     from holdfast.service.health import HttpAddress
 
-__all__ = ["RunOptions", "Viewer", "viewer"]
+__all__ = ["RunOptions", "viewer"]
 
 _MIN_RATE_HZ = 0.001
 _MAX_RATE_HZ = 10_000.0
 
 
-class Viewer(NamedTuple):
-    """The value of ``--view``, and the URL that it means; empty for a viewer of this machine."""
-
-    given: str
-    url: str
-
-    def __str__(self) -> str:
-        return self.given
-
-
-def viewer(text: str) -> Viewer:
+def viewer(text: str) -> str:
     """Read ``rerun`` or ``rerun=HOST:PORT``."""
     name, equals, place = text.partition("=")
     if name == "rerun":
         with contextlib.suppress(InvalidValueError):
-            return Viewer(text, viewer_url(place) if equals else "")
+            if equals:
+                viewer_url(place)
+            return text
     raise bad_value(text, "rerun, or rerun=HOST:PORT of a viewer that runs elsewhere")
 
 
@@ -172,7 +164,7 @@ class RunOptions(Options):
         help="Offer this robot's metrics for Prometheus at http://HOST:PORT/metrics. The address "
         "may be that of --health.",
     )
-    view: Viewer | None = option(
+    view: str | None = option(
         metavar="rerun",
         read=viewer,
         help="Show the run in Rerun's viewer while it goes on (extra view); rerun=HOST:PORT is one "
@@ -189,8 +181,11 @@ class RunOptions(Options):
         """Return where to show the run while it goes on, if anywhere."""
         if self.view is None and self.view_file is None:
             return None
-        file = None if self.view_file is None else str(self.view_file)
-        return ViewTarget(None if self.view is None else self.view.url, file)
+        url = None
+        if self.view is not None:
+            place = self.view.partition("=")[2]
+            url = viewer_url(place) if place else ""
+        return ViewTarget(url, None if self.view_file is None else str(self.view_file))
 
     def resume_command(self, directory: Path) -> str:
         """Return the command that goes on."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -11,15 +10,13 @@ from holdfast.cli.exit_codes import ended_by_signals
 from holdfast.cli.export import (
     chosen_trials,
     notes_about,
+    print_written,
     problem_directory_option,
-    rate_option,
     replay_trials,
-    size_of,
     trials_option,
 )
-from holdfast.errors import InvalidValueError, OptionError, ViewError
-from holdfast.files import directory_beside, move_into_place, require_free, shown_path
-from holdfast.printable import printable
+from holdfast.errors import InvalidValueError, OptionError
+from holdfast.files import directory_beside, move_into_place, require_free
 from holdfast.recording.view_target import ViewTarget, require_rerun, viewer_url
 from holdfast.runtime.command_line import (
     Options,
@@ -54,7 +51,6 @@ class ViewOptions(Options):
         help="Show it in the viewer that listens there; Rerun's port is 9876.",
     )
     problem_directory: Path | None = problem_directory_option()
-    rate: float = rate_option()
     quiet: bool = flag("-q", help="Show no progress.")
 
 
@@ -83,7 +79,7 @@ def _view(options: ViewOptions) -> None:
     own = options.problem_directory
     with RecordedRun(options.run, "view", problem_directory=own) as recorded, ExitStack() as stack:
         trials = chosen_trials(recorded, options.trials)
-        notes = notes_about(recorded, trials, options.rate)
+        notes = notes_about(recorded, trials)
         made = None
         if save is not None:
             made = stack.enter_context(directory_beside(save)) / save.name
@@ -91,23 +87,7 @@ def _view(options: ViewOptions) -> None:
         with RerunSink(
             recorded.configuration, target, has_times=recorded.has_times, live=False
         ) as sink:
-
-            def require_viewer() -> None:
-                if sink.streams.lost is not None:
-                    raise ViewError(f"the viewer {sink.streams.lost}")
-
-            replay_trials(
-                recorded,
-                trials,
-                [sink],
-                options.rate,
-                quiet=options.quiet,
-                after_each=require_viewer,
-            )
+            replay_trials(recorded, trials, [sink], quiet=options.quiet)
         if save is not None and made is not None:
             move_into_place(made, save)
-    for note in () if options.quiet else notes:
-        sys.stderr.write(f"note: {printable(note)}\n")
-    if save is not None:
-        sys.stdout.write(printable(f"{shown_path(save)}  {size_of(save)}\n"))
-        sys.stdout.flush()
+    print_written([] if options.quiet else notes, save)

@@ -15,10 +15,8 @@ its settings.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
@@ -309,35 +307,23 @@ def _checked_offload(
 
 
 def _located_environment(source: Source, settings: EnvironmentSettings) -> EnvironmentSettings:
-    """Check the name of the environment and find its module, without importing it."""
+    """Find the directory of the environment's module; what makes the environment imports it."""
     name = settings.object
     if name is None:
         return settings
-    key = ("environment", "object")
-    module, colon, class_name = name.partition(":")
+    key = ("environment", "directory")
+    module, colon, _ = name.partition(":")
     if not colon:
-        directory_key = ("environment", "directory")
         if settings.directory is not None and (
-            source.is_overridden(directory_key) or not source.is_overridden(key)
+            source.is_overridden(key) or not source.is_overridden(("environment", "object"))
         ):
             raise source.error(
-                directory_key,
+                key,
                 f"is {shown(settings.directory)}; only an environment that is named module:Class"
                 " has one",
             )
         return msgspec.structs.replace(settings, directory=None)
-    if not all(part.isidentifier() for part in [*module.split("."), class_name]):
-        raise source.error(
-            key, f"is {shown(name)}; expected module:Class or the name of an entry point"
-        )
-    directory = module_directory(source, ("environment", "directory"), settings.directory, module)
-    package = module.partition(".")[0]
-    if directory is None and package not in sys.modules and PathFinder.find_spec(package) is None:
-        raise source.error(
-            key,
-            f"is {shown(name)}; there is no module {package} beside {source.path.name}, in the"
-            " current directory or among the installed ones",
-        )
+    directory = module_directory(source, key, settings.directory, module)
     return msgspec.structs.replace(
         settings, directory=None if directory is None else str(directory)
     )

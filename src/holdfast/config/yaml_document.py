@@ -5,7 +5,9 @@ means something else. So this reader takes the part of YAML that every reader un
 refuses the rest, with the line. Plain scalars follow YAML 1.2 (``1e-3`` is a number, which PyYAML
 alone takes for text); those that YAML 1.1 and 1.2 read differently (``no``, ``010``, ``1:30``,
 ``1_000``) have to be rewritten or quoted; a key that stands twice, a tag, a value that is not
-finite and a document made to exhaust memory are errors.
+finite and a document made to exhaust memory are errors. ruamel.yaml, which loads as fast, reads
+``no``, ``010`` and ``1_000`` by YAML 1.2 without a word, makes dates, and has no bounds: to refuse
+these with their lines would take as much code on top of it.
 
 :func:`write` is the inverse: what it writes, :func:`read` gives back.
 """

@@ -154,9 +154,11 @@ class Pricing(NamedTuple):
     slowness: float = 1.0
     measure: Callable[[Problem], ProblemCost] | None = None
 
-    def price_of(self, problem: Problem, planning: PlanningSettings) -> Price:
-        """Return what decisions cost."""
-        own = TYPICAL_PROBLEM if self.measure is None else self.measure(problem)
+    def price_of(
+        self, problem: Problem, planning: PlanningSettings, known: ProblemCost | None = None
+    ) -> Price:
+        """Return what decisions cost; ``known`` is what the problem does, if it was measured."""
+        own = known or (TYPICAL_PROBLEM if self.measure is None else self.measure(problem))
         return Price(own, cost_of_sensing(problem, planning, own, self.slowness))
 
 

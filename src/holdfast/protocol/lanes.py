@@ -1,25 +1,28 @@
-"""Four lanes for the tasks of a service, so that none has to wait for what takes much longer.
+"""Five lanes for the tasks of a service, so that none has to wait for what takes much longer.
 
 A robot chooses how long its decisions take, and a new identity costs nothing without a certificate.
 In one queue a few decisions that take seconds, or many robots that nobody has seen before, would
 keep all others waiting. So tasks of different kinds have different threads, and the system divides
 the cores between these:
 
-- *New*: of sessions that were not served yet, and states that come from outside (checkpoints).
+- *New*: of sessions with a problem that nobody has brought before, and states that come from
+  outside (checkpoints).
+- *First*: of sessions with a known problem that were not served yet.
 - *Brief*: of all other sessions. The lane has as many threads as the service has workers, each of
   the others one less, but at least one.
-- *Medium* and *long*: what is estimated to take too long for the first two, or for the third.
+- *Medium* and *long*: what is estimated to take too long for the first three, or for the fourth.
 
 A job first estimates what it costs (:mod:`~holdfast.protocol.decision_cost`); if that is too much
 for its lane, nothing is computed, and the task moves. An estimate can be wrong, or made wrong: a
 belief may hold states for which the problem's functions take a thousand times as long as for those
-that were measured. So a job ends by itself once it has computed for several times its lane's limit
-(after its problem is built and measured, which happens once).
-It is computed anew as a long one, and so are the session's next ones until one takes less.
+that were measured. So a job ends by itself once it has computed for several times its lane's
+limit, and it is computed anew as a long one, as are the session's next ones until one takes less.
+Building a problem and measuring it count, but not in the long lane, which would do it again.
 
 The lanes go by cost and not by owner, because without certificates all robots are one owner, and
 nothing tells them apart. Each lane is a :class:`~holdfast.protocol.request_queue.RequestQueue`.
-Long decisions share a bound on memory, and new ones have half of the room for what waits.
+Long decisions share a bound on memory, and new and first ones have half of the room for what waits
+each.
 """
 
 from __future__ import annotations
@@ -33,8 +36,10 @@ from holdfast.protocol.request_queue import RequestQueue
 from holdfast.protocol.service_jobs import Job
 from holdfast.protocol.service_limits import ServiceLimits
 from holdfast.protocol.service_sessions import (
+    FIRST,
     LONG,
     MEDIUM,
+    NEW,
     REQUESTED,
     Owner,
     PendingTask,
@@ -69,14 +74,14 @@ class Lanes:
     def __init__(self, workers: int, limits: ServiceLimits) -> None:
         self._limits = limits
         fewer = max(1, workers - 1)
-        self.max_running = workers + 3 * fewer
+        self.max_running = workers + 4 * fewer
         self._fewer = fewer
         self._lanes = [
-            RequestQueue(fewer, limits, room=0.5),
+            *(RequestQueue(fewer, limits, room=0.5) for _ in (NEW, FIRST)),
             *(RequestQueue(number, limits) for number in (workers, fewer, fewer)),
         ]
         brief_s = limits.max_brief_s
-        self.limits_s = (brief_s, brief_s, limits.max_medium_s, limits.max_decision_s)
+        self.limits_s = (brief_s, brief_s, brief_s, limits.max_medium_s, limits.max_decision_s)
 
     @property
     def num_waiting(self) -> int:

@@ -42,7 +42,6 @@ __all__ = [
     "decode_record",
     "encode_record",
     "has_shown",
-    "reinitialised_after",
     "replay",
 ]
 
@@ -286,19 +285,6 @@ def decisions_of(records: Sequence[Record]) -> Iterator[SensingDecision | TaskDe
         elif isinstance(record, ActingRecord):
             action = decode_floats(record.action, len(record.action) // 8)
             yield TaskDecision(record.step, tuple(action.tolist()))
-
-
-def reinitialised_after(records: Sequence[Record]) -> frozenset[int]:
-    """Return after how many inputs the belief was begun anew (as a ``Trial`` counts them)."""
-    inputs = 0
-    found = set()
-    for record in records:
-        if isinstance(record, ReinitialisedRecord):
-            found.add(inputs)
-        inputs += isinstance(record, ObservedRecord | LateRecord | ReinitialisedRecord) or (
-            isinstance(record, PerformedRecord) and bool(record.motion or record.observation)
-        )
-    return frozenset(found)
 
 
 def _replay_record(planner: Planner, history: TrialHistory, record: Record) -> None:

@@ -57,7 +57,6 @@ from holdfast.protocol.service_sessions import (
     BRIEF,
     LONG,
     MEDIUM,
-    NEW,
     REQUESTED,
     CachedAnswer,
     Owner,
@@ -183,13 +182,15 @@ class Service:
         session = task.session
         is_awaited = session.pending.get(task.digest) is task
         session.remove_task(task)
-        self._problems.release(session.problem_key, outcome.problem)
+        price = outcome.price
+        cost = None if price is None else price.problem
+        self._problems.release(session.problem_key, outcome.problem, cost)
         if not session.closed:
             self._sessions.use(session, now)
             # The first job of a problem also imports and builds it: no measure of the next ones.
             typical = session.built
             session.built = session.built or outcome.problem is not None
-            session.price = outcome.price or session.price
+            session.price = price or session.price
             if outcome.cancelled or outcome.postponed is not None:
                 if is_awaited:
                     self._postpone(task, outcome.postponed, now)
@@ -293,10 +294,6 @@ class Service:
             )
             self._calls.send_refused(call, request.number, "invalid", text)
             return None
-        if self._queue.is_overloaded(now, key[0], NEW):
-            self._sessions.note_epoch(key, request.epoch)
-            self._reject_busy(call, request.number, key, NEW, now)
-            return None
         session = Session(
             key,
             request,
@@ -304,6 +301,12 @@ class Service:
             ExpectedTime(self._task_time.mean_s, _INERTIA_OF_ONE),
             ExpectedTime(self._sensing_time.mean_s, _INERTIA_OF_ONE),
         )
+        session.known = self._problems.cost_of(session.problem_key)
+        lane = session.lane_of(request)
+        if self._queue.is_overloaded(now, key[0], lane):
+            self._sessions.note_epoch(key, request.epoch)
+            self._reject_busy(call, request.number, key, lane, now)
+            return None
         session.used_at = now
         while not self._sessions.has_room_for(session):
             unused = self._sessions.evictable_for(session)
@@ -311,7 +314,7 @@ class Service:
                 # It is free once another robot has left, not once the next decision is computed.
                 self._sessions.note_epoch(key, request.epoch)
                 least_ms = _NO_ROOM_RETRY_MS
-                self._reject_busy(call, request.number, key, NEW, now, least_ms=least_ms)
+                self._reject_busy(call, request.number, key, lane, now, least_ms=least_ms)
                 return None
             self._forget(unused, "room needed")
         self._sessions.add(session)
@@ -469,11 +472,14 @@ class Service:
             state,
             self._pricing,
             session.price,
+            session.known,
             None if task.lane == LONG else Cost(estimated_s, self._limits.max_medium_bytes),
             self._queue.most_s(task),
+            # A long one would have to build it again.
+            building_counts=task.lane != LONG,
         )
         self._queue.handed_out(task, job, now)
-        self._effects.append(StartJob(job, expected_s, task.lane == BRIEF))
+        self._effects.append(StartJob(job, expected_s, task.lane <= BRIEF))
 
     # -- outcomes --------------------------------------------------------------------------------
 

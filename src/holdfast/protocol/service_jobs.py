@@ -35,6 +35,7 @@ from holdfast.protocol.decision_cost import (
     Cost,
     Price,
     Pricing,
+    ProblemCost,
     cost_of_answer,
     describe_cost,
 )
@@ -64,6 +65,9 @@ __all__ = [
     "ServiceEffect",
     "StartJob",
 ]
+
+_COSTS_PER_PROBLEM = 128
+"""So many costs are kept for each problem of which instances are; they take little memory."""
 
 
 class JobResult(NamedTuple):
@@ -136,12 +140,15 @@ class Job:
         Where to start; None for the trial's beginning.
     price : Price or None
         From an earlier job of this session.
+    known : ProblemCost or None
+        What the problem's functions take, from an earlier job of any session.
     most : Cost or None
         What it may take; if it is estimated to take more, nothing is computed. None: what a
         decision may take at all.
     most_s : float
-        Processor time after which it ends, whatever was estimated; once its problem is built and
-        measured.
+        Processor time after which it ends, whatever was estimated.
+    building_counts : bool
+        Whether building the problem and measuring it are part of that time.
 
     Attributes
     ----------
@@ -163,13 +170,18 @@ class Job:
         state: PlanningState | None,
         pricing: Pricing = ANY_MACHINE,
         price: Price | None = None,
+        known: ProblemCost | None = None,
         most: Cost | None = None,
         most_s: float = math.inf,
+        *,
+        building_counts: bool = False,
     ) -> None:
         self.kind = kind
         self._pricing = pricing
         self._price = price
+        self._known = known
         self._most = most
+        self._building_counts = building_counts
         self.interruption = Interruption(most_s)
         self._problem = problem
         self._make_problem = make_problem
@@ -216,12 +228,14 @@ class Job:
         try:
             # All of it: a model may take long to build, and to measure.
             with interruptible(self.interruption):
+                if self._building_counts:
+                    self.interruption.start_clock()
                 if problem is None:
                     problem = self._make_problem(unpack_configuration(self._configuration))
                 if self._price is None:
-                    self._price = self._pricing.price_of(problem, self._planning)
-                # Building and measuring happen once, and would have to be done again.
-                self.interruption.start_clock()
+                    self._price = self._pricing.price_of(problem, self._planning, self._known)
+                if not self._building_counts:
+                    self.interruption.start_clock()
                 check()
                 cost = self._checked_cost(problem, self._price)
                 most = self._most
@@ -420,27 +434,38 @@ def _code_of(error: HoldfastError) -> str:
 
 
 class ProblemPool:
-    """Problem instances that no job is using.
+    """Problem instances that no job is using, and what problems cost.
 
     Each instance is used by one job at a time, since it may keep buffers.
 
     Parameters
     ----------
     max_problems : int
-        Distinct problems of which instances are kept; the least recently released goes first.
+        Distinct problems of which instances are kept; the least recently released goes first. What
+        a problem costs is kept for many times as many.
     """
 
     def __init__(self, max_problems: int) -> None:
         self._max_problems = max_problems
         self._idle: OrderedDict[bytes, list[Problem]] = OrderedDict()
+        self._costs: OrderedDict[bytes, ProblemCost] = OrderedDict()
+
+    def cost_of(self, key: bytes) -> ProblemCost | None:
+        """Return what a problem's functions take; None if that is not known any more."""
+        return self._costs.get(key)
 
     def acquire(self, key: bytes) -> Problem | None:
         """Take an unused instance; None if one must be built."""
         idle = self._idle.get(key)
         return idle.pop() if idle else None
 
-    def release(self, key: bytes, problem: Problem | None) -> None:
-        """Keep an instance for the next job."""
+    def release(self, key: bytes, problem: Problem | None, cost: ProblemCost | None) -> None:
+        """Keep an instance for the next job, and what it costs."""
+        if cost is not None:
+            self._costs[key] = cost
+            self._costs.move_to_end(key)
+            if len(self._costs) > _COSTS_PER_PROBLEM * self._max_problems:
+                self._costs.popitem(last=False)
         if problem is None:
             return
         self._idle.setdefault(key, []).append(problem)
@@ -471,8 +496,8 @@ class StartJob(NamedTuple):
         Typical time of the robot's earlier jobs; infinite if that predicts nothing: the first job,
         a problem that is not built in, or an unusual request.
     is_brief : bool
-        Whether it is one of a known robot's brief ones. All others may take any time, so their
-        threads have less weight (:class:`~holdfast.protocol.lanes.Lanes`).
+        Whether its lane ends it after a moment. All others may take any time, so their threads have
+        less weight (:class:`~holdfast.protocol.lanes.Lanes`).
     """
 
     job: Job

@@ -24,13 +24,14 @@ import msgspec
 from holdfast.config.settings import PlanningSettings
 from holdfast.planning import PlanningState
 from holdfast.problems.registry import BUILT_IN
-from holdfast.protocol.decision_cost import Cost, Price
+from holdfast.protocol.decision_cost import Cost, Price, ProblemCost
 from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.messages import Request, SessionConfiguration, pack_configuration
 from holdfast.protocol.service_limits import ServiceLimits
 
 __all__ = [
     "BRIEF",
+    "FIRST",
     "LONG",
     "MEDIUM",
     "NEW",
@@ -65,7 +66,7 @@ SessionKey: TypeAlias = tuple[Owner, bytes]
 _ESTIMATING_S = 1e-4
 """Time of a job that does no more than that."""
 
-NEW, BRIEF, MEDIUM, LONG = range(4)
+NEW, FIRST, BRIEF, MEDIUM, LONG = range(5)
 """Lanes."""
 
 REQUESTED, PREFETCHED = 0, 1
@@ -219,6 +220,8 @@ class Session:
         Digest that identifies the problem among those kept for reuse.
     built, built_in : bool
         Whether the problem was built before, and whether it is part of holdfast.
+    known : ProblemCost or None
+        What its problem's functions take, if they were measured for another session.
     is_brief : bool
         Whether no decision was estimated to be too long for the lane of brief ones.
     overran : bool
@@ -267,6 +270,7 @@ class Session:
             )
         )
         self.built = False
+        self.known: ProblemCost | None = None
         self.is_brief = True
         self.overran = False
         self.restored_trial: int | None = None
@@ -296,10 +300,13 @@ class Session:
     def lane_of(self, request: Request | None) -> int:
         """Return the lane in which a task begins.
 
-        Nothing is known of a session that was not served, nor of a state that comes from outside.
+        Of a session that was not served at most its problem is known, and nothing of a state that
+        comes from outside.
         """
-        if not self.served or (request is not None and request.checkpoint is not None):
+        if request is not None and request.checkpoint is not None:
             return NEW
+        if not self.served:
+            return NEW if self.known is None else FIRST
         return LONG if self.overran else BRIEF
 
     def remove_task(self, task: PendingTask) -> None:

@@ -12,7 +12,7 @@ import json
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Self, TextIO
+from typing import Any, Self
 
 from holdfast.arrays import FloatArray
 from holdfast.belief import Belief
@@ -97,11 +97,6 @@ class CsvSink:
 
     def __exit__(self, *error: object) -> None:
         self._close.close()
-
-    @property
-    def files(self) -> Sequence[TextIO]:
-        """The open files."""
-        return self._files
 
     def trial_begins(self, fact: TrialBeginFact) -> None:
         """Note when the trial began."""

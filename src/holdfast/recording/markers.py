@@ -1,8 +1,8 @@
 """A problem as shapes for RViz and Foxglove: obstacles, goal, body and sensing action.
 
-A marker here is plain data; :mod:`holdfast.ros.mcap_export` makes ``visualization_msgs`` of it. The
-body's frame is the estimate (or the true pose), which moves, so the body is written once. What a
-problem does not define is left out.
+A marker here is plain data; :mod:`holdfast.recording.mcap_export` makes ``visualization_msgs`` of
+it. The body's frame is the estimate (or the true pose), which moves, so the body is written once.
+What a problem does not define is left out.
 """
 
 from __future__ import annotations

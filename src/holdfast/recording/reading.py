@@ -132,7 +132,7 @@ class RunArrays:
         with RecordedRun(self.path, "open", problem_directory=self.problem_directory) as run:
             planner = Planner(run.configuration.problem, run.configuration.planning)
             sink = _Collector(planner.num_choices)
-            for trial in run.replay(chosen, [sink], rate_hz=1.0):
+            for trial in run.replay(chosen, [sink]):
                 yield sink.collected(trial, run.configuration.problem.action_size)
 
 

@@ -12,11 +12,11 @@ decisions and their times, and no beliefs.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import shlex
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -26,7 +26,6 @@ from holdfast.arrays import FloatArray, floats_or_none
 from holdfast.config.loader import Configuration
 from holdfast.errors import (
     DecidedOtherwiseError,
-    EndOfRecordsError,
     HoldfastError,
     UntrustedCodeError,
 )
@@ -34,7 +33,7 @@ from holdfast.floating_mode import in_own_mode
 from holdfast.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
 from holdfast.planning import Planner, PlanningState, digest
 from holdfast.printable import one_line
-from holdfast.protocol.records import decisions_of, reinitialised_after
+from holdfast.protocol.records import decisions_of
 from holdfast.recording.facts import (
     Decider,
     EventFact,
@@ -47,11 +46,9 @@ from holdfast.recording.facts import (
 )
 from holdfast.recording.fingerprint import difference, fingerprint
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
-from holdfast.recording.recorded_environment import RecordedEnvironment
 from holdfast.recording.run_clock import RunClock
 from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME, recorded_configuration
 from holdfast.recording.step_times import (
-    NS_PER_S,
     StepClock,
     TrialTimes,
     dated,
@@ -60,6 +57,7 @@ from holdfast.recording.step_times import (
 )
 from holdfast.recording.timings import rows_by_trial
 from holdfast.robot.environment import Environment, SimulatedEnvironment
+from holdfast.robot.recorded_trial import run_recorded_trial
 from holdfast.robot.trial import LateStep, SensingStep, TaskStep, TrialObserver, run_trial
 
 __all__ = ["RecordedRun"]
@@ -100,7 +98,7 @@ class RecordedRun:
         self, run: Path, purpose: str = "export", *, problem_directory: Path | None = None
     ) -> None:
         self.path = run
-        with ExitStack() as stack:
+        with contextlib.ExitStack() as stack:
             self._journal = stack.enter_context(JournalReader.read_run(run, purpose))
             path = self._journal.path
             directory = path.parent
@@ -158,12 +156,10 @@ class RecordedRun:
             return True
         return self._journal.kept_steps(trial) is not None
 
-    def replay(
-        self, trials: Sequence[int], sinks: Sequence[FactSink], rate_hz: float
-    ) -> Iterator[int]:
+    def replay(self, trials: Sequence[int], sinks: Sequence[FactSink]) -> Iterator[int]:
         """Write the facts of some trials to each sink, and yield each trial's number at its end.
 
-        ``trials`` ascend; a run without times has ``rate_hz`` steps a second.
+        ``trials`` ascend; in a run without times each step takes 0.1 s.
 
         Raises
         ------
@@ -172,7 +168,7 @@ class RecordedRun:
         HoldfastError
             If a trial is decided otherwise when it is run again.
         """
-        clock = StepClock(round(NS_PER_S / rate_hz))
+        clock = StepClock()
         chosen = set(trials)
         events = self._events if self.has_times else []
         output = _Output(sinks, events, with_others=chosen.issuperset(self.trials))
@@ -191,53 +187,48 @@ class RecordedRun:
         trial, decisions = result.trial, result.decisions
         assert decisions is not None
         times = self._times(trial, result.steps, clock)
-        world: Environment | None = None
-        if self.world_is_simulated:
-            world = self._simulated_world(trial)
-        elif (records := self._journal.kept_steps(trial)) is not None:
-            world = RecordedEnvironment(trial, records, result)
-        if world is None:
-            _write_decisions(result, decisions, times, output)
-        else:
-            replay = _Replay(trial, list(decisions), times, output, result, self._planner)
-            self._run_again(trial, world, replay, decisions.reinitialised_after())
+        simulator = self.configuration.simulator
+        replay = _Replay(trial, list(decisions), times, output, result, self._planner)
+        with self._named_otherwise():
+            if self.world_is_simulated:
+                run_trial(
+                    self._planner,
+                    simulator.seed,
+                    trial,
+                    max_steps=simulator.max_steps,
+                    observer=replay,
+                    reinitialised_after=decisions.reinitialised_after(),
+                )
+            elif (records := self._journal.kept_steps(trial)) is not None:
+                run_recorded_trial(self._planner, simulator.seed, trial, records, replay, result)
+            else:
+                _write_decisions(result, decisions, times, output)
         return trial
 
     def _replay_unfinished(self, begun: UnfinishedTrial, output: _Output, clock: StepClock) -> int:
-        trial = begun.trial
+        trial, seed = begun.trial, self.configuration.simulator.seed
         expected = list(decisions_of(begun.records))
         steps = sum(isinstance(decision, TaskDecision) for decision in expected)
-        simulated = self._simulated_world(trial) if self.world_is_simulated else None
-        world = RecordedEnvironment(trial, begun.records, simulated=simulated)
+        simulated = None
+        if self.world_is_simulated:
+            simulated = SimulatedEnvironment(self.configuration.problem, seed, trial)
         times = self._times(trial, steps, clock)
         replay = _Replay(trial, expected, times, output, None, self._planner)
-        try:
-            self._run_again(trial, world, replay, reinitialised_after(begun.records))
-        except EndOfRecordsError:
-            replay.end_here()
+        with self._named_otherwise():
+            run_recorded_trial(
+                self._planner, seed, trial, begun.records, replay, simulated=simulated
+            )
+        replay.end_here()
         return trial
 
-    def _simulated_world(self, trial: int) -> SimulatedEnvironment:
-        configuration = self.configuration
-        return SimulatedEnvironment(configuration.problem, configuration.simulator.seed, trial)
-
-    def _run_again(
-        self, trial: int, world: Environment, replay: _Replay, reinitialised_after: Collection[int]
-    ) -> None:
-        configuration = self.configuration
+    @contextlib.contextmanager
+    def _named_otherwise(self) -> Iterator[None]:
+        """Say what may be the reason where something is decided otherwise."""
         try:
-            run_trial(
-                self._planner,
-                configuration.simulator.seed,
-                trial,
-                max_steps=configuration.simulator.max_steps,
-                environment=world,
-                observer=replay,
-                reinitialised_after=reinitialised_after,
-            )
+            yield
         except DecidedOtherwiseError as error:
             # Most likely the code has changed.
-            changed = difference(self._meta, fingerprint(configuration))
+            changed = difference(self._meta, fingerprint(self.configuration))
             because = "" if changed is None else f" ({changed})"
             raise HoldfastError(f"{error}{because}; --trials leaves it out") from error
 

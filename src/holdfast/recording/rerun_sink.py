@@ -24,7 +24,7 @@ from holdfast import checked
 from holdfast.arrays import FloatArray
 from holdfast.belief import Belief, standard_deviation
 from holdfast.config.loader import Configuration
-from holdfast.errors import HoldfastError
+from holdfast.errors import HoldfastError, ViewError
 from holdfast.problem_attributes import choice_labels, circular_states
 from holdfast.protocol.status import Status
 from holdfast.randomness import NoiseFreeStream
@@ -93,12 +93,13 @@ class RerunSink:
     has_times : bool
         Whether the times of the facts are those of a clock, in nanoseconds since 1970.
     live : bool
-        Whether the viewer follows the last fact.
+        Whether the viewer follows the last fact; then one that is lost is told by ``streams``.
 
     Raises
     ------
     ViewError
-        If the viewer cannot be started or reached, or the file not be written.
+        If the viewer cannot be started or reached, or the file not be written; later if the viewer
+        of a recorded run is lost.
     """
 
     def __init__(
@@ -107,6 +108,7 @@ class RerunSink:
         problem = configuration.problem
         self._problem = problem
         self._has_times = has_times
+        self._live = live
         self._layout = drawn_layout(problem)
         self._labels = state_labels(problem)
         self._choices = choice_labels(problem)
@@ -184,7 +186,7 @@ class RerunSink:
         self._place(fact.belief, fact.estimate, fact.true_state)
         if fact.estimate is not None:
             self._action(fact.estimate, fact.action)
-        self._recording.flush()
+        self._flush()
 
     def observed_late(self, fact: LateFact) -> None:
         """Log the belief that an earlier step's observation led to."""
@@ -214,7 +216,7 @@ class RerunSink:
         self._text("INFO" if result.outcome == "succeeded" else "WARN", text)
         # The next trial's first step comes after this one's last belief.
         self._last += 1
-        self._recording.flush()
+        self._flush()
 
     def happened(self, fact: EventFact) -> None:
         """Log an event of the services."""
@@ -228,9 +230,10 @@ class RerunSink:
         name = fact.name.replace("_", " ")
         self._text(severity(fact.name, fact.fields), f"{name}: {words}" if words else name)
 
-    def note(self, text: str) -> None:
-        """Log a remark of the view itself, at the time of the last fact."""
-        self._text("WARN", text)
+    def _flush(self) -> None:
+        self._recording.flush()
+        if self._recording.lost is not None and not self._live:
+            raise ViewError(f"the viewer {self._recording.lost}")
 
     # -- what is logged ----------------------------------------------------------------------------
 

@@ -20,9 +20,21 @@ from holdfast.recording.facts import Decider, EventFact
 from holdfast.recording.run_clock import RunClock, Stamp
 from holdfast.recording.timings import TimingRow, nanoseconds
 
-__all__ = ["MOMENTS", "NS_PER_S", "StepClock", "TrialTimes", "dated", "read_events", "trial_ends"]
+__all__ = [
+    "MOMENTS",
+    "NS_PER_S",
+    "UNTIMED_STEP_S",
+    "StepClock",
+    "TrialTimes",
+    "dated",
+    "read_events",
+    "trial_ends",
+]
 
 NS_PER_S = 1_000_000_000
+
+UNTIMED_STEP_S = 0.1
+"""How long a step takes in a run that was recorded without times."""
 
 MOMENTS = 4
 """Of a step: sensing action decided, observed, task action decided, and before the next step."""
@@ -48,8 +60,8 @@ class TrialTimes(NamedTuple):
 class StepClock:
     """Assigns times to the moments of one trial after the other; they only grow."""
 
-    def __init__(self, period_ns: int) -> None:
-        self._period_ns = max(period_ns, MOMENTS * _LEAST_GAP_NS)
+    def __init__(self, period_ns: int = round(UNTIMED_STEP_S * NS_PER_S)) -> None:
+        self._period_ns = period_ns
         self._last_ns = _FIRST_NS - self._period_ns
 
     def next_trial(

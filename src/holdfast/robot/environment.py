@@ -32,6 +32,7 @@ __all__ = [
     "MissingReadings",
     "ObservationSizes",
     "SimulatedEnvironment",
+    "is_no_reading",
     "require_methods",
 ]
 
@@ -200,6 +201,11 @@ def require_methods(environment: object, name: str) -> None:
         )
 
 
+def is_no_reading(numbers: FloatArray) -> bool:
+    """Return whether an observation is no reading: it has components, and each of them is NaN."""
+    return bool(numbers.size) and bool(np.isnan(numbers).all())
+
+
 class MissingReadings:
     """Tells no reading from an observation, and bounds how many come without one in a row.
 
@@ -223,7 +229,7 @@ class MissingReadings:
         """
         if shown is not None:
             numbers = real_numbers(shown)
-            if numbers is None or not numbers.size or not np.isnan(numbers).all():
+            if numbers is None or not is_no_reading(numbers):
                 self._in_a_row = 0
                 return False
         self._in_a_row += 1

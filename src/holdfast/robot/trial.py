@@ -152,7 +152,8 @@ def run_trial(
     max_missing_in_a_row : int
         How often in a row sensing may give no reading; once more is an EnvironmentFailedError.
     reinitialised_after : collection of int, optional
-        Of a recorded trial: after how many inputs the belief was begun anew; instead of ``lost``.
+        Of a simulated trial that is run again: after how many inputs the belief was begun anew;
+        instead of ``lost``.
 
     Raises
     ------
@@ -182,18 +183,13 @@ def run_trial(
     name = type(environment).__name__
     observer.trial_began(environment, track.state)
 
-    # Only a recorded world has the first two.
-    late_ones = {
-        method: ask
-        for method in ("late_before_choosing", "late_before_moving", "late_observations")
-        if callable(ask := getattr(environment, method, None))
-    }
+    late_observations = getattr(environment, "late_observations", None)
 
-    def take_late(method: str) -> None:
-        for step, came in late_ones[method]() if method in late_ones else ():
-            if missing.is_missing(f"{name}: {method}", came):
+    def take_late() -> None:
+        for step, came in late_observations() if callable(late_observations) else ():
+            if missing.is_missing(f"{name}: late_observations", came):
                 continue
-            late = LateObservation(step, _reading(environment, method, came))
+            late = LateObservation(step, _reading(environment, "late_observations", came))
             found = track.observe_late(late)
             if found is not None:
                 observer.observed_late(LateStep(late, track.state, found[0]))
@@ -204,10 +200,8 @@ def run_trial(
         if planner.needs_sensing(track.state):
             _sense(track, environment, observer, missing)
             _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
-        take_late("late_before_choosing")
         before = track.state
         executed, task_info = planner.choose_task_action(before)
-        take_late("late_before_moving")
         # A copy, as of all that it shows: what late observations are folded in with must stay.
         shown = environment.perform(executed.copy())
         result = shown if isinstance(shown, MoveResult) else MoveResult(shown)
@@ -228,7 +222,7 @@ def run_trial(
         observer.acted(TaskStep(environment, before, task_info, executed, reward, result, info))
         if info is not None:
             _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
-        take_late("late_observations")
+        take_late()
         ending = _ask_done(environment)
     ended = track.result(ending)
     observer.trial_ended(track.state, ended)

@@ -194,7 +194,8 @@ class Options:
     @classmethod
     def table(cls) -> dict[str, Option]:
         """Return the options by the names of their attributes."""
-        return {name: each for name, each in vars(cls).items() if isinstance(each, Option)}
+        own = {name: each for kind in reversed(cls.__mro__) for name, each in vars(kind).items()}
+        return {name: each for name, each in own.items() if isinstance(each, Option)}
 
     @classmethod
     def parse(cls, command: str, arguments: Sequence[str]) -> Self:

@@ -15,8 +15,6 @@ interrupted, offers.
 Of a service: ready, session_opened, session_taken_over, restored, state_diverged, refused, busy,
 evicted, robot_connected, robot_disconnected, link_refused, credentials, credentials_reloaded,
 stopping, process_ended, process_started, ros_master, ros_shutdown. Of both: defect.
-Of ``holdfast ros1-guard``: ready, guarding, master_started, master_lost, master_failed,
-master_hangs, nodes_gone, journal_failed, journal_written, rosout_ended, note, stopping.
 Of a command that ends with an error: error. These fields have a place of their own in the text
 form: ``from`` and ``to`` (of a change), ``service``, ``robot``, ``reason``, ``duration_ms``.
 """

@@ -53,11 +53,6 @@ class EventLog:
     clock : callable
         Returns nanoseconds since 1970.
 
-    Attributes
-    ----------
-    lost : int
-        Lines that could not be written.
-
     Raises
     ------
     OutputError
@@ -79,7 +74,6 @@ class EventLog:
         self._descriptor: int | None = None
         # Reentrant: a signal handler may report an event while this thread writes one.
         self._lock = threading.RLock()
-        self.lost = 0
         self._writer: _BackgroundWriter | None = None
         if isinstance(target, (str, Path)):
             self._descriptor = _open_for_lines(Path(target))
@@ -104,17 +98,14 @@ class EventLog:
             # A field's own methods must not end a robot's run.
             unwritable = {"unwritable_fields": type(error).__name__}
             line = self._line(now_ns, self._component, name, unwritable)
-        with self._lock:
-            try:
-                if self._descriptor is not None:
-                    os.write(self._descriptor, line.encode())
-                elif self._writer is not None:
-                    self.lost += not self._writer.put(line)
-                elif self._stream is not None:
-                    _write_line(self._stream, line)
-            # ValueError: the stream is closed. RuntimeError: a signal handler writes in mid-write.
-            except (OSError, ValueError, RuntimeError):
-                self.lost += 1
+        # ValueError: the stream is closed. RuntimeError: a signal handler writes in mid-write.
+        with self._lock, contextlib.suppress(OSError, ValueError, RuntimeError):
+            if self._descriptor is not None:
+                os.write(self._descriptor, line.encode())
+            elif self._writer is not None:
+                self._writer.put(line)
+            elif self._stream is not None:
+                _write_line(self._stream, line)
 
     def close(self) -> None:
         """Ignore further events; may be repeated. Waits at most 0.5 s for a slow terminal."""
@@ -125,7 +116,7 @@ class EventLog:
                 os.close(self._descriptor)
                 self._descriptor = None
         if writer is not None:
-            self.lost += writer.close()
+            writer.close()
 
     def __enter__(self) -> Self:
         return self
@@ -146,32 +137,27 @@ class _BackgroundWriter:
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
         self._lines: SimpleQueue[str | None] = SimpleQueue()
-        self._num_queued = self._num_written = 0
         self._thread: threading.Thread | None = None
 
-    def put(self, line: str) -> bool:
-        """Queue a line; return False if the queue is full. The caller holds a lock."""
+    def put(self, line: str) -> None:
+        """Queue a line, or drop it if the queue is full. The caller holds a lock."""
         if self._lines.qsize() >= _MAX_QUEUED_LINES:
-            return False
-        self._num_queued += 1
+            return
         self._lines.put(line)
         if self._thread is None:
             self._thread = threading.Thread(target=self._work, name="holdfast-log", daemon=True)
             self._thread.start()
-        return True
 
-    def close(self) -> int:
-        """Write what can be written in time; return the number of lines that were not."""
+    def close(self) -> None:
+        """Write what can be written in time."""
         self._lines.put(None)
         if self._thread is not None:
             self._thread.join(_FLUSH_TIMEOUT_S)
-        return self._num_queued - self._num_written
 
     def _work(self) -> None:
         while (line := self._lines.get()) is not None:
             with contextlib.suppress(OSError, ValueError, RuntimeError):
                 _write_line(self._stream, line)
-                self._num_written += 1
 
 
 def _may_block(stream: TextIO) -> bool:

@@ -70,7 +70,8 @@ class ServeOptions(Options):
         many=True,
         read=absolute_endpoint,
         metavar="ENDPOINT",
-        help="A robot that listens. Then nothing listens here without --listen.",
+        help="The local socket at which a robot listens for this service (unix/PATH). Then nothing "
+        "listens here without --listen.",
     )
     name: str = option(metavar="NAME", default=DEFAULT_NAME, help="Name of the service.")
     tls: Path | None = option(
@@ -162,20 +163,6 @@ class ServeOptions(Options):
         help="Stop when standard input ends, as it does when the process that started this one "
         "dies.",
     )
-    configuration: Path | None = option(
-        read=location,
-        metavar="FILE",
-        help="Configuration for the nodes of ROS 1, which have none.",
-    )
-    ros1: bool = flag(
-        help="Offer a service in ROS 1, at the address of ROS_MASTER_URI and the like. It needs no "
-        "ROS (pip install 'holdfast[ros]'). Then nothing else listens here without --listen.",
-    )
-    ros1_name: str = option(
-        default=DEFAULT_NAME,
-        metavar="NAME",
-        help="Name of that service and of its node in ROS 1.",
-    )
     # For the processes that a supervisor starts: its number, and the descriptors they inherit.
     supervised: tuple[int, int] | None = option(
         metavar="N,N", read=_descriptors, help="", hidden=True
@@ -203,33 +190,16 @@ def parse_options(arguments: Sequence[str]) -> ServeOptions:
         If an option cannot be used, or two do not go together.
     """
     options = ServeOptions.parse("serve", arguments)
-    _check_ros1(options)
     if options.processes > 1:
         for name, given in (
             ("--connect", options.connect),
-            ("--ros1", options.ros1),
             ("--until-stdin-closes", options.until_stdin_closes),
         ):
             if given:
                 raise InvalidValueError(f"{name}: goes with one process only, not with --processes")
-    if not options.listen and not options.connect and not options.ros1:
+    if not options.listen and not options.connect:
         options.listen = (f"{'tls' if options.tls else 'tcp'}/{_DEFAULT_PLACE}",)
     return options
-
-
-def _check_ros1(options: ServeOptions) -> None:
-    """Refuse options for ROS 1 that do not go together."""
-    if not options.ros1 and options.ros1_name != DEFAULT_NAME:
-        raise InvalidValueError("--ros1-name: goes with --ros1 only")
-    if options.ros1 and options.configuration is None:
-        raise InvalidValueError(
-            "--ros1: --configuration is missing; it says for which problem and with which settings "
-            "this service decides in ROS"
-        )
-    if options.configuration is not None and not options.ros1:
-        raise InvalidValueError(
-            "--configuration: goes with --ros1 only; other robots bring theirs along"
-        )
 
 
 def checked_endpoints(options: ServeOptions) -> list[Endpoint]:

@@ -16,10 +16,11 @@ import socket
 import sys
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from holdfast.errors import DEFECT, HoldfastError, InvalidValueError, defect_fields
 from holdfast.printable import printable
+from holdfast.service.garbage import collect_in_loop
 from holdfast.service.options import ServeOptions, checked_endpoints, parse_options
 
 if TYPE_CHECKING:
@@ -31,12 +32,11 @@ if TYPE_CHECKING:
     from holdfast.service.shell import ServiceShell
     from holdfast.service.supervisor import Supervised
 
-__all__ = ["Extension", "MakeExtension", "main"]
+__all__ = ["Extension", "main", "serve"]
 
 _SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while another waits for it."""
 
-_BETWEEN_COLLECTIONS = 10_000
 _CLOSE_TIMEOUT_S = 0.7
 _CHECK_INTERVAL_S = 0.01
 _STDIN = 0
@@ -48,7 +48,7 @@ _OFFERED = ("health", "metrics", "ros1")
 class Extension(Protocol):
     """Something else that runs in a service's process, on threads of its own: a service in ROS 1.
 
-    This package knows none. Who starts the service passes a function that makes it.
+    This package knows none. The package ``holdfast_ros`` passes a function that makes it.
     """
 
     @property
@@ -76,12 +76,16 @@ class Extension(Protocol):
         ...
 
 
-MakeExtension: TypeAlias = "Callable[[ServeOptions], Extension]"
-"""Makes the extension for some options; raises a HoldfastError if they cannot be used."""
+def main(arguments: Sequence[str]) -> int:
+    """Run ``holdfast serve`` until it has to stop, and return the exit code: see :func:`serve`."""
+    return serve(parse_options(arguments))
 
 
-def main(arguments: Sequence[str], make_extension: MakeExtension | None = None) -> int:
-    """Run ``holdfast serve`` until it has to stop.
+def serve(options: ServeOptions, make_extension: Callable[[], Extension] | None = None) -> int:
+    """Serve until there is a reason to stop.
+
+    ``make_extension`` is called once the options are checked; it raises a HoldfastError if there
+    can be none.
 
     Returns
     -------
@@ -94,7 +98,6 @@ def main(arguments: Sequence[str], make_extension: MakeExtension | None = None) 
     HoldfastError
         If an option cannot be used; the message says which and why.
     """
-    options = parse_options(arguments)
     # Importing modules leaves no garbage to collect.
     gc.disable()
     # Threads of NumPy's BLAS would have no work here.
@@ -172,7 +175,7 @@ def _serve_supervised(options: ServeOptions, parent: int, descriptor: int) -> in
 def _serve(
     options: ServeOptions,
     supervised: Supervised | None = None,
-    make_extension: MakeExtension | None = None,
+    make_extension: Callable[[], Extension] | None = None,
 ) -> int:
     if options.until_stdin_closes and sys.stdin is None:
         raise InvalidValueError("--until-stdin-closes: this process has no standard input")
@@ -182,7 +185,7 @@ def _serve(
 
     if credentials is None:
         _import_without_openssl()
-    extension = make_extension(options) if make_extension and options.ros1 else None
+    extension = None if make_extension is None else make_extension()
     process = _ServiceProcess(options, credentials, extension, supervised)
 
     import asyncio
@@ -295,10 +298,7 @@ class _ServiceProcess:
                     )
                 if options.until_stdin_closes:
                     _watch_stdin(loop, shell)
-                # Loaded modules stay; the collector need not scan them.
-                gc.freeze()
-                gc.set_threshold(_BETWEEN_COLLECTIONS)
-                gc.enable()
+                collect_in_loop(loop)
                 self._is_serving = True
                 if supervised is None:
                     where: dict[str, object] = {"boot": self._incarnation, **watched, **offered}

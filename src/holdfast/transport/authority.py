@@ -6,16 +6,15 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Sequence
 from datetime import datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
 from typing import NamedTuple, Self
 
-from holdfast.errors import CredentialsError
+from holdfast.errors import CredentialsError, TransportError
 from holdfast.transport.credentials import date_text, warn_if_open
-from holdfast.transport.endpoints import AUTHORITY_FILE, REVOKED_FILE, Role
+from holdfast.transport.endpoints import AUTHORITY_FILE, REVOKED_FILE, Role, parse_host
 
 try:
     from cryptography import x509
@@ -60,9 +59,6 @@ AUTHORITY_KEY_FILE = "authority.key"
 
 # A robot whose clock is a little behind would refuse a certificate that begins now.
 _BACKDATED = timedelta(days=1)
-
-_HOST_LABEL = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
-
 
 _USAGES: dict[Role, x509.ObjectIdentifier] = {
     "robot": ExtendedKeyUsageOID.CLIENT_AUTH,
@@ -309,10 +305,9 @@ def key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 def is_host(host: str) -> bool:
     """Return whether a certificate can name this host."""
     try:
-        ip_address(host)
-    except ValueError:
-        labels = host.split(".")
-        return len(host) <= 253 and all(_HOST_LABEL.fullmatch(label) for label in labels)
+        parse_host(f"[{host}]" if ":" in host else host)
+    except TransportError:
+        return False
     return True
 
 

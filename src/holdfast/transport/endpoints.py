@@ -58,7 +58,7 @@ NEXT_KEY_FILE = "key.next.pem"
 _RENAMED = {
     "quic": "over UDP, services are at udp/HOST:PORT",
     "unixsock-stream": "a local socket is written unix/PATH",
-    "ros1": "sessions go over tcp/HOST:PORT; in ROS 1 there is the typed service, serve --ros1",
+    "ros1": "sessions go over tcp/HOST:PORT; in ROS 1 there is holdfast ros1-serve",
 }
 """Protocols of earlier releases, and their replacements."""
 
@@ -77,7 +77,6 @@ class SchemeEntry(NamedTuple):
     implementation: str  # MODULE:CLASS, a Scheme
     is_encrypted: bool = False  # and both ends authenticate by a certificate
     place: Literal["address", "path"] = "address"  # HOST:PORT or a path
-    services_listen: str = ""  # why a robot cannot listen, as a sentence; empty if it can
 
 
 _STREAMS = "holdfast.transport.schemes:Scheme"
@@ -85,12 +84,7 @@ _STREAMS = "holdfast.transport.schemes:Scheme"
 SCHEMES = {
     "tcp": SchemeEntry(_STREAMS),
     "tls": SchemeEntry(_STREAMS, is_encrypted=True),
-    "udp": SchemeEntry(
-        "holdfast.transport.datagram_links:DatagramScheme",
-        is_encrypted=True,
-        services_listen="over udp it is the service that listens and the robot that connects; "
-        "write tls/... where a robot listens",
-    ),
+    "udp": SchemeEntry("holdfast.transport.datagram_links:DatagramScheme", is_encrypted=True),
     "unix": SchemeEntry(_STREAMS, place="path"),
 }
 """The protocols of endpoints."""
@@ -182,8 +176,8 @@ class ServiceAddress(NamedTuple):
     """How a robot and a service find each other."""
 
     endpoint: str
-    # Whether the robot listens there and the service connects. A service that the robot launches
-    # does, so the robot need not poll for it.
+    # Whether the robot listens there, at a local socket, and the service connects. A service that
+    # the robot launches does, so the robot need not poll for it.
     listens: bool = False
     name: str | None = None  # that the service must have; None accepts any
 
@@ -302,8 +296,7 @@ def check_endpoint(text: str, role: Role, *, listens: bool) -> Endpoint:
     Raises
     ------
     TransportError
-        If it is malformed, has port 0 to connect to, or a protocol with which the other end
-        listens.
+        If it is malformed, has port 0 to connect to, or is one at which the other end listens.
     """
     endpoint = parse_endpoint(text)
     if not listens and endpoint.port == 0 and not endpoint.is_local_socket:
@@ -311,9 +304,11 @@ def check_endpoint(text: str, role: Role, *, listens: bool) -> Endpoint:
             f"endpoint {endpoint}: port 0 is for listening; to connect, give the port, "
             f"as in {endpoint._replace(port=7447)}"
         )
-    reason = SCHEMES[endpoint.protocol].services_listen
-    if reason and listens != (role == "service"):
-        raise TransportError(f"endpoint {endpoint}: {reason}")
+    if listens != (role == "service") and not endpoint.is_local_socket:
+        raise TransportError(
+            f"endpoint {endpoint}: there the service listens and the robot connects; a robot "
+            "listens at a local socket alone (unix/PATH), for the service that it launches"
+        )
     return endpoint
 
 

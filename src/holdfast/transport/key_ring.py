@@ -120,7 +120,6 @@ class KeyRing(NamedTuple):
     """The result of :func:`make_credentials`."""
 
     authority_key: Path
-    authority_is_new: bool
     authority_expires: datetime
     made: tuple[MadeCredentials, ...]
 
@@ -272,7 +271,6 @@ def make_credentials(
                 _rotate(place, files)
     return KeyRing(
         home / AUTHORITY_KEY_FILE,
-        authority_is_new,
         authority.certificate.not_valid_after_utc,
         tuple(party.made for party in parties),
     )

@@ -36,7 +36,7 @@ from holdfast.transport.endpoints import (
 from holdfast.transport.frames import CALL, END, LAST, REPLY, Frame, Hello, encode_hello
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
-from holdfast.transport.listener import Listener, connection_to_drop
+from holdfast.transport.listener import Listener
 from holdfast.transport.schemes import load_scheme
 from holdfast.transport.tls import ClientCredentials, TlsStream
 
@@ -229,8 +229,8 @@ class _ServiceLinks(LinkOwner):
         self._successor: tuple[Link, str] | None = None
         # Whether the current process has said goodbye and no other was found.
         self._has_no_successor = False
-        # All links, the oldest first, with the network from which each came.
-        self._made: dict[Link, bytes] = {}
+        # All links, the oldest first.
+        self._made: dict[Link, None] = {}
         self._calls: dict[Link, dict[int, PendingCall]] = {}
         self._numbers = count()
         # From the last hello, and the name under which that process was reported.
@@ -242,9 +242,7 @@ class _ServiceLinks(LinkOwner):
         self._reported_reasons: deque[str] = deque(maxlen=_MAX_REPORTED_REASONS)
         self._reported_blocked = False
         self._stopped = False
-        self._endpoint = (
-            endpoint  # where it listens or, for one that connects, where the robot does
-        )
+        self._endpoint = endpoint  # where it listens or, for one that connects, the robot
 
     @property
     def current(self) -> Link | None:
@@ -254,9 +252,7 @@ class _ServiceLinks(LinkOwner):
 
     def start(self) -> None:
         if self._address.listens:
-            self._listener = Listener(
-                self._endpoint, self._accepted, speaks_first=self._credentials is not None
-            )
+            self._listener = Listener(self._endpoint, self._accepted)
         else:
             self._dialer = Dialer(
                 self._endpoint,
@@ -306,11 +302,11 @@ class _ServiceLinks(LinkOwner):
 
     # -- links -----------------------------------------------------------------------------------
 
-    def _make_link(self, network: bytes = b"") -> Link:
+    def _make_link(self) -> Link:
         tls = None
         if self._credentials is not None:
-            host = None if self._address.listens else self._endpoint.host
-            tls = TlsStream(self._credentials.context(), host, self._incarnation)
+            context = self._credentials.context()
+            tls = TlsStream(context, self._endpoint.host, self._incarnation)
         link = self._scheme.make_link(
             self,
             self._robot.settings,
@@ -319,21 +315,18 @@ class _ServiceLinks(LinkOwner):
             role="robot",
             dialled=not self._address.listens,
         )
-        self._made[link] = network
+        self._made[link] = None
         return link
 
     def _accepted(self, connection: socket.socket, network: bytes) -> None:
-        unknown = {
-            link: its_network
-            for link, its_network in self._made.items()
-            if link.hello is None and not link.ended
-        }
+        del network
+        unknown = [link for link in self._made if link.hello is None and not link.ended]
         if len(unknown) >= _MAX_WITHOUT_HELLO:
-            connection_to_drop(unknown).end("has said no hello, and others wait", abort=True)
-        self._make_link(network).begin(connection)
+            unknown[0].end("has said no hello, and others wait", abort=True)
+        self._make_link().begin(connection)
 
     def on_handshake(self, link: Link) -> None:
-        if not self._handshake_is_enough or self._address.listens or self._links:
+        if not self._handshake_is_enough or self._links:
             return
         assert link.tls is not None
         same = link.tls.is_known_incarnation

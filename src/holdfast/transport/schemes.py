@@ -48,9 +48,8 @@ class Scheme:
         dialled: bool,
     ) -> Link:
         """Make the link of a new connection; ``dialled`` if this end has opened it."""
-        del endpoint
-        speaks_first = dialled if tls is None else role == "robot"
-        return Link(owner, settings, speaks_first=speaks_first, tls=tls)
+        del endpoint, role
+        return Link(owner, settings, speaks_first=dialled, tls=tls)
 
     def close(self) -> None:
         """Close what the links of this end share. May be repeated."""

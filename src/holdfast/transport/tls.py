@@ -1,8 +1,8 @@
 """TLS for one link, in memory: encrypted bytes in, messages out.
 
 Both ends show a certificate of our own authority, and TLS 1.3 is the only version. The robot is
-always the client, whichever end dialled. So its certificate only allows calls, and it checks the
-service's host against the service's certificate.
+the client. So its certificate only allows calls, and it checks the service's host against the
+service's certificate.
 
 The link reads the socket and decrypts in memory, so no handshake begins before the peer's first
 byte, and a port scanner costs no more than its connection.
@@ -177,8 +177,8 @@ def _alpn_name(incarnation: str) -> str:
 class TlsStream:
     """One end of TLS on one stream.
 
-    For a robot, ``host`` is the name or address that the certificate must be for, None if the
-    service has dialled, and ``known`` is the last incarnation of the service.
+    For a robot, ``host`` is the name or address that the certificate must be for, and ``known`` the
+    last incarnation of the service.
     """
 
     def __init__(
@@ -186,7 +186,6 @@ class TlsStream:
     ) -> None:
         self._is_server = context.protocol == ssl.PROTOCOL_TLS_SERVER
         if not self._is_server:
-            context.check_hostname = host is not None
             names = [_ANY_INCARNATION]
             context.set_alpn_protocols([_alpn_name(known), *names] if known is not None else names)
         self._known = known

@@ -1,0 +1,250 @@
+"""Active sensing as one stateless, typed service with three kinds of request.
+
+The first implementation had a service ``cloud_active_sensing`` in the cloud and another one,
+``cloud_active_sensing_recovery``, on the robot. Each kept the belief, so a robot that changed the
+service lost it. Here each request brings the planning state and each answer returns it, so any
+service can answer any request.
+
+This module has the service without a wire: requests and answers as Python objects.
+``srv/ActiveSensing.srv`` of ``holdfast_interfaces`` defines them as messages, field by field.
+"""
+
+from __future__ import annotations
+
+import enum
+import hashlib
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from holdfast import planning
+from holdfast.arrays import FloatArray
+from holdfast.belief import Belief
+from holdfast.config.loader import Configuration
+from holdfast.config.user_code import account_of_user_error
+from holdfast.errors import CheckpointError, HoldfastError, InvalidValueError, ProblemError
+from holdfast.planning import Planner, PlanningState
+from holdfast.robot.environment import is_no_reading
+from holdfast.robot.session_configuration import session_configuration_of
+
+__all__ = [
+    "ANOTHER_MAY_ANSWER",
+    "ActiveSensing",
+    "DecisionAnswer",
+    "DecisionRequest",
+    "ErrorCode",
+    "RequestKind",
+    "checked_state",
+    "configuration_digest",
+    "no_state",
+]
+
+
+_MAX_MESSAGE = 2000
+_NO_ENTROPIES = np.empty(0)
+
+
+class RequestKind(enum.IntEnum):
+    """The kind of a request."""
+
+    INITIALIZE = 0
+    """Return the state that a trial begins with."""
+    CHOOSE_SENSING_ACTION = 1
+    """Choose what to sense."""
+    CHOOSE_TASK_ACTIONS = 2
+    """Choose the task actions after an observation."""
+
+
+class ErrorCode(enum.IntEnum):
+    """Why there is no answer."""
+
+    OK = 0
+    BAD_REQUEST = 1
+    """The request is invalid for every service."""
+    OTHER_CONFIGURATION = 2
+    """This service plans with another configuration or other code."""
+    PROBLEM_FAILED = 3
+    """The problem's own code has raised an error."""
+    BUSY = 4
+    """Too many requests: another service may answer now, or this one later."""
+
+
+ANOTHER_MAY_ANSWER = (ErrorCode.OTHER_CONFIGURATION, ErrorCode.BUSY)
+"""Refusals of one service; every other error is the request's or the problem's own."""
+
+
+class DecisionRequest(NamedTuple):
+    """A request; fields that its kind does not need keep their defaults.
+
+    Attributes
+    ----------
+    kind : int
+        One of :class:`RequestKind`.
+    configuration : str
+        Digest of the required configuration; empty accepts the service's.
+    seed, trial : int
+        Of the trial that begins.
+    state : PlanningState or None
+        None only for INITIALIZE.
+    sensing_action : int
+        The sensing action that was performed.
+    observation : array of shape (observation_size,)
+        Its result; NaN in every component is no reading.
+    """
+
+    kind: int
+    configuration: str = ""
+    seed: int = 0
+    trial: int = 0
+    state: PlanningState | None = None
+    sensing_action: int = 0
+    observation: FloatArray = _NO_ENTROPIES
+
+
+class DecisionAnswer(NamedTuple):
+    """An answer; fields that its request did not ask for are empty.
+
+    Attributes
+    ----------
+    message : str
+        Why there is no answer, in words.
+    configuration : str
+        Digest of the service's configuration.
+    state : PlanningState or None
+        For the next request; None if there is no answer.
+    entropies : array of shape (J,)
+        Expected entropy after each sensing action, in nats; empty if the selector has none.
+    task_actions : array of shape (n, action_size)
+        Up to the next sensing step, in order.
+    """
+
+    error: ErrorCode
+    message: str
+    configuration: str
+    state: PlanningState | None = None
+    sensing_action: int = 0
+    entropies: FloatArray = _NO_ENTROPIES
+    task_actions: FloatArray = np.empty((0, 0))
+
+
+def no_state() -> PlanningState:
+    """Return a state without particles, which messages use for none."""
+    return PlanningState(0, 0, 0, 0, False, Belief(np.empty((0, 0)), np.empty(0)))
+
+
+def configuration_digest(configuration: Configuration) -> str:
+    """Return 16 digits of a digest over the problem, its code, the settings and the version.
+
+    Everything that decides is in it, except seed, trial and state.
+    """
+    session_configuration = msgspec.structs.replace(session_configuration_of(configuration), seed=0)
+    return hashlib.blake2b(
+        msgspec.msgpack.encode(session_configuration, order="sorted"), digest_size=8
+    ).hexdigest()
+
+
+class ActiveSensing:
+    """Answers the requests of one configuration; for one thread at a time."""
+
+    def __init__(self, configuration: Configuration) -> None:
+        self._problem_name = configuration.problem_name
+        self._planner = Planner(configuration.problem, configuration.planning)
+        self._max_actions = configuration.planning.sensing_interval + 1
+        self.configuration = configuration_digest(configuration)
+
+    def refusal(self, error: ErrorCode, message: str) -> DecisionAnswer:
+        """Return an answer with an error."""
+        return DecisionAnswer(error, message[:_MAX_MESSAGE], self.configuration)
+
+    def answer(self, request: DecisionRequest) -> DecisionAnswer:
+        """Answer a request; errors are answers, too."""
+        if request.configuration not in ("", self.configuration):
+            return self.refusal(
+                ErrorCode.OTHER_CONFIGURATION,
+                f"configuration {request.configuration!r:.60} was asked for; this service has "
+                f"{self.configuration} ({self._problem_name})",
+            )
+        try:
+            return self._answer(request)
+        except HoldfastError as error:
+            # Only the author can fix a problem that breaks its contract.
+            is_problem = isinstance(error, ProblemError)
+            code = ErrorCode.PROBLEM_FAILED if is_problem else ErrorCode.BAD_REQUEST
+            return self.refusal(code, str(error))
+        except Exception as error:
+            account = account_of_user_error(error, self._problem_name)
+            if account is None:
+                raise
+            return self.refusal(ErrorCode.PROBLEM_FAILED, account)
+
+    def _answer(self, request: DecisionRequest) -> DecisionAnswer:
+        planner = self._planner
+        if request.kind == RequestKind.INITIALIZE:
+            state = planner.init(request.seed, request.trial)
+            return DecisionAnswer(ErrorCode.OK, "", self.configuration, state)
+        if request.kind not in (RequestKind.CHOOSE_SENSING_ACTION, RequestKind.CHOOSE_TASK_ACTIONS):
+            known = ", ".join(f"{kind.value} {kind.name}" for kind in RequestKind)
+            raise InvalidValueError(f"kind {request.kind}: there are {known}")
+        if request.state is None:
+            raise InvalidValueError("state: there are no particles in it")
+        state = request.state
+        planner.check(state)
+        needs_sensing = planner.needs_sensing(state)
+        if request.kind == RequestKind.CHOOSE_SENSING_ACTION:
+            if not needs_sensing:
+                raise InvalidValueError(
+                    f"step {state.step} needs no sensing action; ask for CHOOSE_TASK_ACTIONS"
+                )
+            chosen, info = planner.choose_sensing_action(state)
+            entropies = _NO_ENTROPIES if info.entropies is None else info.entropies
+            return DecisionAnswer(ErrorCode.OK, "", self.configuration, state, chosen, entropies)
+        if needs_sensing:
+            shown = request.observation
+            chosen_not_to = request.sensing_action == planner.no_sensing and not shown.size
+            observation = None if chosen_not_to or is_no_reading(shown) else shown
+            state, _ = planner.observe(state, request.sensing_action, observation)
+        elif request.observation.size:
+            raise InvalidValueError(
+                f"observation of {request.observation.size} values: step {state.step} needs none"
+            )
+        actions, ahead = planner.plan_until_sensing(state, self._max_actions)
+        return DecisionAnswer(
+            ErrorCode.OK,
+            "",
+            self.configuration,
+            ahead,
+            task_actions=np.reshape(actions, (len(actions), planner.problem.action_size)),
+        )
+
+
+def checked_state(
+    seed: int,
+    trial: int,
+    step: int,
+    stage: int,
+    sensed: bool,
+    state_size: int,
+    states: FloatArray,
+    weights: FloatArray,
+) -> PlanningState | None:
+    """Return the state that a message has, or None if it has no particles.
+
+    ``states`` has shape ``(num_particles * state_size,)``, particle after particle, and ``weights``
+    ``(num_particles,)``.
+
+    Raises CheckpointError if this is no state: numbers that are missing or not finite, weights that
+    are negative or do not sum to 1, a negative seed.
+    """
+    if not weights.size and not states.size:
+        return None
+    if states.size != weights.size * state_size:
+        raise CheckpointError(
+            f"state.belief.states has {states.size} numbers: {weights.size} weights and "
+            f"state_size {state_size} need {weights.size * state_size}"
+        )
+    belief = Belief(states.reshape(weights.size, state_size), weights)
+    # A state from outside must pass the checks of a checkpoint.
+    return planning.decode_checkpoint(
+        planning.encode_checkpoint(PlanningState(seed, trial, step, stage, sensed, belief))
+    )

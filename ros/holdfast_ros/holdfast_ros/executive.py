@@ -1,0 +1,267 @@
+"""An environment for robots with an executive: a program that drives the robot and asks to decide.
+
+Such a program calls; it does not want to be called. So this environment's ``perform_sensing`` and
+``perform`` publish the decision, and wait until a call of :meth:`DecisionHandover.call` reports its
+outcome. The run is like any other: journalled, resumable, with services that may die.
+
+Calls may be repeated after a lost reply or a crash. So a decision's number follows from its place
+in the trial: the sensing action of step t is number 2 t + 1, the task action is 2 t + 2. A resumed
+run gives the same decisions the same numbers.
+"""
+
+from __future__ import annotations
+
+import enum
+import threading
+from time import monotonic
+from typing import NamedTuple
+
+import numpy as np
+
+from holdfast.arrays import FloatArray
+from holdfast.errors import EnvironmentFailedError, InvalidValueError
+from holdfast.outcome import Done
+from holdfast.problems.problem import Problem
+from holdfast.robot.environment import ObservationSizes, is_no_reading
+from holdfast.robot.environment_maker import EnvironmentMaker
+
+__all__ = [
+    "DecideCode",
+    "DecideRequest",
+    "DecisionHandover",
+    "DueDecision",
+    "ExecutiveEnvironment",
+    "ExecutiveMaker",
+]
+
+
+_NO_NUMBERS: FloatArray = np.empty(0)
+
+
+class DecideCode(enum.IntEnum):
+    """The result of a call."""
+
+    OK = 0
+    HOLDING = 1
+    """There is no decision yet: repeat the call."""
+    FINISHED = 2
+    """All trials are finished."""
+    BAD_REQUEST = 3
+    """The reported outcome was refused; the decision is still due."""
+    INACTIVE = 4
+    """No run is active."""
+    ENDED = 5
+    """The run has ended early."""
+
+
+class DueDecision(NamedTuple):
+    """A decision whose outcome is awaited; ``trial`` and ``number`` identify it.
+
+    ``sensing_action`` is None for a task action, and ``task_action``, of shape ``(action_size,)``,
+    is empty for a sensing action. ``step`` counts the task actions before it.
+    """
+
+    trial: int
+    number: int
+    step: int
+    sensing_action: int | None
+    task_action: FloatArray = _NO_NUMBERS
+
+
+class DecideRequest(NamedTuple):
+    """The outcome of a decision; number 0 reports none. The observation has shape ``(n,)``."""
+
+    trial: int = 0
+    number: int = 0
+    observation: FloatArray = _NO_NUMBERS
+    reward: float | None = None
+    done: Done = False
+
+
+class DecideReply(NamedTuple):
+    """The reply to a call; the message says why there is no decision."""
+
+    code: DecideCode
+    message: str = ""
+    due: DueDecision | None = None
+
+
+class DecisionHandover:
+    """Hands a run's decisions to an executive and its outcomes back; usable from any thread.
+
+    It serves one run, until that ends or is held. Only callers' threads may use ``problem``.
+    """
+
+    def __init__(self, problem: Problem, sensing_interval: int) -> None:
+        self._problem = problem
+        self._interval = sensing_interval
+        self._sizes = ObservationSizes(problem)
+        self._changed = threading.Condition()
+        self._due: DueDecision | None = None
+        self._answer: DecideRequest | None = None
+        self._answered: tuple[int, int] | None = None
+        self._end: DecideReply | None = None
+
+    def end(self, code: DecideCode, message: str) -> None:
+        """End all waits, because the run has ended or will end. The first call counts."""
+        with self._changed:
+            self._end = self._end or DecideReply(code, message)
+            self._due = None
+            self._changed.notify_all()
+
+    def perform(self, due: DueDecision) -> DecideRequest:
+        """Publish a decision and wait for its outcome.
+
+        Raises EnvironmentFailedError if the run ends first.
+        """
+        with self._changed:
+            self._answer = None
+            if self._end is None:
+                self._due = due
+                self._changed.notify_all()
+            self._changed.wait_for(lambda: self._answer or self._end)
+            answer: DecideRequest | None = self._answer
+            if answer is None:
+                raise EnvironmentFailedError("" if self._end is None else self._end.message)
+            return answer
+
+    def call(self, call: DecideRequest, within_s: float) -> DecideReply:
+        """Take the outcome of a decision, and return the next decision.
+
+        The reply is ``HOLDING`` after ``within_s``.
+        """
+        deadline = monotonic() + within_s
+        named = call.trial, call.number
+        with self._changed:
+            while self._end is None:
+                due = self._due
+                if due is not None:
+                    if not call.number or self._precedes(named, due):
+                        return DecideReply(DecideCode.OK, due=due)
+                    try:
+                        self._check(call, due)
+                    except InvalidValueError as error:
+                        return DecideReply(DecideCode.BAD_REQUEST, str(error), due)
+                    self._answer, self._answered, self._due = call, named, None
+                    self._changed.notify_all()
+                elif call.number and self._answered not in (None, named):
+                    return DecideReply(
+                        DecideCode.BAD_REQUEST, self._wrong_number(named, self._answered)
+                    )
+                if not self._changed.wait(deadline - monotonic()) and monotonic() >= deadline:
+                    return DecideReply(
+                        DecideCode.HOLDING, "nothing is decided yet; make the same call again"
+                    )
+            return self._end
+
+    def _precedes(self, named: tuple[int, int], due: DueDecision) -> bool:
+        """Return whether a decision directly precedes the due one."""
+        if due.number <= 1 or (due.number == 2 and not self._senses_at(0)):
+            return named[0] == due.trial - 1
+        by_sensing = due.sensing_action is None and self._senses_at(due.step)
+        return named == (due.trial, due.number - 1 if by_sensing else 2 * due.step)
+
+    def _senses_at(self, step: int) -> bool:
+        return step % (self._interval + 1) == 0
+
+    @staticmethod
+    def _wrong_number(named: tuple[int, int], expected: tuple[int, int] | None) -> str:
+        trial, number = expected or (0, 0)
+        return (
+            f"trial {named[0]}, number {named[1]}: trial {trial}, number {number} is to be "
+            "answered, or was last; number 0 asks what is due"
+        )
+
+    def _check(self, call: DecideRequest, due: DueDecision) -> None:
+        if (call.trial, call.number) != (due.trial, due.number):
+            raise InvalidValueError(
+                self._wrong_number((call.trial, call.number), (due.trial, due.number))
+            )
+        if call.reward is not None and not np.isfinite(call.reward):
+            raise InvalidValueError(f"reward {call.reward}: must be a finite number")
+        if due.sensing_action is None:
+            if call.observation.size:
+                raise InvalidValueError(
+                    f"observation of {call.observation.size} values: number {due.number} is a task "
+                    "action, of which there is none"
+                )
+            return
+        if call.done is not False:
+            said = "that the task has failed" if call.done == "failed" else "that it has succeeded"
+            raise InvalidValueError(
+                f"done says {said}: number {due.number} is a sensing action, after which the task "
+                "goes on; say so with the task action that it ended with"
+            )
+        size = self._sizes[due.sensing_action]
+        if call.observation.size < 1 or size not in (None, call.observation.size):
+            raise InvalidValueError(
+                f"observation of {call.observation.size} values: sensing action "
+                f"{due.sensing_action} of {self._problem.name} has {size or 'at least 1'}"
+            )
+        if not np.isfinite(call.observation).all() and not is_no_reading(call.observation):
+            place = int(np.argmin(np.isfinite(call.observation)))
+            raise InvalidValueError(
+                f"observation[{place}] is {call.observation[place]}: must be a finite number"
+            )
+
+
+class ExecutiveEnvironment:
+    """One trial that an executive performs; the journal has ``step`` task actions of it."""
+
+    def __init__(self, executive: DecisionHandover, trial: int = 0, step: int = 0) -> None:
+        self._executive = executive
+        self._trial = trial
+        self._step = step
+        self._done: Done = False
+
+    def perform_sensing(self, sensing_action: int) -> FloatArray:
+        """Have the executive sense."""
+        step = self._step
+        due = DueDecision(self._trial, 2 * step + 1, step, sensing_action)
+        return self._executive.perform(due).observation
+
+    def perform(self, task_action: FloatArray) -> float | None:
+        """Have the executive act."""
+        step = self._step
+        due = DueDecision(self._trial, 2 * step + 2, step, None, task_action)
+        call = self._executive.perform(due)
+        self._step = step + 1
+        self._done = call.done
+        return call.reward
+
+    def is_done(self) -> Done:
+        """Return what the executive said with the last task action."""
+        return self._done
+
+    def steps_performed(self) -> int:
+        """Return how many task actions the journal knows to be performed.
+
+        One that may have begun is handed out again with its number. The executive knows whether it
+        has performed it, and answers without performing it twice.
+        """
+        return self._step
+
+
+class ExecutiveMaker(EnvironmentMaker):
+    """Makes the environment of each trial; a decision may take the executive ``timeout_ms``."""
+
+    def __init__(
+        self,
+        executive: DecisionHandover,
+        problem: Problem,
+        timeout_ms: float,
+        max_missing_in_a_row: int,
+    ) -> None:
+        super().__init__(
+            "the executive", problem, 0, timeout_ms, max_missing_in_a_row=max_missing_in_a_row
+        )
+        self.simulated = False
+        self._executive = executive
+
+    def __call__(
+        self, trial: int, *, resumed: bool = False, performed: object = ()
+    ) -> ExecutiveEnvironment:
+        """Make the environment of a trial."""
+        del resumed
+        assert isinstance(performed, list | tuple)
+        return ExecutiveEnvironment(self._executive, trial, len(performed))

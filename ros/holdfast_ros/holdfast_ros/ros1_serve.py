@@ -1,0 +1,16 @@
+"""``holdfast ros1-serve``: ``holdfast serve``, which offers the typed service of ROS 1 as well."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+__all__ = ["SUMMARY", "main"]
+
+SUMMARY = "Decide for robots in ROS 1, as a service."
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Serve until a signal ends it, and return the exit code."""
+    from holdfast_ros.ros1_process import main
+
+    return main(arguments)

@@ -1,0 +1,590 @@
+"""The lifecycle node: parameters in, a run on its own thread, and topics, services and actions.
+
+The node decides nothing. It reads the parameters when it is configured. While it is active, a goal
+of ``~/run`` or a call of ``~/decide`` starts a segment of the run
+(:class:`~holdfast_ros.ros2.run_segment.RunSegment`): the same robot process as in ``holdfast run``.
+Deactivating the node pauses the segment; the next one continues the run.
+
+Threads: rclpy's executor calls the node's methods on several threads. The robot's loop, the
+environment and the telemetry have one thread each. Callbacks wait for the robot only with a
+deadline, except the running goal's, which keeps one thread of the executor.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import diagnostic_msgs.msg
+import geometry_msgs.msg
+import holdfast_interfaces.action
+import holdfast_interfaces.msg
+import holdfast_interfaces.srv
+import numpy as np
+import std_msgs.msg
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+from holdfast.errors import HoldfastError
+from holdfast.planning import PlanningState
+from holdfast.problem_attributes import sensing_labels
+from holdfast.protocol.events import Act, Sense
+from holdfast.recording.poses import PoseLayout, pose_layout
+from holdfast.recording.run_directory import RunDirectory
+from holdfast.robot.links import check_services
+from holdfast.runtime.log_lines import fields_as_text
+from holdfast_ros.executive import DecideCode, DecideRequest
+from holdfast_ros.ros2 import messages
+from holdfast_ros.ros2.diagnostics import Diagnostics
+from holdfast_ros.ros2.parameters import (
+    OWN_DEFAULTS,
+    NodeParameters,
+    in_parameters,
+    known_parameters,
+    read_parameters,
+)
+from holdfast_ros.ros2.run_segment import Ending, RunSegment, SegmentResult, make_world
+from holdfast_ros.ros2.telemetry import PublishedDecision, Telemetry
+from holdfast_ros.ros2_connections import Connections
+
+__all__ = ["NUM_THREADS", "HoldfastNode"]
+
+_Run = holdfast_interfaces.action.Run
+_Decide = holdfast_interfaces.srv.Decide
+_Level = diagnostic_msgs.msg.DiagnosticStatus
+
+_MOST_CALLS = 3
+"""Calls of ``~/decide`` that may wait at once."""
+
+NUM_THREADS = 4 + _MOST_CALLS
+"""Of the executor: a goal and the calls may keep theirs for a while, the rest is always free."""
+
+_DIAGNOSTICS_S = 1.0
+
+_RESULT_S = 0.5
+"""At the end of the process: for the client that waits for its result to get it."""
+
+_TOLD_AT_ONCE = frozenset(
+    (
+        "status",
+        "holding",
+        "resumed",
+        "launch_failed",
+        "recovery_exited",
+        "unexplained",
+        "lost",
+        "sensor_suspect",
+        "reinitialised",
+        "service_vanished",
+        "service_appeared",
+        "wrong_answer",
+        "stopped",
+        "trial",
+    )
+)
+"""Events that change the diagnostics."""
+
+_LOGGED = frozenset(
+    (
+        "status",
+        "holding",
+        "resumed",
+        "lost",
+        "sensor_suspect",
+        "reinitialised",
+        "wrong_answer",
+        "stopped",
+    )
+)
+
+
+class _Events:
+    """Takes the robot's events, on the robot's loop."""
+
+    def __init__(self, node: HoldfastNode, diagnostics: Diagnostics, telemetry: Telemetry) -> None:
+        self._node = node
+        self._diagnostics = diagnostics
+        self._telemetry = telemetry
+
+    def event(self, name: str, /, **fields: object) -> None:
+        """Take an event."""
+        if name in _TOLD_AT_ONCE:
+            self._diagnostics.event(name)
+            if name in _LOGGED:
+                words = in_parameters(fields_as_text(fields))
+                self._node.get_logger().info(f"{name.replace('_', ' ')}: {words}")
+            self._telemetry.notice()
+
+    def close(self) -> None:
+        """Take no more."""
+
+
+class HoldfastNode(LifecycleNode):  # type: ignore[misc]
+    """The robot's part of active sensing."""
+
+    SUCCESS = TransitionCallbackReturn.SUCCESS
+
+    def __init__(self, name: str = "holdfast") -> None:
+        super().__init__(
+            name,
+            allow_undeclared_parameters=True,
+            automatically_declare_parameters_from_overrides=True,
+        )
+        self._declare()
+        self._robot = Connections(self)
+        # Guards the fields below.
+        self._changed = threading.RLock()
+        self._parameters_read: NodeParameters | None = None
+        self._layout: PoseLayout | None = None
+        self._active = False
+        self._segment: RunSegment | None = None
+        self._telemetry: Telemetry | None = None
+        self._diagnostics: Diagnostics | None = None
+        self._goal: Any = None
+        self._last_result: SegmentResult | None = None
+        self._calls = threading.BoundedSemaphore(_MOST_CALLS)
+        self._goals_ended = threading.Event()
+        self._goals_ended.set()
+
+        best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        self._cloud_publisher = self.create_lifecycle_publisher(
+            geometry_msgs.msg.PoseArray, "~/particle_cloud", best_effort
+        )
+        self._belief_publisher = self.create_lifecycle_publisher(
+            holdfast_interfaces.msg.BeliefStamped, "~/belief", best_effort
+        )
+        self._decision_publisher = self.create_lifecycle_publisher(
+            holdfast_interfaces.msg.Decision, "~/decision", QoSProfile(depth=100)
+        )
+        self._status_publisher = self.create_lifecycle_publisher(
+            std_msgs.msg.String, "~/status", QoSProfile(depth=10)
+        )
+        self._diagnostics_publisher = self.create_lifecycle_publisher(
+            diagnostic_msgs.msg.DiagnosticArray, "/diagnostics", QoSProfile(depth=10)
+        )
+        self._group = ReentrantCallbackGroup()
+        self._decide_server = self.create_service(
+            _Decide, "~/decide", self._decide, callback_group=self._group
+        )
+        self._run_server = ActionServer(
+            self,
+            _Run,
+            "~/run",
+            self._execute,
+            callback_group=self._group,
+            goal_callback=self._judge_goal,
+            cancel_callback=self._cancel,
+        )
+        self._diagnostics_timer = self.create_timer(
+            _DIAGNOSTICS_S,
+            self._tell_diagnostics,
+            callback_group=MutuallyExclusiveCallbackGroup(),
+            # Simulated time may stand still; the diagnostics are to come all the same.
+            clock=Clock(clock_type=ClockType.STEADY_TIME),
+        )
+        self.add_on_set_parameters_callback(self._judge_parameters)
+
+    # -- parameters ------------------------------------------------------------------------------
+
+    def _declare(self) -> None:
+        for name, text in known_parameters().items():
+            descriptor = ParameterDescriptor(description=text, dynamic_typing=True)
+            if self.has_parameter(name):
+                self.set_descriptor(name, descriptor)
+            else:
+                # An empty list has no type in ROS.
+                default = OWN_DEFAULTS.get(name)
+                self.declare_parameter(name, None if default == [] else default, descriptor)
+
+    def _judge_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        known = known_parameters()
+        if self._parameters_read is not None:
+            for parameter in parameters:
+                if parameter.name in known or "." in parameter.name:
+                    return SetParametersResult(
+                        successful=False,
+                        reason=f"{parameter.name} is read-only once the node is configured: "
+                        "clean it up first",
+                    )
+        return SetParametersResult(successful=True)
+
+    def _values(self) -> Mapping[str, Any]:
+        return {
+            name: _plain(parameter.value)
+            for name, parameter in self.get_parameters_by_prefix("").items()
+        }
+
+    @property
+    def autostart(self) -> bool:
+        """Whether the node is to configure and activate itself."""
+        return self.get_parameter("autostart").value is True
+
+    def how_to_activate(self) -> str:
+        """Return the commands that activate the node."""
+        set_state = f"ros2 lifecycle set {self.get_fully_qualified_name()}"
+        steps = {
+            "unconfigured": f"{set_state} configure, then {set_state} activate",
+            "inactive": f"{set_state} activate",
+            "finalized": "start it again",
+        }
+        return steps.get(self._state_machine.current_state[1], "wait until it has changed")
+
+    # -- lifecycle -------------------------------------------------------------------------------
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Read the parameters, and check all that can be checked before a run."""
+        try:
+            read = read_parameters(self._values())
+            check_services(read.configuration)
+            layout = pose_layout(read.configuration.problem)
+            make_world(self._robot, read)
+            # Whether a run can begin there, or go on.
+            RunDirectory.resume_if_begun(read.run_directory, read.configuration).close()
+        except Exception as error:  # noqa: BLE001 - rclpy would hide it
+            self.get_logger().error(f"not configured: {_in_words(error)}")
+            return TransitionCallbackReturn.FAILURE
+        with self._changed:
+            self._parameters_read = read
+            self._layout = layout
+            self._last_result = None
+            self._diagnostics = Diagnostics(read.configuration.recovery)
+        self.get_logger().info(
+            f"configured: {read.configuration.problem_name}, "
+            f"{read.configuration.simulator.num_trials} trials in {read.run_directory}"
+        )
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take goals and calls from now on, and publish."""
+        result = super().on_activate(state)
+        with self._changed:
+            self._active = True
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Hold the run, if there is one, and publish nothing more."""
+        self._hold("the node was deactivated")
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Forget the parameters that were read."""
+        self._forget()
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Hold the run and forget everything."""
+        self._hold("the node was shut down")
+        super().on_deactivate(state)
+        self._forget()
+        return super().on_shutdown(state)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Go back to the beginning after a defect."""
+        self.get_logger().error("a transition has failed; the node is unconfigured again")
+        self._hold("a transition of the node has failed")
+        super().on_deactivate(state)
+        self._forget()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _hold(self, why: str) -> None:
+        """End what runs, so that it can go on later, and let nothing begin."""
+        with self._changed:
+            self._active = False
+            segment, telemetry = self._segment, self._telemetry
+            read = self._parameters_read
+        if segment is not None and read is not None:
+            segment.pause(why, read.own.pause_timeout_s)
+            # It ends itself within the time that it was given; the rest is for a slow disk.
+            if not segment.ended.wait(read.own.pause_timeout_s + 10.0):
+                self.get_logger().error("the run has not ended; its journal has everything")
+        if telemetry is not None:
+            telemetry.close()
+
+    def _forget(self) -> None:
+        with self._changed:
+            self._parameters_read = None
+            self._last_result = None
+            self._telemetry = None
+            self._diagnostics = None
+
+    def end(self) -> bool:
+        """End in order, in any state, when the process is asked to end.
+
+        Returns
+        -------
+        bool
+            Whether the run has ended.
+        """
+        is_asked = not self._goals_ended.is_set()
+        if self._state_machine.current_state[1] in ("unconfigured", "inactive", "active"):
+            self.trigger_shutdown()
+        if is_asked and self._goals_ended.wait(_RESULT_S):
+            # rclpy sends the result some turns of the executor later, and does not say when.
+            time.sleep(_RESULT_S)
+        return self._segment is None
+
+    # -- runs ------------------------------------------------------------------------------------
+
+    def _begin_segment(self) -> RunSegment:
+        """Start the next part of the run; the caller holds the lock."""
+        read, diagnostics = self._parameters_read, self._diagnostics
+        assert read is not None
+        assert diagnostics is not None
+        configuration = read.configuration
+        world = make_world(self._robot, read)
+        telemetry = Telemetry(
+            configuration,
+            self._show_order,
+            self._show_belief,
+            self._tell_diagnostics,
+            self._tell_failure,
+            belief_rate_hz=read.own.belief_rate_hz,
+            wants_entropies=self._wants_entropies,
+        )
+
+        def on_order(state: PlanningState, order: Act | Sense) -> None:
+            telemetry.order(state, order, segment.status)
+
+        segment = RunSegment(
+            configuration,
+            read.run_directory,
+            world,
+            rate_hz=read.own.rate_hz or None,
+            after_reboot=read.own.after_reboot,
+            sink=_Events(self, diagnostics, telemetry),
+            on_order=on_order,
+            on_timing=telemetry.time,
+            on_end=self._segment_ended,
+        )
+        self._telemetry = telemetry
+        self._segment = segment
+        segment.start()
+        return segment
+
+    def _segment_ended(self, outcome: SegmentResult) -> None:
+        with self._changed:
+            telemetry, segment = self._telemetry, self._segment
+            self._last_result = outcome
+        handover = None if segment is None else segment.world.handover
+        if handover is not None:
+            finished = outcome.ending == Ending.FINISHED
+            handover.end(DecideCode.FINISHED if finished else DecideCode.ENDED, outcome.message)
+        if telemetry is not None:
+            telemetry.close()
+        level = "info" if outcome.ending in (Ending.FINISHED, Ending.PAUSED) else "error"
+        getattr(self.get_logger(), level)(f"{outcome.ending.name.lower()}: {outcome.message}")
+        with self._changed:
+            self._segment = None
+        self._tell_diagnostics()
+
+    def _judge_goal(self, request: Any) -> GoalResponse:
+        del request
+        if self._active:
+            return GoalResponse.ACCEPT
+        state = self._state_machine.current_state[1]
+        self.get_logger().warning(
+            f"a goal of ~/run was rejected: the node is {state}, and takes goals while it is "
+            f"active: {self.how_to_activate()}"
+        )
+        return GoalResponse.REJECT
+
+    def _cancel(self, goal: Any) -> CancelResponse:
+        with self._changed:
+            segment = self._segment if goal == self._goal else None
+            read = self._parameters_read
+        if segment is not None and read is not None:
+            segment.pause("the goal was cancelled", read.own.pause_timeout_s)
+        return CancelResponse.ACCEPT
+
+    def _execute(self, goal: Any) -> Any:
+        """Run until it is done, or held; on a thread of the executor."""
+        read = self._parameters_read
+        refusal = None
+        segment = None
+        with self._changed:
+            if not self._active or read is None:
+                refusal = "the node is not active"
+            elif self._goal is not None:
+                refusal = "another goal is running; cancel it, or wait for its result"
+            else:
+                try:
+                    # One that a call of ~/decide has begun is gone on with.
+                    segment = self._segment or self._begin_segment()
+                except Exception as error:  # noqa: BLE001 - rclpy would call it finished
+                    goal.abort()
+                    return _Run.Result(code=_Run.Result.HELD, message=_in_words(error))
+                self._goal = goal
+                self._goals_ended.clear()
+        if segment is None or read is None:
+            goal.abort()
+            return _Run.Result(code=_Run.Result.REFUSED, message=refusal or "")
+        try:
+            if goal.is_cancel_requested:
+                segment.pause("the goal was cancelled", read.own.pause_timeout_s)
+            segment.ended.wait()
+            outcome = segment.outcome
+            assert outcome is not None
+            if outcome.ending == Ending.FINISHED:
+                goal.succeed()
+            elif goal.is_cancel_requested:
+                goal.canceled()
+            else:
+                goal.abort()
+            return _Run.Result(
+                code=int(outcome.ending),
+                message=outcome.message,
+                run_directory=str(read.run_directory),
+                trials=[messages.outcome_message(result) for result in outcome.trials],
+            )
+        finally:
+            with self._changed:
+                self._goal = None
+            self._goals_ended.set()
+
+    # -- ~/decide --------------------------------------------------------------------------------
+
+    def _decide(self, request: Any, response: Any) -> Any:
+        if not self._calls.acquire(blocking=False):
+            response.code = DecideCode.HOLDING
+            response.message = f"{_MOST_CALLS} calls are waiting already; make the same call again"
+            return response
+        try:
+            return self._decide_one(request, response)
+        except Exception as error:  # noqa: BLE001 - else there is no answer at all
+            response.code, response.message = DecideCode.ENDED, _in_words(error)
+            return response
+        finally:
+            self._calls.release()
+
+    def _decide_one(self, request: Any, response: Any) -> Any:
+        with self._changed:
+            read, last = self._parameters_read, self._last_result
+            reason = self._no_calls()
+            segment: RunSegment | None = None
+            if reason is None and (last is None or last.ending != Ending.FINISHED):
+                segment = self._segment or self._begin_segment()
+        if reason is not None:
+            response.code, response.message = DecideCode.INACTIVE, reason
+            return response
+        handover = None if segment is None else segment.world.handover
+        if handover is None or segment is None or read is None:
+            response.code = DecideCode.FINISHED
+            response.message = "" if last is None else last.message
+            return response
+        if request.done > _Decide.Request.FAILED:
+            reply = handover.call(DecideRequest(), read.own.decide_timeout_s)  # asks what is due
+            if reply.code in (DecideCode.OK, DecideCode.HOLDING):
+                message = f"done {request.done}: allowed are 0 to {_Decide.Request.FAILED}"
+                reply = reply._replace(code=DecideCode.BAD_REQUEST, message=message)
+        else:
+            call = DecideRequest(
+                request.trial,
+                request.number,
+                np.array(request.observation, dtype=np.float64),
+                request.reward if request.has_reward else None,
+                (False, True, "failed")[request.done],
+            )
+            reply = handover.call(call, read.own.decide_timeout_s)
+        response.code, response.message = reply.code, reply.message
+        response.status = segment.status
+        due = reply.due
+        if due is not None:
+            response.trial, response.number, response.step = due.trial, due.number, due.step
+            if due.sensing_action is None:
+                response.kind = _Decide.Response.ACT
+                response.task_action = messages.floats(due.task_action)
+            else:
+                response.kind = _Decide.Response.SENSE
+                response.sensing_action = due.sensing_action
+                names = sensing_labels(read.configuration.problem)
+                response.sensing_action_name = names[due.sensing_action]
+        return response
+
+    def _no_calls(self) -> str | None:
+        """Return why no call can be answered; None if it can."""
+        read = self._parameters_read
+        if not self._active or read is None:
+            return f"the node is not active: {self.how_to_activate()}"
+        if read.own.environment != "executive":
+            return (
+                f"environment.kind is {read.own.environment}: the node itself performs what it "
+                "decides; it must be executive for calls of ~/decide"
+            )
+        return None
+
+    # -- what others see -------------------------------------------------------------------------
+
+    def _show_order(self, shown: PublishedDecision) -> None:
+        read, goal, segment = self._parameters_read, self._goal, self._segment
+        if read is None or not self._active:
+            return
+        problem = read.configuration.problem
+        now = self.get_clock().now().to_msg()
+        message = messages.decision_message(shown, problem, read.own.frame_id, now)
+        self._decision_publisher.publish(message)
+        if goal is not None:
+            finished = 0 if segment is None else segment.num_finished
+            goal.publish_feedback(_Run.Feedback(finished=finished, decision=message))
+
+    def _wants_entropies(self) -> bool:
+        read = self._parameters_read
+        heard = self._goal is not None or self._decision_publisher.get_subscription_count() > 0
+        return heard and read is not None and read.own.publish_entropies
+
+    def _tell_failure(self, error: Exception) -> None:
+        self.get_logger().warning(
+            f"not all is published of what the robot decides: {_in_words(error)}"
+        )
+
+    def _show_belief(self, state: PlanningState) -> None:
+        read, layout = self._parameters_read, self._layout
+        if read is None or not self._active:
+            return
+        now = self.get_clock().now().to_msg()
+        if self._belief_publisher.get_subscription_count():
+            self._belief_publisher.publish(messages.belief_message(state, read.own.frame_id, now))
+        if layout is not None and self._cloud_publisher.get_subscription_count():
+            poses = layout.poses(state.belief.states)
+            self._cloud_publisher.publish(messages.pose_array(poses, read.own.frame_id, now))
+
+    def _tell_diagnostics(self) -> None:
+        with self._changed:
+            read, segment, telemetry = self._parameters_read, self._segment, self._telemetry
+            last, active, diagnostics = self._last_result, self._active, self._diagnostics
+        if read is None or diagnostics is None or not active:
+            return
+        told = diagnostics.tell(segment, last, telemetry)
+        facts = told.facts | {"run_directory": str(read.run_directory)}
+        status = _Level(
+            level=bytes((told.level,)),
+            name=f"{self.get_name()}: active sensing",
+            message=told.word,
+            hardware_id=read.configuration.offload.name or "",
+            values=[
+                diagnostic_msgs.msg.KeyValue(key=key, value=value) for key, value in facts.items()
+            ],
+        )
+        message = diagnostic_msgs.msg.DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics_publisher.publish(message)
+        # The status; after the end of the run, how it ended.
+        word = told.word if segment is None else told.facts["status"] or told.word
+        self._status_publisher.publish(std_msgs.msg.String(data=word))
+
+
+def _in_words(error: Exception) -> str:
+    if isinstance(error, HoldfastError):
+        return in_parameters(str(error))
+    return f"{type(error).__name__}: {error}"
+
+
+def _plain(value: Any) -> Any:
+    """Return a parameter's value as plain data."""
+    return value if value is None or isinstance(value, bool | int | float | str) else list(value)

@@ -1,0 +1,283 @@
+"""A segment of a run, on its own thread: from the end of the journal until all trials are done.
+
+A segment ends early when it is paused or something fails. The next segment continues there, in this
+process or another one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import enum
+import functools
+import itertools
+import threading
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple
+
+from holdfast.config.loader import Configuration
+from holdfast.errors import (
+    HeldError,
+    HoldfastError,
+    LostJournalError,
+    StaleEpochError,
+    UnknownPerformanceError,
+)
+from holdfast.outcome import TrialResult
+from holdfast.planning import PlanningState
+from holdfast.protocol.events import Act, Sense, Timing
+from holdfast.recording.robot_run import RobotObserver, perform_trials
+from holdfast.recording.run_directory import RunDirectory
+from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
+from holdfast.robot.health import Condition
+from holdfast.robot.process import RobotProcess
+from holdfast.runtime.events import EventSink
+from holdfast_ros.executive import DecideCode, DecisionHandover, ExecutiveMaker
+from holdfast_ros.ros2.parameters import NodeParameters, in_parameters
+
+__all__ = ["MAX_TRIALS_TOLD", "Ending", "RunSegment", "SegmentResult", "World", "make_world"]
+
+MAX_TRIALS_TOLD = 10_000
+"""Of a result; ``trials.csv`` has all."""
+
+_INTERRUPTED_S = 2.0
+"""For a call of the environment that was interrupted to end."""
+
+_CANNOT_GO_ON = (UnknownPerformanceError, LostJournalError, StaleEpochError)
+
+
+class Ending(enum.IntEnum):
+    """How a segment ended."""
+
+    FINISHED = 0
+    """All trials are finished."""
+    PAUSED = 1
+    """It was asked to pause."""
+    HELD = 2
+    """An error; the run can continue once its cause is gone."""
+    FAILED = 3
+    """An error; the run cannot continue."""
+
+
+class SegmentResult(NamedTuple):
+    """The result of a segment, the trials of earlier segments included.
+
+    ``trials`` are the first :data:`MAX_TRIALS_TOLD` finished ones; ``status`` is empty if the robot
+    had not started.
+    """
+
+    ending: Ending
+    message: str
+    trials: tuple[TrialResult, ...]
+    status: str = ""
+    num_finished: int = 0
+
+
+class World(NamedTuple):
+    """What a segment acts on.
+
+    ``interrupt`` gets a reason and ends the environment's current call where possible. A pause does
+    so at once if an interrupted call is repeated later, so that it costs nothing. ``handover`` is
+    where calls of ``~/decide`` meet the run; None where the node itself performs.
+    """
+
+    maker: EnvironmentMaker
+    interrupt: Callable[[str], None]
+    interrupt_at_once: bool = False
+    handover: DecisionHandover | None = None
+
+
+def make_world(connections: Any, parameters: NodeParameters) -> World:
+    """Make what the parameters name, for one segment of a run.
+
+    Raises HoldfastError if that cannot be; the message names the parameter.
+    """
+    configuration = parameters.configuration
+    if parameters.own.environment == "configuration":
+        return World(load_environment(configuration), lambda _: None)
+    # Other threads than the robot's use it.
+    problem = Configuration.from_plain(configuration.plain()).problem
+    timeout_ms = configuration.environment.timeout_ms
+    missing = configuration.environment.max_missing_in_a_row
+    if parameters.own.environment == "executive":
+        handover = DecisionHandover(problem, configuration.planning.sensing_interval)
+        return World(
+            ExecutiveMaker(handover, configuration.problem, timeout_ms, missing),
+            functools.partial(handover.end, DecideCode.ENDED),
+            interrupt_at_once=True,
+            handover=handover,
+        )
+    from holdfast_ros.ros2_environment import Ros2Environment
+
+    make: Any = functools.partial(
+        Ros2Environment,
+        connections,
+        act=parameters.own.act,
+        timeout_ms=timeout_ms,
+        discovery_timeout_ms=parameters.own.discovery_timeout_ms,
+    )
+    maker = EnvironmentMaker(
+        "the robot",
+        problem,
+        configuration.simulator.seed,
+        timeout_ms,
+        make,
+        max_missing_in_a_row=missing,
+    )
+    return World(maker, lambda _: connections.cancel())
+
+
+class RunSegment:
+    """Runs the remaining trials of the run in the directory ``path``, once it is started.
+
+    ``on_order`` and ``on_timing`` are those of a
+    :class:`~holdfast.recording.robot_run.RobotObserver`; ``on_end`` gets the result, on the
+    segment's thread. ``outcome`` is there when ``ended`` is set.
+    """
+
+    def __init__(
+        self,
+        configuration: Configuration,
+        path: Path,
+        world: World,
+        *,
+        rate_hz: float | None,
+        after_reboot: bool = False,
+        sink: EventSink,
+        on_order: Callable[[PlanningState, Act | Sense], None],
+        on_timing: Callable[[Timing], None],
+        on_end: Callable[[SegmentResult], None],
+    ) -> None:
+        self._configuration = configuration
+        self._path = path
+        self.world = world
+        self._rate_hz = rate_hz
+        self._after_reboot = after_reboot
+        self._sink = sink
+        self._on_order = on_order
+        self._on_timing = on_timing
+        self._on_end = on_end
+        self._changed = threading.Lock()
+        self._process: RobotProcess | None = None
+        self._why_paused: str | None = None
+        self._pause_within_s = 0.0
+        self._thread = threading.Thread(target=self._work, name="robot", daemon=True)
+        self.ended = threading.Event()
+        self.outcome: SegmentResult | None = None
+        self.num_finished = 0
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def condition(self) -> Condition | None:
+        """Return how the robot is doing; None before it runs."""
+        process = self._process
+        return None if process is None else process.condition()
+
+    @property
+    def status(self) -> str:
+        """Who decides."""
+        process = self._process
+        return "" if process is None else process.status.value
+
+    @property
+    def unexplained_observations(self) -> int:
+        """Those of the trial that is running."""
+        process = self._process
+        return 0 if process is None else process.unexplained_observations
+
+    def pause(self, why: str, within_s: float) -> None:
+        """End in order, from any thread: :attr:`ended` says when. Only the first call counts.
+
+        The environment has ``within_s`` to end its current call, which is then interrupted, and
+        abandoned if that does not help.
+        """
+        with self._changed:
+            if self._why_paused is not None:
+                return
+            self._why_paused = why
+            self._pause_within_s = within_s + _INTERRUPTED_S
+            process = self._process
+        if process is not None:
+            process.pause(self._pause_within_s)
+        if self.world.interrupt_at_once:
+            self.world.interrupt(why)
+        else:
+            threading.Thread(
+                target=self._interrupt_later, args=(why, within_s), name="pause", daemon=True
+            ).start()
+
+    def _interrupt_later(self, why: str, within_s: float) -> None:
+        if not self.ended.wait(within_s):
+            self.world.interrupt(why)
+
+    def _take_process(self, process: RobotProcess) -> None:
+        with self._changed:
+            self._process = process
+            if self._why_paused is not None:
+                process.pause(self._pause_within_s)
+
+    def _work(self) -> None:
+        trials: tuple[TrialResult, ...] = ()
+        try:
+            with RunDirectory.resume_if_begun(self._path, self._configuration) as directory:
+                try:
+                    self._run(directory)
+                finally:
+                    trials = tuple(itertools.islice(directory.journal.results(), MAX_TRIALS_TOLD))
+                complete = self.num_finished >= self._configuration.simulator.num_trials
+            if complete:
+                result = SegmentResult(Ending.FINISHED, f"{self.num_finished} trials", trials)
+            else:
+                result = SegmentResult(Ending.PAUSED, self._why_paused or "paused", trials)
+        except HoldfastError as error:
+            result = SegmentResult(self._ending_of(error), in_parameters(str(error)), trials)
+            if result.ending == Ending.PAUSED:
+                result = result._replace(message=self._why_paused or result.message)
+        except BaseException:  # noqa: BLE001 - waiting callers need a result
+            result = SegmentResult(Ending.FAILED, traceback.format_exc(), trials)
+        result = result._replace(status=self.status, num_finished=self.num_finished)
+        self.outcome = result
+        try:
+            self._on_end(result)
+        finally:
+            self.ended.set()
+
+    def _ending_of(self, error: HoldfastError) -> Ending:
+        if isinstance(error, _CANNOT_GO_ON):
+            return Ending.FAILED
+        # An interrupted call reports a failure.
+        paused = self._why_paused is not None and isinstance(error, HeldError)
+        return Ending.PAUSED if paused else Ending.HELD
+
+    def _run(self, directory: RunDirectory) -> None:
+        self.num_finished = sum(1 for _ in directory.journal.results())
+        if directory.complete_summary() is not None:
+            return
+        began = perf_counter()
+
+        def on_result(result: TrialResult) -> None:
+            directory.add(result)
+            self.num_finished += 1
+
+        observer = RobotObserver(self._take_process, self._on_order, self._on_timing)
+        try:
+            perform_trials(
+                self._configuration,
+                directory,
+                self.world.maker,
+                on_result,
+                rate_hz=self._rate_hz,
+                after_reboot=self._after_reboot,
+                sinks=[self._sink],
+                observer=observer,
+            )
+        except BaseException:
+            # If the disk is the trouble, the first error says so.
+            with contextlib.suppress(HoldfastError):
+                directory.write_tables(perf_counter() - began)
+            raise
+        directory.write_tables(perf_counter() - began)

@@ -1,0 +1,7 @@
+"""``python -m ros1_master_guard``."""
+
+import sys
+
+from ros1_master_guard.command import main
+
+sys.exit(main())

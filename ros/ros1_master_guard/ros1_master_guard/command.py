@@ -1,0 +1,154 @@
+"""The command: guards a ROS 1 master until a signal comes."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import os
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from ros1_master_guard.errors import GuardError
+from ros1_master_guard.events import EventLog, json_line
+from ros1_master_guard.guard import MasterGuard
+from ros1_master_guard.settings import GuardSettings, MasterAddress
+
+__all__ = ["main"]
+
+_ABOUT = """\
+Guard the ROS 1 master: when it dies, the next one knows all that it knew.
+
+Start it instead of roscore. It starts a master, or guards the one that runs on this machine, and
+/rosout. When the master is killed or hangs, a new one takes its place, with all services,
+publishers, subscribers and parameters. No node is started again, and connections between nodes go
+on meanwhile. Ctrl-C or SIGTERM ends the guard and the master that it started.
+
+If the guard is killed, the master lives on: start another guard. If both are killed, the next guard
+goes on where they stopped, if a node of theirs still runs.
+
+Exit codes: 0 after SIGTERM; 2 an error; 128 + N ended by the signal N."""
+
+
+def _between(least: float, most: float, read: Callable[[str], float]) -> Callable[[str], float]:
+    def checked(text: str) -> float:
+        with contextlib.suppress(ValueError):
+            if least <= (value := read(text)) <= most:
+                return value
+        kind = "whole numbers" if read is int else "numbers"
+        raise argparse.ArgumentTypeError(f"is {text!r:.80}; allowed are {kind} from {least:g} to "
+                                         f"{most:g}")  # fmt: skip
+
+    return checked
+
+
+def _directory(text: str) -> Path:
+    if not text:
+        raise argparse.ArgumentTypeError("is empty; it must name a directory")
+    return Path(text).absolute()
+
+
+def _parser(program: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        program,
+        description=_ABOUT,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument(
+        "--port",
+        metavar="N",
+        type=_between(1, 65_535, int),
+        help="the master's port (default: that of ROS_MASTER_URI, or 11311)",
+    )
+    parser.add_argument(
+        "--silent-s",
+        metavar="S",
+        type=_between(0.5, 3600.0, float),
+        default=3.0,
+        help="a master that has not answered for this long is killed and replaced (default: 3)",
+    )
+    parser.add_argument(
+        "--rosout",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="run /rosout, too, as roscore does",
+    )
+    parser.add_argument(
+        "--python",
+        metavar="FILE",
+        default="/usr/bin/python3",
+        help="ROS's Python, which has rosmaster (default: /usr/bin/python3)",
+    )
+    parser.add_argument(
+        "--directory",
+        metavar="DIR",
+        type=_directory,
+        help="where the master's registrations are written (default: a directory of this user that "
+        "is gone after a restart of the machine)",
+    )
+    parser.add_argument(
+        "--log",
+        choices=("text", "json"),
+        default="text",
+        help="form of the ready line and of the log on standard error (default: text)",
+    )
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None, program: str = "ros1_master_guard") -> int:
+    """Guard until a signal comes, and return the exit code."""
+    given = _parser(program).parse_args(arguments)
+    events = EventLog(sys.stderr, as_json=given.log == "json")
+    try:
+        settings = GuardSettings(
+            MasterAddress.of(os.environ, given.port),
+            given.python,
+            given.directory,
+            given.silent_s,
+            given.rosout,
+        )
+        number = asyncio.run(_guard(settings, events, as_json=given.log == "json"))
+    except GuardError as error:
+        if given.log == "json":
+            events.event("error", reason=str(error))
+        else:
+            sys.stderr.write(f"{program}: error: {error}\n")
+        return 2
+    finally:
+        events.close()
+    return 0 if number is signal.SIGTERM else 128 + number
+
+
+async def _guard(settings: GuardSettings, events: EventLog, *, as_json: bool) -> signal.Signals:
+    loop = asyncio.get_running_loop()
+    ended: asyncio.Future[signal.Signals] = loop.create_future()
+
+    def end(number: signal.Signals) -> None:
+        if not ended.done():
+            ended.set_result(number)
+
+    def ready(how: str) -> None:
+        uri = settings.address.uri
+        told = {"service": uri, "pid": os.getpid(), "master": how}
+        text = f"guards the master at {uri}, which was {how}"
+        line = json_line("ready", told) if as_json else text
+        # A closed standard output is no reason not to guard.
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.write(f"{line}\n")
+            sys.stdout.flush()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            loop.add_signal_handler(number, end, number)
+    guarding = asyncio.create_task(MasterGuard(settings, events).run(ready))
+    await asyncio.wait((ended, guarding), return_when=asyncio.FIRST_COMPLETED)
+    if guarding.done():
+        await guarding
+    events.event("stopping", reason=ended.result().name)
+    guarding.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await guarding
+    return ended.result()

@@ -1,0 +1,82 @@
+"""Headers of TCPROS connections, and places in URIs, as ROS 1 writes them.
+
+A connection begins with a header from each end: fields NAME=VALUE that name the service or topic
+and the MD5 digest of its type. A header, like any message of TCPROS, comes after its length.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from urllib.parse import urlsplit
+
+from ros1_master_guard.errors import ProtocolError
+
+__all__ = [
+    "ANY_TYPE",
+    "MAX_HEADER_BYTES",
+    "decode_header",
+    "encode_header",
+    "encode_message",
+    "host_and_port_of",
+]
+
+MAX_HEADER_BYTES = 64 * 1024
+"""Bound on a connection header; a topic's contains the whole definition of its type."""
+
+_MAX_FIELDS = 64
+"""Bound on its fields; ROS has eight."""
+
+ANY_TYPE = "*"
+"""The digest that matches any type."""
+
+_LENGTH = struct.Struct("<I")
+
+
+def encode_header(fields: Mapping[str, str]) -> bytes:
+    """Encode a connection header."""
+    parts = []
+    for name, value in fields.items():
+        field = f"{name}={value}".encode()
+        parts += [_LENGTH.pack(len(field)), field]
+    return encode_message(b"".join(parts))
+
+
+def encode_message(payload: bytes) -> bytes:
+    """Encode a request, or a message of a topic."""
+    return _LENGTH.pack(len(payload)) + payload
+
+
+def decode_header(data: bytes) -> dict[str, str]:
+    """Decode a connection header, without its length.
+
+    Raises
+    ------
+    ProtocolError
+        If it is malformed; the message continues a sentence about its sender.
+    """
+    fields: dict[str, str] = {}
+    place = 0
+    while place < len(data):
+        if len(fields) >= _MAX_FIELDS:
+            raise ProtocolError(f"has sent a connection header of more than {_MAX_FIELDS} fields")
+        if place + 4 > len(data):
+            raise ProtocolError("has sent a connection header that is cut off")
+        (size,) = _LENGTH.unpack_from(data, place)
+        field = data[place + 4 : place + 4 + size]
+        name, equals, value = field.decode(errors="replace").partition("=")
+        if len(field) != size or not equals:
+            raise ProtocolError("has sent no connection header of ROS 1")
+        fields[name] = value
+        place += 4 + size
+    return fields
+
+
+def host_and_port_of(uri: str, scheme: str | None = None) -> tuple[str, int] | None:
+    """Return host and port of a URI; None if one is missing or the scheme is another."""
+    try:
+        parts = urlsplit(uri)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        return None
+    return (host, port) if host and port and scheme in (None, parts.scheme) else None

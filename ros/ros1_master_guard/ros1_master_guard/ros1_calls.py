@@ -1,0 +1,275 @@
+"""XML-RPC calls to ROS 1 masters and nodes, with deadlines.
+
+The standard library's XML-RPC client has no deadline of its own and makes one call at a time. Here
+a call is a coroutine, so a hundred nodes are called at once, and a timeout differs from a refused
+connection: a node whose port refuses connections is dead, a silent one may be stopped, far away or
+slow.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import xmlrpc.client
+from collections.abc import Iterable, Sequence
+from typing import Any, Final, NamedTuple, Self
+from urllib.parse import urlsplit
+from xml.parsers import expat
+
+from ros1_master_guard.errors import CallError, GoneError, ProtocolError, SilentError
+from ros1_master_guard.headers import (
+    ANY_TYPE,
+    MAX_HEADER_BYTES,
+    decode_header,
+    encode_header,
+    host_and_port_of,
+)
+
+__all__ = [
+    "CALLER",
+    "Connection",
+    "HttpHead",
+    "call",
+    "decoded",
+    "message",
+    "offers_service",
+]
+
+CALLER: Final = "/ros1_master_guard"
+"""Name of the caller where no node calls."""
+
+_MAX_RESPONSE_BYTES: Final = 256 * 1024 * 1024
+
+_MAX_LEVELS: Final = 100
+"""Bound on lists and mappings within each other in a message."""
+
+
+class HttpHead(NamedTuple):
+    """The head of an HTTP message.
+
+    It is the first line, the content's size in bytes (-1: not given), and whether the connection
+    ends after the message.
+    """
+
+    line: str
+    size: int
+    ends: bool
+
+    @classmethod
+    async def read(cls, reader: asyncio.StreamReader) -> Self:
+        """Read a head; raise ValueError if the size is no number, or as ``readuntil`` does."""
+        line, *lines = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1").split("\r\n")
+        fields = {}
+        for each in lines:
+            name, _, value = each.partition(":")
+            fields[name.strip().lower()] = value.strip()
+        ends = "HTTP/1.0" in line or "close" in fields.get("connection", "").lower()
+        return cls(line, int(fields.get("content-length", "-1")), ends)
+
+
+async def message(reader: asyncio.StreamReader, max_bytes: int, begun: bytes = b"") -> bytes:
+    """Read a message of TCPROS after its length; ``begun`` are bytes of the length read before.
+
+    Raises ProtocolError if it is larger than allowed; the message continues a sentence about the
+    sender. Raises EOFError, OSError if none arrives.
+    """
+    size = int.from_bytes(begun + await reader.readexactly(4 - len(begun)), "little")
+    if size > max_bytes:
+        raise ProtocolError(f"sends {size} bytes; {max_bytes} are allowed")
+    return await reader.readexactly(size)
+
+
+class _Unmarshaller(xmlrpc.client.Unmarshaller):
+    """The library's, but what it builds, and the time for it, are in proportion to what it reads.
+
+    The library repeats a text for each element that ends after it, takes any value for a name (a
+    peer can choose thousands of integers of one hash) and nests lists as deeply as it is told,
+    deeper than they can be printed.
+    """
+
+    def start(self, tag: str, attrs: dict[str, str]) -> None:
+        super().start(tag, attrs)
+        if len(self._marks) > _MAX_LEVELS:
+            raise xmlrpc.client.ResponseError(f"more than {_MAX_LEVELS} levels")
+
+    def end(self, tag: str) -> None:
+        if tag.split(":")[-1] == "struct":
+            for name in self._stack[self._marks[-1] :: 2]:
+                if not isinstance(name, str):
+                    raise xmlrpc.client.ResponseError(f"a member has the name {name!r:.100}")
+        super().end(tag)
+        self._data = []
+
+
+def _refuse_doctype(*_: object) -> None:
+    raise xmlrpc.client.ResponseError("a document type, which ROS never sends")
+
+
+def decoded(content: bytes) -> tuple[tuple[Any, ...], str | None]:
+    """Decode an XML-RPC message of a peer; return its values, and the method if it is a call.
+
+    A document type is refused: from a few hundred bytes of nested entities millions of elements
+    are made. Raises Fault if the message says so, and anything else if it is malformed.
+    """
+    unmarshaller = _Unmarshaller()
+    parser = expat.ParserCreate()
+    parser.StartDoctypeDeclHandler = _refuse_doctype
+    parser.StartElementHandler = unmarshaller.start
+    parser.EndElementHandler = unmarshaller.end
+    parser.CharacterDataHandler = unmarshaller.data
+    unmarshaller.xml("", None)  # what expat hands over is text already
+    parser.Parse(content, True)
+    return unmarshaller.close(), unmarshaller.getmethodname()
+
+
+async def _connect(uri: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    host, port = _place_of(uri)
+    # As in ROS 1: IPv4 unless the host is an IPv6 address, and the first address of a name.
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return await asyncio.open_connection(host, port, family=family, limit=MAX_HEADER_BYTES)
+    except ConnectionRefusedError as error:
+        raise GoneError(f"{uri}: nobody listens there") from error
+    except OSError as error:
+        raise CallError(f"{uri}: {error.strerror or error}") from error
+
+
+def _place_of(uri: str) -> tuple[str, int]:
+    place = host_and_port_of(uri)
+    if place is None:
+        raise CallError(f"{uri!r:.200} names no host and port")
+    return place
+
+
+class Connection:
+    """A connection to the XML-RPC server of a master or node; ``caller`` is the calling node.
+
+    Larger answers than ``max_answer_bytes`` are errors.
+    """
+
+    def __init__(
+        self, uri: str, caller: str = CALLER, max_answer_bytes: int = _MAX_RESPONSE_BYTES
+    ) -> None:
+        self._max_answer_bytes = max_answer_bytes
+        self.uri = uri
+        self._caller = caller
+        self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
+
+    async def call(self, method: str, *arguments: object, within_s: float) -> Any:
+        """Call a method with the caller's name and these arguments; return its value.
+
+        Raises GoneError if nobody listens there. Raises SilentError if no response came in time.
+        Raises CallError if the response reports an error or is malformed.
+        """
+        return _value_of(await self._request(method, (self._caller, *arguments), within_s), method)
+
+    async def calls(
+        self, calls: Iterable[tuple[str, Sequence[object]]], *, within_s: float
+    ) -> list[Any]:
+        """Make several calls in one request; the value of a refused one is None.
+
+        Each call is a method and all its arguments, the caller's name included. Raises as
+        :meth:`call` does.
+        """
+        batch = [{"methodName": method, "params": list(arguments)} for method, arguments in calls]
+        responses = await self._request("system.multicall", (batch,), within_s)
+        if not isinstance(responses, list) or len(responses) != len(batch):
+            raise CallError(f"{self.uri}: system.multicall: the answer has another form")
+        values = []
+        for made, response in zip(batch, responses, strict=True):
+            value = None
+            # The response to a failed call is a dict.
+            with contextlib.suppress(CallError, LookupError, TypeError):
+                value = _value_of(response[0], str(made["methodName"]))
+            values.append(value)
+        return values
+
+    async def _request(self, method: str, arguments: tuple[Any, ...], within_s: float) -> Any:
+        try:
+            body = xmlrpc.client.dumps(arguments, method).encode()
+            async with asyncio.timeout(within_s):
+                return await self._exchange(body)
+        except TimeoutError as error:
+            self.close()
+            raise SilentError(f"{self.uri}: {method}: no answer within {within_s:g} s") from error
+        except xmlrpc.client.Fault as fault:
+            raise CallError(f"{self.uri}: {method}: {fault.faultString:.500}") from fault
+        except BaseException as error:
+            self.close()
+            if isinstance(error, CallError) or not isinstance(error, Exception):
+                raise
+            # A malformed response can make the parser raise anything.
+            raise CallError(f"{self.uri}: {method}: {error or type(error).__name__}") from error
+
+    async def _exchange(self, body: bytes) -> Any:
+        if self._streams is None:
+            self._streams = await _connect(self.uri)
+        reader, writer = self._streams
+        place = urlsplit(self.uri)
+        head_lines = (
+            f"POST {place.path or '/'} HTTP/1.1",
+            f"Host: {place.netloc}",
+            "Content-Type: text/xml",
+            f"Content-Length: {len(body)}",
+        )
+        writer.write("\r\n".join([*head_lines, "\r\n"]).encode() + body)
+        head = await HttpHead.read(reader)
+        if head.line.split(" ")[1:2] != ["200"]:
+            raise ValueError(f"it answers {head.line:.100}")
+        if not 0 <= head.size <= self._max_answer_bytes:
+            most = self._max_answer_bytes
+            raise ValueError(f"its answer has {head.size} bytes; allowed are {most}")
+        content = await reader.readexactly(head.size)
+        if head.ends:
+            self.close()
+        values, _ = decoded(content)
+        return values[0]
+
+    def close(self) -> None:
+        """Close the connection; the next call opens another."""
+        if self._streams is not None:
+            self._streams[1].close()
+            self._streams = None
+
+
+def _value_of(answer: object, method: str) -> Any:
+    if not isinstance(answer, list) or len(answer) != 3:
+        raise CallError(f"{method}: the answer has another form")
+    code, message, value = answer
+    if code != 1:
+        raise CallError(f"{method}: {message!s:.500}")
+    return value
+
+
+async def call(
+    uri: str, method: str, *arguments: object, within_s: float, caller: str = CALLER
+) -> Any:
+    """Make one call on a new connection; see :meth:`Connection.call`."""
+    connection = Connection(uri, caller)
+    try:
+        return await connection.call(method, *arguments, within_s=within_s)
+    finally:
+        connection.close()
+
+
+async def offers_service(uri: str, service: str, *, within_s: float) -> bool | None:
+    """Return whether a service is offered at its URI, ``rosrpc://host:port``; None if unknown."""
+    # `rosservice` sends this header to learn a service's type; no call is made.
+    probe = {"probe": "1", "md5sum": ANY_TYPE, "callerid": CALLER, "service": service}
+    writer = None
+    try:
+        async with asyncio.timeout(within_s):
+            reader, writer = await _connect(uri)
+            writer.write(encode_header(probe))
+            return "error" not in decode_header(await message(reader, MAX_HEADER_BYTES))
+    except GoneError:
+        return False
+    except (asyncio.IncompleteReadError, ProtocolError):
+        # Another service or another program listens there.
+        return False
+    except (CallError, OSError, ValueError):  # ValueError: a malformed host name
+        return None
+    finally:
+        if writer is not None:
+            writer.close()

@@ -1,0 +1,199 @@
+"""A master's address, and its guard's settings, directory and lock."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import socket
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple, Self
+from urllib.parse import urlsplit
+
+from ros1_master_guard.errors import GuardError
+from ros1_master_guard.process import touch
+
+__all__ = [
+    "DEFAULT_PORT",
+    "GuardLock",
+    "GuardSettings",
+    "MasterAddress",
+    "listens_at",
+    "own_directory",
+]
+
+DEFAULT_PORT = 11311
+
+
+class MasterAddress(NamedTuple):
+    """A master's address: ``host`` is what ``ROS_MASTER_URI`` names, ``bind`` where it listens."""
+
+    host: str
+    port: int
+    bind: str
+
+    @property
+    def uri(self) -> str:
+        """The nodes' ``ROS_MASTER_URI``."""
+        return f"http://{self.host}:{self.port}/"
+
+    @property
+    def own_uri(self) -> str:
+        """The URI for this machine."""
+        near = {"0.0.0.0": "127.0.0.1", "::": "[::1]", "::1": "[::1]"}.get(self.bind, self.bind)
+        return f"http://{near}:{self.port}/"
+
+    @classmethod
+    def of(cls, environment: Mapping[str, str], port: int | None = None) -> Self:
+        """Read ``ROS_MASTER_URI``, ``ROS_HOSTNAME``, ``ROS_IP`` and ``ROS_IPV6``.
+
+        ``port`` replaces that of the URI. Raises GuardError if the URI is none, or names another
+        machine.
+        """
+        text = environment.get("ROS_MASTER_URI") or f"http://localhost:{DEFAULT_PORT}"
+        try:
+            parts = urlsplit(text)
+            scheme, host, named = parts.scheme, parts.hostname, parts.port
+        except ValueError:
+            scheme, host, named = "", None, None
+        if scheme != "http" or not host:
+            raise GuardError(f"ROS_MASTER_URI is {text!r:.200}; expected http://HOST:PORT")
+        # As rosgraph.network has it.
+        own = environment.get("ROS_HOSTNAME") or environment.get("ROS_IP") or ""
+        version_6 = environment.get("ROS_IPV6") == "on"
+        if own == "localhost" or own.startswith("127.") or own == "::1":
+            loopback = own if own.startswith("127.") else "127.0.0.1"
+            bind = "::1" if version_6 else loopback
+        else:
+            bind = "::" if version_6 else "0.0.0.0"
+        address = cls(host, port or named or DEFAULT_PORT, bind)
+        if not _is_here(host):
+            raise GuardError(
+                f"ROS_MASTER_URI is {text!r:.200}: {host} is no address of this machine; a guard "
+                "runs where its master runs"
+            )
+        return address
+
+
+def _is_here(host: str) -> bool:
+    """Return whether a name is this machine's."""
+    try:
+        found = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
+    except OSError:
+        return False
+    for family, kind, number, _, address in found:
+        with contextlib.suppress(OSError), socket.socket(family, kind, number) as probe:
+            probe.bind(address)
+            return True
+    return False
+
+
+class GuardSettings(NamedTuple):
+    """How to guard a master; the command's options say what each means."""
+
+    address: MasterAddress
+    python: str = "/usr/bin/python3"
+    directory: Path | None = None
+    silent_s: float = 3.0
+    rosout: bool = True
+
+
+def own_directory() -> Path:
+    """Return a directory of this user alone, which does not outlive the machine's uptime."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    name = "ros1_master_guard"
+    directory = Path(runtime) / name if runtime else Path(f"/tmp/{name}-{os.getuid()}")
+    try:
+        directory.mkdir(mode=0o700, exist_ok=True)
+        found = directory.lstat()
+    except OSError as error:
+        raise GuardError(f"{directory}: cannot be made: {error.strerror}") from error
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
+        raise GuardError(
+            f"{directory}: is not a directory that you alone can write to; name another one: "
+            "--directory"
+        )
+    return directory
+
+
+class GuardLock:
+    """Keeps a second guard of the same master, with the same directory, away.
+
+    Raises
+    ------
+    GuardError
+        If there is one already.
+    """
+
+    def __init__(self, path: Path, port: int) -> None:
+        self._path = path
+        try:
+            self._descriptor = self._open()
+        except OSError as error:
+            raise GuardError(f"{path}: cannot be written: {error.strerror}") from error
+        if not self._take(self._descriptor):
+            who = os.pread(self._descriptor, 20, 0).decode(errors="replace").strip()
+            os.close(self._descriptor)
+            raise GuardError(
+                f"the master at port {port} has a guard already: process {who or 'unknown'}"
+            )
+
+    def _open(self) -> int:
+        return os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+
+    def _take(self, descriptor: int) -> bool:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            return False
+        # The lock is on the file; its content is optional, as the disk may be full.
+        with contextlib.suppress(OSError):
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+        return True
+
+    def keep(self) -> None:
+        """Keep the file young for cleaners of old files, and lock a new one if it is gone."""
+        try:
+            found = self._path.lstat()
+            if os.path.samestat(found, os.fstat(self._descriptor)):
+                touch(self._path, found)
+                return
+        except OSError:
+            pass
+        with contextlib.suppress(OSError):
+            descriptor = self._open()
+            if self._take(descriptor):
+                descriptor, self._descriptor = self._descriptor, descriptor
+            os.close(descriptor)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._descriptor)
+
+
+def listens_at(pid: int, port: int) -> bool:
+    """Return whether a process of this user listens at a port of this machine.
+
+    A master reports its process, but in a container process numbers differ.
+    """
+    sockets = set()
+    for table in ("tcp", "tcp6"):
+        with contextlib.suppress(OSError):
+            for line in Path(f"/proc/self/net/{table}").read_text().splitlines()[1:]:
+                fields = line.split()
+                if fields[3] == "0A" and int(fields[1].rpartition(":")[2], 16) == port:
+                    sockets.add(f"socket:[{fields[9]}]")
+    try:
+        descriptors = list(Path(f"/proc/{pid}/fd").iterdir())
+    except OSError:
+        return False
+    for descriptor in descriptors:
+        with contextlib.suppress(OSError):
+            if str(descriptor.readlink()) in sockets:
+                return True
+    return False

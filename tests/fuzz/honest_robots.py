@@ -1,0 +1,135 @@
+"""Robots that use a service under attack; each decision is compared with the planner's own."""
+
+from __future__ import annotations
+
+import collections
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from tests.processes.faults import PROBLEMS, Robot, Service, Site, document_of, events_of
+
+from holdfast.config.loader import load
+from holdfast.planning import Planner
+from holdfast.recording.journal import Journal
+from holdfast.robot.trial import run_trial
+
+__all__ = ["HonestRobots"]
+
+_RATE_HZ = 50.0
+
+_DISTURBANCES = (
+    "busy",
+    "service_suspected",
+    "service_vanished",
+    "restore",
+    "retry",
+    "waiting",
+    "holding",
+    "malformed_reply",
+    "disagreement",
+    "refused",
+)
+"""What a robot tells when its service is not there for it; each costs time and nothing else."""
+
+
+class HonestRobots:
+    """Robots that use the service all the time, one run after another, each with its own seed.
+
+    Parameters
+    ----------
+    trials : int
+        Of each run.
+    problems : sequence of str
+        For each a robot.
+    options : sequence of str
+        Further ones of ``holdfast run``.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        service: Service,
+        seed: int,
+        trials: int,
+        max_steps: int = 60,
+        problems: Sequence[str] = PROBLEMS,
+        options: Sequence[str] = (),
+    ) -> None:
+        self._site = site
+        self._service = service
+        self._problems = problems
+        self._options = options
+        self._stopped = threading.Event()
+        self.failures: list[str] = []
+        self.runs: list[tuple[Path, Path]] = []
+        self._threads = [
+            threading.Thread(target=self._series, args=(index, seed, trials, max_steps))
+            for index in range(len(problems))
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def finish(self) -> None:
+        """Let the runs that have begun come to their ends, and begin no more."""
+        self._stopped.set()
+        for thread in self._threads:
+            thread.join()
+
+    def _series(self, index: int, seed: int, trials: int, max_steps: int) -> None:
+        count = 0
+        while not self._stopped.is_set() and not self.failures:
+            name = f"robot-{seed}-{index}-{count}"
+            document = document_of(
+                self._problems[index],
+                trials=trials,
+                max_steps=max_steps,
+                seed=1000 * seed + 100 * index + count,
+            )
+            file = self._site.configure(document, name, recovery={"launch": "never"})
+            robot: Robot = self._site.run(
+                file,
+                *("--rate", str(_RATE_HZ), *self._options),
+                services=[self._service],
+                out=f"{name}-out",
+            )
+            code = robot.wait()
+            if code != 0:
+                self.failures.append(f"{name}: {robot.account()[-3000:]}")
+            self.runs.append((file, robot.out))
+            count += 1
+
+    def compare(self) -> dict[str, Any]:
+        """Compare every decision with that of the planner by itself."""
+        trials = decisions = 0
+        for file, out in self.runs:
+            configuration = load(file)
+            with Journal.read(out / "journal.sqlite") as journal:
+                for result in journal.results(with_decisions=True):
+                    expected = run_trial(
+                        Planner(configuration.problem, configuration.planning),
+                        configuration.simulator.seed,
+                        result.trial,
+                        max_steps=configuration.simulator.max_steps,
+                    )
+                    trials += 1
+                    decisions += result.steps + result.sensing_decisions
+                    alike = (result.digest, result.reward, result.steps, result.success) == (
+                        expected.digest,
+                        expected.reward,
+                        expected.steps,
+                        expected.success,
+                    )
+                    if not alike:
+                        self.failures.append(f"{out.name}, trial {result.trial}: other decisions")
+        return {"runs": len(self.runs), "trials": trials, "decisions": decisions}
+
+    def told(self) -> dict[str, int]:
+        """Count what the robots tell of the service's not being there for them."""
+        counted: collections.Counter[str] = collections.Counter()
+        for _, out in self.runs:
+            for event in events_of(out):
+                if event["event"] in _DISTURBANCES:
+                    counted[event["event"]] += 1
+        return dict(counted)
