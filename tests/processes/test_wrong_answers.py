@@ -165,7 +165,6 @@ def test_a_lie_that_nobody_computed_again_is_found_when_the_figure_is_drawn(
     told = [each["reason"] for each in robot.matching("note") if "was run again" in each["reason"]]
     assert len(told) == 1
     assert f"{cloud.endpoint} answered with another {kind} action at step " in told[0]
-    assert "deterministic" not in told[0]
 
 
 UNSTEADY = """
