@@ -13,9 +13,9 @@ from holdfast.errors import OutputError
 from holdfast.files import claim_directory
 from holdfast.recording.compare import Comparison, Difference
 from holdfast_lab.demo.command import account
-from holdfast_lab.demo.narrator import Activity, Change, DemoState, Line, Mark
+from holdfast_lab.demo.narrator import Activity, Change, DemoState, Mark
 from holdfast_lab.demo.scenario import Findings
-from holdfast_lab.demo.timeline import ASCII, UNICODE, legend, plain_line, timeline
+from holdfast_lab.demo.timeline import ASCII, UNICODE, legend, timeline
 from holdfast_lab.testbed.fault_times import FaultTimes
 
 

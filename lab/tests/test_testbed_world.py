@@ -9,7 +9,7 @@ import pytest
 
 from holdfast.errors import EnvironmentFailedError
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.robot.environment import CountingEnvironment, SimulatedEnvironment
+from holdfast.robot.environment import SimulatedEnvironment
 from holdfast_lab.testbed.world import (
     WitnessedWorld,
     difference_of_performances,
