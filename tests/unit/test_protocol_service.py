@@ -287,26 +287,6 @@ class TestAnswers:
         assert (statistics.task_parts, statistics.sensing_parts) == (5, 6)
         assert statistics.state_requests == 0
 
-    def test_numbers_are_those_of_the_requests(self) -> None:
-        bench, robot = Bench(), Robot()
-        for _ in range(3):
-            request = robot.request()
-            assert {reply.number for reply in bench.ask(request)} == {request.number}
-            robot.sense()
-            robot.act_until_sensing()
-
-    def test_task_part_is_answered_before_the_sensing_part_is_begun(self) -> None:
-        bench, robot = Bench(), Robot()
-        robot.sense()
-        call = bench.send(robot.request())
-        bench.run()
-        assert bench.kinds(call) == ["TaskAnswer"]
-        assert bench.trace == [("run task", -1), ("TaskAnswer", call), ("run sensing", -1)]
-        assert call not in bench.ended
-        bench.run()
-        assert bench.kinds(call) == ["TaskAnswer", "SensingAnswer"]
-        assert call in bench.ended
-
     def test_time_of_an_answer_is_that_of_its_job(self) -> None:
         bench, robot = Bench(), Robot()
         call = bench.send(robot.request())
@@ -329,51 +309,8 @@ class TestAnswers:
             if needs_sensing(robot.planning, robot.state):
                 robot.sense()
 
-    def test_in_the_middle_between_two_sensing_steps(self) -> None:
-        bench, robot = Bench(), Robot()
-        robot.sense()
-        bench.ask(robot.request())
-        robot.act()
-        robot.act()
-        assert (
-            content(bench.ask(robot.request(session_configuration=False, since=1)))
-            == robot.right_answer()
-        )
-        # The sensing part is that of the request before.
-        assert bench.service.statistics.sensing_parts == 1
-
-    def test_next_trial_needs_no_opening(self) -> None:
-        bench, robot = Bench(), Robot()
-        bench.ask(robot.request())
-        robot.sense()
-        bench.ask(robot.request())
-        robot.begin(1)
-        assert (
-            content(bench.ask(robot.request(session_configuration=False))) == robot.right_answer()
-        )
-
 
 class TestRollingForward:
-    def test_from_the_beginning_by_all_observations(self) -> None:
-        bench, robot = Bench(), Robot()
-        for _ in range(4):
-            robot.sense()
-            robot.act_until_sensing()
-        assert content(bench.ask(robot.request())) == robot.right_answer()
-
-    def test_observations_that_are_known_already_are_passed_over(self) -> None:
-        bench, robot = Bench(), Robot()
-        for _ in range(2):
-            robot.sense()
-            bench.ask(robot.request())  # as far as the robot knows its answers are lost
-            robot.act_until_sensing()
-        robot.sense()
-        assert (
-            content(bench.ask(robot.request(session_configuration=False, since=0)))
-            == robot.right_answer()
-        )
-        assert bench.service.statistics.state_requests == 0
-
     def test_from_a_checkpoint(self) -> None:
         bench, robot = Bench(), Robot()
         for _ in range(3):
@@ -388,13 +325,6 @@ class TestRollingForward:
             content(bench.ask(robot.request(session_configuration=False, since=4)))
             == robot.right_answer()
         )
-
-    def test_unknown_session(self) -> None:
-        bench, robot = Bench(), Robot()
-        request = robot.request(session_configuration=False)
-        assert bench.ask(request) == [NeedState(request.number, differs=False)]
-        request = robot.restore(session_configuration=False)
-        assert bench.ask(request) == [NeedState(request.number, differs=False)]
 
     def test_missing_observation(self) -> None:
         bench, robot = Bench(), Robot()
@@ -491,54 +421,6 @@ class TestOnce:
         statistics = bench.service.statistics
         return statistics.task_parts, statistics.sensing_parts
 
-    def test_the_same_bytes_at_any_moment(self) -> None:
-        bench, robot, other = Bench(), Robot(), Robot(key=2)
-        robot.sense()
-        request = robot.request()
-        right = robot.right_answer()
-        bench.send(other.request())  # takes the worker
-        calls = [bench.send(request), bench.send(request)]  # waiting
-        bench.run()
-        calls.append(bench.send(request))  # the task part is in work
-        bench.run()
-        calls.append(bench.send(request))  # the sensing part is
-        bench.run()
-        calls.append(bench.send(request))  # all is there
-        bench.run_all()
-        assert [content(bench.replies[call]) for call in calls] == [right] * 5
-        assert bench.ended >= set(calls)
-        assert self.computed(bench) == (1, 2)  # the other robot's first sensing action is one
-
-    def test_under_another_number(self) -> None:
-        bench, robot = Bench(), Robot()
-        robot.sense()
-        first = bench.send(robot.request())
-        bench.run()
-        second = bench.send(robot.request())
-        bench.run_all()
-        third = bench.send(robot.request())
-        for call in (first, second, third):
-            assert content(bench.replies[call]) == robot.right_answer()
-            assert len({reply.number for reply in bench.replies[call]}) == 1
-        assert self.computed(bench) == (1, 1)
-        assert bench.service.statistics.cache_hits == 2
-
-    @pytest.mark.parametrize("moment", ["waiting", "running", "done"])
-    def test_state_ahead_asked_for_by_itself(self, moment: str) -> None:
-        bench, robot, other = Bench(), Robot(), Robot(key=2)
-        robot.sense()
-        bench.send(robot.request())
-        if moment == "waiting":
-            bench.send(other.request())
-        bench.run()
-        if moment == "done":
-            bench.run()
-        robot.act_until_sensing()
-        call = bench.send(robot.request(session_configuration=False, since=1))
-        bench.run_all()
-        assert content(bench.replies[call]) == robot.right_answer()
-        assert self.computed(bench) == (1, 1 + (moment == "waiting"))
-
     def test_calls_that_wait_for_one_answer_are_bounded(self) -> None:
         bench, robot = Bench(max_calls_per_request=3), Robot()
         robot.sense()
@@ -573,62 +455,6 @@ class TestOnce:
 
 
 class TestOrder:
-    def test_first_parts_go_before_prefetches(self) -> None:
-        bench = Bench()
-        calls = [bench.send(robot.request()) for robot in bench.known(1, 2, 3)]
-        bench.run_all()
-        assert bench.trace == [
-            ("run task", -1),
-            *[
-                step
-                for call in calls
-                for step in (
-                    ("TaskAnswer", call),
-                    ("run task" if call != calls[-1] else "run sensing", -1),
-                )
-            ],
-            ("SensingAnswer", calls[0]),
-            ("run sensing", -1),
-            ("SensingAnswer", calls[1]),
-            ("run sensing", -1),
-            ("SensingAnswer", calls[2]),
-        ]
-
-    def test_a_prefetch_is_not_put_off_for_ever(self) -> None:
-        bench = Bench(prefetch_patience_ms=20.0)
-        robots = bench.known(*range(1, 9))
-        first = bench.send(robots[0].request())
-        bench.send(robots[1].request())
-        bench.run()  # the first's task part; the second's is handed out
-        ran = 0
-        for robot in robots[2:]:
-            bench.now += 0.015
-            bench.send(robot.request())
-            bench.run()
-            ran += 1
-            if first in bench.ended:
-                break
-        assert ran <= 4
-
-    def test_a_robot_that_floods_has_one_turn(self) -> None:
-        bench = Bench()
-        flood, calm, third = Robot(key=1), Robot(key=2), Robot(key=3)
-        bench.send(third.request())  # takes the worker
-        flood.sense()
-        for _ in range(50):
-            flood.act() if not needs_sensing(flood.planning, flood.state) else flood.sense()
-            bench.send(flood.request())
-        call = bench.send(calm.request())
-        for _ in range(50):
-            flood.act() if not needs_sensing(flood.planning, flood.state) else flood.sense()
-            bench.send(flood.request())
-        assert bench.service.statistics.waiting == 2
-        bench.run()  # the third
-        bench.run()  # the flood
-        bench.run()
-        assert call in bench.ended
-        assert content(bench.replies[call]) == calm.right_answer()
-
     def test_newer_request_supersedes(self) -> None:
         bench, robot, other = Bench(), Robot(), Robot(key=2)
         bench.send(other.request())
@@ -642,22 +468,6 @@ class TestOrder:
         assert content(bench.replies[newer]) == robot.right_answer()
         assert bench.service.statistics.task_parts == 1
 
-    def test_newer_request_ends_the_calls_of_what_runs(self) -> None:
-        bench, robot = Bench(workers=2), Robot()
-        robot.sense()
-        older = bench.send(robot.request())
-        bench.run()  # the prefetch is handed out
-        robot.act_until_sensing()
-        robot.sense()
-        newer = bench.send(robot.request(session_configuration=False, since=1))
-        assert bench.kinds(older) == ["TaskAnswer"]
-        assert older in bench.ended
-        assert len(bench.jobs) == 2
-        bench.run(1)  # the newer one is not held up by the older prefetch
-        assert bench.kinds(newer) == ["TaskAnswer"]
-        bench.run_all()
-        assert content(bench.replies[newer]) == robot.right_answer()
-
     def test_request_that_comes_late_is_ended(self) -> None:
         bench, robot = Bench(), Robot()
         robot.sense()
@@ -669,30 +479,8 @@ class TestOrder:
         assert call in bench.ended
         assert not bench.jobs
 
-    def test_one_robot_has_one_worker_for_its_requests(self) -> None:
-        bench = Bench(workers=2)
-        robot, other = bench.known(1, 2)
-        bench.send(robot.request())
-        robot.act()
-        newer = bench.send(robot.request())
-        assert len(bench.jobs) == 1
-        bench.send(other.request())
-        assert len(bench.jobs) == 2
-        bench.run_all()
-        assert content(bench.replies[newer]) == robot.right_answer()
-
 
 class TestEpochs:
-    def test_lower_epoch_is_refused(self) -> None:
-        bench, robot = Bench(), Robot()
-        robot.epoch = 3
-        bench.ask(robot.request())
-        robot.epoch = 2
-        reply = refused(bench.ask(robot.request()))
-        assert reply.code == "stale_epoch"
-        assert "2" in reply.text
-        assert "3" in reply.text
-
     def test_higher_epoch_takes_over_with_the_state(self) -> None:
         bench, robot = Bench(), Robot()
         robot.sense()
@@ -705,15 +493,6 @@ class TestEpochs:
         bench.run_all()
         assert content(bench.replies[newer]) == robot.right_answer()
         assert [note.name for note in bench.notes] == ["session_opened", "session_taken_over"]
-
-    def test_epoch_outlives_the_session(self) -> None:
-        bench, robot, other = Bench(max_sessions=1), Robot(), Robot(key=2)
-        robot.epoch = 7
-        bench.ask(robot.request())
-        bench.ask(other.request())
-        assert bench.service.statistics.sessions == 1
-        robot.epoch = 6
-        assert refused(bench.ask(robot.request())).code == "stale_epoch"
 
     def test_other_settings_under_the_same_epoch(self) -> None:
         bench, robot = Bench(), Robot()
@@ -1247,17 +1026,9 @@ class TestProgress:
             assert {len(replies) for replies in bench.replies.values()} == {turn}
 
 
-class TestAnyOrder:
-    def test_with_no_worker_there_is_no_service(self) -> None:
-        with pytest.raises(ValueError, match="workers 0"):
-            Service(make_problem, 0)
-
-    def test_selector_fixed(self) -> None:
-        planning = msgspec.structs.replace(
-            planning_of(), selector=SelectorSettings(method="fixed", sensing_action=1)
-        )
-        bench, robot = Bench(), Robot(planning=planning)
-        assert content(bench.ask(robot.request())) == robot.right_answer()
+def test_with_no_worker_there_is_no_service() -> None:
+    with pytest.raises(ValueError, match="workers 0"):
+        Service(make_problem, 0)
 
 
 def runs_of(service: Service, call: int, request: Request, now: float) -> list[float]:
