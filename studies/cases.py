@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from holdfast.config.settings import (
+from holdfast.planning.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,

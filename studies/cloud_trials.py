@@ -19,7 +19,7 @@ from typing import Any
 import msgspec
 import pandas as pd
 
-from holdfast.config.settings import ActiveSensingSettings
+from holdfast.planning.settings import ActiveSensingSettings
 from holdfast.recording.compare import compare_runs
 from holdfast.robot.links import RECOVERY_SERVICE
 from holdfast_lab.errors import NoProgressError, ProcessEndedError

@@ -38,10 +38,10 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.config.settings import PlanningSettings
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import Purpose, stream
+from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Purpose, stream
 from studies.trial_batches import TrialSeries, problem_of
 
 __all__ = [

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import pandas as pd
 
-from holdfast.config.settings import ParticleFilterSettings, SelectorSettings
+from holdfast.planning.settings import ParticleFilterSettings, SelectorSettings
 from studies import statistics
 from studies.cases import CASES, Case
 from studies.judged_study import (

@@ -21,9 +21,10 @@ from typing import Any, NamedTuple, TypeAlias
 import msgspec
 import pandas as pd
 
-from holdfast.config.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
-from holdfast.planning import Planner, digest
-from holdfast.problems.registry import problem_class, problem_module
+from holdfast.config.registry import problem_class, problem_module
+from holdfast.config.source_digest import core_version, problem_digest
+from holdfast.planning.planner import Planner, digest
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared, TransportEvent
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
@@ -42,7 +43,6 @@ from holdfast.protocol.messages import (
 from holdfast.protocol.service import Service
 from holdfast.runtime.events import NullEventLog
 from holdfast.service.shell import ServiceShell
-from holdfast.source_digest import core_version, problem_digest
 from holdfast.transport.contract import RobotTransport
 from holdfast.transport.endpoints import ServiceAddress
 from holdfast.transport.robot_end import StreamRobotTransport

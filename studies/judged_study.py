@@ -13,8 +13,8 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 import pandas as pd
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import InvalidValueError
+from holdfast.numerics.arrays import FloatArray
 from studies import statistics
 from studies.statistics import Interval, cells_of
 from studies.study import CHOICE, CLAIM, Part, Scale, TrialStudy

@@ -25,8 +25,8 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import PlanningSettings
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.settings import PlanningSettings
 from holdfast.robot.trials import available_cores
 from studies.cost_model import BreakEven, Scaling, break_even
 from studies.exchange_times import Exchange

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from holdfast.arrays import FloatArray
+from holdfast.numerics.arrays import FloatArray
 from holdfast.recording.figure import STYLE
 from studies import plots
 from studies.cost_model import Scaling, break_even

@@ -15,7 +15,11 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from holdfast.config.settings import ActiveSensingSettings, ParticleFilterSettings, SelectorSettings
+from holdfast.planning.settings import (
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    SelectorSettings,
+)
 from studies import statistics
 from studies.cases import CASES
 from studies.judged_study import (

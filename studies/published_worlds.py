@@ -26,14 +26,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.config.settings import (
+from holdfast.errors import InvalidValueError
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import Stream
+from holdfast.planning.settings import (
     ActiveSensingSettings,
     PlanningSettings,
     SelectorSettings,
 )
-from holdfast.errors import InvalidValueError
-from holdfast.randomness import Stream
 from studies import statistics
 from studies.errors import TaskError
 from studies.statistics import Interval, cells_of, interval_in

@@ -20,8 +20,8 @@ from typing import ClassVar
 import numpy as np
 import pandas as pd
 
-from holdfast.arrays import BoolArray, FloatArray
-from holdfast.config.settings import Estimator, Method, SelectorSettings
+from holdfast.numerics.arrays import BoolArray, FloatArray
+from holdfast.planning.settings import Estimator, Method, SelectorSettings
 from studies import statistics
 from studies.cases import CASES, Case
 from studies.judged_study import (

@@ -21,8 +21,8 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import (
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.settings import (
     ENTROPY_METHODS,
     ActiveSensingSettings,
     ParticleFilterSettings,

@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from holdfast.config.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 from studies.cloud_trials import (
     MAX_STEPS,
     PROBLEM,

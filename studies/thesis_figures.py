@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator
 
-from holdfast.arrays import FloatArray
+from holdfast.numerics.arrays import FloatArray
 from holdfast.recording.figure import STYLE
 from studies.plots import COLORS, MARKERS, figure_of, legend_below, milliseconds
 from studies.statistics import Interval, interval_in, median_interval

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 
-from holdfast.arrays import FloatArray
+from holdfast.numerics.arrays import FloatArray
 from holdfast.recording.figure import STYLE
 from studies.plots import COLORS, MARKERS, figure_of, milliseconds
 

@@ -21,11 +21,11 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from holdfast import _kernel, numerics
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.belief import Belief
-from holdfast.config.settings import PlanningSettings
-from holdfast.randomness import Stream
-from holdfast.sensing import choose_sensing_action
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import Stream
+from holdfast.planning.belief import Belief
+from holdfast.planning.sensing import choose_sensing_action
+from holdfast.planning.settings import PlanningSettings
 from studies.vdp_tag import (
     DISCOUNT,
     INSIDE_TIPS,

@@ -8,9 +8,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from holdfast import _kernel, numerics
-from holdfast.arrays import BoolArray, FloatArray, IntArray
-from holdfast.belief import Belief, resample, uniform_weights
-from holdfast.randomness import Purpose, Stream, stream
+from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
+from holdfast.numerics.randomness import Purpose, Stream, stream
+from holdfast.planning.belief import Belief, resample, uniform_weights
 from studies.vdp_tag import (
     DISCOUNT,
     MAX_STEPS,

@@ -10,8 +10,8 @@ import pytest
 from rich.console import Console
 
 from holdfast.errors import OutputError
-from holdfast.files import claim_directory
 from holdfast.recording.compare import Comparison, Difference
+from holdfast.runtime.files import claim_directory
 from holdfast_lab.demo.command import account
 from holdfast_lab.demo.narrator import Activity, Change, DemoState, Mark
 from holdfast_lab.demo.scenario import Findings

@@ -6,13 +6,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import PlanningSettings
-from holdfast.outcome import TrialResult
-from holdfast.planning import Planner
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import Stream
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.records import ActingRecord, PerformedRecord, TrialHistory
-from holdfast.randomness import Stream
 from holdfast_lab.errors import Violation
 from holdfast_lab.simulation.checked_memo import CheckedPlanner
 from holdfast_lab.simulation.checkers import StatusChecker, WireChecker, check_size

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from holdfast.belief import Belief
-from holdfast.randomness import Purpose, stream
+from holdfast.numerics.randomness import Purpose, stream
+from holdfast.planning.belief import Belief
 from studies.cases import CASES
 from studies.errors import TaskError
 from studies.estimate_candidates import CANDIDATES, run_estimates

@@ -8,11 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief
-from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.errors import InvalidValueError
-from holdfast.planning import Planner
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.belief import Belief
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
 from studies import offload_break_even
 from studies.errors import TaskError
 from studies.exchange_times import measure_exchange

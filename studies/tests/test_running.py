@@ -128,7 +128,7 @@ def digests():
 first = digests()
 assert digests() == first
 root = Path(holdfast.__file__).parents[1]
-for name in ("studies/light_dark.py", "holdfast/belief.py", "holdfast_lab/chaos/trial.py"):
+for name in ("studies/light_dark.py", "holdfast/planning/belief.py", "holdfast_lab/chaos/trial.py"):
     with (root / name).open("a") as source:
         source.write("# edited")
     second = digests()
@@ -148,7 +148,7 @@ for name in ("studies/light_dark.py", "holdfast/belief.py", "holdfast_lab/chaos/
         assert done.returncode == 0, done.stderr
         assert done.stdout.splitlines() == [
             "studies/light_dark.py [False, True]",
-            "holdfast/belief.py [True, True]",
+            "holdfast/planning/belief.py [True, True]",
             "holdfast_lab/chaos/trial.py [False, False]",
         ]
 
@@ -173,8 +173,8 @@ for name in ("studies/light_dark.py", "holdfast/belief.py", "holdfast_lab/chaos/
         """What a trial is made of is among them; what only shows or moves it is not."""
         names = set(tasks._sources_behind("studies.trial_batches"))
         assert {
-            "holdfast.belief",
-            "holdfast.sensing",
+            "holdfast.planning.belief",
+            "holdfast.planning.sensing",
             "holdfast.problems.peg_in_hole_3d",  # named in a registry alone
             "studies.trial_batches",
             "holdfast",

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from holdfast.config.settings import PlanningSettings, SelectorSettings
-from holdfast.outcome import SensingDecision
-from holdfast.planning import Planner
+from holdfast.planning.outcome import SensingDecision
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import PlanningSettings, SelectorSettings
 from holdfast.robot.trial import run_trial
 from studies import sensing_price
 from studies.priced_problems import Boat

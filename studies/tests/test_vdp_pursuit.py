@@ -7,10 +7,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief
-from holdfast.config.settings import ActiveSensingSettings, PlanningSettings, SelectorSettings
-from holdfast.randomness import Purpose, Stream, stream
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import Purpose, Stream, stream
+from holdfast.planning.belief import Belief
+from holdfast.planning.settings import ActiveSensingSettings, PlanningSettings, SelectorSettings
 from studies.vdp_pursuit import (
     Pursuit,
     PursuitSettings,

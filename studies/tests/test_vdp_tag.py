@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.belief import Belief, update
-from holdfast.randomness import Purpose, Stream, stream
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import Purpose, Stream, stream
+from holdfast.planning.belief import Belief, update
 from studies.vdp_tag import (
     DISCOUNT,
     MAX_STEPS,

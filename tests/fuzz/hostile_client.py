@@ -13,7 +13,11 @@ from tests.fuzz import corpus
 from tests.fuzz.mutations import Mutator
 from tests.wire import frame_of, hello_of
 
-from holdfast.config.settings import ActiveSensingSettings, ParticleFilterSettings, PlanningSettings
+from holdfast.planning.settings import (
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+)
 from holdfast.protocol.messages import (
     MAX_INPUTS,
     Observed,

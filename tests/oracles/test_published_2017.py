@@ -83,7 +83,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from holdfast.arrays import FloatArray
+from holdfast.numerics.arrays import FloatArray
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem
 from studies.emulation_2017 import drawn_particle, likelihoods, run_emulation

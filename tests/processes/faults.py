@@ -28,8 +28,8 @@ from tests.processes.world import Gate, World
 from tests.processes.world import Hook as Hook
 
 from holdfast.config.loader import load
-from holdfast.outcome import TaskDecision
-from holdfast.problems.registry import BUILT_IN
+from holdfast.config.registry import BUILT_IN
+from holdfast.planning.outcome import TaskDecision
 from holdfast.protocol.records import ActingRecord
 from holdfast.recording.compare import compare_runs
 from holdfast.recording.journal import Journal

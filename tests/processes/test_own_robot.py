@@ -22,7 +22,7 @@ import pytest
 from tests.ports import free_port
 
 from holdfast.config.loader import Configuration, load
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.events import (
     EnvironmentEvent,

@@ -14,7 +14,7 @@ from pathlib import Path
 from tests.processes.faults import events_of, holdfast, rows_of, summary_of
 
 from holdfast import __version__
-from holdfast.outcome import DONE_VALUES
+from holdfast.planning.outcome import DONE_VALUES
 from holdfast.recording.journal import Journal
 
 BEFORE_OUTCOMES = Path(__file__).parents[1] / "unit" / "data" / "journal_before_outcomes.sqlite"

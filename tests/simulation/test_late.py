@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from holdfast.numerics.randomness import Stream, stream
 from holdfast.protocol.records import (
     ActingRecord,
     LateRecord,
@@ -13,7 +14,6 @@ from holdfast.protocol.records import (
     PerformedRecord,
     Record,
 )
-from holdfast.randomness import Stream, stream
 from holdfast_lab.errors import Violation
 from holdfast_lab.simulation.checkers import WireChecker
 from holdfast_lab.simulation.environment_model import EnvironmentModel

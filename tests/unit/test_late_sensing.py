@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.errors import EnvironmentFailedError
-from holdfast.outcome import TrialResult
-from holdfast.planning import Planner
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import LATER, Environment, Later, SimulatedEnvironment

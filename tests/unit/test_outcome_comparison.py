@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import OutputError
-from holdfast.outcome import DecisionLog, TrialResult
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import DecisionLog, TrialResult
 from holdfast.recording import outcome_comparison
 from holdfast.recording.journal import Journal
 from holdfast.recording.outcome_comparison import OutcomeEffect, compare_outcomes, effects_of

@@ -18,10 +18,11 @@ from tests.robot_world import (
     World,
 )
 
-from holdfast.config.settings import LostSettings, OnLost, SimulatorSettings
 from holdfast.errors import HeldError, UnknownPerformanceError
-from holdfast.outcome import ending_of
-from holdfast.planning import Planner
+from holdfast.planning.outcome import ending_of
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import LostSettings, OnLost, SimulatorSettings
+from holdfast.planning.tracking import LateObservation
 from holdfast.protocol.events import (
     Act,
     Acted,
@@ -52,7 +53,6 @@ from holdfast.protocol.robot import Robot
 from holdfast.recording.recorder import Recorder
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import run_trial
-from holdfast.tracking import LateObservation
 
 # -- the robot's own death ------------------------------------------------------------------------
 

@@ -13,8 +13,8 @@ from tests.command_line import run_here
 from tests.recordings import configuration_of, record_trial
 
 from holdfast.cli.run_figure import Deviation, repeat, service_that_decided
-from holdfast.outcome import TrialResult
-from holdfast.planning import Planner
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import Planner
 from holdfast.protocol.events import Timing
 from holdfast.protocol.question import OWN_PLANNER
 from holdfast.recording.recorder import Recorder

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from holdfast import planning
 from holdfast.cli import main
 from holdfast.config.loader import load
 from holdfast.config.user_code import find_class, is_users_file
 from holdfast.errors import ConfigurationError
+from holdfast.planning import planner as planning
 from holdfast.robot.trials import run_trials
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from tests.robot_world import LOCAL, PLANNING, PROBLEM, World
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import ProblemError, ServiceRefusedError
-from holdfast.planning import Planner
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.planner import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.events import (
     Act,

@@ -24,8 +24,8 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import TransportError
+from holdfast.numerics.arrays import FloatArray
 from holdfast.protocol.status import Status
 from holdfast.transport.endpoints import host_and_port, system_words
 from holdfast_ros.active_sensing import DecisionAnswer, DecisionRequest, ErrorCode, RequestKind

@@ -78,8 +78,8 @@ def run_application(arguments: Sequence[str]) -> int:
         (sys.stdout if first else sys.stderr).write(_help())
         return 0 if first else EXIT_ERROR
     if first == "--version":
+        from holdfast.config.source_digest import core_version
         from holdfast.recording.machine import machines
-        from holdfast.source_digest import core_version
 
         sys.stdout.write(f"holdfast {core_version()} ({machines()} state machines)\n")
         return 0
@@ -100,7 +100,7 @@ def run_application(arguments: Sequence[str]) -> int:
             f"the command {first} is in the package {package}, not installed here: pip install "
             f"{package}"
         )
-    from holdfast.config.validation import close_match
+    from holdfast.validation import close_match
 
     what = "option of holdfast" if first.startswith("-") else "command"
     names = [*COMMANDS, *added]

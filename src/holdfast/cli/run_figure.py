@@ -22,7 +22,7 @@ from holdfast.errors import DecidedOtherwiseError
 
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
-    from holdfast.outcome import TrialResult
+    from holdfast.planning.outcome import TrialResult
     from holdfast.protocol.records import Record
     from holdfast.recording.recorder import Recorder
     from holdfast.recording.run_directory import RunDirectory
@@ -178,7 +178,7 @@ def repeat(
 
     ``result`` has its decisions; the ``records`` are None for a simulated world.
     """
-    from holdfast.planning import Planner
+    from holdfast.planning.planner import Planner
     from holdfast.recording.compare import difference_of_decisions
     from holdfast.robot.recorded_trial import run_recorded_trial
     from holdfast.robot.trial import run_trial

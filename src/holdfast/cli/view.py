@@ -16,7 +16,6 @@ from holdfast.cli.export import (
     trials_option,
 )
 from holdfast.errors import InvalidValueError, OptionError
-from holdfast.files import directory_beside, move_into_place, require_free
 from holdfast.recording.view_target import ViewTarget, require_rerun, viewer_url
 from holdfast.runtime.command_line import (
     Options,
@@ -25,6 +24,7 @@ from holdfast.runtime.command_line import (
     location,
     option,
 )
+from holdfast.runtime.files import directory_beside, move_into_place, require_free
 
 __all__ = ["main"]
 

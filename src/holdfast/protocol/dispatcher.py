@@ -15,9 +15,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from holdfast.config.settings import OffloadSettings, RecoverySettings
 from holdfast.errors import HoldfastError, ServiceRefusedError
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import OffloadSettings, RecoverySettings
 from holdfast.problems.problem import Problem
 from holdfast.protocol.events import (
     CallEnded,

@@ -24,9 +24,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from holdfast import checked
-from holdfast.arrays import FloatArray
-from holdfast.planning import Planner
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.planner import Planner
+from holdfast.problems import checked
 from holdfast.protocol.events import (
     ComputeOwnAnswer,
     Effects,

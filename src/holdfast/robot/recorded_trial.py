@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import cast
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import DecidedOtherwiseError
-from holdfast.outcome import Ending, MoveResult, TrialResult
-from holdfast.planning import Planner, PlanningState, TaskInfo
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import Ending, MoveResult, TrialResult
+from holdfast.planning.planner import Planner, PlanningState, TaskInfo
+from holdfast.planning.tracking import Trial
 from holdfast.protocol.messages import encode_floats, numbers_of
 from holdfast.protocol.records import (
     ActingRecord,
@@ -24,7 +25,6 @@ from holdfast.protocol.records import (
 )
 from holdfast.robot.environment import Environment, SimulatedEnvironment
 from holdfast.robot.trial import LateStep, SensingStep, TaskStep, TrialObserver
-from holdfast.tracking import Trial
 
 __all__ = ["run_recorded_trial"]
 

@@ -141,7 +141,7 @@ def _chosen(option: str, names: Sequence[str], known: Iterable[str]) -> list[str
     known = list(known)
     for name in names:
         if name not in known:
-            from holdfast.config.validation import close_match
+            from holdfast.validation import close_match
 
             hint = close_match(name.replace("-", "_"), known)
             raise OptionError(f"{option} is {name!r}; allowed are {', '.join(known)}{hint}")
@@ -172,7 +172,7 @@ def _plan_of(options: ChaosOptions) -> tuple[SeriesPlan, dict[FaultKind, str]]:
 
 def _run(options: ChaosOptions) -> bool:
     from holdfast.cli.terminal import counted, progress_line
-    from holdfast.files import claim_directory
+    from holdfast.runtime.files import claim_directory
     from holdfast_lab.chaos.report import WIDE, summarise, text_of, write_report
     from holdfast_lab.chaos.series import Series
 

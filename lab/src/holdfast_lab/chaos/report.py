@@ -14,8 +14,8 @@ from pathlib import Path
 import msgspec
 
 from holdfast.cli.terminal import counted
-from holdfast.files import write_atomically
 from holdfast.recording.machine import describe
+from holdfast.runtime.files import write_atomically
 from holdfast_lab.chaos.trial import TrialOutcome
 from holdfast_lab.testbed.fault_times import Spread, spread_of
 from holdfast_lab.testbed.faults import FaultKind

@@ -17,8 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from holdfast.arrays import FloatArray
-from holdfast.outcome import TrialResult
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.tracking import LateObservation
 from holdfast.protocol.records import (
     ActingRecord,
     LateRecord,
@@ -26,7 +27,6 @@ from holdfast.protocol.records import (
     PerformedRecord,
     Record,
 )
-from holdfast.tracking import LateObservation
 from holdfast_lab.errors import Violation
 from holdfast_lab.simulation.reference_runs import (
     BEFORE_CHOOSING,

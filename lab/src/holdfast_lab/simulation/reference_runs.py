@@ -12,10 +12,10 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import PlanningSettings
-from holdfast.outcome import DecisionLog, MoveResult
-from holdfast.planning import ObservationInfo, Planner, PlanningState
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import DecisionLog, MoveResult
+from holdfast.planning.planner import ObservationInfo, Planner, PlanningState
+from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast_lab.simulation.checked_memo import Memo

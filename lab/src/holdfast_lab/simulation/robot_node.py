@@ -11,16 +11,17 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import (
+from holdfast.errors import HoldfastError, UnknownPerformanceError
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import Ending
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import (
     LostSettings,
     OffloadSettings,
     RecoverySettings,
     SimulatorSettings,
 )
-from holdfast.errors import HoldfastError, UnknownPerformanceError
-from holdfast.outcome import Ending
-from holdfast.planning import Planner
+from holdfast.planning.tracking import LateObservation
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.events import (
     Abandon,
@@ -49,7 +50,6 @@ from holdfast.protocol.events import (
 from holdfast.protocol.messages import MAX_TASK_ACTIONS
 from holdfast.protocol.records import Record, TrialHistory, replay
 from holdfast.protocol.robot import Robot
-from holdfast.tracking import LateObservation
 from holdfast_lab.errors import Violation
 from holdfast_lab.simulation.checkers import StatusChecker
 from holdfast_lab.simulation.disk import Disk

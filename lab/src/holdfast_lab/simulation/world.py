@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from holdfast.config.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 from holdfast.errors import HoldfastError, IllegalTransitionError, MessageError
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.events import (
     Act,
