@@ -13,11 +13,11 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from holdfast.belief import Belief
-from holdfast.config.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
-from holdfast.planning import Planner, PlanningState
+from holdfast.numerics.randomness import Purpose, stream
+from holdfast.planning.belief import Belief
+from holdfast.planning.planner import Planner, PlanningState
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Purpose, stream
 from holdfast.robot.environment import SimulatedEnvironment
 
 __all__ = [

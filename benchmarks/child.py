@@ -20,7 +20,7 @@ from benchmarks.beliefs import SEED, concentrated_state, recorded_trial, setting
 from benchmarks.common import decide, evenly_spread
 from benchmarks.measure import alternate, peak_memory_bytes
 from holdfast import _kernel
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 
 

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.report import Result
-from holdfast.config.settings import PlanningSettings
-from holdfast.planning import Planner, PlanningState
+from holdfast.planning.planner import Planner, PlanningState
+from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
 from holdfast.robot.trials import available_cores
 

@@ -19,10 +19,10 @@ from time import thread_time
 
 from tests.fuzz.hostile_settings import random_settings
 
+from holdfast.config import registry
+from holdfast.config.registry import BUILT_IN
 from holdfast.errors import HoldfastError
-from holdfast.planning import Planner
-from holdfast.problems import registry
-from holdfast.problems.registry import BUILT_IN
+from holdfast.planning.planner import Planner
 from holdfast.protocol.decision_cost import cost_of_answer, cost_of_sensing, describe_cost
 from holdfast.protocol.service_sessions import with_cores
 from holdfast.service.calibration import measure_problem, measure_slowness

@@ -26,9 +26,9 @@ from benchmarks.common import (
 from benchmarks.measure import alternate, ratio_of_turns
 from benchmarks.report import Bar, Result, Table, milliseconds, paragraph
 from holdfast import _kernel
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import PlanningSettings, SelectorSettings
-from holdfast.planning import Planner, PlanningState
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.planner import Planner, PlanningState
+from holdfast.planning.settings import PlanningSettings, SelectorSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem
 

@@ -18,17 +18,17 @@ from typing import get_args
 
 import numpy as np
 
-from holdfast.arrays import BoolArray, FloatArray, IntArray
-from holdfast.belief import Belief
-from holdfast.config.settings import (
+from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
+from holdfast.numerics.randomness import Purpose, Stream, stream
+from holdfast.planning.belief import Belief
+from holdfast.planning.sensing import choose_sensing_action
+from holdfast.planning.settings import (
     ActiveSensingSettings,
     Estimator,
     PlanningSettings,
     SelectorSettings,
 )
 from holdfast.problems.problem import ProblemBase
-from holdfast.randomness import Purpose, Stream, stream
-from holdfast.sensing import choose_sensing_action
 
 COUNTS = (100, 300, 1000)
 DEVIATIONS = (0.02, 0.1, 0.5)

@@ -11,15 +11,17 @@ from benchmarks.beliefs import recorded_trial, settings_for
 from benchmarks.common import THREADS, Context, decide, evenly_spread
 from benchmarks.measure import alternate, ratio_of_turns
 from benchmarks.report import Result, Table, milliseconds, paragraph
-from holdfast import _kernel, checked, sensing
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief, estimate
-from holdfast.config.settings import PlanningSettings
-from holdfast.estimators import KernelEstimator, scaled
+from holdfast import _kernel
 from holdfast.lab.studies.cases import CASES
 from holdfast.lab.studies.trial_batches import problem_of
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import Stream
+from holdfast.planning import sensing
+from holdfast.planning.belief import Belief, estimate
+from holdfast.planning.estimators import KernelEstimator, scaled
+from holdfast.planning.settings import PlanningSettings
+from holdfast.problems import checked
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Stream
 
 __all__ = ["horizon", "one_by_one"]
 
@@ -34,7 +36,7 @@ def one_by_one(
     estimator: KernelEstimator,
     points_of: Callable[[FloatArray, int], FloatArray],
 ) -> FloatArray:
-    """Return what ``holdfast.sensing._later_entropies`` returns."""
+    """Return what ``holdfast.planning.sensing._later_entropies`` returns."""
     horizon, discount = settings.active_sensing.horizon, settings.active_sensing.discount
     actions, samples, _ = weights.shape
     motion = hypotheses.substream(2)

@@ -23,12 +23,12 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 from scipy.special import digamma
 
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief
-from holdfast.config.settings import PlanningSettings
-from holdfast.planning import PlanningState
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import Purpose, stream
+from holdfast.planning.belief import Belief
+from holdfast.planning.planner import PlanningState
+from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Purpose, stream
 
 __all__ = [
     "choose_sensing_action",
@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 
-# As `holdfast.estimators.NearestNeighbor` says: weights below one of these fractions of the
+# As `holdfast.planning.estimators.NearestNeighbor` says: weights below one of these fractions of the
 # greatest are left out, the first that loses no more than this share of the sum, else the last.
 NEGLIGIBLE = tuple(10.0**-i * (1.0 - 2.0**-40) for i in range(2, 7))
 LOST_SHARE = 0.005

@@ -17,15 +17,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from holdfast.arrays import FloatArray
-from holdfast.circular import differences
 from holdfast.config.loader import Configuration, load
-from holdfast.config.settings import LostSettings, OnLost
-from holdfast.lost import LostTest
-from holdfast.outcome import MoveResult
-from holdfast.planning import Planner
-from holdfast.problem_attributes import circular_states
-from holdfast.randomness import Purpose, stream
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.circular import differences
+from holdfast.numerics.randomness import Purpose, stream
+from holdfast.planning.lost import LostTest
+from holdfast.planning.outcome import MoveResult
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import LostSettings, OnLost
+from holdfast.problems.attributes import circular_states
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import SensingStep, TrialObserver, run_trial
 

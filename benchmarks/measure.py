@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from holdfast.arrays import FloatArray
+from holdfast.numerics.arrays import FloatArray
 
 __all__ = [
     "OtherLoad",

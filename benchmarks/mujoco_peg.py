@@ -18,7 +18,7 @@ from typing import Any
 from benchmarks import trial_table
 from holdfast.config.loader import load
 from holdfast.lab.studies.statistics import mean_interval
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
 from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.trial import run_trial
 

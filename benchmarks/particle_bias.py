@@ -21,12 +21,12 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.beliefs import recorded_trial, settings_for
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief
-from holdfast.config.settings import PlanningSettings, SelectorSettings
 from holdfast.lab.studies.cases import CASES
 from holdfast.lab.studies.trial_batches import problem_of
-from holdfast.planning import Planner, PlanningState
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.belief import Belief
+from holdfast.planning.planner import Planner, PlanningState
+from holdfast.planning.settings import PlanningSettings, SelectorSettings
 from holdfast.problems.problem import Problem
 
 MANY = 4000

@@ -12,8 +12,8 @@ from benchmarks.beliefs import recorded_trial, settings_for
 from benchmarks.common import THREADS, Context, decide, evenly_spread, threads_in_words
 from benchmarks.measure import alternate, ratio_of_turns
 from benchmarks.report import Bar, Result, Table, milliseconds, paragraph
-from holdfast.config.settings import PlanningSettings, path_steps
-from holdfast.policy_path import path_points
+from holdfast.planning.policy_path import path_points
+from holdfast.planning.settings import PlanningSettings, path_steps
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.multitier_peg_in_hole_2d import MultitierPegInHole2D
 from holdfast.problems.peg_in_hole_2d import PegInHole2D

@@ -15,7 +15,7 @@ from time import time
 from typing import NamedTuple
 
 from holdfast.config.loader import Configuration, load
-from holdfast.outcome import TrialResult
+from holdfast.planning.outcome import TrialResult
 from holdfast.protocol.events import Timing, TransportEvent
 from holdfast.recording.run_directory import RunDirectory
 from holdfast.robot.environment_maker import load_environment

@@ -16,7 +16,7 @@ from benchmarks.beliefs import (
 from benchmarks.common import THREADS, Context, child, decide, threads_in_words
 from benchmarks.measure import alternate, fitted_exponent
 from benchmarks.report import Bar, Result, Table, milliseconds, paragraph
-from holdfast.planning import Planner, PlanningState
+from holdfast.planning.planner import Planner, PlanningState
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.peg_in_hole_3d import PegInHole3D
 

@@ -34,8 +34,8 @@ from benchmarks.robots import Notebook, configuration_for, run_robot
 from benchmarks.turns import Asker, decided_in_process, recorded_turns
 from holdfast.lab.testbed.processes import free_port
 from holdfast.lab.testbed.proxy import Proxy
-from holdfast.outcome import TrialResult
-from holdfast.planning import Planner, digest, encode_checkpoint
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import Planner, digest, encode_checkpoint
 from holdfast.protocol.messages import DIGEST_SIZE, encode_floats
 from holdfast.protocol.records import ActingRecord, PerformedRecord
 from holdfast.recording.journal import Journal

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks import trial_table
-from holdfast.arrays import FloatArray
 from holdfast.config.loader import load
 from holdfast.lab.studies.statistics import mean_interval
-from holdfast.outcome import Ending
-from holdfast.planning import Planner
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import Ending
+from holdfast.planning.planner import Planner
 from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.trial import run_trial
 

@@ -12,8 +12,8 @@ from time import perf_counter
 from typing import NamedTuple, Self
 
 from benchmarks.beliefs import MAX_STEPS, SEED
-from holdfast.config.settings import PlanningSettings
-from holdfast.planning import Planner, PlanningState, digest, encode_checkpoint
+from holdfast.planning.planner import Planner, PlanningState, digest, encode_checkpoint
+from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
 from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared, TransportEvent
 from holdfast.protocol.messages import (

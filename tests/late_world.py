@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from holdfast.arrays import FloatArray
+from holdfast.numerics.arrays import FloatArray
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import LATER, Later, SimulatedEnvironment
 

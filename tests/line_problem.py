@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import Stream
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.problems.problem import ProblemBase
-from holdfast.randomness import Stream
 
 SETTINGS = PlanningSettings(particle_filter=ParticleFilterSettings(num_particles=30))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from holdfast.config.settings import (
+from holdfast.planning.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,

@@ -6,7 +6,7 @@ from typing import Any
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import MessageError
-from holdfast.planning import Planner, PlanningState, digest
+from holdfast.planning.planner import Planner, PlanningState, digest
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
     PROTOCOL_VERSION,

@@ -7,8 +7,8 @@ from pathlib import Path
 import msgspec
 
 from holdfast.config.loader import Configuration, load
-from holdfast.outcome import Decisions, TrialResult
-from holdfast.planning import Planner
+from holdfast.planning.outcome import Decisions, TrialResult
+from holdfast.planning.planner import Planner
 from holdfast.recording.recorder import Recorder
 from holdfast.robot.trial import run_trial
 

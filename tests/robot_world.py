@@ -9,8 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import (
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import MoveResult, TrialResult, ending_of
+from holdfast.planning.planner import Planner, PlanningState, decode_checkpoint, digest
+from holdfast.planning.settings import (
     LostSettings,
     OffloadSettings,
     OnLost,
@@ -19,8 +21,6 @@ from holdfast.config.settings import (
     RecoverySettings,
     SimulatorSettings,
 )
-from holdfast.outcome import MoveResult, TrialResult, ending_of
-from holdfast.planning import Planner, PlanningState, decode_checkpoint, digest
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.events import (

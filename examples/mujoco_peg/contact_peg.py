@@ -12,8 +12,8 @@ import numpy as np
 
 import holdfast as hf
 from holdfast import numerics
-from holdfast.geometry import FAR, BoxWorld, RectangleWorld
-from holdfast.randomness import NOISE_FREE
+from holdfast.numerics.geometry import FAR, BoxWorld, RectangleWorld
+from holdfast.numerics.randomness import NOISE_FREE
 
 COLLISION_TOLERANCE = 0.01
 """Fraction of a step to which contact is located."""

@@ -15,7 +15,7 @@ import numpy as np
 
 import holdfast as hf
 from holdfast import numerics
-from holdfast.randomness import NoiseFreeStream
+from holdfast.numerics.randomness import NoiseFreeStream
 
 
 class TouchedBoard(hf.ProblemBase):

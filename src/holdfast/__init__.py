@@ -10,21 +10,26 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from holdfast.belief import Belief
     from holdfast.config.loader import load as load_configuration
-    from holdfast.config.settings import (
+    from holdfast.config.registry import make
+    from holdfast.errors import HoldfastError
+    from holdfast.planning.belief import Belief
+    from holdfast.planning.estimators import (
+        GaussianMixture,
+        NearestNeighbor,
+        PriorNeighbors,
+        entropy,
+    )
+    from holdfast.planning.outcome import Ending, MoveResult
+    from holdfast.planning.planner import Planner, PlanningState
+    from holdfast.planning.settings import (
         ActiveSensingSettings,
         LostSettings,
         ParticleFilterSettings,
         PlanningSettings,
         SelectorSettings,
     )
-    from holdfast.errors import HoldfastError
-    from holdfast.estimators import GaussianMixture, NearestNeighbor, PriorNeighbors, entropy
-    from holdfast.outcome import Ending, MoveResult
-    from holdfast.planning import Planner, PlanningState
     from holdfast.problems.problem import Problem, ProblemBase, Scene
-    from holdfast.problems.registry import make
     from holdfast.recording.reading import open_run
     from holdfast.robot.environment import LATER, Environment, SimulatedEnvironment
     from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
@@ -64,31 +69,31 @@ __all__ = [
 __version__ = "0.1.0"
 
 _PLACES = {
-    "ActiveSensingSettings": "config.settings.ActiveSensingSettings",
-    "LostSettings": "config.settings.LostSettings",
-    "ParticleFilterSettings": "config.settings.ParticleFilterSettings",
-    "Belief": "belief.Belief",
-    "Ending": "outcome.Ending",
+    "ActiveSensingSettings": "planning.settings.ActiveSensingSettings",
+    "LostSettings": "planning.settings.LostSettings",
+    "ParticleFilterSettings": "planning.settings.ParticleFilterSettings",
+    "Belief": "planning.belief.Belief",
+    "Ending": "planning.outcome.Ending",
     "Environment": "robot.environment.Environment",
     "LATER": "robot.environment.LATER",
-    "MoveResult": "outcome.MoveResult",
+    "MoveResult": "planning.outcome.MoveResult",
     "SenseInBackground": "robot.late_sensing.SenseInBackground",
-    "GaussianMixture": "estimators.GaussianMixture",
+    "GaussianMixture": "planning.estimators.GaussianMixture",
     "GymnasiumEnvironment": "robot.gymnasium_environment.GymnasiumEnvironment",
     "HoldfastError": "errors.HoldfastError",
-    "NearestNeighbor": "estimators.NearestNeighbor",
-    "Planner": "planning.Planner",
-    "PlanningSettings": "config.settings.PlanningSettings",
-    "PlanningState": "planning.PlanningState",
-    "PriorNeighbors": "estimators.PriorNeighbors",
+    "NearestNeighbor": "planning.estimators.NearestNeighbor",
+    "Planner": "planning.planner.Planner",
+    "PlanningSettings": "planning.settings.PlanningSettings",
+    "PlanningState": "planning.planner.PlanningState",
+    "PriorNeighbors": "planning.estimators.PriorNeighbors",
     "Problem": "problems.problem.Problem",
     "ProblemBase": "problems.problem.ProblemBase",
     "Scene": "problems.problem.Scene",
     "SimulatedEnvironment": "robot.environment.SimulatedEnvironment",
-    "SelectorSettings": "config.settings.SelectorSettings",
-    "entropy": "estimators.entropy",
+    "SelectorSettings": "planning.settings.SelectorSettings",
+    "entropy": "planning.estimators.entropy",
     "load_configuration": "config.loader.load",
-    "make": "problems.registry.make",
+    "make": "config.registry.make",
     "open_run": "recording.reading.open_run",
     "run_trial": "robot.trial.run_trial",
 }

@@ -20,8 +20,8 @@ from tests.command_line import run_here
 
 import holdfast as hf
 from holdfast import errors
-from holdfast.problems.registry import BUILT_IN
-from holdfast.randomness import NOISE_FREE, Purpose, stream
+from holdfast.config.registry import BUILT_IN
+from holdfast.numerics.randomness import NOISE_FREE, Purpose, stream
 from holdfast.robot.problem_env import ProblemEnv
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

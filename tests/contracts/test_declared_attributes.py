@@ -13,7 +13,7 @@ import pytest
 from tests.line_problem import Line
 
 import holdfast as hf
-from holdfast.problem_attributes import check_problem
+from holdfast.problems.attributes import check_problem
 from holdfast.recording.belief_remarks import belief_remarks
 from holdfast.recording.csv_export import state_labels
 from holdfast.recording.poses import pose_layout

@@ -16,8 +16,8 @@ import pytest
 from tests.line_problem import SETTINGS, Line
 
 import holdfast as hf
-from holdfast.outcome import MoveResult, TrialResult
-from holdfast.randomness import Purpose, stream
+from holdfast.numerics.randomness import Purpose, stream
+from holdfast.planning.outcome import MoveResult, TrialResult
 
 gymnasium = pytest.importorskip("gymnasium")
 

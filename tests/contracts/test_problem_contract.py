@@ -10,10 +10,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.problems import registry
+from holdfast.config import registry
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import Purpose, stream
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Purpose, stream
 
 SEED = 11
 LEADING_SHAPES = [(), (1,), (13,), (3, 5), (2, 3, 4), (0,)]

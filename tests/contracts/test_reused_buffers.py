@@ -14,16 +14,16 @@ import pytest
 from tests.golden.sonar_room import SonarRoom
 from tests.line_problem import Line
 
-from holdfast.config.settings import (
+from holdfast.lab.simulation.peg_with_encoders import PegWithEncoders
+from holdfast.planning.outcome import MoveResult
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
 )
-from holdfast.lab.simulation.peg_with_encoders import PegWithEncoders
-from holdfast.outcome import MoveResult
-from holdfast.planning import Planner
-from holdfast.problem_attributes import PARAMETERS
+from holdfast.problems.attributes import PARAMETERS
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import SimulatedEnvironment

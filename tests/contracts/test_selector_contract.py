@@ -13,9 +13,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief
-from holdfast.config.settings import (
+from holdfast.config import registry
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import Purpose, stream
+from holdfast.planning.belief import Belief
+from holdfast.planning.sensing import SensingInfo, choose_sensing_action
+from holdfast.planning.settings import (
     ENTROPY_METHODS,
     UNINFORMED_METHODS,
     ActiveSensingSettings,
@@ -24,10 +27,7 @@ from holdfast.config.settings import (
     PlanningSettings,
     SelectorSettings,
 )
-from holdfast.problems import registry
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Purpose, stream
-from holdfast.sensing import SensingInfo, choose_sensing_action
 
 SEED = 17
 COUNT = 60

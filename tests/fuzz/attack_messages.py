@@ -17,16 +17,16 @@ from tests.fuzz import corpus
 from tests.fuzz.odd_values import STORMS, OddValues, replaced
 from tests.questions import request_of
 
-from holdfast.belief import Belief
-from holdfast.config.settings import (
+from holdfast.config import registry
+from holdfast.planning.belief import Belief
+from holdfast.planning.planner import PlanningState, encode_checkpoint
+from holdfast.planning.settings import (
     Estimator,
     Method,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
 )
-from holdfast.planning import PlanningState, encode_checkpoint
-from holdfast.problems import registry
 from holdfast.protocol.messages import (
     CHECKSUM_SIZE,
     encode,

@@ -51,7 +51,7 @@ from tests.ports import free_port
 from tests.processes.faults import Service, Site
 from tests.wire import CALL, PING, RawClient, RawLink, frame_of, hello_of
 
-from holdfast.config.settings import OffloadSettings
+from holdfast.planning.settings import OffloadSettings
 from holdfast.protocol.messages import encode
 from holdfast.transport.credentials import load_credentials
 from holdfast.transport.datagram_links import RobotDatagramLink

@@ -9,9 +9,14 @@ from typing import NamedTuple
 import numpy as np
 from tests.questions import request_of
 
-from holdfast.config.settings import ActiveSensingSettings, ParticleFilterSettings, PlanningSettings
-from holdfast.planning import Planner, PlanningState, encode_checkpoint
-from holdfast.problems import registry
+from holdfast.config import registry
+from holdfast.config.source_digest import core_version, problem_digest
+from holdfast.planning.planner import Planner, PlanningState, encode_checkpoint
+from holdfast.planning.settings import (
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+)
 from holdfast.problems.problem import Problem
 from holdfast.protocol.messages import (
     CHECKSUM_SIZE,
@@ -38,7 +43,6 @@ from holdfast.protocol.records import (
     Record,
 )
 from holdfast.robot.environment import SimulatedEnvironment
-from holdfast.source_digest import core_version, problem_digest
 
 __all__ = [
     "PLANNING",

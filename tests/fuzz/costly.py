@@ -27,9 +27,10 @@ from tests.fuzz.hostile_settings import hostile_settings, random_settings
 from tests.unit.test_protocol_service import Robot, content
 from tests.wire import RawClient
 
-from holdfast.config.settings import PlanningSettings
+from holdfast.config.registry import BUILT_IN
+from holdfast.config.source_digest import core_version, problem_digest
 from holdfast.errors import HoldfastError
-from holdfast.problems.registry import BUILT_IN
+from holdfast.planning.settings import PlanningSettings
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
     PROTOCOL_VERSION,
@@ -38,7 +39,6 @@ from holdfast.protocol.messages import (
     decode_reply,
     encode,
 )
-from holdfast.source_digest import core_version, problem_digest
 
 __all__ = ["Outcome", "attack", "costly_requests"]
 

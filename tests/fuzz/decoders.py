@@ -23,8 +23,8 @@ import yaml
 from tests.fuzz import message_pack, targets
 from tests.fuzz.mutations import Mutator
 
-from holdfast import planning
 from holdfast.config import yaml_document
+from holdfast.planning import planner as planning
 from holdfast.protocol import messages, records
 
 __all__ = ["main"]

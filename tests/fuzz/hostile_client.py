@@ -25,8 +25,12 @@ from tests.fuzz import corpus
 from tests.fuzz.mutations import Mutator
 from tests.wire import CALL, END, LAST, REPLY, Frame, RawClient, frame_of, hello_of
 
-from holdfast.config.settings import ActiveSensingSettings, ParticleFilterSettings, PlanningSettings
 from holdfast.errors import MessageError
+from holdfast.planning.settings import (
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+)
 from holdfast.protocol.messages import (
     MAX_INPUTS,
     Observed,

@@ -11,7 +11,7 @@ from typing import NamedTuple, get_args
 import msgspec
 from msgspec import inspect
 
-from holdfast.config.settings import Estimator, Method, PlanningSettings, unfit_for_the_method
+from holdfast.planning.settings import Estimator, Method, PlanningSettings, unfit_for_the_method
 
 __all__ = ["Hostile", "hostile_settings", "numeric_keys", "random_settings", "with_key"]
 

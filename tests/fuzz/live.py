@@ -29,8 +29,8 @@ from tests.fuzz.raw_connections import RawConnections
 from tests.processes.faults import PROBLEMS, Process, Robot, Service, Site, document_of, events_of
 
 from holdfast.config.loader import load
-from holdfast.config.settings import OffloadSettings
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import OffloadSettings
 from holdfast.recording.journal import Journal
 from holdfast.robot.trial import run_trial
 

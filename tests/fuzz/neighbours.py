@@ -24,8 +24,8 @@ import numpy as np
 from tests.fuzz import corpus
 from tests.wire import CALL, RawClient, RawLink, frame_of, hello_of
 
-from holdfast.belief import Belief
-from holdfast.planning import PlanningState, encode_checkpoint
+from holdfast.planning.belief import Belief
+from holdfast.planning.planner import PlanningState, encode_checkpoint
 from holdfast.protocol.messages import encode
 
 __all__ = ["KINDS", "main"]

@@ -28,7 +28,7 @@ from tests.fuzz.measuring import Watch, flatness
 from tests.processes.faults import PROBLEMS, Robot, Service, Site, document_of, events_of
 
 from holdfast.config.loader import load
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
 from holdfast.recording.journal import Journal
 from holdfast.robot.trial import run_trial
 

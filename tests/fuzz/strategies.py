@@ -9,14 +9,14 @@ import numpy as np
 from hypothesis import strategies as st
 from tests.fuzz.mutations import Mutator
 
-from holdfast.belief import Belief
-from holdfast.config.settings import (
+from holdfast.planning.belief import Belief
+from holdfast.planning.planner import PlanningState
+from holdfast.planning.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
 )
-from holdfast.planning import PlanningState
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_INPUTS,

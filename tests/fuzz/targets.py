@@ -24,7 +24,7 @@ from holdfast.errors import (
     MessageError,
     RecordError,
 )
-from holdfast.planning import Planner, decode_checkpoint, digest, encode_checkpoint
+from holdfast.planning.planner import Planner, decode_checkpoint, digest, encode_checkpoint
 from holdfast.problems.problem import Problem
 from holdfast.protocol.messages import (
     MAX_INPUTS,

@@ -12,7 +12,7 @@ from tests.fuzz.examples import always, examples
 from tests.fuzz.mutations import Mutator
 from tests.fuzz.targets import SPECIMENS, TARGETS
 
-from holdfast.planning import PlanningState, decode_checkpoint, digest, encode_checkpoint
+from holdfast.planning.planner import PlanningState, decode_checkpoint, digest, encode_checkpoint
 from holdfast.printable import one_line
 from holdfast.protocol.messages import (
     Refused,

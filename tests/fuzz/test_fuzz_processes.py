@@ -25,9 +25,9 @@ from tests.fuzz.soak import run_soak
 from tests.fuzz.targets import TARGETS
 from tests.unit.test_protocol_service import Bench
 
-from holdfast.config.settings import PlanningSettings
-from holdfast.problems import registry
-from holdfast.problems.registry import BUILT_IN
+from holdfast.config import registry
+from holdfast.config.registry import BUILT_IN
+from holdfast.planning.settings import PlanningSettings
 from holdfast.protocol.messages import SensingAnswer, TaskAnswer, decode_request
 
 ROOT = Path(__file__).parents[2]

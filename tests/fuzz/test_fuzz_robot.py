@@ -18,7 +18,7 @@ from tests.fuzz.examples import always, examples
 from tests.fuzz.mutations import Mutator
 from tests.robot_world import LOCAL, World
 
-from holdfast.config.settings import SimulatorSettings
+from holdfast.planning.settings import SimulatorSettings
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.events import (
     CallEnded,

@@ -22,7 +22,7 @@ from tests.unit.test_protocol_service import Robot as ReferenceRobot
 from tests.unit.test_protocol_service import content
 from tests.wire import RawClient
 
-from holdfast.planning import encode_checkpoint
+from holdfast.planning.planner import encode_checkpoint
 from holdfast.protocol.messages import NeedState, encode
 
 __all__ = ["main"]

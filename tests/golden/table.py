@@ -21,11 +21,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_type_hints
 
+from holdfast.config import registry
 from holdfast.config.loader import Configuration, load
-from holdfast.config.settings import SelectorSettings
 from holdfast.lab.studies.cases import CASES
-from holdfast.outcome import TrialResult
-from holdfast.problems import registry
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.settings import SelectorSettings
 from holdfast.recording.tables import SummaryBuilder
 from holdfast.robot.trials import run_trials
 

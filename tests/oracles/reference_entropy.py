@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import digamma
 
-from holdfast.arrays import FloatArray, IntArray
+from holdfast.numerics.arrays import FloatArray, IntArray
 
 
 def significant(weights: FloatArray) -> npt.NDArray[np.bool_]:

@@ -13,9 +13,9 @@ import fcl
 import numpy as np
 import pytest
 
-from holdfast.arrays import BoolArray, FloatArray
-from holdfast.geometry import BoxWorld, DiscWorld, RectangleWorld
-from holdfast.randomness import Purpose, stream
+from holdfast.numerics.arrays import BoolArray, FloatArray
+from holdfast.numerics.geometry import BoxWorld, DiscWorld, RectangleWorld
+from holdfast.numerics.randomness import Purpose, stream
 
 NUM_POSES = 3000
 MARGIN = 2e-6

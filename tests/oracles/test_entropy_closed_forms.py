@@ -28,9 +28,9 @@ import pytest
 from scipy import special, stats
 from tests.oracles.reference_entropy import log_unit_ball
 
-from holdfast import estimators as estimation
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.estimators import GaussianMixture, NearestNeighbor
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.planning import estimators as estimation
+from holdfast.planning.estimators import GaussianMixture, NearestNeighbor
 
 FALSE_ALARM = 1e-6
 POWER = 0.12

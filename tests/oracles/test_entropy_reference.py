@@ -20,8 +20,8 @@ from tests.oracles.reference_entropy import (
 )
 
 from holdfast import _kernel
-from holdfast.arrays import FloatArray
-from holdfast.estimators import GaussianMixture, NearestNeighbor, entropy, kernel_estimator
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.estimators import GaussianMixture, NearestNeighbor, entropy, kernel_estimator
 
 TOLERANCE = 1e-9
 
@@ -93,7 +93,7 @@ class Found(NamedTuple):
 def find(
     points: FloatArray, weights: FloatArray, estimator: NearestNeighbor | GaussianMixture
 ) -> Found:
-    """Return what :func:`holdfast.estimators.entropy` returns, with the ways to it."""
+    """Return what :func:`holdfast.planning.estimators.entropy` returns, with the ways to it."""
     kernel = kernel_estimator(estimator, points.shape[1])
     result, _, visits, ways = _kernel.entropies(
         points if kernel.scale is None else points * kernel.scale,

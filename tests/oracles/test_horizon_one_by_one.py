@@ -14,21 +14,23 @@ import pytest
 from benchmarks.horizon import one_by_one
 from tests.golden.sonar_room import SonarRoom
 
-from holdfast import _kernel, checked, sensing
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief
-from holdfast.config.settings import (
+from holdfast import _kernel
+from holdfast.config import registry
+from holdfast.lab.studies.busy_room import BusyRoom
+from holdfast.lab.studies.light_dark import LightDark
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import Purpose, Stream, stream
+from holdfast.planning import sensing
+from holdfast.planning.belief import Belief
+from holdfast.planning.sensing import choose_sensing_action
+from holdfast.planning.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
 )
-from holdfast.lab.studies.busy_room import BusyRoom
-from holdfast.lab.studies.light_dark import LightDark
-from holdfast.problems import registry
+from holdfast.problems import checked
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.randomness import Purpose, Stream, stream
-from holdfast.sensing import choose_sensing_action
 
 PROBLEMS: dict[str, Callable[[], Any]] = {
     **{

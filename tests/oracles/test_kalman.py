@@ -17,12 +17,12 @@ import numpy.typing as npt
 import pytest
 from scipy import stats
 
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.belief import estimate
-from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
-from holdfast.planning import Planner
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import Purpose, Stream, stream
+from holdfast.planning.belief import estimate
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.problems.problem import ProblemBase
-from holdfast.randomness import Purpose, Stream, stream
 
 FALSE_ALARM = 1e-6
 NUM_PARTICLES = 20_000

@@ -18,19 +18,19 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks import literal
 from tests.oracles.reference_entropy import nearest_neighbor_entropy
 
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief
-from holdfast.config.settings import (
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import Purpose, stream
+from holdfast.planning.belief import Belief
+from holdfast.planning.planner import Planner, PlanningState
+from holdfast.planning.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
 )
-from holdfast.planning import Planner, PlanningState
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.peg_in_hole_3d import PegInHole3D
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Purpose, stream
 from holdfast.robot.environment import SimulatedEnvironment
 
 # The sum of some thousand terms of about 10 nats, each with a relative error of a few 1e-15.

@@ -17,18 +17,18 @@ from tests.oracles.test_sensing_reference import (
     some_belief,
 )
 
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.belief import Belief
-from holdfast.config.settings import PlanningSettings, SelectorSettings, check_settings
+from holdfast.config import registry
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.lab.studies.busy_room import BusyRoom
-from holdfast.policy_path import _followed, path_points
-from holdfast.problem_attributes import check_problem, has_own
-from holdfast.problems import registry
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import NOISE_FREE, Purpose, Stream, stream
+from holdfast.planning.belief import Belief
+from holdfast.planning.policy_path import _followed, path_points
+from holdfast.planning.sensing import SensingInfo, choose_sensing_action
+from holdfast.planning.settings import PlanningSettings, SelectorSettings, check_settings
+from holdfast.problems.attributes import check_problem, has_own
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem
-from holdfast.randomness import NOISE_FREE, Purpose, Stream, stream
-from holdfast.sensing import SensingInfo, choose_sensing_action
 
 Actions = Literal["commanded", "executed"]
 

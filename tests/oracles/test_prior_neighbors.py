@@ -12,9 +12,9 @@ import pytest
 from tests.oracles.reference_entropy import prior_neighbors_entropy
 from tests.oracles.test_entropy_reference import draw_points, draw_weights
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import InvalidValueError
-from holdfast.estimators import NearestNeighbor, PriorNeighbors, entropy
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.estimators import NearestNeighbor, PriorNeighbors, entropy
 
 TOLERANCE = 1e-9
 

@@ -83,9 +83,9 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from holdfast.arrays import FloatArray
 from holdfast.lab.studies.emulation_2017 import drawn_particle, likelihoods, run_emulation
 from holdfast.lab.studies.published_2017 import PublishedRow, published_rows, series_of
+from holdfast.numerics.arrays import FloatArray
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem
 

@@ -23,17 +23,17 @@ from tests.oracles.reference_entropy import (
 )
 
 from holdfast import _kernel
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.belief import Belief
-from holdfast.config.settings import (
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import Purpose, Stream, stream
+from holdfast.planning.belief import Belief
+from holdfast.planning.sensing import _stratified, choose_sensing_action
+from holdfast.planning.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
 )
 from holdfast.problems.problem import Problem, ProblemBase
-from holdfast.randomness import Purpose, Stream, stream
-from holdfast.sensing import _stratified, choose_sensing_action
 
 TOLERANCE = 1e-9
 

@@ -14,7 +14,7 @@ import pytest
 from scipy import stats
 
 from holdfast.config.loader import Configuration, load
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
 from holdfast.robot.trial import run_trial
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

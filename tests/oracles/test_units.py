@@ -16,22 +16,23 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from holdfast import _kernel, sensing
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.config.settings import (
+from holdfast import _kernel
+from holdfast.lab.studies.light_dark import LightDark
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import Stream
+from holdfast.planning import sensing
+from holdfast.planning.planner import Planner, PlanningState
+from holdfast.planning.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
 )
-from holdfast.lab.studies.light_dark import LightDark
-from holdfast.planning import Planner, PlanningState
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.multitier_peg_in_hole_2d import MultitierPegInHole2D
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.peg_in_hole_3d import PegInHole3D
 from holdfast.problems.problem import ProblemBase
-from holdfast.randomness import Stream
 from holdfast.robot.environment import SimulatedEnvironment
 
 PEG = PegInHole2D()

@@ -24,11 +24,11 @@ from tests.processes.world import Gate, World
 from tests.processes.world import Hook as Hook
 
 from holdfast.config.loader import load
+from holdfast.config.registry import BUILT_IN
 from holdfast.lab.testbed import processes as lab
 from holdfast.lab.testbed.driver import ServiceCommand
 from holdfast.lab.testbed.records import LogEvent, log_event_of
-from holdfast.outcome import TaskDecision
-from holdfast.problems.registry import BUILT_IN
+from holdfast.planning.outcome import TaskDecision
 from holdfast.protocol.records import ActingRecord
 from holdfast.recording.compare import compare_runs
 from holdfast.recording.journal import Journal

@@ -15,9 +15,9 @@ import socket
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import FloatArray
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import Stream
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.randomness import Stream
 
 VARIABLE = "HOLDFAST_TEST_GATE"
 STUCK = "HOLDFAST_TEST_STUCK"

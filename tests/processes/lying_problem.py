@@ -19,7 +19,7 @@ import time
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import FloatArray
+from holdfast.numerics.arrays import FloatArray
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 
 VARIABLE = "HOLDFAST_TEST_LIE"

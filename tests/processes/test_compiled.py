@@ -29,7 +29,7 @@ import hashlib
 from holdfast.recording.machine import machines
 from holdfast.lab.simulation.schedule_draws import draw_schedule
 from holdfast.lab.simulation.world import Simulator
-from holdfast.source_digest import core_version
+from holdfast.config.source_digest import core_version
 simulator, hashed = Simulator(), hashlib.sha256()
 for seed in range({SEEDS}):
     hashed.update(repr(simulator.run(draw_schedule(seed), tell=True)).encode())

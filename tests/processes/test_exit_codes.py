@@ -14,7 +14,7 @@ import pytest
 IN_DAEMON_THREADS = """
 import threading, time
 import numpy as np
-from holdfast.estimators import entropy
+from holdfast.planning.estimators import entropy
 
 points = np.random.default_rng(0).normal(size=({count}, 3))
 weights = np.random.default_rng(1).random((64, {count}))

@@ -38,7 +38,7 @@ from tests.processes.faults import (
     wait_for_end,
 )
 
-from holdfast.config.settings import OffloadSettings
+from holdfast.planning.settings import OffloadSettings
 
 PEG = "peg_in_hole_2d"
 OTHERS = [pytest.param(name, marks=pytest.mark.slow) for name in PROBLEMS if name != PEG]

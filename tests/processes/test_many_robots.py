@@ -27,7 +27,7 @@ from tests.questions import request_of
 from tests.wire import RawClient
 
 from holdfast.config.loader import Configuration, load
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
 from holdfast.protocol.messages import (
     PROTOCOL_VERSION,
     Progress,

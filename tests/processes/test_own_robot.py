@@ -24,10 +24,10 @@ import numpy as np
 import pytest
 from tests.ports import free_port
 
-from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration, load
-from holdfast.outcome import Done, MoveResult
-from holdfast.planning import Planner
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import Done, MoveResult
+from holdfast.planning.planner import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.events import (
     Acted,

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 import holdfast as hf
+from holdfast.config.registry import BUILT_IN
 from holdfast.errors import MessageError
-from holdfast.problems.registry import BUILT_IN
 
 BEFORE, AFTER = 10, 20
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tests.recordings import configuration_of, record_trial
 
-from holdfast.outcome import TrialResult
+from holdfast.planning.outcome import TrialResult
 from holdfast.recording.robot_run import RobotObserver, perform_trials
 from holdfast.recording.run_directory import RunDirectory
 from holdfast.recording.timings import read_timings

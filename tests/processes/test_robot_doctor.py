@@ -27,8 +27,8 @@ from tests.unit.test_transport_credentials import sign_with_names
 from tests.wire import CALL, LAST, frame_of, hello_of
 
 from holdfast.cli.doctor import _as_text
-from holdfast.config.settings import OffloadSettings
 from holdfast.lab.testbed.namespace import NetworkNamespace, why_no_namespace
+from holdfast.planning.settings import OffloadSettings
 from holdfast.protocol.messages import NeedState, Refused, Reply, decode_request, encode
 from holdfast.robot.doctor import Examination, LayerFinding, State
 from holdfast.transport.endpoints import parse_endpoint

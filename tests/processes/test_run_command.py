@@ -17,8 +17,8 @@ import pytest
 from tests.ports import free_port
 from tests.processes.faults import COMMAND
 
+from holdfast.config.source_digest import core_version
 from holdfast.recording.machine import machines
-from holdfast.source_digest import core_version
 
 WITH_FIGURES = [sys.executable, "-c", "from holdfast.cli import main; main()"]
 

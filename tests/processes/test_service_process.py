@@ -75,8 +75,8 @@ def robot_of_busy(directory: Path) -> Robot:
     """Write that problem's module, and return a robot that has it."""
     (directory / "busy_problem.py").write_text(BUSY)
     program = (
-        "from holdfast.problems.registry import problem_class\n"
-        "from holdfast.source_digest import problem_digest\n"
+        "from holdfast.config.registry import problem_class\n"
+        "from holdfast.config.source_digest import problem_digest\n"
         "print(problem_digest(problem_class('busy_problem:Busy')))"
     )
     done = subprocess.run(
@@ -666,7 +666,7 @@ sys.exit(service_process.main(["--listen", "tcp/127.0.0.1:0", "--until-stdin-clo
     assert "numpy" in modules
     for heavy in (
         "cryptography", "holdfast.config.loader", "holdfast.config.user_code",
-        "holdfast.service.health",
+        "holdfast.runtime.monitoring",
         "importlib.metadata", "matplotlib", "multiprocessing", "prometheus_client", "rich",
         "scipy", "sqlite3", "ssl", "yaml",
     ):  # fmt: skip

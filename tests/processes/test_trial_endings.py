@@ -17,7 +17,7 @@ from typing import Any
 from tests.processes.faults import COMMAND, PATIENCE_S, events_of
 
 from holdfast import __version__
-from holdfast.outcome import DONE_VALUES
+from holdfast.planning.outcome import DONE_VALUES
 from holdfast.recording.journal import Journal
 
 BEFORE_OUTCOMES = Path(__file__).parents[1] / "unit" / "data" / "journal_before_outcomes.sqlite"

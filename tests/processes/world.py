@@ -18,7 +18,7 @@ import numpy as np
 from tests.ports import free_port
 
 from holdfast.config.loader import Configuration
-from holdfast.outcome import TaskDecision
+from holdfast.planning.outcome import TaskDecision
 from holdfast.recording.journal import Journal
 from holdfast.robot.environment import SimulatedEnvironment
 

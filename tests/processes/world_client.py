@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from holdfast.arrays import FloatArray
+from holdfast.numerics.arrays import FloatArray
 
 
 class PlainWorldClient:

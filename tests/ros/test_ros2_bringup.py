@@ -20,7 +20,7 @@ from tests.ros.domains import own_domain
 from tests.ros.ros2_processes import WAIT_S, Process
 
 from holdfast.config.loader import load
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
 from holdfast.robot.trial import run_trial
 
 PACKAGE = "holdfast_bringup"

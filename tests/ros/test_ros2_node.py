@@ -20,7 +20,7 @@ from tests.ros.domains import own_domain
 from tests.ros.ros2_processes import ObservedProcess
 
 from holdfast.config.loader import load
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
 from holdfast.recording.poses import pose_layout
 from holdfast.robot.trial import run_trial
 

@@ -13,7 +13,7 @@ from tests.ros.ros2_processes import ObservedProcess
 from tests.ros.test_ros2_node import Ros
 
 from holdfast.config.loader import load
-from holdfast.outcome import TrialResult
+from holdfast.planning.outcome import TrialResult
 from holdfast.robot.trials import run_trials
 
 CONFIGURATION = ROOT / "examples" / "peg_in_hole_2d.yaml"

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from tests.simulation.edits import Change, Defect, Edit
 
+from holdfast.planning.tracking import Trial
 from holdfast.protocol import records
 from holdfast.protocol.question import Question
 from holdfast.protocol.records import TrialHistory
 from holdfast.protocol.robot import Robot
-from holdfast.tracking import Trial
 
 __all__ = ["LATE_DEFECTS"]
 

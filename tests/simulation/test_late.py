@@ -7,9 +7,6 @@ import numpy as np
 import pytest
 from tests.late_world import LateWorld
 
-from holdfast import tracking
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import LostSettings
 from holdfast.lab.errors import Violation
 from holdfast.lab.simulation.checkers import WireChecker
 from holdfast.lab.simulation.environment_model import EnvironmentModel
@@ -27,8 +24,12 @@ from holdfast.lab.simulation.reference_runs import (
 from holdfast.lab.simulation.schedule import RunSettings, SimulationSchedule, parse_schedule
 from holdfast.lab.simulation.schedule_draws import draw_schedule
 from holdfast.lab.simulation.world import Setup, Simulator
-from holdfast.lost import LostTest
-from holdfast.outcome import MoveResult
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import Stream, stream
+from holdfast.planning import tracking
+from holdfast.planning.lost import LostTest
+from holdfast.planning.outcome import MoveResult
+from holdfast.planning.settings import LostSettings
 from holdfast.protocol.records import (
     ActingRecord,
     LateRecord,
@@ -36,7 +37,6 @@ from holdfast.protocol.records import (
     PerformedRecord,
     Record,
 )
-from holdfast.randomness import Stream, stream
 from holdfast.robot.trial import run_trial
 
 MAX_STEPS = 40

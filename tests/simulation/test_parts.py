@@ -6,8 +6,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import PlanningSettings
 from holdfast.lab.errors import Violation
 from holdfast.lab.simulation.checked_memo import CheckedPlanner
 from holdfast.lab.simulation.checkers import StatusChecker, WireChecker, check_size
@@ -30,11 +28,13 @@ from holdfast.lab.simulation.schedule import (
     Stop,
 )
 from holdfast.lab.simulation.schedule_draws import draw_schedule
-from holdfast.outcome import TrialResult
-from holdfast.planning import Planner
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import Stream
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.records import ActingRecord, PerformedRecord, TrialHistory
-from holdfast.randomness import Stream
 
 
 class TestEventQueue:

@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from holdfast.belief import Belief
 from holdfast.lab.errors import TaskError
 from holdfast.lab.studies.cases import CASES
 from holdfast.lab.studies.estimate_candidates import CANDIDATES, run_estimates
@@ -17,7 +16,8 @@ from holdfast.lab.studies.estimates import Estimates, Variant, variants
 from holdfast.lab.studies.study import CHOICE, CLAIM, TRIALS, Scale
 from holdfast.lab.studies.tasks import run_task
 from holdfast.lab.studies.trial_batches import problem_of, run_trials_of
-from holdfast.randomness import Purpose, stream
+from holdfast.numerics.randomness import Purpose, stream
+from holdfast.planning.belief import Belief
 
 PARTICLES = ("most_likely", "nearest_particle", "medoid", "densest_particle")
 

@@ -8,9 +8,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief
-from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.errors import InvalidValueError
 from holdfast.lab.errors import TaskError
 from holdfast.lab.studies import offload_break_even
@@ -26,7 +23,10 @@ from holdfast.lab.studies.running import Workload, compute, write_report
 from holdfast.lab.studies.sensing_times import Sensed, history_of, measure_sensing, state_in
 from holdfast.lab.studies.study import Scale
 from holdfast.lab.studies.trial_batches import problem_of
-from holdfast.planning import Planner
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.belief import Belief
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
 
 BRIEF: dict[str, Any] = {
     "problem": "peg_in_hole_2d",

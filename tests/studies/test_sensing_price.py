@@ -8,15 +8,15 @@ from collections.abc import Iterator
 import pytest
 from tests.studies.made_up import noise, report_on
 
-from holdfast.config.settings import PlanningSettings, SelectorSettings
 from holdfast.lab.studies import sensing_price
 from holdfast.lab.studies.priced_problems import Boat
 from holdfast.lab.studies.sensing_price import FIXED, NATS, PRICES, PROBLEMS, SensingPrice
 from holdfast.lab.studies.study import CHOICE, CLAIM, Report, Scale
 from holdfast.lab.studies.tasks import Task
 from holdfast.lab.studies.trial_batches import problem_of
-from holdfast.outcome import SensingDecision
-from holdfast.planning import Planner
+from holdfast.planning.outcome import SensingDecision
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import PlanningSettings, SelectorSettings
 from holdfast.robot.trial import run_trial
 
 SCALE = Scale(seed=5)

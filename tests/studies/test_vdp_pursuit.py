@@ -7,9 +7,6 @@ from functools import partial
 import numpy as np
 import pytest
 
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief
-from holdfast.config.settings import ActiveSensingSettings, PlanningSettings, SelectorSettings
 from holdfast.lab.studies.vdp_pursuit import (
     Pursuit,
     PursuitSettings,
@@ -30,7 +27,10 @@ from holdfast.lab.studies.vdp_tag import (
     way_length,
 )
 from holdfast.lab.studies.vdp_trials import intercept, run_vdp_tag_trials, to_next
-from holdfast.randomness import Purpose, Stream, stream
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import Purpose, Stream, stream
+from holdfast.planning.belief import Belief
+from holdfast.planning.settings import ActiveSensingSettings, PlanningSettings, SelectorSettings
 
 SEED = 8101
 fresh = partial(stream, SEED, 0, 0, Purpose.SELECTION)  # anew at each call

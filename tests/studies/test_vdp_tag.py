@@ -8,8 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.belief import Belief, update
 from holdfast.lab.studies.vdp_tag import (
     DISCOUNT,
     MAX_STEPS,
@@ -26,7 +24,9 @@ from holdfast.lab.studies.vdp_trials import (
     run_vdp_tag_trials,
     to_next,
 )
-from holdfast.randomness import Purpose, Stream, stream
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import Purpose, Stream, stream
+from holdfast.planning.belief import Belief, update
 
 SEED = 8101
 PUBLISHED = {"to_next": (-17.0546, 0.3837), "manage_uncertainty": (-2.7325, 1.2332)}

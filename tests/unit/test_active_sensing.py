@@ -9,7 +9,7 @@ import pytest
 
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import CheckpointError
-from holdfast.planning import Planner, digest
+from holdfast.planning.planner import Planner, digest
 from holdfast.ros.active_sensing import (
     ActiveSensing,
     DecisionRequest,

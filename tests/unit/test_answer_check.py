@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import threading
 
-from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
-from holdfast.planning import Decision, Planner, PlanningState
+from holdfast.planning.planner import Decision, Planner, PlanningState
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.events import ComputeOwnAnswer, OwnAnswer
 from holdfast.robot.answer_check import AnswerChecker

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from holdfast.arrays import (
+from holdfast.errors import InvalidValueError
+from holdfast.numerics.arrays import (
     KeepsReadOnly,
     floats,
     in_brief,
@@ -20,7 +21,6 @@ from holdfast.arrays import (
     real_numbers,
     whole,
 )
-from holdfast.errors import InvalidValueError
 
 
 @pytest.mark.parametrize(

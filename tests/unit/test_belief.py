@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from holdfast.arrays import FloatArray
-from holdfast.belief import (
+from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import Purpose, stream
+from holdfast.planning.belief import (
     Belief,
     effective_sample_size,
     estimate,
@@ -18,8 +20,6 @@ from holdfast.belief import (
     uniform_weights,
     update,
 )
-from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.randomness import Purpose, stream
 
 fresh = partial(stream, 21, 0, 0, Purpose.RESAMPLING)  # anew at each call
 

@@ -12,11 +12,11 @@ import pytest
 from tests.line_problem import SETTINGS, Line
 from tests.recordings import record_trial
 
-from holdfast.arrays import FloatArray, IntArray
 from holdfast.config.loader import Configuration, load
-from holdfast.outcome import TrialResult
-from holdfast.planning import Planner
-from holdfast.randomness import Stream
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import Stream
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import Planner
 from holdfast.recording.belief_remarks import belief_remarks
 from holdfast.recording.recorder import Recorder
 from holdfast.robot.trial import SensingStep, run_trial

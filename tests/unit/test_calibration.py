@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from holdfast.config import registry
+from holdfast.config.registry import BUILT_IN
 from holdfast.errors import InvalidValueError
-from holdfast.problems import registry
 from holdfast.problems.capsule_robot import CapsuleRobot
-from holdfast.problems.registry import BUILT_IN
 from holdfast.protocol.decision_cost import TYPICAL_PROBLEM
 from holdfast.service import calibration
 from holdfast.service.calibration import measure_problem, measure_slowness

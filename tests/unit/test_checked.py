@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from tests.line_problem import SETTINGS, Line
 
-from holdfast import checked
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import ActiveSensingSettings, SelectorSettings
 from holdfast.errors import ProblemError
-from holdfast.planning import Planner
-from holdfast.randomness import Stream
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import Stream
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import ActiveSensingSettings, SelectorSettings
+from holdfast.problems import checked
 from holdfast.robot.environment import SimulatedEnvironment
 
 

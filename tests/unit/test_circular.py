@@ -12,19 +12,19 @@ from tests.line_problem import Line
 
 import holdfast as hf
 from holdfast import _kernel, numerics
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief, estimate, standard_deviation, update
-from holdfast.circular import embedded, mean_angles, unwrapped
-from holdfast.config.settings import (
+from holdfast.errors import ProblemError
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.circular import embedded, mean_angles, unwrapped
+from holdfast.numerics.randomness import Purpose, Stream, stream
+from holdfast.planning.belief import Belief, estimate, standard_deviation, update
+from holdfast.planning.settings import (
     ActiveSensingSettings,
     Method,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
 )
-from holdfast.errors import ProblemError
 from holdfast.problems.problem import ProblemBase
-from holdfast.randomness import Purpose, Stream, stream
 
 fresh = partial(stream, 77, 0, 0, Purpose.HYPOTHESES)  # anew at each call
 

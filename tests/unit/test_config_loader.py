@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 import yaml
 
+from holdfast.config import registry
 from holdfast.config.loader import Configuration, load
-from holdfast.config.settings import EnvironmentSettings, OffloadSettings, RecoverySettings
 from holdfast.errors import ConfigurationError, UnknownProblemError
-from holdfast.problems import registry
+from holdfast.planning.settings import EnvironmentSettings, OffloadSettings, RecoverySettings
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

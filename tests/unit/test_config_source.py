@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from holdfast.config.settings import SimulatorSettings
 from holdfast.config.source import Source, module_directory
 from holdfast.config.yaml_document import read
 from holdfast.errors import ConfigurationError
+from holdfast.planning.settings import SimulatorSettings
 
 PATH = Path("run.yaml")
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from holdfast.config.loader import Configuration, load
-from holdfast.outcome import Ending
-from holdfast.planning import Planner
-from holdfast.randomness import NOISE_FREE
+from holdfast.numerics.randomness import NOISE_FREE
+from holdfast.planning.outcome import Ending
+from holdfast.planning.planner import Planner
 from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.trial import run_trial
 

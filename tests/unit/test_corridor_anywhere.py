@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from holdfast.config.loader import load
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
 from holdfast.robot.trial import run_trial
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "corridor_anywhere.yaml"

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from tests.recordings import configuration_of, result_of
 
-from holdfast.belief import Belief
+from holdfast.planning.belief import Belief
 from holdfast.recording.csv_export import TABLES, CsvSink, state_labels
 from holdfast.recording.facts import (
     Decider,

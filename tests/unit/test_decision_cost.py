@@ -14,8 +14,8 @@ from tests.fuzz.hostile_settings import (
     with_key,
 )
 
-from holdfast.config.settings import Method, PlanningSettings
-from holdfast.problems import registry
+from holdfast.config import registry
+from holdfast.planning.settings import Method, PlanningSettings
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.protocol.decision_cost import (
     COSTLY,

@@ -11,13 +11,13 @@ import pytest
 from rich.console import Console
 
 from holdfast.errors import OutputError
-from holdfast.files import claim_directory
 from holdfast.lab.demo.command import account
 from holdfast.lab.demo.narrator import Activity, Change, DemoState, Line, Mark
 from holdfast.lab.demo.scenario import Findings
 from holdfast.lab.demo.timeline import ASCII, UNICODE, legend, plain_line, timeline
 from holdfast.lab.testbed.fault_times import FaultTimes
 from holdfast.recording.compare import Comparison, Difference
+from holdfast.runtime.files import claim_directory
 
 
 def state() -> DemoState:

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from holdfast.arrays import FloatArray
+from holdfast.config import registry
 from holdfast.errors import (
     HoldfastError,
     InvalidValueError,
     ProblemError,
 )
-from holdfast.outcome import MoveResult
-from holdfast.problems import registry
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import Purpose, Stream, stream
+from holdfast.planning.outcome import MoveResult
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Purpose, Stream, stream
 from holdfast.robot.environment import CountingEnvironment, Environment, SimulatedEnvironment
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import EnvironmentFailedError, InvalidValueError
-from holdfast.outcome import Ending, MoveResult, ending_of
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import Stream
+from holdfast.planning.outcome import Ending, MoveResult, ending_of
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.events import (
@@ -24,7 +25,6 @@ from holdfast.protocol.events import (
     EnvironmentReady,
     Sensed,
 )
-from holdfast.randomness import Stream
 from holdfast.robot.environment import LATER, Environment, MissingReadings, SimulatedEnvironment
 from holdfast.robot.environment_maker import EnvironmentMaker
 from holdfast.robot.environment_runner import (

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from holdfast import estimators as estimation
-from holdfast.arrays import FloatArray
 from holdfast.errors import InvalidValueError
-from holdfast.estimators import GaussianMixture, NearestNeighbor, PriorNeighbors
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning import estimators as estimation
+from holdfast.planning.estimators import GaussianMixture, NearestNeighbor, PriorNeighbors
 
 # Sums of up to some thousand terms, the same but for rounding.
 TOLERANCE = 1e-9

@@ -9,8 +9,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from holdfast.config.registry import problem_class
 from holdfast.errors import EnvironmentFailedError
-from holdfast.problems.registry import problem_class
 from holdfast.robot.environment import MissingReadings
 from holdfast.ros.executive import DecideCode, DecideRequest, DecisionHandover, ExecutiveEnvironment
 

@@ -10,26 +10,26 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from holdfast import expected_return
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.belief import Belief
-from holdfast.config.settings import (
+from holdfast.errors import ProblemError
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import Purpose, Stream, stream
+from holdfast.planning import expected_return
+from holdfast.planning.belief import Belief
+from holdfast.planning.expected_return import rollout_returns
+from holdfast.planning.outcome import SensingDecision
+from holdfast.planning.planner import Planner
+from holdfast.planning.sensing import SensingInfo, choose_sensing_action
+from holdfast.planning.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
     SimulatorSettings,
 )
-from holdfast.errors import ProblemError
-from holdfast.expected_return import rollout_returns
-from holdfast.outcome import SensingDecision
-from holdfast.planning import Planner
-from holdfast.problem_attributes import sensing_costs
+from holdfast.problems.attributes import sensing_costs
 from holdfast.problems.problem import ProblemBase
 from holdfast.protocol.records import TrialHistory
-from holdfast.randomness import Purpose, Stream, stream
 from holdfast.robot.trial import run_trial
-from holdfast.sensing import SensingInfo, choose_sensing_action
 
 HYPOTHESES = stream(43, 0, 0, Purpose.HYPOTHESES)
 SELECTION = stream(43, 0, 0, Purpose.SELECTION)

@@ -33,12 +33,12 @@ from rosbags.typesys import Stores, get_typestore
 from tests.command_line import Said, run_here
 
 import holdfast as hf
-from holdfast.belief import Belief
 from holdfast.config.loader import Configuration, load
+from holdfast.config.registry import BUILT_IN
 from holdfast.errors import UntrustedCodeError
-from holdfast.outcome import SensingDecision, TaskDecision, TrialResult
-from holdfast.planning import Planner
-from holdfast.problems.registry import BUILT_IN
+from holdfast.planning.belief import Belief
+from holdfast.planning.outcome import SensingDecision, TaskDecision, TrialResult
+from holdfast.planning.planner import Planner
 from holdfast.protocol.records import ActingRecord, ObservedRecord
 from holdfast.recording.journal import Journal
 from holdfast.recording.poses import PoseLayout, pose_layout
@@ -853,7 +853,7 @@ class TestUnfinished:
         with Journal.read(run / "journal.sqlite") as journal:
             meta, first = journal.meta(), next(iter(journal.results(with_decisions=True)))
         (run / "journal.sqlite").unlink()
-        from holdfast.planning import digest
+        from holdfast.planning.planner import digest
 
         records: list[Any] = []
         sensed = {step.before.step: step for step in seen.sensed_steps}

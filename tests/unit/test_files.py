@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from holdfast import files
 from holdfast.cli import main
 from holdfast.errors import OutputError
-from holdfast.files import (
+from holdfast.runtime import files
+from holdfast.runtime.files import (
     directory_beside,
     move_into_place,
     read_bounded,

@@ -15,12 +15,12 @@ import pytest
 from tests.line_problem import Line
 
 import holdfast as hf
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.belief import standard_deviation
 from holdfast.config.loader import load
-from holdfast.config.settings import ActiveSensingSettings, PlanningSettings, SelectorSettings
-from holdfast.floating_mode import as_caller, in_own_mode
-from holdfast.planning import decode_checkpoint, encode_checkpoint
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.floating_mode import as_caller, in_own_mode
+from holdfast.planning.belief import standard_deviation
+from holdfast.planning.planner import decode_checkpoint, encode_checkpoint
+from holdfast.planning.settings import ActiveSensingSettings, PlanningSettings, SelectorSettings
 from holdfast.recording.belief_remarks import belief_remarks
 from holdfast.recording.figure import trial_figure
 from holdfast.recording.recorder import Recorder

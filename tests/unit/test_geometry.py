@@ -7,10 +7,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import InvalidValueError
-from holdfast.geometry import FAR, MAX_NOISE_ATTEMPTS, BoxWorld, DiscWorld, RectangleWorld
-from holdfast.randomness import Purpose, Stream, stream
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.geometry import FAR, MAX_NOISE_ATTEMPTS, BoxWorld, DiscWorld, RectangleWorld
+from holdfast.numerics.randomness import Purpose, Stream, stream
 
 World = DiscWorld | RectangleWorld | BoxWorld
 

@@ -16,7 +16,7 @@ from gymnasium import spaces
 import holdfast as hf
 from holdfast.config.loader import load
 from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
-from holdfast.outcome import MoveResult
+from holdfast.planning.outcome import MoveResult
 from holdfast.robot.environment import CountingEnvironment, MissingReadings, RememberingEnvironment
 from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.gymnasium_environment import GymnasiumEnvironment

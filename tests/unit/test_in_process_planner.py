@@ -10,7 +10,7 @@ from tests.recordings import robot_configuration
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import ProblemError
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
 from holdfast.protocol.events import Halt, Plan, Planned
 from holdfast.protocol.question import OWN_PLANNER, InProcessSource, Question
 from holdfast.robot import in_process_planner

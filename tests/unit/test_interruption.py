@@ -12,12 +12,12 @@ import pytest
 from tests.fuzz.hostile_settings import with_key
 
 from holdfast import _kernel
-from holdfast.config.settings import Method, PlanningSettings
 from holdfast.errors import InterruptedComputationError
-from holdfast.interruption import Interruption, check, interruptible
-from holdfast.planning import Planner
+from holdfast.numerics.randomness import Purpose, stream
+from holdfast.planning.interruption import Interruption, check, interruptible
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import Method, PlanningSettings
 from holdfast.problems.capsule_robot import CapsuleRobot
-from holdfast.randomness import Purpose, stream
 
 
 class Counting(CapsuleRobot):

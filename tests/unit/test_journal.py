@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from holdfast.errors import InvalidValueError, OutputError
-from holdfast.outcome import Decisions, TrialResult
+from holdfast.planning.outcome import Decisions, TrialResult
 from holdfast.protocol.records import (
     ActingRecord,
     ObservedRecord,
@@ -210,7 +210,7 @@ class TestSteps:
         code = WRITER.replace(
             "for step in range(int(sys.argv[4])):\n",
             "import resource, signal\n"
-            "from holdfast.files import OutputError\n"
+            "from holdfast.runtime.files import OutputError\n"
             "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
             "journal.append(TRIAL, records_of(0))\n"
             "hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]\n"

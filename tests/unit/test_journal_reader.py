@@ -13,8 +13,8 @@ from tests.recordings import failed, result_of, without_decisions
 
 from holdfast.config.loader import load
 from holdfast.errors import OutputError
-from holdfast.outcome import Decisions
-from holdfast.planning import Planner
+from holdfast.planning.outcome import Decisions
+from holdfast.planning.planner import Planner
 from holdfast.protocol.records import (
     replay,
 )

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from holdfast import _kernel
-from holdfast.arrays import FloatArray, IntArray
+from holdfast.numerics.arrays import FloatArray, IntArray
 
 ALL_ONES = 0xFFFFFFFF
 WORDS = (7, 0, 3, 2, 1)
@@ -25,8 +25,8 @@ WORKLOAD = """
 import hashlib, json
 import numpy as np
 from holdfast import _kernel as kernel
-from holdfast.geometry import BoxWorld, DiscWorld, RectangleWorld
-from holdfast.randomness import Stream
+from holdfast.numerics.geometry import BoxWorld, DiscWorld, RectangleWorld
+from holdfast.numerics.randomness import Stream
 
 words = (7, 0, 3, 2, 1)
 stream = Stream(words)

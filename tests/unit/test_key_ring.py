@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from holdfast.errors import CredentialsError, OutputError
-from holdfast.files import NewFile, create_directory_atomically
+from holdfast.runtime.files import NewFile, create_directory_atomically
 from holdfast.transport import key_ring
 from holdfast.transport.credentials import load_credentials
 from holdfast.transport.key_ring import (

@@ -15,7 +15,7 @@ from tests.unit.test_protocol_service import (
     refused,
 )
 
-from holdfast.config.settings import PlanningSettings
+from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
 from holdfast.protocol.decision_cost import cost_of_sensing
 from holdfast.protocol.messages import Busy, Refused, SessionConfiguration

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from tests.late_world import LateWorld
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.errors import EnvironmentFailedError
-from holdfast.outcome import MoveResult, TrialResult
-from holdfast.planning import Planner
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import MoveResult, TrialResult
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.robot.environment import LATER, Environment, SimulatedEnvironment
 from holdfast.robot.late_sensing import SenseInBackground

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from tests.recordings import configuration_of
 
-from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration
-from holdfast.outcome import Ending
-from holdfast.planning import Planner
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import Ending
+from holdfast.planning.planner import Planner
+from holdfast.planning.tracking import LateObservation
 from holdfast.protocol.events import Timing
 from holdfast.protocol.messages import encode_floats
 from holdfast.protocol.records import (
@@ -41,7 +42,6 @@ from holdfast.recording.live_messages import (
 )
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
-from holdfast.tracking import LateObservation
 
 SECOND = 1_000_000_000
 

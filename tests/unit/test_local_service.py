@@ -6,8 +6,8 @@ import random
 
 import pytest
 
-from holdfast.config.settings import OffloadSettings, PlanningSettings, RecoverySettings
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import OffloadSettings, PlanningSettings, RecoverySettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.local_service import HedgingBudget, RestartPolicy
 from holdfast.protocol.question import Question

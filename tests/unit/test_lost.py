@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from benchmarks.lost import trials
 
-from holdfast.lost import MAX_OUTSIDE, MOVE, LostTest, Verdict
+from holdfast.planning.lost import MAX_OUTSIDE, MOVE, LostTest, Verdict
 
 Seen = tuple[int, bool]
 

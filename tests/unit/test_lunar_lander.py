@@ -10,9 +10,9 @@ import pytest
 
 import holdfast as hf
 from holdfast.config.loader import Configuration, load
-from holdfast.outcome import TrialResult
-from holdfast.planning import Planner
-from holdfast.randomness import NOISE_FREE, Purpose, stream
+from holdfast.numerics.randomness import NOISE_FREE, Purpose, stream
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import Planner
 from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
 from holdfast.robot.trial import run_trial

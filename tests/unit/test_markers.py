@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from holdfast.belief import Belief
+from holdfast.planning.belief import Belief
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.recording.markers import scene_markers, sensing_markers
 from holdfast.recording.poses import PoseLayout, pose_layout

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from rosbags.highlevel import AnyReader
 
-from holdfast.belief import Belief
 from holdfast.config.loader import load
+from holdfast.planning.belief import Belief
 from holdfast.recording.facts import EventFact, TrialBeginFact, TrialEndFact
 from holdfast.ros.mcap_export import McapSink
 

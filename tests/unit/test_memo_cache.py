@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
-from holdfast.planning import Planner, PlanningState, digest
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import Stream
+from holdfast.planning.planner import Planner, PlanningState, digest
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.randomness import Stream
 from holdfast.robot import memo_cache
 from holdfast.robot.memo_cache import MemoCache, MemoizingPlanner
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from holdfast.arrays import BoolArray, FloatArray
-from holdfast.belief import Belief, estimate
-from holdfast.modes import heaviest_mode
 from holdfast.numerics import wrapped
-from holdfast.randomness import Purpose, stream
+from holdfast.numerics.arrays import BoolArray, FloatArray
+from holdfast.numerics.randomness import Purpose, stream
+from holdfast.planning.belief import Belief, estimate
+from holdfast.planning.modes import heaviest_mode
 
 
 def heap(seed: int, count: int, size: int) -> FloatArray:

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from tests.robot_world import PLANNING, PROBLEM, World
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import LostSettings, OnLost, SimulatorSettings
 from holdfast.errors import HeldError
-from holdfast.lost import MOVE, Verdict
-from holdfast.outcome import MoveResult, TrialResult
-from holdfast.planning import ObservationInfo, Planner
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.lost import MOVE, Verdict
+from holdfast.planning.outcome import MoveResult, TrialResult
+from holdfast.planning.planner import ObservationInfo, Planner
+from holdfast.planning.settings import LostSettings, OnLost, SimulatorSettings
+from holdfast.planning.tracking import Trial
 from holdfast.protocol.events import Effects, Halt, LogEvent, RobotEffect, WriteRecords
 from holdfast.protocol.observation_reports import ObservationReports
 from holdfast.protocol.records import ObservedRecord, Record, ReinitialisedRecord, replay
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import run_trial
-from holdfast.tracking import Trial
 
 SIMULATOR = SimulatorSettings(num_trials=1, max_steps=120, seed=11)
 

@@ -10,7 +10,7 @@ import pytest
 from tests.recordings import failed, result_of
 
 from holdfast.errors import InvalidValueError
-from holdfast.outcome import (
+from holdfast.planning.outcome import (
     TRIAL_COLUMNS,
     DecisionLog,
     Decisions,

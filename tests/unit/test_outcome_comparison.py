@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from holdfast.errors import OutputError
-from holdfast.outcome import DecisionLog, TrialResult
+from holdfast.planning.outcome import DecisionLog, TrialResult
 from holdfast.recording.journal import Journal
 from holdfast.recording.outcome_comparison import OutcomeEffect, compare_outcomes, effects_of
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from holdfast.errors import InvalidValueError
+from holdfast.numerics.randomness import Purpose, stream
 from holdfast.problems.peg_in_hole_2d import PegInHole2D, PegInHole2DModel
-from holdfast.randomness import Purpose, stream
 
 fresh = partial(stream, 5, 0, 0, Purpose.INITIAL_BELIEF)  # anew at each call
 

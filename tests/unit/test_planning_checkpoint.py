@@ -11,15 +11,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as some
 from tests.planning_settings import SEED, TRIAL, planning_settings
 
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief
-from holdfast.config.settings import (
+from holdfast.config import registry
+from holdfast.errors import CheckpointError, InvalidValueError
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.belief import Belief
+from holdfast.planning.planner import (
+    Planner,
+    PlanningState,
+    decode_checkpoint,
+    digest,
+    encode_checkpoint,
+)
+from holdfast.planning.settings import (
     ParticleFilterSettings,
     PlanningSettings,
 )
-from holdfast.errors import CheckpointError, InvalidValueError
-from holdfast.planning import Planner, PlanningState, decode_checkpoint, digest, encode_checkpoint
-from holdfast.problems import registry
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem

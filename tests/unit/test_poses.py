@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from holdfast.belief import Belief, estimate
+from holdfast.config.registry import BUILT_IN, problem_class
 from holdfast.errors import ProblemError
+from holdfast.planning.belief import Belief, estimate
 from holdfast.problems.problem import ProblemBase
-from holdfast.problems.registry import BUILT_IN, problem_class
 from holdfast.recording.poses import pose_layout
 
 RANDOM = np.random.default_rng(7)

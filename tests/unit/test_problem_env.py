@@ -15,12 +15,12 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from holdfast.config.loader import load
-from holdfast.config.settings import PlanningSettings, SelectorSettings
+from holdfast.config.registry import BUILT_IN, make
 from holdfast.errors import ConfigurationError, HoldfastError, InvalidValueError
-from holdfast.planning import Planner
-from holdfast.problem_attributes import circular_states
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import PlanningSettings, SelectorSettings
+from holdfast.problems.attributes import circular_states
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.problems.registry import BUILT_IN, make
 from holdfast.robot.problem_env import ProblemEnv
 from holdfast.robot.trial import run_trial
 

@@ -11,11 +11,11 @@ import msgspec
 import pytest
 from tests.unit.test_protocol_service import CODE, planning_of
 
+from holdfast.config import registry
+from holdfast.config.source_digest import core_version, problem_digest
 from holdfast.errors import ConfigurationError, OtherCodeError, UnknownProblemError
-from holdfast.problems import registry
 from holdfast.protocol.messages import SessionConfiguration
 from holdfast.service.problem_factory import ProblemFactory
-from holdfast.source_digest import core_version, problem_digest
 
 
 class TestProblemFactory:
@@ -133,11 +133,11 @@ class TestProblemFactory:
     def test_several_workers_build_their_first_problem_at_once(self) -> None:
         program = """
 import sys, threading
-from holdfast.problems import registry
+from holdfast.config import registry
 from holdfast.service.problem_factory import ProblemFactory
 from holdfast.protocol.messages import SessionConfiguration
-from holdfast.config.settings import PlanningSettings
-from holdfast.source_digest import core_version, problem_digest
+from holdfast.planning.settings import PlanningSettings
+from holdfast.config.source_digest import core_version, problem_digest
 
 code = core_version(), problem_digest(object)
 sys.setswitchinterval(1e-6)

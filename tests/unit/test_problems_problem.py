@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from holdfast import checked
+from holdfast.config.registry import make
 from holdfast.errors import ProblemError
+from holdfast.problems import checked
 from holdfast.problems.problem import ProblemBase, Scene
-from holdfast.problems.registry import make
 
 
 class Minimal(ProblemBase):

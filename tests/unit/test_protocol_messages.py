@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from tests.fuzz.odd_values import STORMS, OddValues, replaced
 
 from holdfast.config import yaml_document
-from holdfast.config.settings import PlanningSettings
 from holdfast.errors import MessageError
+from holdfast.planning.settings import PlanningSettings
 from holdfast.protocol import messages
 from holdfast.protocol.messages import (
     CHECKSUM_SIZE,

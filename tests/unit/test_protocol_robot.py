@@ -19,10 +19,11 @@ from tests.robot_world import (
     nth,
 )
 
-from holdfast.config.settings import LostSettings, OnLost, SimulatorSettings
 from holdfast.errors import HeldError, UnknownPerformanceError
-from holdfast.outcome import ending_of
-from holdfast.planning import Planner
+from holdfast.planning.outcome import ending_of
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import LostSettings, OnLost, SimulatorSettings
+from holdfast.planning.tracking import LateObservation
 from holdfast.protocol.events import (
     Act,
     Acted,
@@ -60,7 +61,6 @@ from holdfast.protocol.status import Status
 from holdfast.recording.recorder import Recorder
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import run_trial
-from holdfast.tracking import LateObservation
 
 
 def test_a_sensing_action_for_another_state_is_not_followed() -> None:

@@ -20,12 +20,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.questions import received, request_of
 
-from holdfast.config.settings import (
-    ActiveSensingSettings,
-    ParticleFilterSettings,
-    PlanningSettings,
-    SelectorSettings,
-)
+from holdfast.config import registry
+from holdfast.config.registry import BUILT_IN
+from holdfast.config.source_digest import core_version, problem_digest
 from holdfast.errors import (
     ConfigurationError,
     MessageError,
@@ -33,11 +30,21 @@ from holdfast.errors import (
     ProblemError,
     UnknownProblemError,
 )
-from holdfast.planning import Planner, PlanningState, digest, encode_checkpoint, needs_sensing
-from holdfast.problems import registry
+from holdfast.planning.planner import (
+    Planner,
+    PlanningState,
+    digest,
+    encode_checkpoint,
+    needs_sensing,
+)
+from holdfast.planning.settings import (
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+    SelectorSettings,
+)
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.problem import Problem
-from holdfast.problems.registry import BUILT_IN
 from holdfast.protocol.events import LogEvent
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
@@ -68,7 +75,6 @@ from holdfast.protocol.service_jobs import (
 )
 from holdfast.protocol.service_limits import ServiceLimits
 from holdfast.robot.environment import SimulatedEnvironment
-from holdfast.source_digest import core_version, problem_digest
 
 PROBLEMS = tuple(BUILT_IN)
 

@@ -7,9 +7,9 @@ import inspect
 import numpy as np
 import pytest
 
-from holdfast.config.settings import PlanningSettings
 from holdfast.errors import MessageError
-from holdfast.planning import Planner, decode_checkpoint
+from holdfast.planning.planner import Planner, decode_checkpoint
+from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.messages import MAX_TASK_ACTIONS, SensingAnswer, TaskAnswer, encode_floats

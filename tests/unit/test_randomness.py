@@ -20,8 +20,8 @@ from scipy import stats
 
 from holdfast import _kernel
 from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.geometry import DiscWorld
-from holdfast.randomness import NOISE_FREE, NoiseFreeStream, Purpose, Stream, stream
+from holdfast.numerics.geometry import DiscWorld
+from holdfast.numerics.randomness import NOISE_FREE, NoiseFreeStream, Purpose, Stream, stream
 
 SAMPLE = 200_000
 MASKED = np.ma.array([1, 2], mask=[True, False])

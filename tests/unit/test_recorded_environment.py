@@ -10,10 +10,11 @@ import pytest
 from tests.recordings import configuration_of, record_trial
 
 from holdfast.config.loader import Configuration
-from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.errors import EndOfRecordsError, RecordError
-from holdfast.outcome import TrialResult
-from holdfast.planning import Planner, digest
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import Planner, digest
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
+from holdfast.planning.tracking import LateObservation
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.messages import encode_floats
 from holdfast.protocol.records import (
@@ -27,7 +28,6 @@ from holdfast.recording.figure import trial_figure
 from holdfast.recording.recorded_environment import RecordedEnvironment
 from holdfast.recording.recorder import Recorder
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
-from holdfast.tracking import LateObservation
 
 
 class _Journalling(TrialObserver):

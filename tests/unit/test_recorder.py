@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.recordings import configuration_of, record_trial
 
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
 from holdfast.recording.recorder import MAX_PARTICLES_KEPT, Recorder
 from holdfast.robot.trial import run_trial
 

@@ -17,7 +17,7 @@ import pytest
 from tests.command_line import run_here
 
 from holdfast.errors import HoldfastError, OutputError
-from holdfast.outcome import DecisionLog, TrialResult
+from holdfast.planning.outcome import DecisionLog, TrialResult
 from holdfast.protocol.records import ActingRecord, ObservedRecord
 from holdfast.recording.compare import Comparison, compare_runs
 from holdfast.recording.journal import Journal

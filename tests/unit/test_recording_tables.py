@@ -12,7 +12,7 @@ import scipy.stats
 from tests.recordings import failed, result_of
 
 from holdfast.cli.terminal import _summary_rows
-from holdfast.outcome import TRIAL_COLUMNS
+from holdfast.planning.outcome import TRIAL_COLUMNS
 from holdfast.recording.tables import (
     SummaryBuilder,
     csv_lines,

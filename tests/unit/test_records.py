@@ -6,9 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.errors import RecordError
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
+from holdfast.planning.tracking import LateObservation
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.messages import encode_floats
 from holdfast.protocol.records import (
@@ -27,7 +28,6 @@ from holdfast.protocol.records import (
     reinitialised_after,
     replay,
 )
-from holdfast.tracking import LateObservation
 
 PROBLEM = PegInHole2D()
 PLANNING = PlanningSettings(

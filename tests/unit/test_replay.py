@@ -11,7 +11,7 @@ import pytest
 from tests.recordings import configuration_of, record_trial
 
 from holdfast.errors import HoldfastError, OutputError
-from holdfast.outcome import TrialResult
+from holdfast.planning.outcome import TrialResult
 from holdfast.recording.csv_export import CsvSink
 from holdfast.recording.facts import (
     EventFact,

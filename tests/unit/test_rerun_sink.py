@@ -13,9 +13,9 @@ import pytest
 from rerun.chunk import RrdReader
 from tests.recordings import result_of
 
-from holdfast.belief import Belief
 from holdfast.config.loader import Configuration, load
-from holdfast.outcome import TrialResult
+from holdfast.planning.belief import Belief
+from holdfast.planning.outcome import TrialResult
 from holdfast.recording.facts import (
     Decider,
     EventFact,

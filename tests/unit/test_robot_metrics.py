@@ -11,7 +11,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from tests.robot_world import Misleading, World
 
-from holdfast.config.settings import SimulatorSettings
+from holdfast.planning.settings import SimulatorSettings
 from holdfast.protocol.events import Timing
 from holdfast.robot.metrics import RobotMetrics
 

@@ -17,8 +17,8 @@ from tests.recordings import robot_configuration
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import HeldError, ProblemError, TrialError
-from holdfast.outcome import SensingDecision, TrialResult
-from holdfast.planning import Planner, PlanningState
+from holdfast.planning.outcome import SensingDecision, TrialResult
+from holdfast.planning.planner import Planner, PlanningState
 from holdfast.protocol.events import (
     Act,
     Acted,

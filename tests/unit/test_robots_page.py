@@ -14,7 +14,7 @@ import pytest
 from holdfast.config.loader import load
 from holdfast.config.user_code import find_class
 from holdfast.errors import ConfigurationError
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
 from holdfast.robot.trial import run_trial
 
 ROOT = Path(__file__).parents[2]

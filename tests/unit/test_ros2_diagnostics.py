@@ -6,7 +6,7 @@ from typing import Any, cast
 
 import pytest
 
-from holdfast.config.settings import RecoverySettings
+from holdfast.planning.settings import RecoverySettings
 from holdfast.robot.health import Condition
 from holdfast.ros.ros2.diagnostics import Diagnostics, Level, RobotDiagnosis
 from holdfast.ros.ros2.run_segment import Ending, SegmentResult

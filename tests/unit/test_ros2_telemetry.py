@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from holdfast.config.loader import Configuration, load
-from holdfast.planning import Planner, PlanningState
+from holdfast.planning.planner import Planner, PlanningState
 from holdfast.protocol.events import Act, Sense, Timing
 from holdfast.robot.links import RECOVERY_SERVICE
 from holdfast.ros.ros2 import telemetry as module

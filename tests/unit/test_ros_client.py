@@ -10,8 +10,8 @@ import pytest
 
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import InvalidValueError, TransportError
-from holdfast.outcome import SensingDecision, TaskDecision
-from holdfast.planning import Planner
+from holdfast.planning.outcome import SensingDecision, TaskDecision
+from holdfast.planning.planner import Planner
 from holdfast.protocol.status import Status
 from holdfast.robot.environment import Environment, SimulatedEnvironment
 from holdfast.robot.trial import run_trial

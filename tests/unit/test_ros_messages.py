@@ -15,9 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from holdfast.belief import Belief
 from holdfast.errors import CheckpointError, HoldfastError, InvalidValueError
-from holdfast.planning import PlanningState
+from holdfast.planning.belief import Belief
+from holdfast.planning.planner import PlanningState
 from holdfast.ros.active_sensing import DecisionAnswer, DecisionRequest, ErrorCode, RequestKind
 from holdfast.ros.messages import (
     SERVICE,

@@ -11,8 +11,8 @@ import pytest
 from tests.recordings import configuration_of, result_of
 
 from holdfast.config.loader import Configuration, load
-from holdfast.config.settings import EnvironmentSettings
 from holdfast.errors import OutputError
+from holdfast.planning.settings import EnvironmentSettings
 from holdfast.protocol.records import (
     PausedRecord,
 )

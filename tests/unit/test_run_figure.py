@@ -13,7 +13,7 @@ from tests.command_line import run_here
 from tests.recordings import configuration_of, record_trial
 
 from holdfast.cli.run_figure import Deviation, Repetition, repeat, wrong_service
-from holdfast.outcome import Decisions
+from holdfast.planning.outcome import Decisions
 from holdfast.protocol.events import Timing
 from holdfast.protocol.question import OWN_PLANNER
 from holdfast.recording.timings import EventTable

@@ -10,14 +10,14 @@ import numpy.typing as npt
 import pytest
 from scipy import stats
 
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.belief import Belief
-from holdfast.config.settings import ActiveSensingSettings, PlanningSettings, SelectorSettings
 from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.estimators import GaussianMixture, NearestNeighbor, PriorNeighbors, entropy
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import Purpose, Stream, stream
+from holdfast.planning.belief import Belief
+from holdfast.planning.estimators import GaussianMixture, NearestNeighbor, PriorNeighbors, entropy
+from holdfast.planning.sensing import SensingInfo, choose_sensing_action
+from holdfast.planning.settings import ActiveSensingSettings, PlanningSettings, SelectorSettings
 from holdfast.problems.problem import Problem, ProblemBase
-from holdfast.randomness import Purpose, Stream, stream
-from holdfast.sensing import SensingInfo, choose_sensing_action
 
 HYPOTHESES = stream(41, 0, 0, Purpose.HYPOTHESES)
 SELECTION = stream(41, 0, 0, Purpose.SELECTION)

@@ -8,7 +8,7 @@ import pytest
 from tests.unit.test_protocol_service import Robot, make_problem
 
 from holdfast.errors import InterruptedComputationError, InvalidValueError
-from holdfast.interruption import check
+from holdfast.planning.interruption import check
 from holdfast.problems.problem import Problem
 from holdfast.protocol.decision_cost import TYPICAL_PROBLEM, Pricing, ProblemCost
 from holdfast.protocol.messages import Request, SessionConfiguration, pack_configuration

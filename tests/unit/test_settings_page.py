@@ -10,7 +10,7 @@ from typing import get_args, get_type_hints
 import msgspec
 import pytest
 
-from holdfast.config.settings import (
+from holdfast.planning.settings import (
     ActiveSensingSettings,
     EnvironmentSettings,
     LostSettings,

@@ -16,10 +16,10 @@ import pytest
 
 import holdfast
 from holdfast import _kernel
+from holdfast.config import registry
 from holdfast.config.imports import follow_imports
-from holdfast.problems import registry
+from holdfast.config.source_digest import core_version, problem_digest, problem_sources
 from holdfast.recording.fingerprint import difference
-from holdfast.source_digest import core_version, problem_digest, problem_sources
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = Path(holdfast.__file__).parent
@@ -101,8 +101,8 @@ class TestProblem:
         shutil.copytree(folder, tmp_path / "elsewhere")
         program = (
             "import sys; from pathlib import Path\n"
-            "from holdfast.problems import registry\n"
-            "from holdfast.source_digest import problem_digest\n"
+            "from holdfast.config import registry\n"
+            "from holdfast.config.source_digest import problem_digest\n"
             "print(problem_digest(registry.problem_class('arm_problem:Arm', Path(sys.argv[1]))))"
         )
         found = {
@@ -244,7 +244,7 @@ class TestCore:
             "import sys; sys.meta_path = [each for each in sys.meta_path "
             "if 'ScikitBuild' not in type(each).__name__]\n"
             f"sys.path.insert(0, {str(tmp_path)!r})\n"
-            "import holdfast, holdfast.source_digest as source_digest\n"
+            "import holdfast, holdfast.config.source_digest as source_digest\n"
             "print(holdfast.__file__); print(source_digest.core_version())"
         )
         done = subprocess.run(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from holdfast.config.loader import load
-from holdfast.randomness import NOISE_FREE, Purpose, stream
+from holdfast.numerics.randomness import NOISE_FREE, Purpose, stream
 from holdfast.robot.environment_maker import load_environment
 
 FILE = Path(__file__).parents[2] / "examples" / "taskboard" / "taskboard.yaml"

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from holdfast import numerics
-from holdfast import tracking as module
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.outcome import Ending
-from holdfast.planning import Planner
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import Stream
+from holdfast.planning import tracking as module
+from holdfast.planning.outcome import Ending
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
+from holdfast.planning.tracking import LateObservation, Trial
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import ProblemBase
-from holdfast.randomness import Stream
-from holdfast.tracking import LateObservation, Trial
 
 SETTINGS = PlanningSettings(
     particle_filter=ParticleFilterSettings(num_particles=50), sensing_interval=2

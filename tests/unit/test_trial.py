@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration, load
-from holdfast.config.settings import LostSettings
 from holdfast.errors import EnvironmentFailedError, InvalidValueError
-from holdfast.outcome import (
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import (
     DONE_VALUES,
     Decisions,
     MoveResult,
@@ -22,7 +21,8 @@ from holdfast.outcome import (
     TaskDecision,
     TrialResult,
 )
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import LostSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.recording.recorder import Recorder
 from holdfast.robot.environment import Environment, SimulatedEnvironment

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from tests.unit.test_trial import configuration_of, failing_configuration, one
 
-from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import InvalidValueError, ProblemError, TrialCrashError
-from holdfast.outcome import TrialResult
-from holdfast.planning import Planner
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import Planner
 from holdfast.robot import trials
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import run_trial

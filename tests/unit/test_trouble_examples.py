@@ -12,9 +12,9 @@ import pytest
 from tests.command_line import run_here
 
 from holdfast.config.loader import Configuration, load
-from holdfast.config.settings import LostSettings, OnLost
-from holdfast.outcome import TrialResult
-from holdfast.planning import Planner
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import LostSettings, OnLost
 from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.trial import run_trial
 

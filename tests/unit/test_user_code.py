@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from holdfast import planning
 from holdfast.cli import main
 from holdfast.config.loader import load
 from holdfast.config.user_code import is_users_file
+from holdfast.planning import planner as planning
 from holdfast.robot.trials import run_trials
 
 

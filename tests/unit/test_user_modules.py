@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.config import registry
 from holdfast.config.user_modules import find_in
 from holdfast.errors import ConfigurationError
-from holdfast.problems import registry
 from holdfast.robot.environment_maker import load_environment
 
 ROBOT = """

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from holdfast import numerics, randomness, validation_gate
-from holdfast.belief import Belief, uniform_weights, update
-from holdfast.planning import Planner
-from holdfast.problems.problem import ProblemBase
-from holdfast.validation_gate import (
+from holdfast import numerics
+from holdfast.numerics import randomness
+from holdfast.planning import validation_gate
+from holdfast.planning.belief import Belief, uniform_weights, update
+from holdfast.planning.planner import Planner
+from holdfast.planning.validation_gate import (
     NUM_RANKED,
     OUTSIDE_PROBABILITY,
     _squared_distance,
@@ -20,6 +21,7 @@ from holdfast.validation_gate import (
     is_typical,
     is_within,
 )
+from holdfast.problems.problem import ProblemBase
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 6, 20, 100, 1000])

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from tests.robot_world import LOCAL, PROBLEM, World
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import OwnDecisionError, ServiceRefusedError
+from holdfast.numerics.arrays import FloatArray
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.events import (
     Act,

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from holdfast.belief import standard_deviation
 from holdfast.config.loader import Configuration, load
-from holdfast.planning import Planner
+from holdfast.planning.belief import standard_deviation
+from holdfast.planning.planner import Planner
 from holdfast.robot.trial import run_trial
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "wrapping_heading.yaml"

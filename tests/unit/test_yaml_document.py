@@ -9,9 +9,9 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from holdfast.config.validation import dotted
 from holdfast.config.yaml_document import read, write
 from holdfast.errors import ConfigurationError
+from holdfast.validation import dotted
 
 TEXT = st.one_of(
     st.text(st.characters(exclude_categories=["Cs"]), max_size=30),

@@ -80,8 +80,8 @@ def run_application(arguments: Sequence[str]) -> int:
         (sys.stdout if first else sys.stderr).write(_HELP.format(commands="".join(lines)))
         return 0 if first else EXIT_ERROR
     if first == "--version":
+        from holdfast.config.source_digest import core_version
         from holdfast.recording.machine import machines
-        from holdfast.source_digest import core_version
 
         sys.stdout.write(f"holdfast {core_version()} ({machines()} state machines)\n")
         return 0
@@ -90,7 +90,7 @@ def run_application(arguments: Sequence[str]) -> int:
 
         command = shlex.join(["holdfast", "run", *arguments])
         raise OptionError(f"{first} is no command; did you mean: {command}")
-    from holdfast.config.validation import close_match
+    from holdfast.validation import close_match
 
     what = "option of holdfast" if first.startswith("-") else "command"
     known = [*COMMANDS, "--help", "--version"]

@@ -9,9 +9,9 @@ from typing import ClassVar
 
 from holdfast.cli.exit_codes import EXIT_DIFFERENT
 from holdfast.errors import OptionError
-from holdfast.files import shown_path
 from holdfast.printable import one_line, printable
 from holdfast.runtime.command_line import Options, argument, flag, location
+from holdfast.runtime.files import shown_path
 
 __all__ = ["main"]
 

@@ -65,7 +65,7 @@ def main(arguments: Sequence[str]) -> int:
     import msgspec
 
     from holdfast.config.loader import load
-    from holdfast.config.settings import OffloadSettings
+    from holdfast.planning.settings import OffloadSettings
     from holdfast.robot.doctor import Examination
     from holdfast.robot.probe import in_thread
     from holdfast.robot.reference_decisions import reference_decisions

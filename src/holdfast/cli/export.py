@@ -13,7 +13,6 @@ from holdfast.cli.exit_codes import ended_by_signals
 from holdfast.cli.terminal import counted, progress_line
 from holdfast.config.user_code import account_of_user_error
 from holdfast.errors import HoldfastError, OptionError, OutputError
-from holdfast.files import directory_beside, move_into_place, require_free, shown_path
 from holdfast.printable import printable
 from holdfast.runtime.command_line import (
     MAX_TRIALS,
@@ -25,6 +24,7 @@ from holdfast.runtime.command_line import (
     number,
     option,
 )
+from holdfast.runtime.files import directory_beside, move_into_place, require_free, shown_path
 
 if TYPE_CHECKING:
     from holdfast.recording.facts import FactSink
@@ -266,7 +266,7 @@ def notes_about(recorded: RecordedRun, trials: Sequence[int], rate_hz: float) ->
 
 def _about(recorded: RecordedRun, rate_hz: float) -> dict[str, str]:
     """Return the metadata of a file about its run."""
-    from holdfast.source_digest import core_version
+    from holdfast.config.source_digest import core_version
 
     configuration = recorded.configuration
     return {

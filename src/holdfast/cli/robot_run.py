@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from holdfast.cli.run_options import RunOptions
     from holdfast.config.loader import Configuration
-    from holdfast.outcome import TrialResult
+    from holdfast.planning.outcome import TrialResult
     from holdfast.recording.run_directory import RunDirectory
     from holdfast.robot.environment_maker import EnvironmentMaker
     from holdfast.runtime.events import EventSink

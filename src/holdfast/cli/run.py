@@ -21,14 +21,14 @@ from holdfast.cli.run_figure import Remark, draw_figure
 from holdfast.cli.run_options import RunOptions
 from holdfast.cli.terminal import RunDisplay, counted, print_files, print_summary
 from holdfast.errors import HoldfastError, InvalidValueError, RunError, UnwritableOutputError
-from holdfast.files import require_free, shown_path
 from holdfast.printable import printable
 from holdfast.recording.view_target import require_rerun
+from holdfast.runtime.files import require_free, shown_path
 
 if TYPE_CHECKING:
     from holdfast.cli.robot_run import RobotFindings
     from holdfast.config.loader import Configuration
-    from holdfast.outcome import TrialResult
+    from holdfast.planning.outcome import TrialResult
     from holdfast.recording.tables import RunSummary
 
 __all__ = ["main"]
@@ -58,7 +58,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def _run(options: RunOptions) -> int:
     from holdfast.cli.robot_run import RobotFindings, is_robot_run, run_as_robot
-    from holdfast.planning import Planner
+    from holdfast.planning.planner import Planner
     from holdfast.recording.belief_remarks import belief_remarks
     from holdfast.recording.recorder import Recorder
     from holdfast.recording.run_directory import (

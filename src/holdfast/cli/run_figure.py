@@ -22,7 +22,7 @@ from holdfast.errors import DecidedOtherwiseError
 
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
-    from holdfast.outcome import Decisions, TrialResult
+    from holdfast.planning.outcome import Decisions, TrialResult
     from holdfast.recording.recorder import Recorder
     from holdfast.recording.run_directory import RunDirectory
     from holdfast.robot.environment import Environment
@@ -226,7 +226,7 @@ def repeat(
     anew : bool
         Whether to build the problem anew, as a service does.
     """
-    from holdfast.planning import Planner
+    from holdfast.planning.planner import Planner
     from holdfast.recording.compare import difference_of_decisions
     from holdfast.robot.trial import NULL_OBSERVER, run_trial
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from holdfast.cli.overrides import Override, combined, parse_assignment
 from holdfast.errors import InvalidValueError
-from holdfast.files import shown_path
 from holdfast.recording.view_target import ViewTarget, viewer_url
 from holdfast.runtime.command_line import (
     MAX_JOBS,
@@ -24,13 +23,14 @@ from holdfast.runtime.command_line import (
     option,
     whole_number,
 )
+from holdfast.runtime.files import shown_path
 from holdfast.runtime.log_lines import LogFormat
 from holdfast.runtime.logs import log_option
 from holdfast.service.options import http_address
 
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
-    from holdfast.service.health import HttpAddress
+    from holdfast.runtime.monitoring import HttpAddress
 
 __all__ = ["RunOptions", "Viewer", "viewer"]
 

@@ -12,15 +12,15 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
 
-from holdfast.files import shown_path
 from holdfast.printable import printable
+from holdfast.runtime.files import shown_path
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
     from holdfast.config.loader import Configuration
-    from holdfast.outcome import TrialResult
+    from holdfast.planning.outcome import TrialResult
     from holdfast.recording.tables import RunSummary
 
 __all__ = [
@@ -236,8 +236,8 @@ def _verified_text(summary: RunSummary) -> str:
 
 
 def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
-    from holdfast.belief import VALIDATION_GATE_SQUARED
-    from holdfast.lost import MAX_OUTSIDE
+    from holdfast.planning.belief import VALIDATION_GATE_SQUARED
+    from holdfast.planning.lost import MAX_OUTSIDE
     from holdfast.protocol.question import OWN_PLANNER
 
     rows = []

@@ -18,7 +18,6 @@ from holdfast.cli.export import (
     trials_option,
 )
 from holdfast.errors import InvalidValueError, OptionError, ViewError
-from holdfast.files import directory_beside, move_into_place, require_free, shown_path
 from holdfast.printable import printable
 from holdfast.recording.view_target import ViewTarget, require_rerun, viewer_url
 from holdfast.runtime.command_line import (
@@ -28,6 +27,7 @@ from holdfast.runtime.command_line import (
     location,
     option,
 )
+from holdfast.runtime.files import directory_beside, move_into_place, require_free, shown_path
 
 __all__ = ["main"]
 

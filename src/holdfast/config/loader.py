@@ -7,7 +7,7 @@ or environment is looked for beside the file and in the current directory, or in
 ``problem_directory`` and ``environment.directory``. Missing sections and keys take their defaults,
 and :meth:`Configuration.to_yaml` writes every value in use.
 
-The bounds stand with the settings (:mod:`holdfast.config.settings`) and with each problem (its
+The bounds stand with the settings (:mod:`holdfast.planning.settings`) and with each problem (its
 ``Model`` and ``StateSpacePlanner``). Checks that involve two keys are here, those of planning with
 its settings.
 """
@@ -25,9 +25,13 @@ from typing import Any
 import msgspec
 import msgspec.inspect
 
-from holdfast.arrays import plain
 from holdfast.config.problem_builder import build_from, find_problem, schemas_of
-from holdfast.config.settings import (
+from holdfast.config.registry import names
+from holdfast.config.source import SECTIONS, SETTINGS, Source, module_directory
+from holdfast.config.yaml_document import MAX_BYTES, Document, read, write
+from holdfast.errors import ConfigurationError, InvalidValueError
+from holdfast.numerics.arrays import plain
+from holdfast.planning.settings import (
     UNINFORMED_METHODS,
     ActiveSensingSettings,
     EnvironmentSettings,
@@ -40,14 +44,10 @@ from holdfast.config.settings import (
     SimulatorSettings,
     unfit_for_the_method,
 )
-from holdfast.config.source import SECTIONS, SETTINGS, Source, module_directory
-from holdfast.config.validation import described, shown
-from holdfast.config.yaml_document import MAX_BYTES, Document, read, write
-from holdfast.errors import ConfigurationError, InvalidValueError
-from holdfast.files import absolute_endpoint, read_bounded
-from holdfast.problem_attributes import resolution_of, sensing_labels
+from holdfast.problems.attributes import resolution_of, sensing_labels
 from holdfast.problems.problem import Problem
-from holdfast.problems.registry import names
+from holdfast.runtime.files import absolute_endpoint, read_bounded
+from holdfast.validation import described, shown
 
 __all__ = ["Configuration", "load", "settings_keys"]
 

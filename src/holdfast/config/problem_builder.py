@@ -17,19 +17,19 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from holdfast.config import registry
 from holdfast.config.source import Source, module_directory
 from holdfast.config.user_code import account_of_user_error, in_words
-from holdfast.config.validation import shown
 from holdfast.config.yaml_document import Document
 from holdfast.errors import ConfigurationError, HoldfastError, UnknownProblemError
-from holdfast.floating_mode import in_own_mode
-from holdfast.problem_attributes import (
+from holdfast.numerics.floating_mode import in_own_mode
+from holdfast.problems.attributes import (
     GAUSSIAN_OBSERVATIONS,
     has_general_observations,
     misspelt_in,
 )
-from holdfast.problems import registry
 from holdfast.problems.problem import Problem, ProblemBase
+from holdfast.validation import shown
 
 __all__ = ["BuiltProblem", "build_from", "build_problem", "find_problem", "schemas_of"]
 

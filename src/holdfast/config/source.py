@@ -14,7 +14,9 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from holdfast.config.settings import (
+from holdfast.config.yaml_document import Document
+from holdfast.errors import ConfigurationError
+from holdfast.planning.settings import (
     ActiveSensingSettings,
     EnvironmentSettings,
     LostSettings,
@@ -24,7 +26,7 @@ from holdfast.config.settings import (
     SelectorSettings,
     SimulatorSettings,
 )
-from holdfast.config.validation import (
+from holdfast.validation import (
     KeyPath,
     close_match,
     dotted,
@@ -32,8 +34,6 @@ from holdfast.config.validation import (
     find_mismatch,
     shown,
 )
-from holdfast.config.yaml_document import Document
-from holdfast.errors import ConfigurationError
 
 __all__ = ["SECTIONS", "SETTINGS", "Source", "module_directory"]
 

@@ -19,8 +19,8 @@ from typing import Any, cast
 
 import yaml
 
-from holdfast.config.validation import KeyPath, dotted
 from holdfast.errors import ConfigurationError
+from holdfast.validation import KeyPath, dotted
 
 __all__ = ["MAX_BYTES", "MAX_DEPTH", "MAX_VALUES", "Document", "read", "write"]
 

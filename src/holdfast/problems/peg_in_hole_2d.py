@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 
 from holdfast import _kernel
-from holdfast.arrays import BoolArray, FloatArray, IntArray
-from holdfast.geometry import FAR, KernelObject, RectangleWorld
+from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
+from holdfast.numerics.geometry import FAR, KernelObject, RectangleWorld
 from holdfast.problems.problem import Scene
 from holdfast.problems.rigid_body import (
     Coordinate,

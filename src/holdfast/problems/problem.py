@@ -19,7 +19,7 @@ Observations are Gaussian, by :meth:`Problem.observation_mean` and
 :class:`GeneralObservationProblem`. What an action does without noise follows from
 :meth:`Problem.move`, unless the problem has a method of :class:`ExpectedMotionProblem`.
 
-Random numbers come from the :class:`~holdfast.randomness.Stream` that a function is given. It has
+Random numbers come from the :class:`~holdfast.numerics.randomness.Stream` that a function is given. It has
 methods of a NumPy ``Generator``, goes on as one does, and begins anew in each call of a function;
 with the call it ends, and must not be kept.
 
@@ -37,9 +37,9 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import BoolArray, FloatArray, IntArray, real_numbers
 from holdfast.errors import ProblemError
-from holdfast.randomness import Stream
+from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray, real_numbers
+from holdfast.numerics.randomness import Stream
 
 __all__ = [
     "BatchedMotionProblem",
@@ -240,9 +240,9 @@ class GeneralObservationProblem(Protocol):
     Sensing costs more: the likelihood is evaluated in Python, once for each hypothetical
     observation.
 
-    A robot is found lost (:mod:`holdfast.lost`) by observations that no particle can have made. A
+    A robot is found lost (:mod:`holdfast.planning.lost`) by observations that no particle can have made. A
     likelihood that is zero nowhere has none of these. An attribute ``rank_test = True`` asks for
-    the test by :func:`holdfast.validation_gate.is_typical` instead: each observation is compared
+    the test by :func:`holdfast.planning.validation_gate.is_typical` instead: each observation is compared
     with up to 19 drawn ones, which takes as many evaluations of the likelihood, 3.5 on average. It
     is right if what is left out of the likelihood does not depend on the observation.
     """
@@ -275,7 +275,7 @@ class ExpectedMotionProblem(Protocol):
         """Return the states after executed ``actions`` if nothing is random, as ``states``.
 
         A problem that does not have this is asked for its ``move`` with the stream
-        :data:`~holdfast.randomness.NOISE_FREE`, whose numbers are all at the middle. A
+        :data:`~holdfast.numerics.randomness.NOISE_FREE`, whose numbers are all at the middle. A
         problem needs the method if it draws otherwise (from ``stream.words``, or again and again
         until something fits). It may have it to be faster.
         """
@@ -315,7 +315,7 @@ class ShownMovesProblem(Protocol):
     """Methods for moves that show something: a measured motion, an observation. Any of them.
 
     The robot's environment returns what a move has shown
-    (:class:`~holdfast.outcome.MoveResult`); these say what it means. With the first or the third
+    (:class:`~holdfast.planning.outcome.MoveResult`); these say what it means. With the first or the third
     the next decision waits for what the move shows, so a service is asked at each step.
     """
 
@@ -376,7 +376,7 @@ def _meant(kind: type, given: list[str]) -> str:
     """Return what to ask after a setting that a constructor does not take; empty for nothing."""
     import inspect
 
-    from holdfast.config.validation import close_match
+    from holdfast.validation import close_match
 
     try:
         takes = list(inspect.signature(kind).parameters)

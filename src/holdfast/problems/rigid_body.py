@@ -18,18 +18,18 @@ from typing import Annotated, Any, ClassVar, Self, TypeVar
 import msgspec
 import numpy as np
 
-from holdfast import numerics
-from holdfast.arrays import FloatArray, IntArray, KeepsReadOnly
 from holdfast.errors import InvalidValueError
-from holdfast.geometry import (
+from holdfast.numerics import reproducible as numerics
+from holdfast.numerics.arrays import FloatArray, IntArray, KeepsReadOnly
+from holdfast.numerics.geometry import (
     MAX_NOISE_ATTEMPTS,
     BoxWorld,
     DiscWorld,
     KernelObject,
     RectangleWorld,
 )
+from holdfast.numerics.randomness import NOISE_FREE, Stream
 from holdfast.problems.problem import ProblemBase
-from holdfast.randomness import NOISE_FREE, Stream
 
 __all__ = [
     "Coordinate",

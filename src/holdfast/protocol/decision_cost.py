@@ -18,14 +18,14 @@ import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-from holdfast.config.settings import (
+from holdfast.planning.settings import (
     ENTROPY_METHODS,
     UNINFORMED_METHODS,
     PlanningSettings,
     estimator_of,
     path_steps,
 )
-from holdfast.problem_attributes import has_general_observations, has_own
+from holdfast.problems.attributes import has_general_observations, has_own
 from holdfast.problems.problem import Problem
 
 __all__ = [
@@ -180,14 +180,14 @@ _CONTACT = 2.0
 _PYTHON = 60e3
 """For the Python code around a handful of calls."""
 _MODE_PARTICLES, _MODE_STARTS, _MODE_CLIMBS, _MODE_SPLITS = 1000, 16, 10, 3
-"""Sizes in :mod:`holdfast.modes`."""
+"""Sizes in :mod:`holdfast.planning.modes`."""
 
 _CLOUD = 8.0
 """Particles that follow each estimate of a rollout."""
 _WEIGHTS_BYTES = 64 << 20
 _GROUP_BYTES = 400
 _BLOCK = 1 << 20
-"""Sizes of the kernel's batches and of :mod:`holdfast.sensing`'s blocks."""
+"""Sizes of the kernel's batches and of :mod:`holdfast.planning.sensing`'s blocks."""
 
 
 class _Sizes:

@@ -15,8 +15,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from holdfast.config.settings import OffloadSettings, RecoverySettings
 from holdfast.errors import OwnDecisionError, ServiceRefusedError, StaleEpochError
+from holdfast.planning.settings import OffloadSettings, RecoverySettings
 from holdfast.problems.problem import Problem
 from holdfast.protocol.events import (
     CallEnded,

@@ -14,12 +14,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Generic, NamedTuple, TypeAlias, TypeVar
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import HoldfastError
-from holdfast.outcome import Ending, TrialResult
-from holdfast.planning import PlanningState
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import Ending, TrialResult
+from holdfast.planning.planner import PlanningState
+from holdfast.planning.tracking import LateObservation
 from holdfast.protocol.records import Record
-from holdfast.tracking import LateObservation
 
 __all__ = [
     "Abandon",

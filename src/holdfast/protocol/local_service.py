@@ -10,7 +10,7 @@ progress, so each later launch gets more time; else it would never come up on a 
 
 from __future__ import annotations
 
-from holdfast.config.settings import OffloadSettings, RecoverySettings
+from holdfast.planning.settings import OffloadSettings, RecoverySettings
 from holdfast.protocol.question import Question
 
 __all__ = ["HedgingBudget", "RestartPolicy"]

@@ -25,10 +25,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from holdfast import numerics
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import PlanningSettings
 from holdfast.errors import MessageError
+from holdfast.numerics import reproducible as numerics
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.settings import PlanningSettings
 from holdfast.printable import one_line
 from holdfast.protocol.plain_data import check_plain_data
 
@@ -92,7 +92,7 @@ MAX_CONFIGURATION_BYTES = 256 * 1024
 """Bound on a session configuration, encoded."""
 
 DIGEST_SIZE = 16
-"""Bytes sent of a state's digest: the first of :func:`holdfast.planning.digest`."""
+"""Bytes sent of a state's digest: the first of :func:`holdfast.planning.planner.digest`."""
 
 Word = Annotated[int, msgspec.Meta(ge=0, le=MAX_WORD)]
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=200)]
@@ -146,7 +146,7 @@ class SessionConfiguration(msgspec.Struct, array_like=True, frozen=True):
         The problem's two sections of the configuration.
     core_version, problem_digest : str
         Of the robot's holdfast, and of the problem's code beyond that
-        (:mod:`holdfast.source_digest`).
+        (:mod:`holdfast.config.source_digest`).
     """
 
     problem: Name
@@ -187,7 +187,7 @@ class Request(msgspec.Struct, array_like=True, frozen=True):
     session_configuration : SessionConfiguration or None
         For a service that may not know the session.
     checkpoint : bytes, memoryview or None
-        The state (:func:`holdfast.planning.encode_checkpoint`); then ``inputs`` is empty. A
+        The state (:func:`holdfast.planning.planner.encode_checkpoint`); then ``inputs`` is empty. A
         decoded one is a view of the message.
     """
 

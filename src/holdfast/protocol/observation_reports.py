@@ -1,20 +1,20 @@
 """What a robot reports about its observations: what no particle explains, lost, a suspect sensor.
 
-The trial counts (:mod:`holdfast.tracking`); here is what becomes an event, with words and bounds.
+The trial counts (:mod:`holdfast.planning.tracking`); here is what becomes an event, with words and bounds.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 
-from holdfast.belief import VALIDATION_GATE_SQUARED
-from holdfast.config.settings import LostSettings, OnLost
 from holdfast.errors import HeldError
-from holdfast.lost import MOVE, Verdict
-from holdfast.planning import ObservationInfo
-from holdfast.problem_attributes import sensing_labels
+from holdfast.planning.belief import VALIDATION_GATE_SQUARED
+from holdfast.planning.lost import MOVE, Verdict
+from holdfast.planning.planner import ObservationInfo
+from holdfast.planning.settings import LostSettings, OnLost
+from holdfast.planning.tracking import Trial
+from holdfast.problems.attributes import sensing_labels
 from holdfast.protocol.events import Effects, RobotEffect
-from holdfast.tracking import Trial
 
 __all__ = ["ObservationReports", "held_error"]
 

@@ -13,9 +13,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import HoldfastError, MessageError
-from holdfast.planning import Planner, PlanningState, encode_checkpoint
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.planner import Planner, PlanningState, encode_checkpoint
 from holdfast.protocol.events import (
     Effects,
     Halt,

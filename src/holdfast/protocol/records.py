@@ -12,11 +12,12 @@ from typing import TypeAlias
 
 import msgspec
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import LostSettings
 from holdfast.errors import InvalidValueError, MessageError, RecordError
-from holdfast.outcome import SensingDecision, TaskDecision
-from holdfast.planning import ObservationInfo, Planner
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import SensingDecision, TaskDecision
+from holdfast.planning.planner import ObservationInfo, Planner
+from holdfast.planning.settings import LostSettings
+from holdfast.planning.tracking import LateObservation, Trial
 from holdfast.protocol.messages import (
     MAX_INPUTS,
     Input,
@@ -26,7 +27,6 @@ from holdfast.protocol.messages import (
     encode_floats,
     numbers_of,
 )
-from holdfast.tracking import LateObservation, Trial
 
 __all__ = [
     "ActingRecord",

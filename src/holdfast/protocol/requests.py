@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from holdfast.errors import MessageError, StaleEpochError
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
 from holdfast.problems.problem import Problem
 from holdfast.protocol.events import Abandon, Effects, RobotEffect, Send
 from holdfast.protocol.messages import (

@@ -16,11 +16,12 @@ The machine touches nothing. Methods take an event and the time and return effec
 
 from __future__ import annotations
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import LostSettings, SimulatorSettings
 from holdfast.errors import HeldError, HoldfastError, UnknownPerformanceError
-from holdfast.outcome import Ending
-from holdfast.planning import ObservationInfo, Planner, PlanningState
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import Ending
+from holdfast.planning.planner import ObservationInfo, Planner, PlanningState
+from holdfast.planning.settings import LostSettings, SimulatorSettings
+from holdfast.planning.tracking import LateObservation
 from holdfast.protocol.events import (
     Act,
     Acted,
@@ -53,7 +54,6 @@ from holdfast.protocol.records import (
     has_shown,
 )
 from holdfast.protocol.status import Status
-from holdfast.tracking import LateObservation
 
 __all__ = ["Robot"]
 

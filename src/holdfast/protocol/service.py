@@ -30,7 +30,7 @@ from collections.abc import Callable
 import msgspec
 
 from holdfast.errors import InvalidValueError, MessageError
-from holdfast.planning import needs_sensing
+from holdfast.planning.planner import needs_sensing
 from holdfast.problems.problem import Problem
 from holdfast.protocol.decision_cost import ANY_MACHINE, Cost, Pricing
 from holdfast.protocol.events import Effects

@@ -16,7 +16,6 @@ from collections import OrderedDict
 from collections.abc import Callable
 from typing import Literal, NamedTuple, TypeAlias
 
-from holdfast.config.settings import PlanningSettings
 from holdfast.errors import (
     CheckpointError,
     ConfigurationError,
@@ -27,8 +26,9 @@ from holdfast.errors import (
     OtherCodeError,
     UnknownProblemError,
 )
-from holdfast.interruption import Interruption, check, interruptible
-from holdfast.planning import Planner, PlanningState
+from holdfast.planning.interruption import Interruption, check, interruptible
+from holdfast.planning.planner import Planner, PlanningState
+from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
 from holdfast.protocol.decision_cost import (
     ANY_MACHINE,

@@ -21,9 +21,9 @@ from typing import Literal, NamedTuple, TypeAlias
 
 import msgspec
 
-from holdfast.config.settings import PlanningSettings
-from holdfast.planning import PlanningState
-from holdfast.problems.registry import BUILT_IN
+from holdfast.config.registry import BUILT_IN
+from holdfast.planning.planner import PlanningState
+from holdfast.planning.settings import PlanningSettings
 from holdfast.protocol.decision_cost import Cost, Price
 from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.messages import Request, SessionConfiguration, pack_configuration

@@ -26,9 +26,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from holdfast import checked
-from holdfast.arrays import FloatArray
 from holdfast.errors import OwnDecisionError
+from holdfast.numerics.arrays import FloatArray
+from holdfast.problems import checked
 from holdfast.problems.problem import Problem
 from holdfast.protocol.events import (
     ComputeOwnAnswer,

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from holdfast.arrays import FloatArray
-from holdfast.circular import unwrapped
-from holdfast.config.settings import PlanningSettings
-from holdfast.floating_mode import in_own_mode
-from holdfast.modes import heaviest_mode
-from holdfast.problem_attributes import circular_states, name_of, state_labels
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.circular import unwrapped
+from holdfast.numerics.floating_mode import in_own_mode
+from holdfast.planning.modes import heaviest_mode
+from holdfast.planning.settings import PlanningSettings
+from holdfast.problems.attributes import circular_states, name_of, state_labels
 from holdfast.recording.recorder import TrialRecord
 
 __all__ = ["belief_remarks"]

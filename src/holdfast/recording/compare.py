@@ -18,7 +18,7 @@ from typing import Any
 
 import msgspec
 
-from holdfast.outcome import Decisions, SensingDecision, TaskDecision
+from holdfast.planning.outcome import Decisions, SensingDecision, TaskDecision
 from holdfast.printable import one_line
 from holdfast.protocol.records import ActingRecord, ObservedRecord, decisions_of
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial

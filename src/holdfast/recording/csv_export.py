@@ -14,11 +14,11 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self, TextIO
 
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.belief import Belief
 from holdfast.printable import cell
-from holdfast.problem_attributes import choice_labels
-from holdfast.problem_attributes import state_labels as declared_labels
+from holdfast.problems.attributes import choice_labels
+from holdfast.problems.attributes import state_labels as declared_labels
 from holdfast.problems.problem import Problem
 from holdfast.recording.facts import (
     Decider,

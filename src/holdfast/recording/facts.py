@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief
-from holdfast.outcome import TrialResult
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.belief import Belief
+from holdfast.planning.outcome import TrialResult
 from holdfast.recording.run_clock import Stamp
 
 __all__ = [

@@ -28,16 +28,17 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from holdfast import checked, numerics
-from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration
-from holdfast.files import write_atomically
-from holdfast.floating_mode import in_own_mode
-from holdfast.outcome import Outcome
-from holdfast.problem_attributes import choice_labels, circular_states, state_labels
+from holdfast.numerics import reproducible as numerics
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.floating_mode import in_own_mode
+from holdfast.planning.outcome import Outcome
+from holdfast.problems import checked
+from holdfast.problems.attributes import choice_labels, circular_states, state_labels
 from holdfast.problems.problem import Problem, Scene
 from holdfast.recording.facts import SCORES
 from holdfast.recording.recorder import SensingRecord, TrialRecord
+from holdfast.runtime.files import write_atomically
 
 __all__ = ["STYLE", "trial_figure"]
 

@@ -1,7 +1,7 @@
 """Which code made a run: only trials that the same code decided can be compared.
 
 holdfast is identified by its version and the digest of its deciding modules, a problem by the
-digests of its sources (:mod:`holdfast.source_digest`).
+digests of its sources (:mod:`holdfast.config.source_digest`).
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from collections.abc import Mapping
 
 from holdfast import __version__
 from holdfast.config.loader import Configuration
-from holdfast.problems.registry import problem_module
-from holdfast.source_digest import core_version, problem_sources
+from holdfast.config.registry import problem_module
+from holdfast.config.source_digest import core_version, problem_sources
 
 __all__ = ["difference", "fingerprint"]
 

@@ -28,7 +28,7 @@ from typing import NamedTuple, Self
 import msgspec
 
 from holdfast.errors import InvalidValueError, LostJournalError, OutputError
-from holdfast.outcome import TrialResult
+from holdfast.planning.outcome import TrialResult
 from holdfast.protocol.records import Record, encode_record
 from holdfast.recording.journal_file import (
     START_ANEW,

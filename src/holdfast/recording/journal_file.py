@@ -46,7 +46,7 @@ __all__ = [
 JOURNAL_NAME = "journal.sqlite"
 
 Survives: TypeAlias = Literal["process_crash", "power_cut"]
-"""What a journalled step survives; see :class:`holdfast.config.settings.RecoverySettings`."""
+"""What a journalled step survives; see :class:`holdfast.planning.settings.RecoverySettings`."""
 
 FileIdentity: TypeAlias = tuple[int, int]
 """Device and inode."""

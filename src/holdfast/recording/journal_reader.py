@@ -15,7 +15,7 @@ from typing import NamedTuple, Self
 import msgspec
 
 from holdfast.errors import OutputError, RecordError
-from holdfast.outcome import Decisions, TrialResult
+from holdfast.planning.outcome import Decisions, TrialResult
 from holdfast.protocol.records import Record, decode_record
 from holdfast.recording.journal_file import (
     START_ANEW,

@@ -16,10 +16,11 @@ from typing import Any, BinaryIO
 
 import msgspec
 
-from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration
 from holdfast.errors import HoldfastError
-from holdfast.planning import Planner, PlanningState
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.planner import Planner, PlanningState
+from holdfast.planning.tracking import Trial
 from holdfast.protocol.messages import decode_floats, numbers_of
 from holdfast.protocol.records import (
     ActingRecord,
@@ -51,7 +52,6 @@ from holdfast.recording.live_messages import (
 )
 from holdfast.recording.view_target import ViewTarget
 from holdfast.robot.environment import SimulatedEnvironment
-from holdfast.tracking import Trial
 
 __all__ = ["Follower", "follow"]
 

@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 import msgspec
 
-from holdfast.outcome import TrialResult
+from holdfast.planning.outcome import TrialResult
 from holdfast.protocol.events import Timing
 from holdfast.protocol.records import Record
 

@@ -23,7 +23,7 @@ import msgspec
 
 from holdfast.config.user_code import in_words
 from holdfast.errors import ViewError
-from holdfast.outcome import TrialResult
+from holdfast.planning.outcome import TrialResult
 from holdfast.protocol.events import Timing
 from holdfast.protocol.records import Record
 from holdfast.recording.live_follower import follow

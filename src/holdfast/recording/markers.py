@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from holdfast import checked
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief, estimate
-from holdfast.geometry import BoxWorld
-from holdfast.problem_attributes import sensing_labels, state_labels
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.geometry import BoxWorld
+from holdfast.planning.belief import Belief, estimate
+from holdfast.problems import checked
+from holdfast.problems.attributes import sensing_labels, state_labels
 from holdfast.problems.problem import Problem, Scene
 from holdfast.recording.poses import POSE_COORDINATES, PoseLayout
 

@@ -17,9 +17,9 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import msgspec
 import numpy as np
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import HoldfastError, OutputError
-from holdfast.outcome import TrialResult
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import TrialResult
 from holdfast.recording.journal_reader import JournalReader
 from holdfast.recording.run_directory import (
     first_difference,

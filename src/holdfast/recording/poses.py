@@ -22,11 +22,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief, estimate
-from holdfast.circular import differences
 from holdfast.errors import ProblemError
-from holdfast.problem_attributes import circular_states, sequence_of
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.circular import differences
+from holdfast.planning.belief import Belief, estimate
+from holdfast.problems.attributes import circular_states, sequence_of
 
 __all__ = ["POSE_COORDINATES", "PoseLayout", "pose_layout"]
 

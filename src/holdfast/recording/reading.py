@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import FloatArray, IntArray, whole
-from holdfast.belief import Belief
 from holdfast.config.loader import Configuration
 from holdfast.errors import OutputError
-from holdfast.outcome import TRIAL_COLUMNS, TrialResult
-from holdfast.planning import Planner
+from holdfast.numerics.arrays import FloatArray, IntArray, whole
+from holdfast.planning.belief import Belief
+from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
+from holdfast.planning.planner import Planner
 from holdfast.recording.facts import (
     EventFact,
     LateFact,

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import DecidedOtherwiseError, EndOfRecordsError
-from holdfast.outcome import Done, Ending, MoveResult, TrialResult
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import Done, Ending, MoveResult, TrialResult
+from holdfast.planning.tracking import LateObservation
 from holdfast.protocol.messages import encode_floats, numbers_of
 from holdfast.protocol.records import (
     ActingRecord,
@@ -23,7 +24,6 @@ from holdfast.protocol.records import (
     Record,
 )
 from holdfast.robot.environment import LATER, Later, SimulatedEnvironment
-from holdfast.tracking import LateObservation
 
 __all__ = ["RecordedEnvironment"]
 

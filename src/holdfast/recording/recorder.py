@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief, estimate, standard_deviation
-from holdfast.floating_mode import in_own_mode
-from holdfast.outcome import TrialResult
-from holdfast.planning import Planner, PlanningState
-from holdfast.problem_attributes import circular_states
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.floating_mode import in_own_mode
+from holdfast.planning.belief import Belief, estimate, standard_deviation
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import Planner, PlanningState
+from holdfast.problems.attributes import circular_states
 from holdfast.robot.environment import Environment
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver
 

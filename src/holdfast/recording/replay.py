@@ -22,7 +22,6 @@ from typing import Self
 
 import numpy as np
 
-from holdfast.arrays import FloatArray, floats_or_none
 from holdfast.config.loader import Configuration
 from holdfast.errors import (
     DecidedOtherwiseError,
@@ -30,9 +29,10 @@ from holdfast.errors import (
     HoldfastError,
     UntrustedCodeError,
 )
-from holdfast.floating_mode import in_own_mode
-from holdfast.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
-from holdfast.planning import Planner, PlanningState, digest
+from holdfast.numerics.arrays import FloatArray, floats_or_none
+from holdfast.numerics.floating_mode import in_own_mode
+from holdfast.planning.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
+from holdfast.planning.planner import Planner, PlanningState, digest
 from holdfast.printable import one_line
 from holdfast.protocol.records import decisions_of, reinitialised_after
 from holdfast.recording.facts import (

@@ -11,9 +11,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from holdfast import checked
 from holdfast.config.loader import Configuration
-from holdfast.problem_attributes import circular_states
+from holdfast.problems import checked
+from holdfast.problems.attributes import circular_states
 from holdfast.problems.problem import Problem, Scene
 from holdfast.recording.csv_export import state_labels
 from holdfast.recording.facts import SCORES

@@ -20,14 +20,14 @@ from typing import Any, Self
 import numpy as np
 import rerun as rr
 
-from holdfast import checked
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief, standard_deviation
 from holdfast.config.loader import Configuration
 from holdfast.errors import HoldfastError
-from holdfast.problem_attributes import choice_labels, circular_states
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import NoiseFreeStream
+from holdfast.planning.belief import Belief, standard_deviation
+from holdfast.problems import checked
+from holdfast.problems.attributes import choice_labels, circular_states
 from holdfast.protocol.status import Status
-from holdfast.randomness import NoiseFreeStream
 from holdfast.recording.csv_export import state_labels
 from holdfast.recording.facts import (
     Decider,
@@ -82,7 +82,7 @@ _STATUSES = {
 _OUTCOMES = {"succeeded": _GOAL, "failed": (235, 98, 86), "truncated": _SENSED}
 
 _MAX_DRAWS = 10_000
-"""Of a move without noise, as in :mod:`holdfast.policy_path`."""
+"""Of a move without noise, as in :mod:`holdfast.planning.policy_path`."""
 
 
 class RerunSink:

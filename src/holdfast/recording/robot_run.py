@@ -27,8 +27,8 @@ from holdfast.runtime.logs import EventLog
 
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
-    from holdfast.outcome import TrialResult
-    from holdfast.planning import PlanningState
+    from holdfast.planning.outcome import TrialResult
+    from holdfast.planning.planner import PlanningState
     from holdfast.protocol.events import Act, Sense
     from holdfast.recording.live_view import LiveView
     from holdfast.recording.run_directory import RunDirectory

@@ -21,16 +21,16 @@ import msgspec
 
 from holdfast import __version__
 from holdfast.config.loader import Configuration
-from holdfast.config.settings import SelectorSettings
 from holdfast.errors import OutputError, RebootedError
-from holdfast.files import write_atomically
-from holdfast.outcome import TrialResult
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.settings import SelectorSettings
 from holdfast.recording.fingerprint import difference, fingerprint
 from holdfast.recording.journal import Journal
 from holdfast.recording.journal_file import JOURNAL_NAME, JournalFile, Survives, boot_id
 from holdfast.recording.journal_reader import JournalReader
 from holdfast.recording.tables import RunSummary, SummaryBuilder, csv_lines
 from holdfast.recording.timings import count_answers, count_verified
+from holdfast.runtime.files import write_atomically
 
 __all__ = [
     "CONFIGURATION_NAME",

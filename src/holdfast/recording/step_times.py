@@ -13,12 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from holdfast.arrays import IntArray
 from holdfast.errors import OutputError
-from holdfast.files import bounded_lines
+from holdfast.numerics.arrays import IntArray
 from holdfast.recording.facts import Decider, EventFact
 from holdfast.recording.run_clock import RunClock, Stamp
 from holdfast.recording.timings import TimingRow, nanoseconds
+from holdfast.runtime.files import bounded_lines
 
 __all__ = ["MOMENTS", "NS_PER_S", "StepClock", "TrialTimes", "dated", "read_events", "trial_ends"]
 

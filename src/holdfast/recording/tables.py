@@ -13,8 +13,8 @@ from collections.abc import Iterable, Iterator
 import msgspec
 import numpy as np
 
-from holdfast.floating_mode import in_own_mode
-from holdfast.outcome import TRIAL_COLUMNS, TrialResult
+from holdfast.numerics.floating_mode import in_own_mode
+from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
 from holdfast.printable import cell
 from holdfast.recording.timings import AnswerCounts, VerificationCounts
 

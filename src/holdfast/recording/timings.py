@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from holdfast.errors import OutputError
-from holdfast.files import bounded_lines
 from holdfast.printable import cell
 from holdfast.protocol.events import Timing, VerificationNoted
 from holdfast.recording.run_clock import Stamp, read_clocks
+from holdfast.runtime.files import bounded_lines
 
 __all__ = [
     "AnswerCounts",

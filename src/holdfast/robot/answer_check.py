@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from time import monotonic
 
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
 from holdfast.protocol.events import ComputeOwnAnswer, OwnAnswer
 from holdfast.protocol.messages import MAX_TASK_ACTIONS
 from holdfast.runtime.pool import ThreadPool

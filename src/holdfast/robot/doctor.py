@@ -26,8 +26,8 @@ from typing import Final, Literal, NamedTuple, TypeAlias, TypeVar
 
 import msgspec
 
-from holdfast.config.settings import OffloadSettings
 from holdfast.errors import HoldfastError
+from holdfast.planning.settings import OffloadSettings
 from holdfast.printable import printable
 from holdfast.protocol.messages import (
     DIGEST_SIZE,

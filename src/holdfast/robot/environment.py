@@ -16,15 +16,15 @@ from typing import Protocol, Self, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from holdfast import checked
-from holdfast.arrays import FloatArray, KeepsReadOnly, floats, real_numbers
-from holdfast.config.settings import EnvironmentSettings
 from holdfast.errors import EnvironmentFailedError
-from holdfast.floating_mode import in_own_mode
-from holdfast.outcome import Done, MoveResult
-from holdfast.problem_attributes import check_sizes, has_general_observations, sensing_action_of
+from holdfast.numerics.arrays import FloatArray, KeepsReadOnly, floats, real_numbers
+from holdfast.numerics.floating_mode import in_own_mode
+from holdfast.numerics.randomness import Purpose, Stream, seed_and_trial, stream
+from holdfast.planning.outcome import Done, MoveResult
+from holdfast.planning.settings import EnvironmentSettings
+from holdfast.problems import checked
+from holdfast.problems.attributes import check_sizes, has_general_observations, sensing_action_of
 from holdfast.problems.problem import Problem, ProblemBase
-from holdfast.randomness import Purpose, Stream, seed_and_trial, stream
 
 __all__ = [
     "LATER",
@@ -69,7 +69,7 @@ class Environment(Protocol):
     def perform(self, task_action: FloatArray) -> float | MoveResult | None:
         """Perform a task action and return its reward, or None where there is none.
 
-        A :class:`~holdfast.outcome.MoveResult` also says what the move has shown.
+        A :class:`~holdfast.planning.outcome.MoveResult` also says what the move has shown.
         """
         ...
 
@@ -77,7 +77,7 @@ class Environment(Protocol):
         """Return True if the task has succeeded, False if it goes on, or ``"failed"``.
 
         ``"failed"`` ends the trial as well, but in failure: the robot has crashed, say, or broken
-        what it was to handle. An :class:`~holdfast.outcome.Ending` also says why, and may say that
+        what it was to handle. An :class:`~holdfast.planning.outcome.Ending` also says why, and may say that
         the trial was cut off.
         """
         ...
@@ -131,7 +131,7 @@ class SimulatedEnvironment(KeepsReadOnly):
     Parameters
     ----------
     seed, trial : int
-        Name the random streams; see :func:`holdfast.randomness.stream`.
+        Name the random streams; see :func:`holdfast.numerics.randomness.stream`.
 
     Attributes
     ----------

@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import EnvironmentSettings
 from holdfast.config.user_code import find_class
 from holdfast.config.user_modules import find_in
 from holdfast.errors import ConfigurationError
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.settings import EnvironmentSettings
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import Environment, SimulatedEnvironment, require_methods
 from holdfast.robot.late_sensing import SenseInBackground
@@ -204,7 +204,7 @@ def _provided_parameters(
         allowed = [key for key in named if key not in _PROVIDED]
         for key in arguments:
             if key not in allowed:
-                from holdfast.config.validation import close_match
+                from holdfast.validation import close_match
 
                 raise ConfigurationError(
                     f"environment.arguments.{key} is no argument of {name}"

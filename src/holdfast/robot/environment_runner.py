@@ -22,10 +22,11 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import NOTHING_ELSE, FloatArray, real_numbers
 from holdfast.config.user_code import account_of_user_error
 from holdfast.errors import EnvironmentFailedError, HoldfastError, InvalidValueError
-from holdfast.outcome import Ending, MoveResult, ending_of
+from holdfast.numerics.arrays import NOTHING_ELSE, FloatArray, real_numbers
+from holdfast.planning.outcome import Ending, MoveResult, ending_of
+from holdfast.planning.tracking import LateObservation
 from holdfast.problems.problem import Problem
 from holdfast.protocol.events import (
     Acted,
@@ -38,7 +39,6 @@ from holdfast.protocol.messages import MAX_ACTION_SIZE
 from holdfast.robot.environment import LATER, Environment, MissingReadings, ObservationSizes
 from holdfast.robot.environment_maker import EnvironmentMaker
 from holdfast.runtime.pool import ThreadPool
-from holdfast.tracking import LateObservation
 
 __all__ = ["EnvironmentRunner", "InlineRunner", "ThreadedRunner", "make_runner"]
 

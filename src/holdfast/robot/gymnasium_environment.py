@@ -27,7 +27,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import (
+from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
+from holdfast.numerics.arrays import (
     FloatArray,
     floats,
     in_brief,
@@ -36,11 +37,10 @@ from holdfast.arrays import (
     real_number,
     real_numbers,
 )
-from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
-from holdfast.outcome import Done, Ending, MoveResult
+from holdfast.numerics.randomness import Purpose, seed_and_trial, stream
+from holdfast.planning.outcome import Done, Ending, MoveResult
 from holdfast.printable import one_line
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Purpose, seed_and_trial, stream
 
 if TYPE_CHECKING:
     import gymnasium
@@ -90,7 +90,7 @@ class GymnasiumEnvironment:
     success : str or function, optional
         By what one knows success: ``terminated`` (the environment terminates in success alone), a
         key of ``info`` such as ``is_success``, or ``function(environment, observation, info)``,
-        asked after each move, which returns True, False or an :class:`~holdfast.outcome.Ending`
+        asked after each move, which returns True, False or an :class:`~holdfast.planning.outcome.Ending`
         with its own reason. Without it no trial succeeds.
     sensing_noise : float or sequence, optional
         Standard deviation of the noise that is added to what sensing shows: for all, or one for
@@ -262,7 +262,7 @@ class GymnasiumEnvironment:
         key = self._success_key
         if key in (None, _TERMINATED, *self.info):
             return ""
-        from holdfast.config.validation import close_match
+        from holdfast.validation import close_match
 
         keys = [str(each) for each in self.info]
         there = ", ".join(keys) or "nothing"

@@ -10,7 +10,7 @@ import asyncio
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
-from holdfast.outcome import TrialResult
+from holdfast.planning.outcome import TrialResult
 from holdfast.protocol.events import Timing
 from holdfast.protocol.robot import Robot
 from holdfast.runtime.events import EventSink
@@ -18,7 +18,7 @@ from holdfast.runtime.service_manager import ServiceManager
 
 if TYPE_CHECKING:
     from holdfast.robot.metrics import RobotMetrics
-    from holdfast.service.health import HttpAddress, MonitoringServers, Pages
+    from holdfast.runtime.monitoring import HttpAddress, MonitoringServers, Pages
 
 __all__ = ["Condition", "RobotWatch"]
 
@@ -71,7 +71,7 @@ class RobotWatch:
         self._manager.watch(asyncio.get_running_loop(), lambda: str(condition()))
 
     async def _offer(self, condition: Callable[[], Condition], robot: Robot) -> None:
-        from holdfast.service.health import MonitoringServers, Page
+        from holdfast.runtime.monitoring import MonitoringServers, Page
 
         async def alive() -> Page:
             return Page.of(None)

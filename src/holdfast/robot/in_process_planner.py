@@ -16,7 +16,7 @@ from collections.abc import Callable
 from time import perf_counter
 
 from holdfast.errors import HoldfastError
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
 from holdfast.protocol.events import Plan, Planned
 from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.messages import MAX_TASK_ACTIONS

@@ -2,7 +2,7 @@
 
 The robot goes on while it senses: ``perform_sensing`` returns :data:`LATER` at once, and each
 observation comes with the task action after which it is there. It belongs to the step at which it
-was taken (:mod:`holdfast.tracking`).
+was taken (:mod:`holdfast.planning.tracking`).
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy.typing as npt
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import EnvironmentFailedError
-from holdfast.outcome import Done, MoveResult
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import Done, MoveResult
 from holdfast.robot.environment import LATER, Environment, Later
 
 __all__ = ["SenseInBackground"]

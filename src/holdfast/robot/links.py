@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from holdfast.config.loader import Configuration
-from holdfast.config.settings import OffloadSettings, PlanningSettings
 from holdfast.errors import TransportError
-from holdfast.planning import Planner
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import OffloadSettings, PlanningSettings
 from holdfast.problems.problem import Problem
 from holdfast.robot.memo_cache import MemoCache, MemoizingPlanner
 from holdfast.robot.recovery_launcher import RecoveryLauncher

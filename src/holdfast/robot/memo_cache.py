@@ -17,9 +17,9 @@ from typing import Any, TypeVar, cast
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import PlanningSettings
-from holdfast.planning import ObservationInfo, Planner, PlanningState
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.planner import ObservationInfo, Planner, PlanningState
+from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
 
 __all__ = ["MemoCache", "MemoizingPlanner"]

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from holdfast import __version__
-from holdfast.outcome import TrialResult
+from holdfast.planning.outcome import TrialResult
 from holdfast.protocol.events import Timing
 from holdfast.protocol.messages import PROTOCOL_VERSION
 from holdfast.protocol.robot import Robot

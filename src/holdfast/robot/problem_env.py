@@ -23,15 +23,19 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from holdfast import checked, numerics
-from holdfast.arrays import FloatArray, floats_or_none, integer, whole
-from holdfast.belief import Belief, standard_deviation
-from holdfast.config.settings import Method, PlanningSettings, SimulatorSettings
+from holdfast.config.registry import make
 from holdfast.errors import InvalidValueError
-from holdfast.floating_mode import in_own_mode
-from holdfast.outcome import Ending, MoveResult, ending_of
-from holdfast.planning import Planner, PlanningState
-from holdfast.problem_attributes import (
+from holdfast.numerics import reproducible as numerics
+from holdfast.numerics.arrays import FloatArray, floats_or_none, integer, whole
+from holdfast.numerics.floating_mode import in_own_mode
+from holdfast.numerics.randomness import Purpose, seed_and_trial, stream
+from holdfast.planning.belief import Belief, standard_deviation
+from holdfast.planning.outcome import Ending, MoveResult, ending_of
+from holdfast.planning.planner import Planner, PlanningState
+from holdfast.planning.settings import Method, PlanningSettings, SimulatorSettings
+from holdfast.planning.tracking import Trial
+from holdfast.problems import checked
+from holdfast.problems.attributes import (
     check_problem,
     choice_labels,
     circular_actions,
@@ -40,10 +44,7 @@ from holdfast.problem_attributes import (
     state_labels,
 )
 from holdfast.problems.problem import Problem
-from holdfast.problems.registry import make
-from holdfast.randomness import Purpose, seed_and_trial, stream
 from holdfast.robot.environment import SimulatedEnvironment
-from holdfast.tracking import Trial
 
 __all__ = ["ProblemEnv"]
 

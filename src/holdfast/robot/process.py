@@ -23,8 +23,8 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 from holdfast.config.loader import Configuration
 from holdfast.config.user_code import account_of_user_error, describe_problem_error
 from holdfast.errors import DEFECT, HeldError, HoldfastError, TrialError, defect_fields
-from holdfast.outcome import TrialResult
-from holdfast.planning import Planner, PlanningState
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import Planner, PlanningState
 from holdfast.problems.problem import Problem
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.events import (

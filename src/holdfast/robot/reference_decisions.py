@@ -9,7 +9,7 @@ from typing import NamedTuple
 from holdfast.config.loader import Configuration
 from holdfast.config.user_code import describe_problem_error
 from holdfast.errors import HoldfastError
-from holdfast.planning import Decision, Planner, PlanningState, digest
+from holdfast.planning.planner import Decision, Planner, PlanningState, digest
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_TASK_ACTIONS,

@@ -6,9 +6,9 @@ A service whose own code or settings differ refuses the run, so both ends must b
 from __future__ import annotations
 
 from holdfast.config.loader import Configuration
-from holdfast.problems.registry import problem_class, problem_module
+from holdfast.config.registry import problem_class, problem_module
+from holdfast.config.source_digest import core_version, problem_digest
 from holdfast.protocol.messages import SessionConfiguration
-from holdfast.source_digest import core_version, problem_digest
 
 __all__ = ["session_configuration_of"]
 

@@ -17,23 +17,18 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import NOTHING_ELSE, FloatArray, real_number, real_numbers, whole
-from holdfast.config.settings import (
+from holdfast.errors import EnvironmentFailedError, HeldError, InvalidValueError, ProblemError
+from holdfast.numerics.arrays import NOTHING_ELSE, FloatArray, real_number, real_numbers, whole
+from holdfast.planning.outcome import Ending, MoveResult, TrialResult, ending_of
+from holdfast.planning.planner import ObservationInfo, Planner, PlanningState, SensingInfo, TaskInfo
+from holdfast.planning.settings import (
     EnvironmentSettings,
     LostSettings,
     OnLost,
     SimulatorSettings,
     check_settings,
 )
-from holdfast.errors import EnvironmentFailedError, HeldError, InvalidValueError, ProblemError
-from holdfast.outcome import Ending, MoveResult, TrialResult, ending_of
-from holdfast.planning import (
-    ObservationInfo,
-    Planner,
-    PlanningState,
-    SensingInfo,
-    TaskInfo,
-)
+from holdfast.planning.tracking import LateObservation, Trial
 from holdfast.printable import one_line
 from holdfast.protocol.messages import MAX_ACTION_SIZE
 from holdfast.robot.environment import (
@@ -43,7 +38,6 @@ from holdfast.robot.environment import (
     SimulatedEnvironment,
     require_methods,
 )
-from holdfast.tracking import LateObservation, Trial
 
 __all__ = [
     "NULL_OBSERVER",

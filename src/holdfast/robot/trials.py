@@ -22,7 +22,6 @@ from typing import Any
 import msgspec
 
 from holdfast.config.loader import Configuration
-from holdfast.config.settings import PlanningSettings
 from holdfast.config.user_code import account_of_user_error
 from holdfast.errors import (
     HoldfastError,
@@ -31,8 +30,9 @@ from holdfast.errors import (
     TrialError,
     WorkerDiedError,
 )
-from holdfast.outcome import TrialResult
-from holdfast.planning import Planner
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
 from holdfast.robot.trial import (
     NULL_OBSERVER,

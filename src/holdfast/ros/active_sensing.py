@@ -18,13 +18,13 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from holdfast import planning
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief
 from holdfast.config.loader import Configuration
 from holdfast.config.user_code import account_of_user_error
 from holdfast.errors import CheckpointError, HoldfastError, InvalidValueError, ProblemError
-from holdfast.planning import Planner, PlanningState
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning import planner as planning
+from holdfast.planning.belief import Belief
+from holdfast.planning.planner import Planner, PlanningState
 from holdfast.robot.session_configuration import session_configuration_of
 
 __all__ = [

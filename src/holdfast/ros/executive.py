@@ -18,9 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import EnvironmentFailedError, InvalidValueError
-from holdfast.outcome import Done
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import Done
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import ObservationSizes
 from holdfast.robot.environment_maker import EnvironmentMaker

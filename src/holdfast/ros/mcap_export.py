@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
-from holdfast.arrays import FloatArray
-from holdfast.belief import Belief
 from holdfast.config.loader import Configuration
 from holdfast.errors import MissingRosbagsError
-from holdfast.problem_attributes import choice_labels
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.belief import Belief
+from holdfast.problems.attributes import choice_labels
 from holdfast.protocol.status import Status
 from holdfast.recording.csv_export import state_labels
 from holdfast.recording.facts import (

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import HoldfastError, InvalidValueError
+from holdfast.numerics.arrays import FloatArray
 from holdfast.ros.active_sensing import (
     DecisionAnswer,
     DecisionRequest,
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rosbags.interfaces.typing import Typesdict
     from rosbags.typesys.store import Typestore
 
-    from holdfast.planning import PlanningState
+    from holdfast.planning.planner import PlanningState
     from holdfast.ros.active_sensing import ActiveSensing
 
 __all__ = [

@@ -24,8 +24,8 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import CallError, GoneError, TransportError
+from holdfast.numerics.arrays import FloatArray
 from holdfast.protocol.status import Status
 from holdfast.ros.active_sensing import DecisionAnswer, DecisionRequest, ErrorCode, RequestKind
 from holdfast.ros.client import ActiveSensingClient

@@ -26,9 +26,9 @@ import holdfast_interfaces.action
 import holdfast_interfaces.srv
 import numpy as np
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import EnvironmentFailedError
-from holdfast.outcome import Done, Ending
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import Done, Ending
 from holdfast.ros.deadlines import Absence, Deadline
 from holdfast.ros.ros2_connections import CallClients, Connections, RobotCall
 

@@ -107,7 +107,7 @@ class Option(NamedTuple):
         """Return the words of a command line that give this value."""
         if self.is_flag:
             return [self.names[0] if value else f"--no-{self.names[0].removeprefix('--')}"]
-        from holdfast.files import shown_path
+        from holdfast.runtime.files import shown_path
 
         values = [
             shown_path(each) if isinstance(each, Path) else str(each)
@@ -207,7 +207,7 @@ class Options:
         SystemExit
             After the help was shown.
         """
-        from holdfast.files import remember_directory
+        from holdfast.runtime.files import remember_directory
 
         remember_directory()
         parser = _parser(cls, f"holdfast {command}")
@@ -225,7 +225,7 @@ class Options:
             if not word.startswith("-"):
                 word = word.removeprefix(_AFTER_DASHES)
                 raise OptionError(f"{word!r:.80} is one argument too many")
-            from holdfast.config.validation import close_match
+            from holdfast.validation import close_match
 
             names = [name for each in cls.table().values() for name in each.names]
             hint = close_match(word, names)
@@ -385,7 +385,7 @@ def one_of(*choices: str) -> Callable[[str], str]:
 
     def read(text: str) -> str:
         if text not in choices:
-            from holdfast.config.validation import close_match
+            from holdfast.validation import close_match
 
             listed = ", ".join(choices[:-1]) + f" and {choices[-1]}"
             raise bad_value(text, listed + close_match(text, choices))

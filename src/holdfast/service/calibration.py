@@ -16,14 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from holdfast import _kernel, checked
-from holdfast.arrays import FloatArray, IntArray
+from holdfast import _kernel
 from holdfast.errors import HoldfastError
-from holdfast.estimators import KernelEstimator, NearestNeighbor, kernel_estimator, scaled
-from holdfast.problem_attributes import has_general_observations, has_own
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import Purpose, stream
+from holdfast.planning.estimators import KernelEstimator, NearestNeighbor, kernel_estimator, scaled
+from holdfast.problems import checked
+from holdfast.problems.attributes import has_general_observations, has_own
 from holdfast.problems.problem import Problem
 from holdfast.protocol.decision_cost import TYPICAL_PROBLEM, CallCost, ProblemCost
-from holdfast.randomness import Purpose, stream
 
 __all__ = ["measure_problem", "measure_slowness"]
 

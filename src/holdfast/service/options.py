@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.errors import InvalidValueError, TransportError
-from holdfast.files import absolute_endpoint
 from holdfast.runtime.command_line import (
     Options,
     flag,
@@ -19,11 +18,12 @@ from holdfast.runtime.command_line import (
     option,
     whole_number,
 )
+from holdfast.runtime.files import absolute_endpoint
 from holdfast.runtime.log_lines import LogFormat
 from holdfast.runtime.logs import log_option
 
 if TYPE_CHECKING:
-    from holdfast.service.health import HttpAddress
+    from holdfast.runtime.monitoring import HttpAddress
     from holdfast.transport.endpoints import Endpoint
 
 __all__ = ["DEFAULT_NAME", "ServeOptions", "checked_endpoints", "http_address", "parse_options"]
@@ -36,7 +36,7 @@ _DEFAULT_PLACE = "127.0.0.1:7447"
 
 def http_address(text: str) -> HttpAddress:
     """Read the address at which HTTP is answered: ``HOST:PORT``, or ``PORT`` of the loopback."""
-    from holdfast.service.health import HttpAddress
+    from holdfast.runtime.monitoring import HttpAddress
     from holdfast.transport.endpoints import parse_host
 
     host, colon, port = text.rpartition(":")

@@ -10,12 +10,12 @@ from typing import Any
 
 import msgspec
 
+from holdfast.config import registry
+from holdfast.config.source_digest import core_version, problem_digest
 from holdfast.errors import HoldfastError, OtherCodeError, UnknownProblemError
-from holdfast.floating_mode import in_own_mode
-from holdfast.problems import registry
+from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.problems.problem import Problem
 from holdfast.protocol.messages import SessionConfiguration
-from holdfast.source_digest import core_version, problem_digest
 
 __all__ = ["ProblemFactory"]
 

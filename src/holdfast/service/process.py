@@ -25,8 +25,8 @@ from holdfast.service.options import ServeOptions, checked_endpoints, parse_opti
 if TYPE_CHECKING:
     import asyncio
 
+    from holdfast.runtime.monitoring import HttpAddress, Pages
     from holdfast.service.credentials import ServiceCredentials
-    from holdfast.service.health import HttpAddress, Pages
     from holdfast.service.metrics import ServiceReport
     from holdfast.service.shell import ServiceShell
     from holdfast.service.supervisor import Supervised
@@ -433,7 +433,7 @@ async def _watched(
     if options.health is None and options.metrics is None:
         yield {}
         return
-    from holdfast.service.health import MonitoringServers, Page
+    from holdfast.runtime.monitoring import MonitoringServers, Page
 
     async def alive() -> Page:
         return Page.of(why_not_alive())

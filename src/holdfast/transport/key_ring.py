@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from holdfast.errors import CredentialsError, OutputError
-from holdfast.files import (
+from holdfast.runtime.files import (
     NewFile,
     create_directory_atomically,
     remove_unfinished_of,

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.cli.exit_codes import EXIT_DIFFERENT, ended_by_signals, interrupted_by
-from holdfast.config.validation import close_match
 from holdfast.errors import OptionError
 from holdfast.printable import printable
 from holdfast.runtime.command_line import (
@@ -23,6 +22,7 @@ from holdfast.runtime.command_line import (
     option,
     whole_number,
 )
+from holdfast.validation import close_match
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -168,9 +168,9 @@ def _plan_of(options: ChaosOptions) -> tuple[SeriesPlan, dict[FaultKind, str]]:
 
 def _run(options: ChaosOptions) -> bool:
     from holdfast.cli.terminal import counted, progress_line
-    from holdfast.files import claim_directory
     from holdfast.lab.chaos.report import WIDE, summarise, text_of, write_report
     from holdfast.lab.chaos.series import Series
+    from holdfast.runtime.files import claim_directory
 
     plan, left_out = _plan_of(options)
     trials = range(options.first, options.first + options.trials)

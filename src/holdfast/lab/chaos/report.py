@@ -14,11 +14,11 @@ from pathlib import Path
 import msgspec
 
 from holdfast.cli.terminal import counted
-from holdfast.files import write_atomically
 from holdfast.lab.chaos.trial import TrialOutcome
 from holdfast.lab.testbed.fault_times import Spread, spread_of
 from holdfast.lab.testbed.faults import FaultKind
 from holdfast.recording.machine import describe
+from holdfast.runtime.files import write_atomically
 
 __all__ = ["WIDE", "ChaosSummary", "KindRow", "kind_rows", "summarise", "text_of", "write_report"]
 

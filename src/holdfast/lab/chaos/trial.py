@@ -15,7 +15,6 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import msgspec
 
 from holdfast.errors import HoldfastError
-from holdfast.files import write_atomically
 from holdfast.lab.chaos.schedule import Schedule, Wire
 from holdfast.lab.errors import CancelledTrialError, NoProgressError, ProcessEndedError
 from holdfast.lab.testbed.driver import Testbed
@@ -27,6 +26,7 @@ from holdfast.lab.testbed.proxy import Place, Proxy, endpoint_at
 from holdfast.lab.testbed.reference_run import ReferenceRun, make_reference_run
 from holdfast.lab.testbed.world import difference_of_performances, witnessed_by
 from holdfast.recording.compare import Comparison, compare_runs
+from holdfast.runtime.files import write_atomically
 
 __all__ = ["Pace", "TrialOutcome", "Verdict", "run_chaos_trial"]
 

@@ -72,11 +72,11 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _run(out: Path | None, seed: int, *, quick: bool) -> Findings:
-    from holdfast.files import claim_directory
     from holdfast.lab.demo.narrator import DemoState
     from holdfast.lab.demo.scenario import Demo, Plan
     from holdfast.lab.demo.timeline import make_show
     from holdfast.lab.testbed.driver import Testbed
+    from holdfast.runtime.files import claim_directory
 
     directory = claim_directory(out, _RUNS, "demo")
     sys.stderr.write(_INTRODUCTION)

@@ -11,9 +11,9 @@ from collections.abc import Callable, Hashable
 from functools import partial
 from typing import Any, Generic, TypeVar
 
-from holdfast.config.settings import PlanningSettings
 from holdfast.lab.errors import Violation
-from holdfast.planning import Decision, PlanningState, digest
+from holdfast.planning.planner import Decision, PlanningState, digest
+from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
 from holdfast.protocol.service_jobs import Job, JobResult
 from holdfast.robot.memo_cache import MemoCache, MemoizingPlanner

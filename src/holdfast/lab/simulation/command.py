@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.cli.exit_codes import EXIT_DIFFERENT, ended_by_signals
 from holdfast.errors import HoldfastError, OptionError
-from holdfast.files import read_bounded, shown_path
 from holdfast.runtime.command_line import (
     MAX_JOBS,
     Options,
@@ -21,6 +20,7 @@ from holdfast.runtime.command_line import (
     option,
     whole_number,
 )
+from holdfast.runtime.files import read_bounded, shown_path
 
 if TYPE_CHECKING:
     from holdfast.lab.simulation.exploration import ExplorationTally

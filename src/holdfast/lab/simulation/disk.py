@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from holdfast.outcome import TrialResult
+from holdfast.planning.outcome import TrialResult
 from holdfast.protocol.records import Record, decode_record, encode_record
 
 __all__ = ["Disk", "Unfinished"]

@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from holdfast.arrays import FloatArray
 from holdfast.lab.errors import Violation
 from holdfast.lab.simulation.reference_runs import (
     BEFORE_CHOOSING,
@@ -28,7 +27,9 @@ from holdfast.lab.simulation.reference_runs import (
     ReferenceRuns,
     ReferenceStep,
 )
-from holdfast.outcome import TrialResult
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.tracking import LateObservation
 from holdfast.protocol.records import (
     ActingRecord,
     LateRecord,
@@ -36,7 +37,6 @@ from holdfast.protocol.records import (
     PerformedRecord,
     Record,
 )
-from holdfast.tracking import LateObservation
 
 __all__ = ["EnvironmentModel", "Resumed"]
 

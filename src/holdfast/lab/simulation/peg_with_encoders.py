@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from holdfast import numerics
-from holdfast.arrays import BoolArray, FloatArray
+from holdfast.numerics.arrays import BoolArray, FloatArray
+from holdfast.numerics.randomness import Stream
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.randomness import Stream
 
 __all__ = ["PegWithEncoders"]
 

@@ -12,11 +12,11 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import PlanningSettings
 from holdfast.lab.simulation.checked_memo import Memo
-from holdfast.outcome import DecisionLog, MoveResult
-from holdfast.planning import ObservationInfo, Planner, PlanningState
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import DecisionLog, MoveResult
+from holdfast.planning.planner import ObservationInfo, Planner, PlanningState
+from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import SimulatedEnvironment
 

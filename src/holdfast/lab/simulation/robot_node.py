@@ -11,13 +11,6 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import (
-    LostSettings,
-    OffloadSettings,
-    RecoverySettings,
-    SimulatorSettings,
-)
 from holdfast.errors import HoldfastError, UnknownPerformanceError
 from holdfast.lab.errors import Violation
 from holdfast.lab.simulation.checkers import StatusChecker
@@ -26,8 +19,16 @@ from holdfast.lab.simulation.environment_model import EnvironmentModel
 from holdfast.lab.simulation.event_queue import Clock
 from holdfast.lab.simulation.reference_runs import ReferenceStep
 from holdfast.lab.simulation.schedule import LOCAL_SERVICE
-from holdfast.outcome import Ending
-from holdfast.planning import Planner
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import Ending
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import (
+    LostSettings,
+    OffloadSettings,
+    RecoverySettings,
+    SimulatorSettings,
+)
+from holdfast.planning.tracking import LateObservation
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.events import (
     Abandon,
@@ -56,7 +57,6 @@ from holdfast.protocol.events import (
 from holdfast.protocol.messages import MAX_TASK_ACTIONS
 from holdfast.protocol.records import Record, TrialHistory, replay
 from holdfast.protocol.robot import Robot
-from holdfast.tracking import LateObservation
 
 if TYPE_CHECKING:
     from holdfast.lab.simulation.world import World

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from holdfast.config.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 from holdfast.errors import HoldfastError, IllegalTransitionError, MessageError
 from holdfast.lab.errors import Violation
 from holdfast.lab.simulation.checked_memo import CheckedPlanner, JobCache, Memo
@@ -42,6 +41,7 @@ from holdfast.lab.simulation.schedule import (
 )
 from holdfast.lab.simulation.service_node import ServiceNode
 from holdfast.lab.simulation.story import RunOutcome, StoryLine
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.events import (
     Act,

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from holdfast.arrays import BoolArray, FloatArray, IntArray
+from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
+from holdfast.numerics.randomness import Stream
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import ProblemBase, Scene
-from holdfast.randomness import Stream
 
 __all__ = ["BusyRoom"]
 

@@ -6,13 +6,13 @@ from typing import Any
 
 import msgspec
 
-from holdfast.config.settings import (
+from holdfast.lab.studies.trial_batches import TrialSeries
+from holdfast.planning.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
 )
-from holdfast.lab.studies.trial_batches import TrialSeries
 
 __all__ = ["CASES", "Case"]
 

@@ -19,7 +19,6 @@ from typing import Any
 import msgspec
 import pandas as pd
 
-from holdfast.config.settings import ActiveSensingSettings
 from holdfast.lab.errors import NoProgressError, ProcessEndedError, TaskError
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.testbed.driver import Script, Testbed, after
@@ -33,6 +32,7 @@ from holdfast.lab.testbed.world import (
     performances,
     witnessed_by,
 )
+from holdfast.planning.settings import ActiveSensingSettings
 from holdfast.recording.compare import compare_runs
 from holdfast.robot.links import RECOVERY_SERVICE
 

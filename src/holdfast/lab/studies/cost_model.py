@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from holdfast.arrays import FloatArray
+from holdfast.numerics.arrays import FloatArray
 
 __all__ = ["BreakEven", "Curve", "Scaling", "break_even", "busy_cores", "parallel_share"]
 

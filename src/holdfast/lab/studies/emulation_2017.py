@@ -38,11 +38,11 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.config.settings import PlanningSettings
 from holdfast.lab.studies.trial_batches import TrialSeries, problem_of
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import Purpose, stream
+from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Purpose, stream
 
 __all__ = [
     "drawn_particle",

@@ -14,14 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from holdfast import _kernel, checked, numerics
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.belief import Belief, estimate
-from holdfast.circular import differences
+from holdfast import _kernel, numerics
 from holdfast.lab.errors import TaskError
 from holdfast.lab.studies.trial_batches import run_trials_of
-from holdfast.planning import Planner, PlanningState
-from holdfast.problem_attributes import circular_states
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.circular import differences
+from holdfast.planning.belief import Belief, estimate
+from holdfast.planning.planner import Planner, PlanningState
+from holdfast.problems import checked
+from holdfast.problems.attributes import circular_states
 from holdfast.problems.problem import Problem
 
 __all__ = ["CANDIDATES", "run_estimates"]

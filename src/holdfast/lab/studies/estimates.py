@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import pandas as pd
 
-from holdfast.config.settings import ParticleFilterSettings, SelectorSettings
 from holdfast.lab.studies import statistics
 from holdfast.lab.studies.cases import CASES, Case
 from holdfast.lab.studies.judged_study import (
@@ -28,6 +27,7 @@ from holdfast.lab.studies.statistics import interval_in
 from holdfast.lab.studies.study import CHOICE, CLAIM, TRIALS, Number, Report, Scale
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.trial_batches import TrialSeries
+from holdfast.planning.settings import ParticleFilterSettings, SelectorSettings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -21,7 +21,8 @@ from typing import Any, NamedTuple, TypeAlias
 import msgspec
 import pandas as pd
 
-from holdfast.config.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
+from holdfast.config.registry import problem_class, problem_module
+from holdfast.config.source_digest import core_version, problem_digest
 from holdfast.lab.errors import NoProgressError, ProcessEndedError, TaskError
 from holdfast.lab.studies.sensing_times import Sensed, history_of
 from holdfast.lab.studies.tables import Cell
@@ -29,8 +30,8 @@ from holdfast.lab.studies.trial_batches import problem_of
 from holdfast.lab.testbed.driver import Testbed
 from holdfast.lab.testbed.in_process import InProcessNetwork
 from holdfast.lab.testbed.processes import free_port
-from holdfast.planning import Planner, digest
-from holdfast.problems.registry import problem_class, problem_module
+from holdfast.planning.planner import Planner, digest
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared, TransportEvent
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
@@ -49,7 +50,6 @@ from holdfast.protocol.messages import (
 from holdfast.protocol.service import Service
 from holdfast.runtime.events import NullEventLog
 from holdfast.service.shell import ServiceShell
-from holdfast.source_digest import core_version, problem_digest
 from holdfast.transport.contract import RobotTransport
 from holdfast.transport.endpoints import ServiceAddress
 from holdfast.transport.robot_end import StreamRobotTransport

@@ -13,7 +13,6 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 import pandas as pd
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import InvalidValueError
 from holdfast.lab.studies import statistics
 from holdfast.lab.studies.statistics import Interval, cells_of
@@ -21,6 +20,7 @@ from holdfast.lab.studies.study import CHOICE, CLAIM, Part, Scale, TrialStudy
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.trial_batches import TrialSeries, trial_tasks
 from holdfast.lab.studies.trial_files import rounded
+from holdfast.numerics.arrays import FloatArray
 
 __all__ = [
     "MEASURES",

@@ -25,8 +25,6 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import PlanningSettings
 from holdfast.lab.studies.cost_model import BreakEven, Scaling, break_even
 from holdfast.lab.studies.exchange_times import Exchange
 from holdfast.lab.studies.sensing_times import Measurement
@@ -41,6 +39,8 @@ from holdfast.lab.studies.study import Number, Part, Report, Scale, Study, drawn
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.tasks import Task
 from holdfast.lab.studies.trial_batches import problem_of
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.settings import PlanningSettings
 from holdfast.robot.trials import available_cores
 
 __all__ = [

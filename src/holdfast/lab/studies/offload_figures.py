@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from holdfast.arrays import FloatArray
 from holdfast.lab.studies import plots
 from holdfast.lab.studies.cost_model import Scaling, break_even
 from holdfast.lab.studies.offload_break_even import (
@@ -31,6 +30,7 @@ from holdfast.lab.studies.offload_break_even import (
     kind_of,
     line_of,
 )
+from holdfast.numerics.arrays import FloatArray
 from holdfast.recording.figure import STYLE
 
 __all__ = ["break_even_lines", "break_even_map", "sensing_time", "waiting"]

@@ -15,7 +15,6 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from holdfast.config.settings import ActiveSensingSettings, ParticleFilterSettings, SelectorSettings
 from holdfast.lab.studies import statistics
 from holdfast.lab.studies.cases import CASES
 from holdfast.lab.studies.judged_study import (
@@ -29,6 +28,11 @@ from holdfast.lab.studies.statistics import interval_in
 from holdfast.lab.studies.study import CHOICE, CLAIM, TRIALS, Number, Report, Scale
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.trial_batches import TrialSeries, problem_of
+from holdfast.planning.settings import (
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    SelectorSettings,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

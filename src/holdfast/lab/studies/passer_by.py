@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from holdfast.arrays import BoolArray, FloatArray, IntArray
+from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
+from holdfast.numerics.randomness import Stream
 from holdfast.problems.problem import ProblemBase, Scene
-from holdfast.randomness import Stream
 
 __all__ = ["PasserBy"]
 

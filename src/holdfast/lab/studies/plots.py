@@ -20,8 +20,8 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from holdfast.files import write_atomically
 from holdfast.recording.figure import STYLE
+from holdfast.runtime.files import write_atomically
 
 __all__ = [
     "COLORS",

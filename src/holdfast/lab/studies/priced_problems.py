@@ -13,10 +13,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from holdfast.arrays import BoolArray, FloatArray, IntArray
+from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
+from holdfast.numerics.randomness import Stream
 from holdfast.problems.peg_in_hole_2d import PegInHole2D, PegInHole2DModel
 from holdfast.problems.problem import ProblemBase
-from holdfast.randomness import Stream
 
 __all__ = ["Boat", "Dock", "PricedPeg"]
 

@@ -18,17 +18,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgspec
 import pandas as pd
 
-from holdfast.config.settings import (
-    ActiveSensingSettings,
-    ParticleFilterSettings,
-    PlanningSettings,
-    SelectorSettings,
-)
 from holdfast.lab.studies import statistics
 from holdfast.lab.studies.statistics import Interval, cells_of, interval_in
 from holdfast.lab.studies.study import Number, Part, Report, Scale, Study
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.trial_batches import TrialSeries, trial_tasks
+from holdfast.planning.settings import (
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+    SelectorSettings,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -26,12 +26,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.config.settings import (
-    ActiveSensingSettings,
-    PlanningSettings,
-    SelectorSettings,
-)
 from holdfast.errors import InvalidValueError
 from holdfast.lab.errors import TaskError
 from holdfast.lab.studies import statistics
@@ -49,7 +43,13 @@ from holdfast.lab.studies.vdp_trials import (
     run_vdp_tag_trials,
     to_next,
 )
-from holdfast.randomness import Stream
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import Stream
+from holdfast.planning.settings import (
+    ActiveSensingSettings,
+    PlanningSettings,
+    SelectorSettings,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

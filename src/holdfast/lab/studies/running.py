@@ -12,7 +12,6 @@ import pandas as pd
 
 from holdfast import __version__
 from holdfast.errors import OutputError
-from holdfast.files import remove_unfinished, write_atomically
 from holdfast.lab.errors import TaskError
 from holdfast.lab.studies.executors import Executor, LocalExecutor
 from holdfast.lab.studies.study import Report, Scale, Study
@@ -20,6 +19,7 @@ from holdfast.lab.studies.tables import Columns, columns_of, to_csv
 from holdfast.lab.studies.tasks import Task, task_key
 from holdfast.lab.studies.trial_files import TRIALS_NAME, TrialFile
 from holdfast.recording.machine import describe
+from holdfast.runtime.files import remove_unfinished, write_atomically
 
 __all__ = ["ResultCache", "Workload", "compute", "write_report"]
 

@@ -20,8 +20,6 @@ from typing import ClassVar
 import numpy as np
 import pandas as pd
 
-from holdfast.arrays import BoolArray, FloatArray
-from holdfast.config.settings import Estimator, Method, SelectorSettings
 from holdfast.lab.studies import statistics
 from holdfast.lab.studies.cases import CASES, Case
 from holdfast.lab.studies.judged_study import (
@@ -38,6 +36,8 @@ from holdfast.lab.studies.statistics import Interval, cells_of, interval_in
 from holdfast.lab.studies.study import CHOICE, CLAIM, TRIALS, Number, Report, Scale, drawn
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.trial_batches import TrialSeries, problem_of
+from holdfast.numerics.arrays import BoolArray, FloatArray
+from holdfast.planning.settings import Estimator, Method, SelectorSettings
 
 __all__ = ["COSTS", "GROUPS", "INTERVALS", "SHOWN", "WAYS", "Selectors"]
 

@@ -21,20 +21,20 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import (
-    ENTROPY_METHODS,
-    ActiveSensingSettings,
-    ParticleFilterSettings,
-    PlanningSettings,
-    SelectorSettings,
-)
 from holdfast.lab.studies import statistics
 from holdfast.lab.studies.judged_study import JudgedStudy
 from holdfast.lab.studies.statistics import cells_of, interval_in
 from holdfast.lab.studies.study import CHOICE, CLAIM, TRIALS, Number, Report, Scale, drawn
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.trial_batches import TrialSeries
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.settings import (
+    ENTROPY_METHODS,
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+    SelectorSettings,
+)
 
 __all__ = ["NATS", "PRICES", "PROBLEMS", "RESOLUTIONS", "WAYS", "SensingPrice"]
 

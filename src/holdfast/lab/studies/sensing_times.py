@@ -25,18 +25,18 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from holdfast import checked
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import (
+from holdfast.errors import InvalidValueError
+from holdfast.lab.studies.cost_model import parallel_share
+from holdfast.lab.studies.trial_batches import problem_of
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.planner import Planner, PlanningState
+from holdfast.planning.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
 )
-from holdfast.errors import InvalidValueError
-from holdfast.lab.studies.cost_model import parallel_share
-from holdfast.lab.studies.trial_batches import problem_of
-from holdfast.planning import Planner, PlanningState
+from holdfast.problems import checked
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import SimulatedEnvironment
 

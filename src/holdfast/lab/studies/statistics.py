@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import BoolArray, FloatArray
 from holdfast.errors import InvalidValueError
+from holdfast.numerics.arrays import BoolArray, FloatArray
 from holdfast.recording.tables import wilson_interval
 
 if TYPE_CHECKING:

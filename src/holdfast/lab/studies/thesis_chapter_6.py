@@ -21,7 +21,6 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from holdfast.config.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 from holdfast.lab.studies.cloud_trials import (
     MAX_STEPS,
     PROBLEM,
@@ -57,6 +56,7 @@ from holdfast.lab.studies.thesis_measurements import (
     select,
 )
 from holdfast.lab.studies.trial_batches import TrialSeries, trial_tasks
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 
 __all__ = ["ThesisChapter6", "series_of"]
 

@@ -17,7 +17,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator
 
-from holdfast.arrays import FloatArray
 from holdfast.lab.studies.plots import COLORS, MARKERS, figure_of, legend_below, milliseconds
 from holdfast.lab.studies.statistics import Interval, interval_in, median_interval
 from holdfast.lab.studies.thesis_measurements import (
@@ -33,6 +32,7 @@ from holdfast.lab.studies.thesis_measurements import (
     paths_of,
     select,
 )
+from holdfast.numerics.arrays import FloatArray
 from holdfast.recording.figure import STYLE
 
 __all__ = ["failbacks", "launches", "round_trips", "sensing_times", "successes"]

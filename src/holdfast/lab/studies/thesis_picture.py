@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 
-from holdfast.arrays import FloatArray
 from holdfast.lab.studies.plots import COLORS, MARKERS, figure_of, milliseconds
+from holdfast.numerics.arrays import FloatArray
 from holdfast.recording.figure import STYLE
 
 __all__ = ["cloud_dies"]

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from holdfast.config.problem_builder import build_problem
-from holdfast.config.settings import PlanningSettings
+from holdfast.config.registry import problem_class
 from holdfast.errors import HoldfastError
 from holdfast.lab.errors import TaskError
 from holdfast.lab.studies.tasks import Task
-from holdfast.outcome import TrialResult
-from holdfast.planning import Planner
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
-from holdfast.problems.registry import problem_class
 from holdfast.robot.trial import run_trial
 
 if TYPE_CHECKING:

@@ -21,9 +21,6 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from holdfast import _kernel, numerics
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.belief import Belief
-from holdfast.config.settings import PlanningSettings
 from holdfast.lab.studies.vdp_tag import (
     DISCOUNT,
     INSIDE_TIPS,
@@ -41,8 +38,11 @@ from holdfast.lab.studies.vdp_tag import (
     value_of_plan,
     way_length,
 )
-from holdfast.randomness import Stream
-from holdfast.sensing import choose_sensing_action
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import Stream
+from holdfast.planning.belief import Belief
+from holdfast.planning.sensing import choose_sensing_action
+from holdfast.planning.settings import PlanningSettings
 
 __all__ = [
     "LookRule",

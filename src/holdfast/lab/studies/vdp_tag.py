@@ -22,9 +22,9 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import numerics
-from holdfast.arrays import BoolArray, FloatArray, IntArray
+from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
+from holdfast.numerics.randomness import Stream
 from holdfast.problems.problem import ProblemBase, Scene
-from holdfast.randomness import Stream
 
 __all__ = [
     "DISCOUNT",

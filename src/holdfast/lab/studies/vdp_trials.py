@@ -8,8 +8,6 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from holdfast import _kernel, numerics
-from holdfast.arrays import BoolArray, FloatArray, IntArray
-from holdfast.belief import Belief, resample, uniform_weights
 from holdfast.lab.studies.vdp_tag import (
     DISCOUNT,
     MAX_STEPS,
@@ -22,7 +20,9 @@ from holdfast.lab.studies.vdp_tag import (
     target_flow,
     toward,
 )
-from holdfast.randomness import Purpose, Stream, stream
+from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
+from holdfast.numerics.randomness import Purpose, Stream, stream
+from holdfast.planning.belief import Belief, resample, uniform_weights
 
 __all__ = [
     "VdpTagPolicy",

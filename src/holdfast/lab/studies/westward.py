@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from holdfast import numerics
-from holdfast.arrays import BoolArray, FloatArray, IntArray
+from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
+from holdfast.numerics.randomness import Stream
 from holdfast.problems.problem import ProblemBase
-from holdfast.randomness import Stream
 
 __all__ = ["Westward"]
 

@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 import yaml
 
 from holdfast.config.loader import Configuration, load
-from holdfast.files import write_atomically
 from holdfast.lab.testbed.world import WitnessedWorld
-from holdfast.outcome import TrialResult
-from holdfast.planning import Planner
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import Planner
 from holdfast.recording.run_directory import RunDirectory
 from holdfast.robot.trial import run_trial
+from holdfast.runtime.files import write_atomically
 
 __all__ = ["ReferenceRun", "make_reference_run"]
 

@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import EnvironmentFailedError
-from holdfast.outcome import MoveResult
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import MoveResult
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import SimulatedEnvironment
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from time import monotonic
 from typing import NamedTuple
 
-from holdfast.config.settings import RecoverySettings
+from holdfast.planning.settings import RecoverySettings
 from holdfast.protocol.status import Status
 from holdfast.ros.ros2.run_segment import Ending, RunSegment, SegmentResult
 from holdfast.ros.ros2.telemetry import Telemetry

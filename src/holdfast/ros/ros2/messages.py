@@ -18,10 +18,10 @@ from holdfast_interfaces.msg import (
 )
 from std_msgs.msg import Header
 
-from holdfast import planning
-from holdfast.arrays import FloatArray
-from holdfast.outcome import TrialResult
-from holdfast.problem_attributes import sensing_labels
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning import planner as planning
+from holdfast.planning.outcome import TrialResult
+from holdfast.problems.attributes import sensing_labels
 from holdfast.problems.problem import Problem
 from holdfast.ros.ros2.telemetry import PublishedDecision
 

@@ -33,8 +33,8 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from holdfast.errors import HoldfastError
-from holdfast.planning import PlanningState
-from holdfast.problem_attributes import sensing_labels
+from holdfast.planning.planner import PlanningState
+from holdfast.problems.attributes import sensing_labels
 from holdfast.protocol.events import Act, Sense
 from holdfast.recording.poses import PoseLayout, pose_layout
 from holdfast.recording.run_directory import RunDirectory

@@ -18,9 +18,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 import msgspec
 
 from holdfast.config.loader import Configuration, load, settings_keys
-from holdfast.config.validation import close_match, dotted, find_mismatch
 from holdfast.config.yaml_document import read
 from holdfast.errors import ConfigurationError
+from holdfast.validation import close_match, dotted, find_mismatch
 
 __all__ = [
     "OWN",

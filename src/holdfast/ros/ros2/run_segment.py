@@ -25,8 +25,8 @@ from holdfast.errors import (
     StaleEpochError,
     UnknownPerformanceError,
 )
-from holdfast.outcome import TrialResult
-from holdfast.planning import PlanningState
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import PlanningState
 from holdfast.protocol.events import Act, Sense, Timing
 from holdfast.recording.robot_run import RobotObserver, perform_trials
 from holdfast.recording.run_directory import RunDirectory

@@ -20,9 +20,9 @@ from time import monotonic
 
 import numpy as np
 
-from holdfast.arrays import FloatArray
 from holdfast.config.loader import Configuration
-from holdfast.planning import Planner, PlanningState
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.planner import Planner, PlanningState
 from holdfast.protocol.events import Act, Sense, Timing
 from holdfast.protocol.status import Status
 from holdfast.robot.links import RECOVERY_SERVICE

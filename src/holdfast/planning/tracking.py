@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from typing import NamedTuple, TypeAlias
 
-from holdfast.arrays import FloatArray
-from holdfast.config.settings import LostSettings
-from holdfast.lost import MOVE, LostTest, Verdict
-from holdfast.outcome import DecisionLog, Ending, RewardAccount, TrialResult
-from holdfast.planning import ObservationInfo, Planner, PlanningState
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.lost import MOVE, LostTest, Verdict
+from holdfast.planning.outcome import DecisionLog, Ending, RewardAccount, TrialResult
+from holdfast.planning.planner import ObservationInfo, Planner, PlanningState
+from holdfast.planning.settings import LostSettings
 
 __all__ = ["MAX_AWAITED", "MAX_INPUTS_SINCE", "LateObservation", "Trial"]
 
@@ -61,7 +61,7 @@ _Input: TypeAlias = _Sensed | _Moved | _Reinitialised
 class Trial:
     """A trial so far.
 
-    ``false_alarm_rate`` is the one of :class:`~holdfast.lost.LostTest`.
+    ``false_alarm_rate`` is the one of :class:`~holdfast.planning.lost.LostTest`.
 
     Attributes
     ----------

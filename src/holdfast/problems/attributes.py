@@ -2,7 +2,7 @@
 
 A problem is a user's own code, and NumPy forgives much: an array that does not fit broadcasts, and
 the decisions are quietly wrong. So its attributes are checked before the first step, and
-:mod:`holdfast.checked` checks what its functions return. Here a problem is any object, which may
+:mod:`holdfast.problems.checked` checks what its functions return. Here a problem is any object, which may
 or may not have the members of :class:`holdfast.problems.problem.Problem`.
 
 An attribute may be a list, a tuple or an array, of Python's numbers or NumPy's, which differ where
@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from holdfast.arrays import FloatArray, in_brief, integer, real_numbers
 from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.numerics.arrays import FloatArray, in_brief, integer, real_numbers
 
 __all__ = [
     "check_problem",

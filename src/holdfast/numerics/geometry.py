@@ -18,12 +18,19 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel
-from holdfast.arrays import BoolArray, FloatArray, IntArray, KeepsReadOnly, floats, real_number
 from holdfast.errors import InvalidValueError
-from holdfast.randomness import NoiseFreeStream
+from holdfast.numerics.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    KeepsReadOnly,
+    floats,
+    real_number,
+)
+from holdfast.numerics.randomness import NoiseFreeStream
 
 if TYPE_CHECKING:
-    from holdfast.randomness import Stream
+    from holdfast.numerics.randomness import Stream
 
 __all__ = [
     "FAR",
@@ -120,7 +127,7 @@ class _World(KeepsReadOnly):
         tolerance : float
             Fraction of the action, above 0 and below 1.
         stream : Stream
-            Source of the noise; a :class:`~holdfast.randomness.NoiseFreeStream` adds none.
+            Source of the noise; a :class:`~holdfast.numerics.randomness.NoiseFreeStream` adds none.
         """
         dimension = self.dimension
         states, actions = self._rows("states", states), self._rows("actions", actions)

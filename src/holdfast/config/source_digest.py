@@ -70,7 +70,7 @@ def problem_sources(problem_class: type, named_in: str | None = None) -> dict[st
     ----------
     named_in : str or None
         Module that the problem's name in a configuration leads to
-        (:func:`holdfast.problems.registry.problem_module`). It need not be the one in which the
+        (:func:`holdfast.config.registry.problem_module`). It need not be the one in which the
         class is defined, and may have made the class or changed it.
 
     Returns

@@ -14,8 +14,8 @@ import numpy.typing as npt
 import pytest
 
 from holdfast import numerics
-from holdfast.arrays import FloatArray
-from holdfast.randomness import Purpose, stream
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.randomness import Purpose, stream
 
 fresh = partial(stream, 5, 0, 0, Purpose.PREDICTION)  # anew at each call
 COUNT = 200_000

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from holdfast.config import registry
 from holdfast.errors import UnknownProblemError
-from holdfast.problems import registry
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 
@@ -51,7 +51,7 @@ class TestRegistry:
 
     def test_not_a_class(self) -> None:
         with pytest.raises(UnknownProblemError, match="not a class but function"):
-            registry.problem_class("holdfast.problems.registry:names")
+            registry.problem_class("holdfast.config.registry:names")
 
     @pytest.mark.parametrize("name", ["", ":", "a:", ":b", "a b:c", "../a:b"])
     def test_not_a_name(self, name: str) -> None:

@@ -20,7 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel
-from holdfast.arrays import (
+from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.numerics.arrays import (
     FloatArray,
     IntArray,
     floats,
@@ -30,7 +31,6 @@ from holdfast.arrays import (
     real_numbers,
     whole,
 )
-from holdfast.errors import InvalidValueError, ProblemError
 
 __all__ = ["NOISE_FREE", "NoiseFreeStream", "Purpose", "Stream", "stream"]
 
@@ -236,7 +236,7 @@ class Stream:
         """Return an independent stream from its beginning; the index is from 0 to 2**32 - 1.
 
         The same index names the same numbers, whatever was drawn before. A world
-        (:mod:`holdfast.geometry`) draws from substreams 0 to 999 of the stream that it is given: if
+        (:mod:`holdfast.numerics.geometry`) draws from substreams 0 to 999 of the stream that it is given: if
         you use substreams too, give it one of them.
         """
         index = whole("substream index", index, 0, _WORD - 1)

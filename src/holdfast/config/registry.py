@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from holdfast.arrays import plain
 from holdfast.errors import InvalidValueError, UnknownProblemError
-from holdfast.floating_mode import in_own_mode
+from holdfast.numerics.arrays import plain
+from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.problems.problem import Problem
 
 __all__ = ["BUILT_IN", "BuiltIn", "make", "names", "problem_class", "problem_module"]
@@ -86,7 +86,7 @@ def make(name: str, **settings: Any) -> Problem:
         allowed = [*model_keys, *planner_keys]
         for key in settings:
             if key not in model_keys:
-                from holdfast.config.validation import close_match
+                from holdfast.validation import close_match
 
                 raise InvalidValueError(
                     f"{name} has no setting {key!r}{close_match(key, allowed)}; allowed: "
@@ -95,7 +95,7 @@ def make(name: str, **settings: Any) -> Problem:
     try:
         problem: Problem = kind.from_settings(settings, planner)
     except msgspec.ValidationError as error:
-        from holdfast.config.validation import dotted, find_mismatch
+        from holdfast.validation import dotted, find_mismatch
 
         for schema, data in (("Model", settings), ("StateSpacePlanner", planner)):
             found = find_mismatch(data, getattr(kind, schema, dict))

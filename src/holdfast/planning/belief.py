@@ -18,16 +18,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from holdfast import _kernel, checked, numerics
-from holdfast.arrays import FloatArray, floats, in_brief
-from holdfast.circular import differences, mean_angles
-from holdfast.config.settings import Estimate
+from holdfast import _kernel
 from holdfast.errors import InvalidValueError
-from holdfast.floating_mode import in_own_mode
-from holdfast.modes import heaviest_mode
-from holdfast.problem_attributes import circular_observation, has_general_observations
-from holdfast.randomness import Stream
-from holdfast.validation_gate import gate, is_typical, is_within
+from holdfast.numerics import reproducible as numerics
+from holdfast.numerics.arrays import FloatArray, floats, in_brief
+from holdfast.numerics.circular import differences, mean_angles
+from holdfast.numerics.floating_mode import in_own_mode
+from holdfast.numerics.randomness import Stream
+from holdfast.planning.modes import heaviest_mode
+from holdfast.planning.settings import Estimate
+from holdfast.planning.validation_gate import gate, is_typical, is_within
+from holdfast.problems import checked
+from holdfast.problems.attributes import circular_observation, has_general_observations
 
 __all__ = [
     "Belief",
@@ -141,7 +143,7 @@ class ObservationInfo(NamedTuple):
         None for a general likelihood, which has no such distance.
     within_gate : bool
         Whether the observation is one that the belief makes likely: within the gate of
-        :mod:`holdfast.validation_gate` (for a general likelihood: possible for some particle).
+        :mod:`holdfast.planning.validation_gate` (for a general likelihood: possible for some particle).
     distinct_particles : int
         How many different particles the observation weighed; copies of one count once. Far below
         their number the belief is depleted: a state that does not move gets no new particles.
@@ -162,7 +164,7 @@ def estimate(
 ) -> FloatArray:
     """Return a point estimate of the state, shape ``(state_size,)``.
 
-    It is the mean, the mean of the heaviest mode (:mod:`holdfast.modes`), or the particle of the
+    It is the mean, the mean of the heaviest mode (:mod:`holdfast.planning.modes`), or the particle of the
     greatest weight (the first of equals). The mean of a ``circular`` coordinate, an angle in
     radians, is the mean direction, in (-pi, pi].
     """

@@ -10,23 +10,29 @@ import numpy as np
 import pytest
 from tests.planning_settings import SEED, STEPS, TRIAL, planning_settings
 
-from holdfast import planning
-from holdfast.arrays import FloatArray, IntArray
-from holdfast.belief import Belief, estimate, resample, update
-from holdfast.config.settings import (
+from holdfast.config import registry
+from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.randomness import Purpose, Stream, stream
+from holdfast.planning import planner as planning
+from holdfast.planning.belief import Belief, estimate, resample, update
+from holdfast.planning.planner import (
+    Planner,
+    PlanningState,
+    decode_checkpoint,
+    digest,
+    encode_checkpoint,
+)
+from holdfast.planning.sensing import choose_sensing_action
+from holdfast.planning.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
 )
-from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.planning import Planner, PlanningState, decode_checkpoint, digest, encode_checkpoint
-from holdfast.problems import registry
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Purpose, Stream, stream
 from holdfast.robot.environment import SimulatedEnvironment
-from holdfast.sensing import choose_sensing_action
 
 
 @pytest.fixture(scope="module", params=registry.names())

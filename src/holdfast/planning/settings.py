@@ -59,7 +59,7 @@ class _Keys(msgspec.StructMeta):
     def __call__(self, *values: Any, **keys: Any) -> Any:
         for key in keys:
             if key not in self.__struct_fields__:
-                from holdfast.config.validation import close_match
+                from holdfast.validation import close_match
 
                 allowed = self.__struct_fields__
                 raise InvalidValueError(
@@ -93,7 +93,7 @@ Method = Literal[
     "random",
     "fixed",
 ]
-"""How a sensing action is chosen: ``holdfast.sensing.choose_sensing_action`` has a branch each."""
+"""How a sensing action is chosen: ``holdfast.planning.sensing.choose_sensing_action`` has a branch each."""
 
 ENTROPY_METHODS: frozenset[Method] = frozenset({"action_entropy", "path_entropy", "state_entropy"})
 """Those that minimise an entropy and so need an estimator."""
@@ -104,14 +104,14 @@ UNINFORMED_METHODS: frozenset[Method] = frozenset({"random", "fixed"})
 Estimator = Literal[
     "nearest_neighbor", "prior_neighbors", "gaussian_mixture_upper", "gaussian_mixture_lower"
 ]
-"""How an entropy is estimated: :mod:`holdfast.estimators` has a class for each."""
+"""How an entropy is estimated: :mod:`holdfast.planning.estimators` has a class for each."""
 
 NEIGHBOR_ESTIMATORS: frozenset[Estimator] = frozenset({"nearest_neighbor", "prior_neighbors"})
 """Those that count nearest neighbours."""
 
 
 Estimate = Literal["mean", "most_likely", "heaviest_mode"]
-"""Which state stands for a belief: ``holdfast.belief.estimate`` has a branch each."""
+"""Which state stands for a belief: ``holdfast.planning.belief.estimate`` has a branch each."""
 
 OnLost = Literal["continue", "hold", "reinitialise"]
 """What a robot that is lost does."""
@@ -336,7 +336,7 @@ class LostSettings(_Section, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     ----------
     false_alarm_rate : float
         For each observation: within n of them a false alarm, of a lost robot or a dead sensor, has
-        a probability of at most n times this (:mod:`holdfast.lost` says for which beliefs).
+        a probability of at most n times this (:mod:`holdfast.planning.lost` says for which beliefs).
     on_lost : {"continue", "hold", "reinitialise"}
         Report it only; hold still and end the run, which can be resumed; or begin the belief anew,
         from the problem's ``reinitial_states`` or else its initial belief.
@@ -460,7 +460,7 @@ def unfit_for_the_method(settings: PlanningSettings) -> tuple[tuple[str, str], s
 
 
 def _plain_or_text(value: Any) -> Any:
-    from holdfast.arrays import plain
+    from holdfast.numerics.arrays import plain
 
     return repr(value) if (found := plain(value)) is value else found
 
@@ -482,7 +482,7 @@ def check_settings(settings: object, schema: type[SectionT], what: str = "settin
     try:
         checked = msgspec.convert(plain, schema)
     except msgspec.ValidationError as error:
-        from holdfast.config.validation import dotted, find_mismatch
+        from holdfast.validation import dotted, find_mismatch
 
         found = find_mismatch(plain, schema)
         if found is None or not found.path:

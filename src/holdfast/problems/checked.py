@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel
-from holdfast.arrays import (
+from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.numerics.arrays import (
     BoolArray,
     FloatArray,
     IntArray,
@@ -26,11 +27,10 @@ from holdfast.arrays import (
     is_masked,
     real_numbers,
 )
-from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.floating_mode import as_caller
+from holdfast.numerics.floating_mode import as_caller
+from holdfast.numerics.randomness import Stream
 from holdfast.printable import one_line
-from holdfast.problem_attributes import has_own, name_of
-from holdfast.randomness import Stream
+from holdfast.problems.attributes import has_own, name_of
 
 __all__ = [
     "executed_action",

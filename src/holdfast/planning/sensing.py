@@ -25,13 +25,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from holdfast import _kernel, checked, interruption, numerics
-from holdfast.arrays import FloatArray, in_brief
-from holdfast.belief import Belief, estimate
-from holdfast.circular import embedded, unwrapped
-from holdfast.config.settings import NEIGHBOR_ESTIMATORS, PlanningSettings, estimator_of
+from holdfast import _kernel
 from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.estimators import (
+from holdfast.numerics import reproducible as numerics
+from holdfast.numerics.arrays import FloatArray, in_brief
+from holdfast.numerics.circular import embedded, unwrapped
+from holdfast.numerics.randomness import Stream, Words
+from holdfast.planning import interruption
+from holdfast.planning.belief import Belief, estimate
+from holdfast.planning.estimators import (
     LARGEST,
     TOTAL_VARIANCE,
     GaussianMixture,
@@ -43,9 +45,11 @@ from holdfast.estimators import (
     scale_of,
     scaled,
 )
-from holdfast.expected_return import expected_returns
-from holdfast.policy_path import path_points
-from holdfast.problem_attributes import (
+from holdfast.planning.expected_return import expected_returns
+from holdfast.planning.policy_path import path_points
+from holdfast.planning.settings import NEIGHBOR_ESTIMATORS, PlanningSettings, estimator_of
+from holdfast.problems import checked
+from holdfast.problems.attributes import (
     circular_actions,
     circular_observation,
     circular_states,
@@ -55,7 +59,6 @@ from holdfast.problem_attributes import (
     sensing_costs,
 )
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Stream, Words
 
 __all__ = ["SensingInfo", "choose_sensing_action"]
 

@@ -12,14 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from holdfast import checked, interruption
-from holdfast.arrays import FloatArray, IntArray, in_brief
-from holdfast.config.settings import PlanningSettings, path_steps, unfit_for_the_method
 from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.estimators import LARGEST, first_unbounded
-from holdfast.problem_attributes import has_own
+from holdfast.numerics.arrays import FloatArray, IntArray, in_brief
+from holdfast.numerics.randomness import NoiseFreeStream
+from holdfast.planning import interruption
+from holdfast.planning.estimators import LARGEST, first_unbounded
+from holdfast.planning.settings import PlanningSettings, path_steps, unfit_for_the_method
+from holdfast.problems import checked
+from holdfast.problems.attributes import has_own
 from holdfast.problems.problem import Problem
-from holdfast.randomness import NoiseFreeStream
 
 __all__ = ["PathPoints", "path_points"]
 

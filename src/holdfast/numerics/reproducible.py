@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel
-from holdfast.arrays import FloatArray
 from holdfast.errors import ConfigurationError, InvalidValueError
+from holdfast.numerics.arrays import FloatArray
 
 __all__ = [
     "all_finite",

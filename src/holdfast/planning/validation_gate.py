@@ -24,8 +24,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from holdfast import _kernel
-from holdfast.arrays import FloatArray
-from holdfast.circular import differences, mean_angles
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.circular import differences, mean_angles
 
 __all__ = ["OUTSIDE_PROBABILITY", "gate", "is_typical", "is_within"]
 
@@ -33,7 +33,7 @@ OUTSIDE_PROBABILITY = 0.01
 """Of an observation, if the belief and the model are right."""
 
 NUM_RANKED = 19
-"""Drawn observations of a rank test: 1 / (19 + 1) is what :mod:`holdfast.lost` allows."""
+"""Drawn observations of a rank test: 1 / (19 + 1) is what :mod:`holdfast.planning.lost` allows."""
 
 _QUANTILE = 2.3263478740408408
 """Of the standard normal distribution, at 1 - OUTSIDE_PROBABILITY."""

@@ -15,8 +15,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from holdfast import _kernel, numerics
-from holdfast.arrays import FloatArray
+from holdfast import _kernel
+from holdfast.numerics import reproducible as numerics
+from holdfast.numerics.arrays import FloatArray
 
 __all__ = ["differences", "embedded", "mean_angles", "unwrapped"]
 

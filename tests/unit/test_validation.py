@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 import pytest
 
-from holdfast.config.validation import close_match, find_mismatch, shown
+from holdfast.validation import close_match, find_mismatch, shown
 
 
 class Leg(msgspec.Struct, forbid_unknown_fields=True):

@@ -17,7 +17,7 @@ One step of the loop::
     state = planner.advance(state, task_action)
 
 An observation may also come with a move (:meth:`Planner.observe_move`), or late
-(:mod:`holdfast.tracking`).
+(:mod:`holdfast.planning.tracking`).
 """
 
 from __future__ import annotations
@@ -30,9 +30,13 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from holdfast import checked, interruption, numerics, sensing
-from holdfast.arrays import FloatArray, floats, in_brief, whole
-from holdfast.belief import (
+from holdfast.errors import CheckpointError, InvalidValueError, ProblemError
+from holdfast.numerics import reproducible as numerics
+from holdfast.numerics.arrays import FloatArray, floats, in_brief, whole
+from holdfast.numerics.floating_mode import in_own_mode
+from holdfast.numerics.randomness import Purpose, seed_and_trial, stream
+from holdfast.planning import interruption, sensing
+from holdfast.planning.belief import (
     Belief,
     ObservationInfo,
     distinct_particles,
@@ -43,15 +47,15 @@ from holdfast.belief import (
     update,
     update_by_move,
 )
-from holdfast.config.settings import (
+from holdfast.planning.sensing import SensingInfo
+from holdfast.planning.settings import (
     MAX_PARTICLES,
     Method,
     PlanningSettings,
     check_settings,
 )
-from holdfast.errors import CheckpointError, InvalidValueError, ProblemError
-from holdfast.floating_mode import in_own_mode
-from holdfast.problem_attributes import (
+from holdfast.problems import checked
+from holdfast.problems.attributes import (
     check_problem,
     check_sizes,
     circular_states,
@@ -59,8 +63,6 @@ from holdfast.problem_attributes import (
     sensing_action_of,
 )
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Purpose, seed_and_trial, stream
-from holdfast.sensing import SensingInfo
 
 __all__ = [
     "Decision",
@@ -235,7 +237,7 @@ class Planner:
         Raises
         ------
         InvalidValueError, ProblemError
-            As :func:`holdfast.sensing.choose_sensing_action`.
+            As :func:`holdfast.planning.sensing.choose_sensing_action`.
         """
         self._require_size(state)
         return sensing.choose_sensing_action(

@@ -16,10 +16,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.arrays import FloatArray
 from holdfast.errors import InvalidValueError
+from holdfast.numerics.arrays import FloatArray
 from holdfast.printable import one_line
-from holdfast.problem_attributes import sensing_costs
+from holdfast.problems.attributes import sensing_costs
 
 __all__ = [
     "DONE_VALUES",
@@ -295,7 +295,7 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     unexplained_observations : int
         Observations that no particle of the belief explained.
     lost, suspect_sensors : int
-        Times that the robot was found lost, and a sensing action suspect (:mod:`holdfast.lost`).
+        Times that the robot was found lost, and a sensing action suspect (:mod:`holdfast.planning.lost`).
     fewest_distinct_particles : int or None
         The least number of different particles that an observation weighed; None without one.
     digest : str

@@ -25,9 +25,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from holdfast import _kernel, numerics
-from holdfast.arrays import FloatArray
-from holdfast.circular import unwrapped
+from holdfast import _kernel
+from holdfast.numerics import reproducible as numerics
+from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.circular import unwrapped
 
 __all__ = ["heaviest_mode"]
 

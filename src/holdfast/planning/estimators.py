@@ -19,12 +19,13 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from holdfast import _kernel, numerics
-from holdfast.arrays import FloatArray, floats, in_brief, real_number, whole
-from holdfast.circular import unwrapped
-from holdfast.config.settings import MAX_PRIOR_NEIGHBORS_POINTS
+from holdfast import _kernel
 from holdfast.errors import InvalidValueError
-from holdfast.floating_mode import in_own_mode
+from holdfast.numerics import reproducible as numerics
+from holdfast.numerics.arrays import FloatArray, floats, in_brief, real_number, whole
+from holdfast.numerics.circular import unwrapped
+from holdfast.numerics.floating_mode import in_own_mode
+from holdfast.planning.settings import MAX_PRIOR_NEIGHBORS_POINTS
 
 __all__ = ["GaussianMixture", "NearestNeighbor", "PriorNeighbors", "entropy"]
 

@@ -9,7 +9,9 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
-from holdfast.config.settings import (
+from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import (
     ENTROPY_METHODS,
     NEIGHBOR_ESTIMATORS,
     UNINFORMED_METHODS,
@@ -22,8 +24,6 @@ from holdfast.config.settings import (
     estimator_of,
     path_steps,
 )
-from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.robot.environment import SimulatedEnvironment
 

@@ -12,8 +12,8 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 import pytest
 
 from holdfast.errors import HealthError
-from holdfast.service import health
-from holdfast.service.health import HttpAddress, HttpServer, Page
+from holdfast.runtime import monitoring as health
+from holdfast.runtime.monitoring import HttpAddress, HttpServer, Page
 from holdfast.service.options import http_address
 
 PATIENCE_S = 30.0

@@ -37,15 +37,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from holdfast import checked, interruption, numerics
-from holdfast.arrays import BoolArray, FloatArray, IntArray
-from holdfast.belief import Belief, estimate
-from holdfast.circular import differences
-from holdfast.config.settings import PlanningSettings
 from holdfast.errors import ProblemError
-from holdfast.problem_attributes import circular_states, sensing_costs
+from holdfast.numerics import reproducible as numerics
+from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
+from holdfast.numerics.circular import differences
+from holdfast.numerics.randomness import Stream
+from holdfast.planning import interruption
+from holdfast.planning.belief import Belief, estimate
+from holdfast.planning.settings import PlanningSettings
+from holdfast.problems import checked
+from holdfast.problems.attributes import circular_states, sensing_costs
 from holdfast.problems.problem import Problem, ProblemBase
-from holdfast.randomness import Stream
 
 __all__ = ["Posteriors", "Returns", "expected_returns", "rollout_returns"]
 
@@ -54,7 +56,7 @@ Posteriors = Callable[[Sequence[int], int, Stream], tuple[Sequence[int], FloatAr
 """Called with sensing actions, a number M of samples and a stream. Returns the M particles that are
 the true states, and the weights of the posteriors, shape ``(len(sensing_actions), M, N)``."""
 
-# Substreams of the stream of hypotheses (1 to 3 are those of holdfast.sensing and the kernel).
+# Substreams of the stream of hypotheses (1 to 3 are those of holdfast.planning.sensing and the kernel).
 # Further rounds of samples have substreams of the first one.
 _ROUNDS = 4
 _CLOUDS = 5

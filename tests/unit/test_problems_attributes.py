@@ -10,8 +10,8 @@ import pytest
 from tests.line_problem import SETTINGS, Line
 
 from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.planning import Planner
-from holdfast.problem_attributes import PARAMETERS, check_problem, resolution_of
+from holdfast.planning.planner import Planner
+from holdfast.problems.attributes import PARAMETERS, check_problem, resolution_of
 from holdfast.problems.problem import (
     BatchedMotionProblem,
     ExpectedMotionProblem,
