@@ -124,7 +124,7 @@ def digests():
 first = digests()
 assert digests() == first
 package = Path(holdfast.__file__).parent
-for number, name in enumerate(("lab/studies/light_dark.py", "belief.py", "lab/chaos/trial.py")):
+for number, name in enumerate(("lab/studies/light_dark.py", "planning/belief.py", "lab/chaos/trial.py")):
     with (package / name).open("a") as source:
         source.write("# edited")
     second = digests()
@@ -143,7 +143,7 @@ for number, name in enumerate(("lab/studies/light_dark.py", "belief.py", "lab/ch
         assert done.returncode == 0, done.stderr
         assert done.stdout.splitlines() == [
             "lab/studies/light_dark.py [False, True]",
-            "belief.py [True, True]",
+            "planning/belief.py [True, True]",
             "lab/chaos/trial.py [False, False]",
         ]
 
@@ -170,8 +170,8 @@ for number, name in enumerate(("lab/studies/light_dark.py", "belief.py", "lab/ch
         behind = tasks._sources_behind("holdfast.lab.studies.trial_batches", package)
         names = {str(path.relative_to(package)) for path in behind}
         assert {
-            "belief.py",
-            "sensing.py",
+            "planning/belief.py",
+            "planning/sensing.py",
             "problems/peg_in_hole_3d.py",  # named in a registry alone
             "lab/studies/trial_batches.py",
             "__init__.py",

@@ -14,8 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-import holdfast
-from holdfast import _kernel
+from holdfast import __version__, _kernel
 from holdfast.robot.trials import available_cores
 
 __all__ = ["commit", "describe", "kernel_hash", "machines"]
@@ -37,7 +36,7 @@ def describe() -> dict[str, str]:
         "compiler of the kernel": _compiler(),
         "instruction set": _kernel.simd(),
         "state machines": machines(),
-        "holdfast": f"{holdfast.__version__}, {commit()}",
+        "holdfast": f"{__version__}, {commit()}",
         "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     }
 

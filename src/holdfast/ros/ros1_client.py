@@ -31,7 +31,7 @@ from holdfast.ros.active_sensing import DecisionAnswer, DecisionRequest, ErrorCo
 from holdfast.ros.client import ActiveSensingClient
 from holdfast.ros.loop_thread import LoopThread
 from holdfast.ros.messages import MAX_BYTES, decode_answer, encode_request, md5_sum
-from holdfast.transport.endpoints import host_and_port, system_words
+from holdfast.runtime.addresses import host_and_port, system_words
 from holdfast.transport.ros1_calls import call
 from holdfast.transport.ros1_node import RosNode, Topic, TopicType
 from holdfast.transport.tcpros import (

@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 from xml.parsers import expat
 
 from holdfast.errors import CallError, GoneError, SilentError, TransportError
-from holdfast.transport.endpoints import host_and_port
+from holdfast.runtime.addresses import host_and_port
 from holdfast.transport.tcpros import (
     ANY_TYPE,
     MAX_HEADER_BYTES,
