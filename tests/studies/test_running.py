@@ -124,7 +124,7 @@ def digests():
 first = digests()
 assert digests() == first
 package = Path(holdfast.__file__).parent
-for number, name in enumerate(("lab/studies/light_dark.py", "planning/belief.py", "lab/chaos/trial.py")):
+for name in ("lab/studies/light_dark.py", "planning/belief.py", "lab/chaos/trial.py"):
     with (package / name).open("a") as source:
         source.write("# edited")
     second = digests()

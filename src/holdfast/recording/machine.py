@@ -12,10 +12,7 @@ from datetime import UTC, datetime
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
-import numpy as np
-
 from holdfast import __version__, _kernel
-from holdfast.robot.trials import available_cores
 
 __all__ = ["commit", "describe", "kernel_hash", "machines"]
 
@@ -26,6 +23,10 @@ _SOURCES = ("src", "cpp", "cmake", "CMakeLists.txt")
 
 def describe() -> dict[str, str]:
     """Return the machine and the software, by name."""
+    import numpy as np  # ``holdfast --version`` asks this module, and needs neither
+
+    from holdfast.robot.trials import available_cores
+
     return {
         "processor": _processor(),
         "cores": f"{available_cores()} of {os.cpu_count()} usable",
