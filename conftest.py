@@ -64,7 +64,7 @@ REAL = (
     "unit/test_transport_credentials.py::TestOnRealLinks",
     "unit/test_datagram_sockets.py",
     "unit/test_endpoints.py::test_loopback_is_what_only_this_machine_can_reach",
-    "unit/test_files.py::test_what_is_no_file_is_refused",
+    "unit/test_config_reading.py::test_what_is_no_file_is_refused",
     "unit/test_monitoring.py",
     "unit/test_ros1_calls.py",
     "unit/test_ros1_node.py",

@@ -38,8 +38,8 @@ __all__ = [
 ]
 
 
-# As `holdfast.planning.estimators.NearestNeighbor` says: weights below one of these fractions of the
-# greatest are left out, the first that loses no more than this share of the sum, else the last.
+# As `holdfast.planning.estimators.NearestNeighbor` says: weights below one of these fractions of
+# the greatest are left out, the first that loses no more than this share of the sum, else the last.
 NEGLIGIBLE = tuple(10.0**-i * (1.0 - 2.0**-40) for i in range(2, 7))
 LOST_SHARE = 0.005
 # Two distances count as equal if they differ by no more than rounding.

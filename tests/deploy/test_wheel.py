@@ -38,7 +38,8 @@ holdfast --version
 cd /tree
 python -m tests.golden.table --check
 # A compiler whose runtime does not know processors would leave the wheel slow, and right.
-HOLDFAST_SIMD=$(grep -o -w -m 1 avx2 /proc/cpuinfo | head -n 1) python -c 'import holdfast.numerics'
+HOLDFAST_SIMD=$(grep -o -w -m 1 avx2 /proc/cpuinfo | head -n 1) \\
+    python -c 'import holdfast.numerics.reproducible'
 holdfast serve --listen tcp/127.0.0.1:7447 > /tmp/service.log 2>&1 &
 holdfast run examples/peg_in_hole_2d.yaml --trials 3 --set simulator.max_steps=300 --quiet \\
     --service tcp/127.0.0.1:7447 --recovery never --out /tmp/run

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
 
@@ -141,6 +142,35 @@ def test_what_is_beside_the_product_has_its_tests_beside_it(name: str) -> None:
     assert {each for each in known if not is_tested(each, known, tests)} == set(elsewhere)
     for place in elsewhere.values():
         assert (ROOT / place).is_file(), place
+
+
+DEFINED_IN_PACKAGES = {"holdfast": {"_kernel", "__version__"}, "holdfast.cli": {"main"}}
+"""Names that a package itself has, and not from one of its modules."""
+
+
+def from_a_face(module: str) -> list[str]:
+    """Return what a module imports from a package, and not from the module that defines it."""
+    tree = ast.parse((PACKAGE / f"{module}.py").read_text(encoding="utf-8"))
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            package = (node.module or "").split(".")
+            place = PACKAGE.parent.joinpath(*package)
+            if node.level or package[0] != "holdfast" or not place.is_dir():
+                continue
+            for alias in node.names:
+                is_module = (place / alias.name).with_suffix(".py").is_file()
+                own = DEFINED_IN_PACKAGES.get(node.module or "", ())
+                if not is_module and alias.name not in own:
+                    found.append(f"from {node.module} import {alias.name}")
+        elif isinstance(node, ast.Import):
+            found += [f"import {alias.name}" for alias in node.names if alias.name == "holdfast"]
+    return found
+
+
+def test_no_module_of_the_product_imports_a_package_s_face() -> None:
+    """It would depend on all that the face names, and no floor would show."""
+    assert {module: found for module in modules() if (found := from_a_face(module))} == {}
 
 
 def test_architecture_names_every_folder() -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 
-from holdfast.runtime.events import BoundedEventLog, EventSink, NullEventLog
+from holdfast.protocol.status import Status
+from holdfast.runtime.events import BoundedEventLog, EventSink, NullEventLog, severity
 from holdfast.runtime.logs import EventLog
 
 
@@ -20,6 +21,15 @@ class RecordingSink:
 
     def close(self) -> None:
         self.closed = True
+
+
+def test_the_worse_status_is_a_warning() -> None:
+    found = {status: severity("status", {"to": status.value}) for status in Status}
+    assert found == {
+        Status.STANDARD: "INFO",
+        Status.LOCAL_RECOVERY: "WARN",
+        Status.KEEP_ALIVE: "INFO",
+    }
 
 
 class TestRepeatedEvents:

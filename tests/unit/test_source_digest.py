@@ -223,13 +223,23 @@ class TestCore:
             return path if name.startswith("holdfast") and path.is_file() else None
 
         problems = [own.place.partition(":")[0] for own in registry.BUILT_IN.values()]
-        deciding = ["holdfast.planning", *problems]
+        deciding = ["holdfast.planning.planner", *problems]
         found = follow_imports(deciding, locate)
         assert len(found) > 15
         folders = {path.parent for path in found.values()}
-        assert folders == {PACKAGE, PACKAGE / "config", PACKAGE / "problems"}
+        rooms = (PACKAGE / room for room in ("numerics", "planning", "problems"))
+        assert folders == {PACKAGE, *rooms}
 
-    @pytest.mark.parametrize("changed", ["sensing.py", "problems/peg_in_hole_2d.py", None])
+    @pytest.mark.parametrize(
+        "changed",
+        [
+            "planning/sensing.py",
+            "numerics/randomness.py",
+            "problems/peg_in_hole_2d.py",
+            "config/problem_builder.py",
+            None,
+        ],
+    )
     def test_a_changed_source(self, changed: str | None, tmp_path: Path) -> None:
         """An installation is copied, and asked for its version as a process of its own."""
         shutil.copytree(

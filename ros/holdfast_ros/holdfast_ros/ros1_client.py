@@ -27,7 +27,7 @@ import numpy as np
 from holdfast.errors import TransportError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.protocol.status import Status
-from holdfast.transport.endpoints import host_and_port, system_words
+from holdfast.runtime.addresses import host_and_port, system_words
 from holdfast_ros.active_sensing import DecisionAnswer, DecisionRequest, ErrorCode, RequestKind
 from holdfast_ros.client import ActiveSensingClient
 from holdfast_ros.loop_thread import LoopThread

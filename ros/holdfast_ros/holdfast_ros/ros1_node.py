@@ -17,8 +17,8 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
 from holdfast.errors import DEFECT, TransportError, defect_fields
+from holdfast.runtime.addresses import host_and_port, why_not_bound
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
-from holdfast.transport.endpoints import host_and_port, why_not_bound
 from holdfast_ros.tcpros import (
     RosEnvironment,
     ServiceType,

@@ -24,6 +24,7 @@ import msgspec
 import msgspec.inspect
 
 from holdfast.config.problem_builder import build_from, find_problem, schemas_of
+from holdfast.config.reading import absolute_endpoint, read_bounded
 from holdfast.config.registry import names
 from holdfast.config.source import SECTIONS, SETTINGS, Source, module_directory
 from holdfast.config.yaml_document import MAX_BYTES, Document, read, write
@@ -44,7 +45,6 @@ from holdfast.planning.settings import (
 )
 from holdfast.problems.attributes import resolution_of, sensing_labels
 from holdfast.problems.problem import Problem
-from holdfast.runtime.files import absolute_endpoint, read_bounded
 from holdfast.validation import described, shown
 
 __all__ = ["Configuration", "load", "settings_keys"]

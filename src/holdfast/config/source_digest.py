@@ -26,7 +26,7 @@ from holdfast.config.imports import follow_imports
 
 __all__ = ["core_version", "problem_digest", "problem_sources"]
 
-_PACKAGE = Path(__file__).resolve().parent
+_PACKAGE = Path(__file__).resolve().parents[1]
 _DIGEST_SIZE = 8
 _SOURCE_DIGEST_SIZE = 32
 
@@ -38,7 +38,8 @@ _LIBRARIES = frozenset({"numpy", "msgspec"})
 def core_version() -> str:
     """Return holdfast's version and the digest of what decides in it, such as ``0.1.0+3f...``.
 
-    That is its kernel, its problems, its settings, and the modules beside this one.
+    That is its kernel, the modules at its top, its numerics, problems and planning, and what makes
+    problems of names and configurations.
     """
     digest = hashlib.blake2b(_kernel.sources().encode(), digest_size=_DIGEST_SIZE)
     for path in sorted(_core_files()):
@@ -49,7 +50,8 @@ def core_version() -> str:
 
 @functools.cache
 def _core_files() -> frozenset[Path]:
-    folders = (_PACKAGE, _PACKAGE / "config", _PACKAGE / "problems")
+    rooms = ("numerics", "problems", "planning", "config")
+    folders = (_PACKAGE, *(_PACKAGE / room for room in rooms))
     return frozenset(path for folder in folders for path in folder.glob("*.py"))
 
 

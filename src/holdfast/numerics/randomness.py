@@ -236,8 +236,8 @@ class Stream:
         """Return an independent stream from its beginning; the index is from 0 to 2**32 - 1.
 
         The same index names the same numbers, whatever was drawn before. A world
-        (:mod:`holdfast.numerics.geometry`) draws from substreams 0 to 999 of the stream that it is given: if
-        you use substreams too, give it one of them.
+        (:mod:`holdfast.numerics.geometry`) draws from substreams 0 to 999 of the stream that it is
+        given: if you use substreams too, give it one of them.
         """
         index = whole("substream index", index, 0, _WORD - 1)
         self._require_open()

@@ -143,7 +143,8 @@ class ObservationInfo(NamedTuple):
         None for a general likelihood, which has no such distance.
     within_gate : bool
         Whether the observation is one that the belief makes likely: within the gate of
-        :mod:`holdfast.planning.validation_gate` (for a general likelihood: possible for some particle).
+        :mod:`holdfast.planning.validation_gate` (for a general likelihood: possible for some
+        particle).
     distinct_particles : int
         How many different particles the observation weighed; copies of one count once. Far below
         their number the belief is depleted: a state that does not move gets no new particles.
@@ -164,8 +165,8 @@ def estimate(
 ) -> FloatArray:
     """Return a point estimate of the state, shape ``(state_size,)``.
 
-    It is the mean, the mean of the heaviest mode (:mod:`holdfast.planning.modes`), or the particle of the
-    greatest weight (the first of equals). The mean of a ``circular`` coordinate, an angle in
+    It is the mean, the mean of the heaviest mode (:mod:`holdfast.planning.modes`), or the particle
+    of the greatest weight (the first of equals). The mean of a ``circular`` coordinate, an angle in
     radians, is the mean direction, in (-pi, pi].
     """
     if kind == "most_likely":

@@ -56,8 +56,8 @@ Posteriors = Callable[[Sequence[int], int, Stream], tuple[Sequence[int], FloatAr
 """Called with sensing actions, a number M of samples and a stream. Returns the M particles that are
 the true states, and the weights of the posteriors, shape ``(len(sensing_actions), M, N)``."""
 
-# Substreams of the stream of hypotheses (1 to 3 are those of holdfast.planning.sensing and the kernel).
-# Further rounds of samples have substreams of the first one.
+# Substreams of the stream of hypotheses (1 to 3 are those of holdfast.planning.sensing and the
+# kernel). Further rounds of samples have substreams of the first one.
 _ROUNDS = 4
 _CLOUDS = 5
 _MOTION = 6

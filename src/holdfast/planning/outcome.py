@@ -295,7 +295,8 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     unexplained_observations : int
         Observations that no particle of the belief explained.
     lost, suspect_sensors : int
-        Times that the robot was found lost, and a sensing action suspect (:mod:`holdfast.planning.lost`).
+        Times that the robot was found lost, and a sensing action suspect
+        (:mod:`holdfast.planning.lost`).
     fewest_distinct_particles : int or None
         The least number of different particles that an observation weighed; None without one.
     digest : str

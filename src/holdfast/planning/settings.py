@@ -93,7 +93,7 @@ Method = Literal[
     "random",
     "fixed",
 ]
-"""How a sensing action is chosen: ``holdfast.planning.sensing.choose_sensing_action`` has a branch each."""
+"""How a sensing action is chosen; :mod:`holdfast.planning.sensing` has a branch for each."""
 
 ENTROPY_METHODS: frozenset[Method] = frozenset({"action_entropy", "path_entropy", "state_entropy"})
 """Those that minimise an entropy and so need an estimator."""
@@ -336,7 +336,8 @@ class LostSettings(_Section, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     ----------
     false_alarm_rate : float
         For each observation: within n of them a false alarm, of a lost robot or a dead sensor, has
-        a probability of at most n times this (:mod:`holdfast.planning.lost` says for which beliefs).
+        a probability of at most n times this (:mod:`holdfast.planning.lost` says for which
+        beliefs).
     on_lost : {"continue", "hold", "reinitialise"}
         Report it only; hold still and end the run, which can be resumed; or begin the belief anew,
         from the problem's ``reinitial_states`` or else its initial belief.

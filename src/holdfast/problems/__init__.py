@@ -1,5 +1,6 @@
 """The problems: what the robot is to do, as plain objects of NumPy functions.
 
-:mod:`holdfast.problems.problem` says what a problem is, :mod:`holdfast.config.registry` finds one
-by its name, and each other public module is one problem or what several have in common.
+:mod:`problem` says what a problem is, :mod:`attributes` reads what it declares and :mod:`checked`
+checks what its functions return. Each other module is one problem of holdfast's own or what several
+have in common; :mod:`holdfast.config.registry` finds them by name.
 """

@@ -2,8 +2,8 @@
 
 A problem is a user's own code, and NumPy forgives much: an array that does not fit broadcasts, and
 the decisions are quietly wrong. So its attributes are checked before the first step, and
-:mod:`holdfast.problems.checked` checks what its functions return. Here a problem is any object, which may
-or may not have the members of :class:`holdfast.problems.problem.Problem`.
+:mod:`holdfast.problems.checked` checks what its functions return. Here a problem is any object,
+which may or may not have the members of :class:`holdfast.problems.problem.Problem`.
 
 An attribute may be a list, a tuple or an array, of Python's numbers or NumPy's, which differ where
 they are compared, repeated or asked whether they are empty. So it is read here alone, and the

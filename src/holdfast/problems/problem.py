@@ -19,9 +19,9 @@ Observations are Gaussian, by :meth:`Problem.observation_mean` and
 :class:`GeneralObservationProblem`. What an action does without noise follows from
 :meth:`Problem.move`, unless the problem has a method of :class:`ExpectedMotionProblem`.
 
-Random numbers come from the :class:`~holdfast.numerics.randomness.Stream` that a function is given. It has
-methods of a NumPy ``Generator``, goes on as one does, and begins anew in each call of a function;
-with the call it ends, and must not be kept.
+Random numbers come from the :class:`~holdfast.numerics.randomness.Stream` that a function is given.
+It has methods of a NumPy ``Generator``, goes on as one does, and begins anew in each call of a
+function; with the call it ends, and must not be kept.
 
 To have the same decisions, bit for bit, on every machine, a problem uses only operations that IEEE
 754 defines exactly (``+ - * /``, ``np.sqrt``, comparisons, ``np.where``) and takes ``exp``,
@@ -240,11 +240,12 @@ class GeneralObservationProblem(Protocol):
     Sensing costs more: the likelihood is evaluated in Python, once for each hypothetical
     observation.
 
-    A robot is found lost (:mod:`holdfast.planning.lost`) by observations that no particle can have made. A
-    likelihood that is zero nowhere has none of these. An attribute ``rank_test = True`` asks for
-    the test by :func:`holdfast.planning.validation_gate.is_typical` instead: each observation is compared
-    with up to 19 drawn ones, which takes as many evaluations of the likelihood, 3.5 on average. It
-    is right if what is left out of the likelihood does not depend on the observation.
+    A robot is found lost (:mod:`holdfast.planning.lost`) by observations that no particle can have
+    made. A likelihood that is zero nowhere has none of these. An attribute ``rank_test = True``
+    asks for the test by :func:`holdfast.planning.validation_gate.is_typical` instead: each
+    observation is compared with up to 19 drawn ones, which takes as many evaluations of the
+    likelihood, 3.5 on average. It is right if what is left out of the likelihood does not depend on
+    the observation.
     """
 
     def log_likelihood(
@@ -315,8 +316,8 @@ class ShownMovesProblem(Protocol):
     """Methods for moves that show something: a measured motion, an observation. Any of them.
 
     The robot's environment returns what a move has shown
-    (:class:`~holdfast.planning.outcome.MoveResult`); these say what it means. With the first or the third
-    the next decision waits for what the move shows, so a service is asked at each step.
+    (:class:`~holdfast.planning.outcome.MoveResult`); these say what it means. With the first or the
+    third the next decision waits for what the move shows, so a service is asked at each step.
     """
 
     def move_by_measurement(

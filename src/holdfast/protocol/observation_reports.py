@@ -1,6 +1,7 @@
 """What a robot reports about its observations: what no particle explains, lost, a suspect sensor.
 
-The trial counts (:mod:`holdfast.planning.tracking`); here is what becomes an event, with words and bounds.
+The trial counts (:mod:`holdfast.planning.tracking`); here is what becomes an event, with words and
+bounds.
 """
 
 from __future__ import annotations

@@ -12,11 +12,7 @@ from datetime import UTC, datetime
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
-import numpy as np
-
-import holdfast
-from holdfast import _kernel
-from holdfast.robot.trials import available_cores
+from holdfast import __version__, _kernel
 
 __all__ = ["commit", "describe", "kernel_hash", "machines"]
 
@@ -27,6 +23,10 @@ _SOURCES = ("src", "cpp", "cmake", "CMakeLists.txt")
 
 def describe() -> dict[str, str]:
     """Return the machine and the software, by name."""
+    import numpy as np  # ``holdfast --version`` asks this module, and needs neither
+
+    from holdfast.robot.trials import available_cores
+
     return {
         "processor": _processor(),
         "cores": f"{available_cores()} of {os.cpu_count()} usable",
@@ -37,7 +37,7 @@ def describe() -> dict[str, str]:
         "compiler of the kernel": _compiler(),
         "instruction set": _kernel.simd(),
         "state machines": machines(),
-        "holdfast": f"{holdfast.__version__}, {commit()}",
+        "holdfast": f"{__version__}, {commit()}",
         "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     }
 

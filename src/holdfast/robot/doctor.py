@@ -40,8 +40,9 @@ from holdfast.protocol.messages import (
 )
 from holdfast.robot.probe import AddressPath, account_of, in_thread, interface_of
 from holdfast.robot.reference_decisions import ReferenceDecision, answer_in
+from holdfast.runtime.addresses import system_words
 from holdfast.transport.credentials import EXPIRES_SOON_DAYS, date_text, load_credentials
-from holdfast.transport.endpoints import Endpoint, system_words
+from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.exchanges import MAX_DATAGRAM_BYTES
 from holdfast.transport.tls import client_context
 

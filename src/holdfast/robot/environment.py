@@ -91,8 +91,8 @@ class Environment(Protocol):
         """Return True if the task has succeeded, False if it goes on, or ``"failed"``.
 
         ``"failed"`` ends the trial as well, but in failure: the robot has crashed, say, or broken
-        what it was to handle. An :class:`~holdfast.planning.outcome.Ending` also says why, and may say that
-        the trial was cut off.
+        what it was to handle. An :class:`~holdfast.planning.outcome.Ending` also says why, and may
+        say that the trial was cut off.
         """
         ...
 

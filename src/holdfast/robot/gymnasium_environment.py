@@ -90,8 +90,9 @@ class GymnasiumEnvironment:
     success : str or function, optional
         By what one knows success: ``terminated`` (the environment terminates in success alone), a
         key of ``info`` such as ``is_success``, or ``function(environment, observation, info)``,
-        asked after each move, which returns True, False or an :class:`~holdfast.planning.outcome.Ending`
-        with its own reason. Without it no trial succeeds.
+        asked after each move, which returns True, False or an
+        :class:`~holdfast.planning.outcome.Ending` with its own reason. Without it no trial
+        succeeds.
     sensing_noise : float or sequence, optional
         Standard deviation of the noise that is added to what sensing shows: for all, or one for
         each sensing action, each a number or one for each coordinate.

@@ -28,7 +28,6 @@ from collections.abc import Callable, Hashable, Iterable, Mapping
 from typing import Literal, Protocol, TypeAlias
 
 from holdfast.errors import DEFECT
-from holdfast.protocol.status import Status
 
 __all__ = [
     "BoundedEventLog",
@@ -70,13 +69,16 @@ _ERRORS = frozenset(
     ("wrong_answer", "not_deterministic", "state_diverged", "stopped", "error", DEFECT)
 )
 
+_WORSE_STATUS = "local_recovery"
+"""The status in which no cloud service decides (:mod:`holdfast.protocol.status`)."""
+
 Event: TypeAlias = tuple[str, Mapping[str, object]]
 """A name and its fields; after dropped ones like it with their number."""
 
 
 def severity(name: str, fields: Mapping[str, object]) -> Literal["INFO", "WARN", "ERROR"]:
     """Return how bad it is that an event has happened."""
-    worse = name == "status" and fields.get("to") == Status.LOCAL_RECOVERY.value
+    worse = name == "status" and fields.get("to") == _WORSE_STATUS
     return "ERROR" if name in _ERRORS else "WARN" if worse or name in _WARNINGS else "INFO"
 
 

@@ -17,7 +17,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 from holdfast.errors import HealthError
-from holdfast.transport.endpoints import host_and_port, why_not_bound
+from holdfast.runtime.addresses import host_and_port, why_not_bound
 
 __all__ = [
     "HttpAddress",

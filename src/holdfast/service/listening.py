@@ -13,7 +13,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from holdfast.errors import TransportError
-from holdfast.transport.endpoints import Endpoint, why_not_bound
+from holdfast.runtime.addresses import why_not_bound
+from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.listener import listen, remove_socket_file
 
 __all__ = ["SharedEndpoints"]

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
+from holdfast.config.reading import absolute_endpoint
 from holdfast.errors import InvalidValueError, TransportError
 from holdfast.runtime.command_line import (
     Options,
@@ -18,7 +19,6 @@ from holdfast.runtime.command_line import (
     option,
     whole_number,
 )
-from holdfast.runtime.files import absolute_endpoint
 from holdfast.runtime.log_lines import LogFormat
 from holdfast.runtime.logs import log_option
 

@@ -23,7 +23,8 @@ import threading
 from collections.abc import Callable
 from typing import Any, Final, TypeAlias
 
-from holdfast.transport.endpoints import Endpoint, system_words
+from holdfast.runtime.addresses import system_words
+from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.links import Link
 
 __all__ = ["Dialer"]

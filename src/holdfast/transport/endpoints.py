@@ -7,9 +7,7 @@ Endpoints are checked here before anything is opened, and errors give the reason
 
 from __future__ import annotations
 
-import errno
 import ipaddress
-import os
 import re
 import socket
 from pathlib import Path
@@ -19,6 +17,7 @@ import msgspec
 
 from holdfast.errors import TransportError
 from holdfast.printable import did_you_mean
+from holdfast.runtime.addresses import host_and_port
 
 __all__ = [
     "AUTHORITY_FILE",
@@ -35,11 +34,8 @@ __all__ = [
     "check_credentials",
     "check_endpoint",
     "check_name",
-    "host_and_port",
     "parse_endpoint",
     "parse_host",
-    "system_words",
-    "why_not_bound",
 ]
 
 Role: TypeAlias = Literal["robot", "service"]
@@ -267,27 +263,6 @@ def parse_host(host: str, before: str = "") -> str:
     if (numeric and _address_of(host) is None) or not _HOST_NAME.fullmatch(host):
         raise TransportError(f"{host!r} is no host name or address, as in {before}127.0.0.1:7447")
     return host
-
-
-def host_and_port(host: str, port: int) -> str:
-    """Return HOST:PORT, with an IPv6 address in brackets."""
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-
-
-def system_words(number: int | None) -> str:
-    """Return the system's text for an error number, as the rest of a sentence."""
-    text = os.strerror(number or 0)
-    return text[:1].lower() + text[1:]
-
-
-def why_not_bound(error: OSError) -> str:
-    """Return why a socket could not be bound to an address."""
-    number = error.errno or 0  # of a name that is not found it is below 0
-    # asyncio's own text names the address again.
-    reason = os.strerror(number) if number > 0 else error.strerror or str(error)
-    if number == errno.EADDRNOTAVAIL:
-        reason += ": this machine has no such address (0.0.0.0 is all that it has)"
-    return reason
 
 
 def check_endpoint(text: str, role: Role, *, listens: bool) -> Endpoint:

@@ -25,7 +25,7 @@ from time import thread_time
 from typing import TYPE_CHECKING, Concatenate, Final, ParamSpec, TypeVar
 
 from holdfast.errors import FrameError
-from holdfast.transport.endpoints import host_and_port
+from holdfast.runtime.addresses import host_and_port
 from holdfast.transport.frames import (
     GOODBYE,
     HELLO,

@@ -21,7 +21,8 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from holdfast.errors import TransportError
-from holdfast.transport.endpoints import Endpoint, why_not_bound
+from holdfast.runtime.addresses import why_not_bound
+from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.links import OPENING_TIMEOUT_S
 
 __all__ = [

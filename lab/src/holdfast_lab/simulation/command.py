@@ -10,6 +10,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.cli.exit_codes import EXIT_DIFFERENT, ended_by_signals
+from holdfast.config.reading import read_bounded
 from holdfast.errors import HoldfastError, OptionError
 from holdfast.runtime.command_line import (
     MAX_JOBS,
@@ -20,7 +21,7 @@ from holdfast.runtime.command_line import (
     option,
     whole_number,
 )
-from holdfast.runtime.files import read_bounded, shown_path
+from holdfast.runtime.files import shown_path
 
 if TYPE_CHECKING:
     from holdfast_lab.simulation.exploration import ExplorationTally
