@@ -90,6 +90,7 @@ lint: $(INSTALLED_DEV) ## style, types and layers
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m tests.line_budgets
 	$(BIN)/clang-format --dry-run -Werror $(CPP_FILES)
 
 format: $(INSTALLED_DEV) ## rewrite the code in the common style

@@ -176,6 +176,8 @@ def pytest_runtest_teardown() -> None:
     user_modules = sys.modules.get("holdfast.config.user_modules")
     found = [] if user_modules is None else list(user_modules._FOUND.values())
     for directory, names in found:
+        if directory == ROOT:  # the studies, which tests have imported as well
+            continue
         for name, module in list(sys.modules.items()):
             if name.partition(".")[0] in names:
                 file = getattr(module, "__file__", None)

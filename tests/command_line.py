@@ -57,9 +57,13 @@ def run_here(
 
 
 def commands() -> dict[str, str]:
-    """Return the modules of all commands by name, those of installed packages as well."""
+    """Return the modules of all commands by name, those of the laboratory as well.
+
+    The commands of ROS have parsers of their own.
+    """
     own = {name: command.module for name, command in COMMANDS.items()}
-    return {**{name: each.value for name, each in added_commands().items()}, **own}
+    added = {name: each.value for name, each in added_commands().items()}
+    return {**{name: place for name, place in added.items() if "holdfast_lab" in place}, **own}
 
 
 def options_of(command: str) -> type[Options]:

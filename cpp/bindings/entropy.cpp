@@ -35,7 +35,7 @@ EntropySettings make_settings(Estimator estimator, std::uint32_t neighbors, doub
     return {estimator, neighbors, resolution, exponent, offset, threads, prior.data()};
 }
 
-/// `number` as in `EstimatorKind` of estimators.py.
+/// `number` as in `EstimatorKind` of planning/estimators.py.
 Estimator to_estimator(int number) {
     switch (number) {
         case 0:

@@ -92,8 +92,8 @@ class _DrawingJob(Job):
     # By session, which its opening stands for: it is kept, so its identity is not another one's.
     drawn: dict[int, tuple[bytes, dict[int, int]]] = {}  # noqa: RUF012
 
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
         self.position = 0
         named = self._request or self.state
         assert named is not None

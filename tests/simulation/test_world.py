@@ -123,7 +123,7 @@ SIXTY = Crowd(service="cloud-1", at=0.0, robots=60)
     [
         ((), 1.8),
         ((SIXTY, SIXTY), 3.0),
-        ((Crowd(service="cloud-1", at=0.9, robots=30),), 2.7),
+        ((Crowd(service="cloud-1", at=0.9, robots=30),), 1.8),
         ((Stop(node="cloud-1", at=0.05, for_s=0.5),), 2.3),
         ((Slow(service="cloud-1", at=0.3, for_s=0.5, factor=2.0),), 2.05),
         ((Crowd(service="cloud-2", at=0.0, robots=30),), 1.8),
@@ -133,7 +133,10 @@ SIXTY = Crowd(service="cloud-1", at=0.0, robots=60)
 def test_crowds_last_until_all_of_them_are_served(
     others: tuple[Crowd | Stop | Slow, ...], served_s: float, simulator: Simulator
 ) -> None:
-    """By one worker, a hundred at the most; who is refused may be told to come back in a second."""
+    """By one worker, a hundred at the most; who is refused may be told to come back in a second.
+
+    Who comes later brings a known problem, for whose first decisions there is another lane.
+    """
     run = RunSettings(replicas=2, launch="never", workers=1, sensing_s=0.03, act_s=1.0)
     outcome = simulator.run(SimulationSchedule(run, (SIXTY, *others)))
     assert fine(outcome)

@@ -110,7 +110,7 @@ def test_a_problem_is_lent_to_one_job_and_the_oldest_are_dropped() -> None:
     problem = make_problem(Robot().session_configuration)
     assert pool.acquire(b"a") is None
     for key in (b"a", b"b", b"c"):
-        pool.release(key, problem, TYPICAL_PROBLEM)
+        pool.release(key, problem)
     assert pool.acquire(b"a") is None
     assert pool.acquire(b"c") is problem
     assert pool.acquire(b"c") is None
@@ -118,14 +118,14 @@ def test_a_problem_is_lent_to_one_job_and_the_oldest_are_dropped() -> None:
 
 def test_what_a_problem_costs_is_known_for_longer_than_it_is_kept() -> None:
     pool = ProblemPool(1)
-    problem = make_problem(Robot().session_configuration)
-    pool.release(b"failed", problem, None)
-    assert pool.cost_of(b"failed") is None
+    pool.note_cost("anna", b"failed", None)
+    assert pool.cost_of("anna", b"failed") is None
     for number in range(200):
-        pool.release(b"%d" % number, problem, TYPICAL_PROBLEM)
-        pool.release(b"used", problem, TYPICAL_PROBLEM)
-    assert pool.cost_of(b"used") == pool.cost_of(b"199") == TYPICAL_PROBLEM
-    assert pool.cost_of(b"0") is None
+        pool.note_cost("anna", b"%d" % number, TYPICAL_PROBLEM)
+        pool.note_cost("anna", b"used", TYPICAL_PROBLEM)
+    assert pool.cost_of("anna", b"used") == pool.cost_of("anna", b"199") == TYPICAL_PROBLEM
+    assert pool.cost_of("anna", b"0") is None
+    assert pool.cost_of(None, b"used") is None
 
 
 def test_a_known_problem_is_not_measured_again() -> None:

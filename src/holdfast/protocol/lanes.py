@@ -5,8 +5,8 @@ In one queue a few decisions that take seconds, or many robots that nobody has s
 keep all others waiting. So tasks of different kinds have different threads, and the system divides
 the cores between these:
 
-- *New*: of sessions with a problem that nobody has brought before, and states that come from
-  outside (checkpoints).
+- *New*: of sessions with a problem that their owner has not brought before, and states that come
+  from outside (checkpoints).
 - *First*: of sessions with a known problem that were not served yet.
 - *Brief*: of all other sessions. The lane has as many threads as the service has workers, each of
   the others one less, but at least one.

@@ -183,8 +183,9 @@ class Service:
         is_awaited = session.pending.get(task.digest) is task
         session.remove_task(task)
         price = outcome.price
+        self._problems.release(session.problem_key, outcome.problem)
         cost = None if price is None else price.problem
-        self._problems.release(session.problem_key, outcome.problem, cost)
+        self._problems.note_cost(session.owner, session.problem_key, cost)
         if not session.closed:
             self._sessions.use(session, now)
             # The first job of a problem also imports and builds it: no measure of the next ones.
@@ -301,7 +302,7 @@ class Service:
             ExpectedTime(self._task_time.mean_s, _INERTIA_OF_ONE),
             ExpectedTime(self._sensing_time.mean_s, _INERTIA_OF_ONE),
         )
-        session.known = self._problems.cost_of(session.problem_key)
+        session.known = self._problems.cost_of(session.owner, session.problem_key)
         lane = session.lane_of(request)
         if self._queue.is_overloaded(now, key[0], lane):
             self._sessions.note_epoch(key, request.epoch)

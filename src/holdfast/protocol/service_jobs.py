@@ -448,24 +448,30 @@ class ProblemPool:
     def __init__(self, max_problems: int) -> None:
         self._max_problems = max_problems
         self._idle: OrderedDict[bytes, list[Problem]] = OrderedDict()
-        self._costs: OrderedDict[bytes, ProblemCost] = OrderedDict()
+        self._costs: OrderedDict[tuple[str | None, bytes], ProblemCost] = OrderedDict()
 
-    def cost_of(self, key: bytes) -> ProblemCost | None:
-        """Return what a problem's functions take; None if that is not known any more."""
-        return self._costs.get(key)
+    def cost_of(self, owner: str | None, key: bytes) -> ProblemCost | None:
+        """Return what the functions of a problem take that this owner has brought before.
+
+        None if that is not known any more. (Nobody's lane depends on what another has brought.)
+        """
+        return self._costs.get((owner, key))
 
     def acquire(self, key: bytes) -> Problem | None:
         """Take an unused instance; None if one must be built."""
         idle = self._idle.get(key)
         return idle.pop() if idle else None
 
-    def release(self, key: bytes, problem: Problem | None, cost: ProblemCost | None) -> None:
-        """Keep an instance for the next job, and what it costs."""
+    def note_cost(self, owner: str | None, key: bytes, cost: ProblemCost | None) -> None:
+        """Remember what a problem of an owner costs."""
         if cost is not None:
-            self._costs[key] = cost
-            self._costs.move_to_end(key)
+            self._costs[owner, key] = cost
+            self._costs.move_to_end((owner, key))
             if len(self._costs) > _COSTS_PER_PROBLEM * self._max_problems:
                 self._costs.popitem(last=False)
+
+    def release(self, key: bytes, problem: Problem | None) -> None:
+        """Keep an instance for the next job."""
         if problem is None:
             return
         self._idle.setdefault(key, []).append(problem)

@@ -221,7 +221,7 @@ class Session:
     built, built_in : bool
         Whether the problem was built before, and whether it is part of holdfast.
     known : ProblemCost or None
-        What its problem's functions take, if they were measured for another session.
+        What its problem's functions take, if they were measured for another session of its owner.
     is_brief : bool
         Whether no decision was estimated to be too long for the lane of brief ones.
     overran : bool
