@@ -1,8 +1,8 @@
 // Python's view of the worlds of geometry_2d.hpp and geometry_3d.hpp and of motion.hpp.
 //
-// Callers go through holdfast/numerics/geometry.py. To cost nothing where all is well, a function here
-// checks its values while it has them at hand and returns false; the Python side then finds out
-// what is wrong and raises the error that says so.
+// Callers go through holdfast/numerics/geometry.py. To cost nothing where all is well, a function
+// here checks its values while it has them at hand and returns false; the Python side then finds
+// out what is wrong and raises the error that says so.
 
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/vector.h>
