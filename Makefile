@@ -135,6 +135,7 @@ requirements: $(INSTALLED_DEV) ## deploy/*requirements.txt anew: the versions an
 	    --custom-compile-command "make requirements" - -o deploy/build-requirements.txt
 
 clean: ## remove what was built or run here, but keep .venv
+	rm -rf ros/*/build ros/*/*.egg-info
 	rm -rf build dist demo-run chaos-run .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
 	rm -f $(INSTALLED_KERNEL) $(INSTALLED_FIGURES) $(INSTALLED_DEV)
 	rm -rf $(COMPILED)

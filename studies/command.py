@@ -155,8 +155,6 @@ def studies_of(names: Sequence[str]) -> list[Study]:
 def main(arguments: Sequence[str]) -> int:
     """Run the studies and return the exit code."""
     options = StudyOptions.parse("studies", arguments)
-    from studies.study import Scale
-
     if options.list:
         if options.names:
             raise OptionError(f"--list shows all; leave {' '.join(options.names)} out")
@@ -173,6 +171,8 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     out = options.table()["out"].words(options.out)
     again = shlex.join(["python", "-m", "studies", *options.words("out"), *out])
+    from studies.study import Scale
+
     scale = Scale(quick=options.quick, seed=options.seed)
     executor = _executor_of(options.executor, options.jobs)
     # One signal is enough: another would cut short what ends the processes.

@@ -93,12 +93,15 @@ def test_an_unknown_command_is_compared_with_all(packages: Path) -> None:
     assert done.stderr == "holdfast: error: 'gret' is no command; did you mean greet?\n"
 
 
-@pytest.mark.parametrize("command", ["demo", "chaos", "simulate"])
+@pytest.mark.parametrize(
+    ("command", "folder"),
+    [("demo", "./lab"), ("simulate", "./lab"), ("ros1-guard", "./ros/ros1_master_guard")],
+)
 def test_without_its_package_a_command_says_what_to_install(
-    command: str, monkeypatch: pytest.MonkeyPatch
+    command: str, folder: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(added_commands, "added_commands", dict)
-    with pytest.raises(OptionError, match=f"{command} is in .*: pip install holdfast-lab"):
+    with pytest.raises(OptionError, match=f"{command} is in .*: pip install {folder}"):
         run_application([command, "--quick"])
 
 

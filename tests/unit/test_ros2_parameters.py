@@ -68,8 +68,8 @@ def test_another_world_is_another_configuration() -> None:
     objects = {kind: one.configuration.environment.object for kind, one in named.items()}
     assert objects == {
         "configuration": None,
-        "executive": "holdfast.ros.executive:ExecutiveEnvironment",
-        "ros": "holdfast.ros.ros2_environment:RosEnvironment",
+        "executive": "holdfast_ros.executive:ExecutiveEnvironment",
+        "ros": "holdfast_ros.ros2_environment:RosEnvironment",
     }
 
 
@@ -87,7 +87,7 @@ def test_the_files_own_world_may_be_another(tmp_path: Path) -> None:
         "environment: {object: 'worlds:World', directory: '.', arguments: {port: 3}}\n"
     )
     settings = read(configuration=str(path), environment__kind="executive").configuration
-    assert settings.environment.object == "holdfast.ros.executive:ExecutiveEnvironment"
+    assert settings.environment.object == "holdfast_ros.executive:ExecutiveEnvironment"
     assert settings.environment.arguments == {}
 
 

@@ -52,7 +52,8 @@ def main(application: Callable[[Sequence[str]], int] = _commands) -> None:
     arguments = sys.argv[1:]
     try:
         allow_descriptors()
-        if arguments[:1] == ["serve"]:  # which goes on when nobody reads its output
+        # A service, and what guards one, go on when nobody reads their output.
+        if arguments[:1] in (["serve"], ["ros1-serve"], ["ros1-guard"]):
             sys.exit(application(arguments))
         end_with_reader()
         try:

@@ -44,6 +44,11 @@ _PACKAGES = {
 }
 """Which package of this project adds a command, for whoever has not installed it."""
 
+_FOLDERS = {
+    "holdfast-lab": "./lab",
+    "holdfast-ros": "./ros/ros1_master_guard ./ros/holdfast_ros",
+}
+
 _HELP = """\
 usage: holdfast [-h] [--version] COMMAND [ARGS]...
 
@@ -97,9 +102,11 @@ def run_application(arguments: Sequence[str]) -> int:
     if first in _PACKAGES:
         package = _PACKAGES[first]
         raise OptionError(
-            f"the command {first} is in the package {package}, not installed here: pip install "
-            f"{package}"
+            f"the command {first} is in the package {package}, which is not installed here; in a "
+            f"clone of the same version: pip install {_FOLDERS[package]}"
         )
+    if first == "experiment":
+        raise OptionError("experiment is python -m studies now, in a clone: docs/results.md")
     from holdfast.validation import close_match
 
     what = "option of holdfast" if first.startswith("-") else "command"

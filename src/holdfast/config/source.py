@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from holdfast.config.user_code import moved
 from holdfast.config.yaml_document import Document
 from holdfast.errors import ConfigurationError
 from holdfast.planning.settings import (
@@ -189,7 +190,7 @@ def module_directory(source: Source, key: KeyPath, value: str | None, module: st
     If it is None, that is the file's own, else the current one, for a resolved configuration stands
     in the directory of its run, far from the module; None if it is in neither.
     """
-    package = module.partition(".")[0]
+    package = moved(module).partition(".")[0]
     if value is not None:
         directory = source.directory_of(key) / value
         if not directory.is_dir():

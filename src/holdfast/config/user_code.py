@@ -273,7 +273,7 @@ def _imported(name: str, search_directory: Path | None) -> object:
         except ConfigurationError as error:
             raise ConfigurationError(f"{name}: {error}") from None
     if module_name.startswith("holdfast.ros."):
-        where += " (holdfast.ros is the package holdfast_ros now, whose node goes on with its runs)"
+        where += " (holdfast.ros is the package holdfast_ros now)"
     module = _loaded(
         functools.partial(importlib.import_module, module_name),
         name,

@@ -94,11 +94,10 @@ OWN: Mapping[str, str] = {
 OWN_DEFAULTS: Mapping[str, Any] = msgspec.to_builtins(OwnParameters())
 
 _OBJECTS = {
-    "executive": "holdfast.ros.executive:ExecutiveEnvironment",
-    "ros": "holdfast.ros.ros2_environment:RosEnvironment",
+    "executive": "holdfast_ros.executive:ExecutiveEnvironment",
+    "ros": "holdfast_ros.ros2_environment:RosEnvironment",
 }
-"""What the run's configuration names, so that no other world goes on with that run. The names are
-of the time when this package was holdfast's own, so that runs of then go on, too."""
+"""What the run's configuration names, so that no other world goes on with that run."""
 
 
 _FOR_OPTIONS = {
