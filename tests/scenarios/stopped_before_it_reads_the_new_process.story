@@ -17,20 +17,20 @@ stop node=cloud-1 at=0.611716 for_s=0.8
    0.2010  robot    hears of call 2: NeedState
    0.2010  robot    restore service=cloud-1 step=0 bytes=1567
    0.2010  robot    asks cloud-1, call 3
-   0.2820  robot    hears of call 3: TaskAnswer
-   0.2820  robot    restored service=cloud-1 step=0 restore_ms=81
-   0.2820  robot    performs task actions 0 to 1
-   0.3120  robot    hears of call 3: SensingAnswer
-   0.3120  robot    hears of call 3: its end
-   0.3224  robot    performs task actions 2 to 8
-   0.4638  robot    performs sensing action 0 of step 9
-   0.4648  robot    is killed
-   0.4658  robot    is started again
-   0.4668  robot    begins trial 0 at step 9
-   0.4668  robot    resumed_trial trial=0 step=9
-   0.4758  robot    service_appeared service=cloud-1
-   0.4758  robot    restore service=cloud-1 step=9 bytes=1567
-   0.4758  robot    asks cloud-1, call 1
+   0.3204  robot    hears of call 3: TaskAnswer
+   0.3204  robot    restored service=cloud-1 step=0 restore_ms=119.405
+   0.3204  robot    performs task actions 0 to 1
+   0.3504  robot    hears of call 3: SensingAnswer
+   0.3504  robot    hears of call 3: its end
+   0.3608  robot    performs task actions 2 to 8
+   0.5022  robot    performs sensing action 0 of step 9
+   0.5032  robot    is killed
+   0.5042  robot    is started again
+   0.5052  robot    begins trial 0 at step 9
+   0.5052  robot    resumed_trial trial=0 step=9
+   0.5142  robot    service_appeared service=cloud-1
+   0.5142  robot    restore service=cloud-1 step=9 bytes=1567
+   0.5142  robot    asks cloud-1, call 1
    0.5440  robot    is killed
    0.5940  robot    is started again
    0.5950  robot    begins trial 0 at step 9
@@ -87,13 +87,10 @@ stop node=cloud-1 at=0.611716 for_s=0.8
    1.4217  robot    service_appeared service=cloud-1
    1.4217  robot    restore service=cloud-1 step=27 bytes=1567
    1.4217  robot    asks cloud-1, call 8
-   1.4240  robot    performs task actions 29 to 32
-   1.5027  robot    hears of call 8: TaskAnswer
-   1.5027  robot    restored service=cloud-1 step=27 restore_ms=81
-   1.5027  robot    status from=local_recovery to=keep_alive outage_ms=648.723 reason=cloud-1 has answered
-   1.5048  robot    performs task actions 33 to 34
-   1.5327  robot    hears of call 8: SensingAnswer
-   1.5327  robot    hears of call 8: its end
+   1.4240  robot    performs task actions 29 to 34
+   1.5427  robot    hears of call 8: TaskAnswer
+   1.5427  robot    restored service=cloud-1 step=27 restore_ms=121
+   1.5427  robot    status from=local_recovery to=keep_alive outage_ms=688.723 reason=cloud-1 has answered
    1.5452  robot    performs task action 35
    1.5654  robot    performs sensing action 2 of step 36
    1.5664  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
