@@ -8,9 +8,11 @@ So automatic collection is off, and a timer of the loop collects what few millis
 
 from __future__ import annotations
 
-import asyncio
 import gc
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    import asyncio
 
 __all__ = ["collect_in_loop"]
 
