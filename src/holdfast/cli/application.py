@@ -35,19 +35,16 @@ COMMANDS = {
     "keys": Command("holdfast.cli.keys", "Make keys for robots and services."),
 }
 
-_PACKAGES = {
-    "demo": "holdfast-lab",
-    "simulate": "holdfast-lab",
-    "chaos": "holdfast-lab",
-    "ros1-guard": "holdfast-ros",
-    "ros1-serve": "holdfast-ros",
+_LAB = "holdfast-lab", "./lab"
+_ROS = "holdfast-ros", "./ros/ros1_master_guard ./ros/holdfast_ros"
+_ELSEWHERE = {
+    "demo": _LAB,
+    "simulate": _LAB,
+    "chaos": _LAB,
+    "ros1-guard": _ROS,
+    "ros1-serve": _ROS,
 }
-"""Which package of this project adds a command, for whoever has not installed it."""
-
-_FOLDERS = {
-    "holdfast-lab": "./lab",
-    "holdfast-ros": "./ros/ros1_master_guard ./ros/holdfast_ros",
-}
+"""Which package of this project adds a command, and its folders, for whoever lacks it."""
 
 _HELP = """\
 usage: holdfast [-h] [--version] COMMAND [ARGS]...
@@ -99,11 +96,11 @@ def run_application(arguments: Sequence[str]) -> int:
     if first in added:
         added_code: int = load_command(added[first]).main(arguments[1:])
         return added_code
-    if first in _PACKAGES:
-        package = _PACKAGES[first]
+    if first in _ELSEWHERE:
+        package, folders = _ELSEWHERE[first]
         raise OptionError(
             f"the command {first} is in the package {package}, which is not installed here; in a "
-            f"clone of the same version: pip install {_FOLDERS[package]}"
+            f"clone of the same version: pip install {folders}"
         )
     if first == "experiment":
         raise OptionError("experiment is python -m studies now, in a clone: docs/results.md")
