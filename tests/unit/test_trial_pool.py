@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import signal
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -81,14 +82,38 @@ def test_a_class_that_only_this_process_knows(tmp_path: Path) -> None:
         }
 
 
-def test_what_cannot_be_sent_is_refused(tmp_path: Path) -> None:
-    problem = PegInHole2D()
-    problem.lock = (each for each in "x")  # type: ignore[attr-defined]
-    arm = dataclasses.replace(Arm.of(configuration_of(tmp_path)), problem=problem, plain=None)
-    with (
-        TrialPool(2) as pool,
-        pytest.raises(InvalidValueError, match=r"PegInHole2D cannot be sent .* with jobs=1 its"),
-    ):
+class OfANotebook(PegInHole2D):
+    __module__ = "__main__"
+
+
+class Locked(PegInHole2D):
+    def __reduce__(self) -> Any:
+        raise TypeError("a lock")
+
+
+class Elsewhere(PegInHole2D):
+    def __reduce__(self) -> Any:
+        return int, ("x",)
+
+
+@pytest.mark.parametrize(
+    ("problem", "error", "message"),
+    [
+        (Locked, InvalidValueError, "Locked cannot be sent to worker processes: a lock; with jobs"),
+        (OfANotebook, InvalidValueError, r"needs cloudpickle: pip install 'holdfast\[tune\]', or"),
+        (Elsewhere, TrialError, "peg_in_hole_2d cannot be made again in a worker process: ValueE"),
+    ],
+)
+def test_what_cannot_be_sent_is_refused(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    problem: type[PegInHole2D],
+    error: type[Exception],
+    message: str,
+) -> None:
+    monkeypatch.setitem(sys.modules, "cloudpickle", None)
+    arm = dataclasses.replace(Arm.of(configuration_of(tmp_path)), problem=problem(), plain=None)
+    with TrialPool(2) as pool, pytest.raises(error, match=message):
         list(pool.run([(arm, 0), (arm, 1)]))
 
 
