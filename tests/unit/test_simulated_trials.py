@@ -97,6 +97,9 @@ def test_comparison_against_the_named_baseline() -> None:
     assert head[:3] == ("", "trials", "success")
     assert (baseline[0], other[0]) == ("chance (baseline)", "ours")
     assert "60 steps" in repr(found)
+    longest = max(map(len, repr(found).splitlines()[:3]))
+    assert found.fitting(longest) == repr(found)
+    assert found.fitting(longest - 1) == found.describe()
 
 
 def test_runs_on_the_disk_and_other_tasks(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shlex
+import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -171,7 +172,10 @@ def _sweep(options: SweepOptions) -> int:
             raise
         except HoldfastError as error:
             raise RunError(error, options.resume_command(directory), EXIT_CAN_GO_ON) from error
-    sys.stdout.write(printable(f"{comparison}\n\n{where}/\n  {'  '.join(names)}\n"))
+    table = str(comparison)
+    if sys.stdout.isatty():
+        table = comparison.fitting(shutil.get_terminal_size().columns)
+    sys.stdout.write(printable(f"{table}\n\n{where}/\n  {'  '.join(names)}\n"))
     return 0
 
 

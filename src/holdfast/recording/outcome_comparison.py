@@ -171,15 +171,18 @@ class OutcomeComparison(Table, msgspec.Struct, frozen=True, kw_only=True):
 
     def legend(self) -> str:
         """Return how the numbers are defined, and the notes."""
-        notes = [f"{run.run}: {note}" for run in self.runs for note in run.notes]
         return "\n".join(
             [
                 "In brackets: the effect against the baseline and its interval (points of a rate, "
                 "ratios of steps and times, differences of rewards).",
                 *self._definitions(),
-                *notes,
+                *self.notes(),
             ]
         )
+
+    def notes(self) -> list[str]:
+        """Return what else a person should know, a line for each."""
+        return [f"{run.run}: {note}" for run in self.runs for note in run.notes]
 
     def _definitions(self) -> list[str]:
         return [
@@ -187,6 +190,12 @@ class OutcomeComparison(Table, msgspec.Struct, frozen=True, kw_only=True):
             f"that did not reach the goal counts as its limit, {self.step_limit:,} steps.",
             f"intervals: {self.method}, each by itself.",
         ]
+
+    def fitting(self, width: int) -> str:
+        """Return the table; if it has longer lines than ``width``, one for each run instead."""
+        text = str(self)
+        longest = max(map(len, text.splitlines()[: len(self.runs) + 2]))
+        return text if longest <= width else "\n".join([self.describe(), *self.notes()])
 
     def describe(self) -> str:
         """Return a table for each run, and how its numbers are defined."""
