@@ -356,7 +356,7 @@ class TestProcesses:
                 assert unfinished is not None
                 assert unfinished.records == records_of(0)
                 with pytest.raises(OutputError, match="readonly"):
-                    journal.set_meta("key", "value")
+                    journal.set_meta(key="value")
             assert content(path.parent) == before
         finally:
             path.parent.chmod(0o700)
@@ -414,7 +414,7 @@ class TestRun:
             with Journal.open(path) as journal:
                 assert journal.raise_epoch() == expected
         with Journal.open(path) as journal:
-            journal.set_meta("epoch", str(2**32 - 1))
+            journal.set_meta(epoch=str(2**32 - 1))
             with pytest.raises(OutputError, match="its epoch is '4294967295'"):
                 journal.raise_epoch()
 
@@ -459,7 +459,7 @@ class TestRun:
             assert unfinished is not None
             assert unfinished.same_boot
             assert unfinished.is_complete
-            journal.set_meta("steps_boot", "another")
+            journal.set_meta(steps_boot="another")
         with Journal.open(path) as journal:
             unfinished = journal.unfinished()
             assert unfinished is not None

@@ -19,7 +19,13 @@ from holdfast.cli.exit_codes import (
 )
 from holdfast.cli.run_figure import Remark, draw_figure
 from holdfast.cli.run_options import RunOptions
-from holdfast.cli.terminal import RunDisplay, counted, print_files, print_summary
+from holdfast.cli.terminal import (
+    RecomputingDisplay,
+    RunDisplay,
+    counted,
+    print_files,
+    print_summary,
+)
 from holdfast.errors import HoldfastError, InvalidValueError, RunError, UnwritableOutputError
 from holdfast.printable import printable
 from holdfast.recording.view_target import require_rerun
@@ -79,20 +85,22 @@ def _run(options: RunOptions) -> int:
     _require_effect(options, configuration, as_robot=as_robot)
     # Before a directory is claimed: a module that cannot be imported leaves nothing behind.
     maker = load_environment(configuration) if as_robot else None
-    if options.resume_if_begun:
-        directory_path = _out_of_one_run(options)
-        directory = RunDirectory.resume_if_begun(directory_path, configuration)
-    elif options.resume:
-        directory_path = options.out or latest_default_directory(configuration, runs)
-        directory = RunDirectory.resume(directory_path, configuration)
+    notes = _Notes(options)
+    if options.resume_if_begun or options.resume:
+        if options.resume_if_begun:
+            directory_path, open_run = _out_of_one_run(options), RunDirectory.resume_if_begun
+        else:
+            directory_path = options.out or latest_default_directory(configuration, runs)
+            open_run = RunDirectory.resume
+        with contextlib.closing(RecomputingDisplay(quiet=notes.is_quiet)) as recomputing:
+            directory = open_run(directory_path, configuration, recomputing.show)
     else:
         directory_path = options.out or claim_default_directory(configuration, runs)
         directory = RunDirectory.create(directory_path, configuration)
     with directory:
-        notes = _Notes(options)
-        display = RunDisplay(
-            configuration, directory.journal.results(), quiet=quiet or options.log == "json"
-        )
+        if directory.before_upgrade is not None:
+            notes.note(directory.before_upgrade.in_words())
+        display = RunDisplay(configuration, directory.journal.results(), quiet=notes.is_quiet)
         if options.resume_if_begun and (complete := directory.complete_summary()) is not None:
             manager.ready()  # otherwise it takes the end for a failed start
             manager.close()
@@ -296,7 +304,8 @@ class _Notes:
     def __init__(self, options: RunOptions) -> None:
         self._as_json = options.log == "json"
         self._quiet = options.quiet
-        self.on_terminal = not (self._quiet or self._as_json) and sys.stderr.isatty()
+        self.is_quiet = self._quiet or self._as_json
+        self.on_terminal = not self.is_quiet and sys.stderr.isatty()
 
     def note(self, text: str) -> None:
         """Print a note, unless the run is quiet."""

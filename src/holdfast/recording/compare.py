@@ -22,6 +22,7 @@ from holdfast.planning.outcome import Decisions, SensingDecision, TaskDecision
 from holdfast.printable import one_line
 from holdfast.protocol.records import ActingRecord, ObservedRecord, decisions_of
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
+from holdfast.recording.recomputing import read_earlier
 from holdfast.recording.run_directory import configuration_difference, recorded_configuration
 
 __all__ = ["Comparison", "Difference", "compare_runs", "difference_of_decisions"]
@@ -146,6 +147,11 @@ def _difference_of_runs(
     versions = [meta.get("holdfast_version", "of an unknown version") for meta in (first, second)]
     if versions[0] != versions[1]:
         notes.append(f"made by holdfast {versions[0]} and by holdfast {versions[1]}")
+    for which, meta in (("first", first), ("second", second)):
+        notes.extend(
+            f"of the {which} run, {earlier.decided()}"
+            for earlier in read_earlier(meta.get("earlier_code"))
+        )
     if first.get("problem_sources") != second.get("problem_sources"):
         notes.append("the source of the problem differs")
     setting = configuration_difference(*texts)

@@ -252,10 +252,10 @@ class Journal(JournalReader):
 
     # -- the run -------------------------------------------------------------------------------
 
-    def set_meta(self, key: str, value: str) -> None:
-        """Write a note about the run."""
+    def set_meta(self, **rows: str) -> None:
+        """Write notes about the run, all or none."""
         with self._transaction():
-            self._note({key: value})
+            self._note(rows)
 
     def _note(self, rows: dict[str, str]) -> None:
         self._connection.executemany(
@@ -281,7 +281,7 @@ class Journal(JournalReader):
         if not text.isdecimal() or not 0 <= int(text) < _MAX_EPOCH:
             raise self._damaged(f"its epoch is {text!r}, not from 0 to {_MAX_EPOCH - 1}")
         epoch = int(text) + 1
-        self.set_meta("epoch", str(epoch))
+        self.set_meta(epoch=str(epoch))
         self._move_log()
         return epoch
 

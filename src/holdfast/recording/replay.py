@@ -46,6 +46,7 @@ from holdfast.recording.facts import (
 )
 from holdfast.recording.fingerprint import difference, fingerprint
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
+from holdfast.recording.recomputing import ComparedTrial, RecordedTrials
 from holdfast.recording.run_clock import RunClock
 from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME, recorded_configuration
 from holdfast.recording.step_times import (
@@ -56,9 +57,8 @@ from holdfast.recording.step_times import (
     trial_ends,
 )
 from holdfast.recording.timings import rows_by_trial
-from holdfast.robot.environment import Environment, SimulatedEnvironment
-from holdfast.robot.recorded_trial import run_recorded_trial
-from holdfast.robot.trial import LateStep, SensingStep, TaskStep, TrialObserver, run_trial
+from holdfast.robot.environment import Environment
+from holdfast.robot.trial import LateStep, SensingStep, TaskStep
 
 __all__ = ["RecordedRun"]
 
@@ -103,10 +103,12 @@ class RecordedRun:
             path = self._journal.path
             directory = path.parent
             self._meta = self._journal.meta()
-            self.configuration, self.world_is_simulated = _configuration(
+            self.configuration, simulated = _configuration(
                 self._meta, path, purpose, problem_directory
             )
-            self._planner = Planner(self.configuration.problem, self.configuration.planning)
+            self._recorded = RecordedTrials(
+                self._journal, self.configuration, world_is_simulated=simulated
+            )
             self._begun = self._journal.unfinished()
             self.unfinished = None if self._begun is None else self._begun.trial
             trials = self._journal.finished()
@@ -152,9 +154,7 @@ class RecordedRun:
 
     def beliefs_known(self, trial: int) -> bool:
         """Return whether a trial can be run again: its observations are known."""
-        if self.world_is_simulated or trial == self.unfinished:
-            return True
-        return self._journal.kept_steps(trial) is not None
+        return trial == self.unfinished or self._recorded.observations_known(trial)
 
     def replay(self, trials: Sequence[int], sinks: Sequence[FactSink]) -> Iterator[int]:
         """Write the facts of some trials to each sink, and yield each trial's number at its end.
@@ -187,37 +187,20 @@ class RecordedRun:
         trial, decisions = result.trial, result.decisions
         assert decisions is not None
         times = self._times(trial, result.steps, clock)
-        simulator = self.configuration.simulator
-        replay = _Replay(trial, list(decisions), times, output, result, self._planner)
+        replay = _Replay(trial, list(decisions), times, output, result, self._recorded.planner)
         with self._named_otherwise():
-            if self.world_is_simulated:
-                run_trial(
-                    self._planner,
-                    simulator.seed,
-                    trial,
-                    max_steps=simulator.max_steps,
-                    observer=replay,
-                    reinitialised_after=decisions.reinitialised_after(),
-                )
-            elif (records := self._journal.kept_steps(trial)) is not None:
-                run_recorded_trial(self._planner, simulator.seed, trial, records, replay, result)
-            else:
+            if self._recorded.run(result, replay) is None:
                 _write_decisions(result, decisions, times, output)
         return trial
 
     def _replay_unfinished(self, begun: UnfinishedTrial, output: _Output, clock: StepClock) -> int:
-        trial, seed = begun.trial, self.configuration.simulator.seed
+        trial = begun.trial
         expected = list(decisions_of(begun.records))
         steps = sum(isinstance(decision, TaskDecision) for decision in expected)
-        simulated = None
-        if self.world_is_simulated:
-            simulated = SimulatedEnvironment(self.configuration.problem, seed, trial)
         times = self._times(trial, steps, clock)
-        replay = _Replay(trial, expected, times, output, None, self._planner)
+        replay = _Replay(trial, expected, times, output, None, self._recorded.planner)
         with self._named_otherwise():
-            run_recorded_trial(
-                self._planner, seed, trial, begun.records, replay, simulated=simulated
-            )
+            self._recorded.run_unfinished(begun, replay)
         replay.end_here()
         return trial
 
@@ -229,7 +212,7 @@ class RecordedRun:
         except DecidedOtherwiseError as error:
             # Most likely the code has changed.
             changed = difference(self._meta, fingerprint(self.configuration))
-            because = "" if changed is None else f" ({changed})"
+            because = "" if changed is None else f" ({changed.words})"
             raise HoldfastError(f"{error}{because}; --trials leaves it out") from error
 
     def _times(self, trial: int, steps: int, clock: StepClock) -> TrialTimes:
@@ -252,7 +235,7 @@ class RecordedRun:
         return TrialTimes(times, deciders)
 
 
-class _Replay(TrialObserver):
+class _Replay(ComparedTrial):
     """Observes a trial that is run again: compares its decisions and writes its facts."""
 
     def __init__(
@@ -264,13 +247,10 @@ class _Replay(TrialObserver):
         result: TrialResult | None,
         planner: Planner,
     ) -> None:
-        self._trial = trial
+        super().__init__(trial, expected, result)
         self._planner = planner
-        self._expected = expected
         self._times = times
         self._output = output
-        self._result = result
-        self._compared = 0
         self._steps = 0
         self._sensed_step = -1
         self._state: PlanningState | None = None
@@ -287,7 +267,7 @@ class _Replay(TrialObserver):
     def sensed(self, step: SensingStep) -> None:
         number, after = step.before.step, step.after
         state_digest = digest(after)
-        self._require(SensingDecision(number, step.sensing_action, state_digest))
+        self.require(SensingDecision(number, step.sensing_action, state_digest))
         entropies = step.sensing_info.entropies
         info = step.observation_info
         fact = SensingFact(
@@ -317,7 +297,7 @@ class _Replay(TrialObserver):
     def acted(self, step: TaskStep) -> None:
         number = step.state.step
         action = np.array(step.executed, dtype=np.float64)
-        self._require(TaskDecision(number, tuple(action.tolist())))
+        self.require(TaskDecision(number, tuple(action.tolist())))
         fact = TaskFact(
             trial=self._trial,
             step=number,
@@ -363,8 +343,7 @@ class _Replay(TrialObserver):
 
     @in_own_mode
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
-        if self._result is None or result.decisions != self._result.decisions:
-            raise DecidedOtherwiseError(self._trial, result.steps, None)
+        super().trial_ended(state, result)
         self._state = state
         self.end_here()
 
@@ -381,22 +360,6 @@ class _Replay(TrialObserver):
         )
         for sink in self._output.at(end.time_ns):
             sink.trial_ends(end)
-
-    def _require(self, decision: SensingDecision | TaskDecision) -> None:
-        kept = self._expected[self._compared] if self._compared < len(self._expected) else None
-        if kept is None or not _same(kept, decision):
-            kind = "sensing" if isinstance(decision, SensingDecision) else "task"
-            raise DecidedOtherwiseError(self._trial, decision.step, kind)
-        self._compared += 1
-
-
-def _same(one: SensingDecision | TaskDecision, other: SensingDecision | TaskDecision) -> bool:
-    if isinstance(one, TaskDecision) and isinstance(other, TaskDecision):
-        # By their bits: 0.0 and -0.0 are different actions.
-        return one.step == other.step and (
-            np.array(one.action).tobytes() == np.array(other.action).tobytes()
-        )
-    return type(one) is type(other) and one == other
 
 
 def _true_state(environment: Environment) -> FloatArray | None:

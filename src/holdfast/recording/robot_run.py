@@ -111,6 +111,8 @@ def perform_trials(
             journal, sinks = ShownJournal(directory.journal, view), [*sinks, view]
         events = BoundedEventLog(log, *sinks)
         stack.callback(events.close)
+        if directory.before_upgrade is not None:
+            events.event("version_changed", reason=directory.before_upgrade.in_words())
         links = make_links(configuration, directory.path / RECOVERY_LOG_NAME, events)
         stack.callback(links.close)
         timings = EventTable(directory.path / TIMINGS_NAME, Timing)

@@ -16,6 +16,7 @@ import numpy as np
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
 from holdfast.printable import cell
+from holdfast.recording.recomputing import EarlierCode
 from holdfast.recording.timings import AnswerCounts, VerificationCounts
 
 __all__ = ["RunSummary", "SummaryBuilder", "csv_lines", "wilson_interval"]
@@ -64,6 +65,8 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         also those of earlier processes of a run that was resumed.
     wall_time_s : float
         Over all parts of the run, without those that were killed.
+    earlier_code : tuple of EarlierCode
+        What other versions of holdfast decided before this one went on; only if one did.
     digest : str
         BLAKE2b-256 over the digests of the trials in order: equal exactly if all decisions of two
         runs are.
@@ -98,6 +101,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     sensing_ms_median: float | None
     sensing_ms_p99: float | None
     wall_time_s: float
+    earlier_code: tuple[EarlierCode, ...] | msgspec.UnsetType = msgspec.UNSET
     digest: str
 
     def to_json(self) -> str:
@@ -203,6 +207,7 @@ class SummaryBuilder:
         wall_time_s: float,
         answers: AnswerCounts | None = None,
         verified: VerificationCounts | None = None,
+        earlier_code: tuple[EarlierCode, ...] = (),
     ) -> RunSummary:
         """Return the summary."""
         count = self._finished
@@ -235,5 +240,6 @@ class SummaryBuilder:
             sensing_ms_median=median,
             sensing_ms_p99=p99,
             wall_time_s=round(wall_time_s, 3),
+            earlier_code=earlier_code or msgspec.UNSET,
             digest=self._digest.hexdigest(),
         )

@@ -1,0 +1,296 @@
+"""Recorded trials, computed again: whether the code of this process decides what the record says.
+
+A decision is a function of seed, trial and observations. What a simulated world has shown follows
+from the seed, and what a robot's own world has shown is in the journal. So a recorded trial can be
+planned again, and each decision compared with the recorded one, bit for bit.
+
+That is how a run goes on with another version of holdfast than began it. Two versions mostly
+decide the same, but their sources do not tell. Their decisions do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from time import perf_counter
+
+import msgspec
+import numpy as np
+
+from holdfast.config.loader import Configuration
+from holdfast.errors import DecidedOtherwiseError, HoldfastError
+from holdfast.numerics.floating_mode import in_own_mode
+from holdfast.planning.outcome import SensingDecision, TaskDecision, TrialResult
+from holdfast.planning.planner import Planner, PlanningState, digest
+from holdfast.protocol.records import decisions_of
+from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
+from holdfast.robot.environment import SimulatedEnvironment
+from holdfast.robot.recorded_trial import run_recorded_trial
+from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
+
+__all__ = ["ComparedTrial", "EarlierCode", "RecordedTrials", "compute_again", "read_earlier"]
+
+_FINISHED_S = 30.0
+"""No further finished trial is begun after this time."""
+
+
+class EarlierCode(msgspec.Struct, frozen=True, kw_only=True):
+    """What another version of holdfast decided in a run, before this one went on with it.
+
+    Attributes
+    ----------
+    holdfast : str
+        The version, with the digest of what decides in it.
+    finished : tuple of (int, int)
+        Ranges of finished trials: the first and the last of each.
+    unfinished : tuple of (int, int), or None
+        The trial that was begun, and how many of its decisions were there.
+    computed_again : tuple of int
+        Trials whose decisions the version that went on has computed, all with the same result.
+    """
+
+    holdfast: str
+    finished: tuple[tuple[int, int], ...]
+    unfinished: tuple[int, int] | None = None
+    computed_again: tuple[int, ...]
+
+    def decided(self) -> str:
+        """Return what was decided, in words."""
+        parts = [_trials(self.finished)] if self.finished else []
+        if self.unfinished is not None:
+            trial, count = self.unfinished
+            parts.append(f"the first {count:,} decisions of trial {trial}")
+        return f"holdfast {self.holdfast} decided {' and '.join(parts) or 'nothing yet'}"
+
+    def in_words(self) -> str:
+        """Return that, and why this version may go on."""
+        if not self.computed_again:
+            return self.decided()
+        again = _trials(_ranges(self.computed_again))
+        return f"{self.decided()}; this version decides the same (computed again: {again})"
+
+
+class RecordedTrials:
+    """The trials of a journal, to be run again.
+
+    Parameters
+    ----------
+    world_is_simulated : bool
+        Else the trials happen in the recorded world, which shows what it has shown.
+    """
+
+    def __init__(
+        self, journal: JournalReader, configuration: Configuration, *, world_is_simulated: bool
+    ) -> None:
+        self._journal = journal
+        self._simulator = configuration.simulator
+        self._world_is_simulated = world_is_simulated
+        self.planner = Planner(configuration.problem, configuration.planning)
+
+    def observations_known(self, trial: int) -> bool:
+        """Return whether a finished trial can be run again."""
+        return (
+            self._world_is_simulated
+            or self._journal.kept_steps(trial) is not None
+            or not any(self._journal.decisions(trial))
+        )
+
+    def run(self, result: TrialResult, observer: TrialObserver) -> TrialResult | None:
+        """Run a finished trial again; return None if its observations were not kept.
+
+        ``result`` has its decisions.
+
+        Raises
+        ------
+        DecidedOtherwiseError
+            If the recorded world has no answer to a decision.
+        """
+        seed, trial = self._simulator.seed, result.trial
+        if self._world_is_simulated:
+            assert result.decisions is not None
+            return run_trial(
+                self.planner,
+                seed,
+                trial,
+                max_steps=self._simulator.max_steps,
+                observer=observer,
+                reinitialised_after=result.decisions.reinitialised_after(),
+            )
+        records = self._journal.kept_steps(trial)
+        if records is None and result.steps:
+            return None
+        return run_recorded_trial(self.planner, seed, trial, records or [], observer, result)
+
+    def run_unfinished(self, begun: UnfinishedTrial, observer: TrialObserver) -> None:
+        """Run the unfinished trial again, as far as its records go; raises as :meth:`run` does."""
+        seed, trial = self._simulator.seed, begun.trial
+        simulated = None
+        if self._world_is_simulated:
+            simulated = SimulatedEnvironment(self.planner.problem, seed, trial)
+        run_recorded_trial(self.planner, seed, trial, begun.records, observer, simulated=simulated)
+
+
+class ComparedTrial(TrialObserver):
+    """Observes a trial that is run again, and compares its decisions with the recorded ones.
+
+    A decision that differs raises DecidedOtherwiseError.
+    """
+
+    def __init__(
+        self,
+        trial: int,
+        expected: Sequence[SensingDecision | TaskDecision],
+        result: TrialResult | None,
+    ) -> None:
+        self._trial = trial
+        self._expected = expected
+        self._result = result
+        self.compared = 0
+
+    @in_own_mode
+    def sensed(self, step: SensingStep) -> None:
+        """Compare a sensing action, and the state after its observation."""
+        self.require(SensingDecision(step.before.step, step.sensing_action, digest(step.after)))
+
+    @in_own_mode
+    def acted(self, step: TaskStep) -> None:
+        """Compare a task action."""
+        action = np.array(step.executed, dtype=np.float64)
+        self.require(TaskDecision(step.state.step, tuple(action.tolist())))
+
+    def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
+        """Compare what is no decision, too: the digests of all states."""
+        del state
+        if self._result is None or result.decisions != self._result.decisions:
+            raise DecidedOtherwiseError(self._trial, result.steps, None)
+
+    def require(self, decision: SensingDecision | TaskDecision) -> None:
+        """Compare the next decision."""
+        kept = self._expected[self.compared] if self.compared < len(self._expected) else None
+        if kept is None or not _same(kept, decision):
+            kind = "sensing" if isinstance(decision, SensingDecision) else "task"
+            raise DecidedOtherwiseError(self._trial, decision.step, kind)
+        self.compared += 1
+
+
+def _same(one: SensingDecision | TaskDecision, other: SensingDecision | TaskDecision) -> bool:
+    if isinstance(one, TaskDecision) and isinstance(other, TaskDecision):
+        # By their bits: 0.0 and -0.0 are different actions.
+        return one.step == other.step and (
+            np.array(one.action).tobytes() == np.array(other.action).tobytes()
+        )
+    return type(one) is type(other) and one == other
+
+
+class _Counted(ComparedTrial):
+    """Tells how many decisions were compared."""
+
+    on_decision: Callable[[], None]
+
+    def require(self, decision: SensingDecision | TaskDecision) -> None:
+        super().require(decision)
+        self.on_decision()
+
+
+def compute_again(
+    journal: JournalReader,
+    configuration: Configuration,
+    made_by: str,
+    earlier: Sequence[EarlierCode],
+    on_progress: Callable[[int, int], None],
+) -> EarlierCode:
+    """Compute decisions of a run again, and return what its earlier code has decided.
+
+    These are all decisions of the unfinished trial, and those of up to three finished ones (the
+    first, the last and one between), of which none but the first is begun after 30 s. So it takes
+    no longer than these trials were planned.
+
+    Parameters
+    ----------
+    made_by : str
+        The version that decided since the last of ``earlier``.
+    on_progress : callable
+        Gets how many decisions were computed, and of how many.
+
+    Raises
+    ------
+    DecidedOtherwiseError
+        If a decision is another one than the recorded.
+    OutputError
+        If the journal is damaged.
+    HoldfastError
+        If it holds decisions, and no observations from which they follow.
+    """
+    trials = RecordedTrials(
+        journal, configuration, world_is_simulated=configuration.environment.object is None
+    )
+    finished, begun = sorted(journal.finished()), journal.unfinished()
+    last = len(finished) - 1
+    chosen = {finished[index] for index in (0, last // 2, last)} if finished else set()
+    results = {
+        each.trial: msgspec.structs.replace(each, decisions=journal.decisions(each.trial))
+        for each in journal.results()
+        if each.trial in chosen
+    }
+    expected = {trial: list(each.decisions or ()) for trial, each in results.items()}
+    so_far = [] if begun is None else list(decisions_of(begun.records))
+    total = len(so_far) + sum(map(len, expected.values()))
+    done = 0
+
+    def count() -> None:
+        nonlocal done
+        done += 1
+        on_progress(done, total)
+
+    computed: list[int] = []
+    started = perf_counter()
+    if begun is not None and so_far:
+        observer = _Counted(begun.trial, so_far, None)
+        observer.on_decision = count
+        trials.run_unfinished(begun, observer)
+        if observer.compared < len(so_far):
+            raise DecidedOtherwiseError(begun.trial, so_far[observer.compared].step, None)
+        computed.append(begun.trial)
+    for trial, result in results.items():
+        if computed and perf_counter() - started > _FINISHED_S:
+            break
+        observer = _Counted(trial, expected[trial], result)
+        observer.on_decision = count
+        if trials.run(result, observer) is not None:
+            computed.append(trial)
+    if finished and not computed:
+        raise HoldfastError("it has not kept its observations")
+    known = {
+        trial
+        for each in earlier
+        for first, last in each.finished
+        for trial in range(first, last + 1)
+    }
+    return EarlierCode(
+        holdfast=made_by,
+        finished=_ranges([trial for trial in finished if trial not in known]),
+        unfinished=None if begun is None else (begun.trial, len(so_far)),
+        computed_again=tuple(sorted(computed)),
+    )
+
+
+def _trials(ranges: Sequence[tuple[int, int]]) -> str:
+    texts = [str(first) if first == last else f"{first} to {last}" for first, last in ranges]
+    return f"trial{'' if ranges[0][0] == ranges[-1][1] else 's'} {', '.join(texts)}"
+
+
+def _ranges(numbers: Sequence[int]) -> tuple[tuple[int, int], ...]:
+    """Return the first and the last of each row of numbers that follow each other."""
+    ranges: list[tuple[int, int]] = []
+    for number in numbers:
+        if ranges and number == ranges[-1][1] + 1:
+            ranges[-1] = ranges[-1][0], number
+        else:
+            ranges.append((number, number))
+    return tuple(ranges)
+
+
+def read_earlier(text: str | None) -> tuple[EarlierCode, ...]:
+    """Read the note of a journal about earlier code."""
+    if text is None:
+        return ()
+    return msgspec.json.decode(text, type=tuple[EarlierCode, ...])
