@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from holdfast.config.problem_builder import find_problem
 from holdfast.config.source import Source, module_directory
 from holdfast.config.yaml_document import read
 from holdfast.errors import ConfigurationError
@@ -48,6 +49,18 @@ def test_a_value_given_instead_has_no_line() -> None:
 def test_an_unknown_section_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="simlator is not a known section; did you mean"):
         source("simlator: {}")
+
+
+def test_names_that_earlier_releases_had_are_those_of_today() -> None:
+    text = "problem: holdfast.lab.studies.x:X\nenvironment: {object: holdfast.lab.y:Y}"
+    named = source(text)
+    assert named.problem == "studies.x:X"
+    assert named.sections["environment"] == {"object": "holdfast_lab.y:Y"}
+    given = source(text, {"environment.object": "holdfast.lab.z:Z"})
+    assert given.sections["environment"]["object"] == "holdfast_lab.z:Z"
+    assert source("problem: holdfast.laboratory:R").problem == "holdfast.laboratory:R"
+    with pytest.raises(ConfigurationError, match="problem is 3"):
+        find_problem(source("problem: 3"), None)
 
 
 def test_the_directory_of_a_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

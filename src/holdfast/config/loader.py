@@ -26,7 +26,7 @@ import msgspec.inspect
 from holdfast.config.problem_builder import build_from, find_problem, schemas_of
 from holdfast.config.reading import absolute_endpoint, read_bounded
 from holdfast.config.registry import names
-from holdfast.config.source import SECTIONS, SETTINGS, Source, module_directory
+from holdfast.config.source import SECTIONS, SETTINGS, Source, module_directory, name_of_today
 from holdfast.config.yaml_document import MAX_BYTES, Document, read, write
 from holdfast.errors import ConfigurationError, InvalidValueError
 from holdfast.numerics.arrays import plain
@@ -216,7 +216,7 @@ def _build(
 ) -> Configuration:
     """Check everything and build the problem."""
     source = Source(document, path, overrides)
-    name, problem_class, directory = find_problem(source, problem_name)
+    name, problem_class, directory = find_problem(source, name_of_today(problem_name))
     source.schemas |= schemas_of(problem_class)
     particle_filter = source.section("particle_filter", ParticleFilterSettings)
     active_sensing = source.section("active_sensing", ActiveSensingSettings)

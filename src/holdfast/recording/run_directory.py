@@ -23,7 +23,7 @@ import msgspec
 
 from holdfast import __version__
 from holdfast.config.loader import Configuration
-from holdfast.config.source import SETTINGS
+from holdfast.config.source import SETTINGS, with_names_of_today
 from holdfast.config.user_code import describe_problem_error
 from holdfast.errors import DecidedOtherwiseError, OutputError, RebootedError
 from holdfast.planning.outcome import TrialResult
@@ -506,7 +506,8 @@ def recorded_configuration(text: str, journal: Path | str = "a journal") -> Any:
     """Return a configuration from a journal, as plain data; somebody else may have written it."""
     from holdfast.config.yaml_document import read
 
-    return read(text.encode(), f"the configuration in {journal}").data
+    data = read(text.encode(), f"the configuration in {journal}").data
+    return with_names_of_today(data) if isinstance(data, Mapping) else data
 
 
 def _compared(configuration: Any) -> Any:
