@@ -71,8 +71,6 @@ def test_the_directory_of_a_module(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     key = ("problem_directory",)
     assert module_directory(here, key, "own", "lamp_module.inner") == tmp_path / "own"
     assert module_directory(here, key, None, "lamp_module") is None
-    (tmp_path / "own" / "studies").mkdir()
-    assert module_directory(here, key, "own", "holdfast.lab.studies.lamps") == tmp_path / "own"
     for value, reason in (("none", "there is no directory"), (".", "there is no module lamp")):
         with pytest.raises(ConfigurationError, match=reason):
             module_directory(here, key, value, "lamp_module")

@@ -252,13 +252,13 @@ def built_in(
     (directory / "run.yaml").write_text(PEG.replace("peg_in_hole_2d", request.param))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(directory)
-        from holdfast.cli.application import run_application
+        from holdfast.cli.application import find_command
 
         for words in (
             ["run", "run.yaml", "--out", "run", "-q"],
             ["export", "run", "--mcap", "run.mcap", "--csv", "tables", "-q"],
         ):
-            assert run_application(words) == 0
+            assert find_command(words).run(words[1:]) == 0
     configuration = load(directory / "run.yaml")
     yield configuration, directory, seen_in(configuration, range(2))
 

@@ -43,6 +43,7 @@ _RUNS = Path("runs")
 _OF_SERVICES = ("recovery.launch", "offload.tls")
 """Keys without effect where no service is named."""
 
+_ENVIRONMENT = "environment.object"
 _OF_ENVIRONMENTS = ("environment.directory", "environment.arguments")
 """Keys without effect where no environment is named."""
 
@@ -84,7 +85,12 @@ def _run(options: RunOptions) -> int:
     as_robot = is_robot_run(options, configuration)
     _require_effect(options, configuration, as_robot=as_robot)
     # Before a directory is claimed: a module that cannot be imported leaves nothing behind.
-    maker = load_environment(configuration) if as_robot else None
+    named_by = next((each for each in options.overrides() if each.key == _ENVIRONMENT), None)
+    maker = (
+        load_environment(configuration, None if named_by is None else named_by.option)
+        if as_robot
+        else None
+    )
     notes = _Notes(options)
     if options.resume_if_begun or options.resume:
         if options.resume_if_begun:
