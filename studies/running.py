@@ -12,8 +12,8 @@ import pandas as pd
 
 from holdfast import __version__
 from holdfast.errors import OutputError
-from holdfast.recording.machine import describe
 from holdfast.runtime.files import remove_unfinished, write_atomically
+from holdfast_lab.testbed.machine import describe
 from studies.errors import TaskError
 from studies.executors import Executor, LocalExecutor
 from studies.study import Report, Scale, Study

@@ -131,8 +131,7 @@ def _explain(_: Sequence[str]) -> int:
 
 
 def _print_version(_: Sequence[str]) -> int:
-    from holdfast.config.source_digest import core_version
-    from holdfast.recording.machine import machines
+    from holdfast.config.source_digest import core_version, machines
 
     sys.stdout.write(f"holdfast {core_version()} ({machines()} state machines)\n")
     return 0

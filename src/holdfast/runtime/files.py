@@ -26,7 +26,6 @@ from holdfast.errors import OutputError
 __all__ = [
     "NewFile",
     "bounded_lines",
-    "claim_directory",
     "create_directory_atomically",
     "directory_beside",
     "move_into_place",
@@ -39,8 +38,6 @@ __all__ = [
     "started_in",
     "write_atomically",
 ]
-
-_MAX_DEFAULT_DIRECTORIES = 10_000
 
 _started_in: Path | None = None
 """Where the command was started; the code of a problem or robot may change the directory later."""
@@ -228,27 +225,6 @@ def remove_unfinished_of(directory: Path) -> None:
         else:
             with _refusals(left, "removed"):
                 left.unlink()
-
-
-def claim_directory(out: Path | None, parent: Path, name: str) -> Path:
-    """Create an empty output directory for a command.
-
-    It is ``out``, which may exist if it is empty; or ``name`` in ``parent``, which is created if
-    missing, with a number if it exists.
-    """
-    parent = parent.absolute()
-    with _refusals(out or parent, "made"):
-        if out is not None:
-            out.mkdir(parents=True, exist_ok=True)
-            _require_empty(out, "--out")
-            return out
-        parent.mkdir(parents=True, exist_ok=True)
-        for number in range(1, _MAX_DEFAULT_DIRECTORIES):
-            path = parent / (f"{name}-{number}" if number > 1 else name)
-            with contextlib.suppress(FileExistsError):
-                path.mkdir()
-                return path
-    raise OutputError(f"{parent}: more than {_MAX_DEFAULT_DIRECTORIES} of {name}; give --out")
 
 
 def require_free(path: Path, option: str, *, directory: bool) -> None:

@@ -75,11 +75,11 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _run(out: Path | None, seed: int, *, quick: bool) -> Findings:
-    from holdfast.runtime.files import claim_directory
     from holdfast_lab.demo.narrator import DemoState
     from holdfast_lab.demo.scenario import Demo, Plan
     from holdfast_lab.demo.timeline import make_show
     from holdfast_lab.testbed.driver import Testbed
+    from holdfast_lab.testbed.output_directory import claim_directory
 
     directory = claim_directory(out, _RUNS, "demo")
     sys.stderr.write(_INTRODUCTION)
