@@ -56,11 +56,10 @@ class Decider(NamedTuple):
 
 
 class TrialBeginFact(NamedTuple):
-    """A trial begins; ``beliefs_known`` says whether its facts have beliefs."""
+    """A trial begins."""
 
     trial: int
     time_ns: int
-    beliefs_known: bool
 
 
 class SensingFact(NamedTuple):
@@ -76,7 +75,7 @@ class SensingFact(NamedTuple):
         When it was chosen, and when its observation was part of the belief.
     state_digest : bytes
         Of the planning state after the observation.
-    before, after : Belief or None
+    before, after : Belief
         The beliefs before and after the observation.
     entropies : array of shape (num_sensing_actions,) or None
         What was minimised, in nats; None if nothing was.
@@ -89,9 +88,9 @@ class SensingFact(NamedTuple):
     sensing_action: int
     state_digest: bytes
     decider: Decider | None
-    before: Belief | None = None
-    after: Belief | None = None
-    stage: int | None = None
+    before: Belief
+    after: Belief
+    stage: int
     entropies: FloatArray | None = None
     observation: FloatArray | None = None
     explained: bool | None = None
@@ -107,7 +106,7 @@ class TaskFact(NamedTuple):
     ----------
     action : array of shape (action_size,)
         As it was executed.
-    belief, estimate : Belief or None, array of shape (state_size,) or None
+    belief, estimate : Belief, array of shape (state_size,)
         From which it was chosen, and the state with which the policy was evaluated.
     true_state : array of shape (state_size,) or None
         Before the action.
@@ -120,9 +119,9 @@ class TaskFact(NamedTuple):
     time_ns: int
     action: FloatArray
     decider: Decider | None
-    belief: Belief | None = None
-    stage: int | None = None
-    estimate: FloatArray | None = None
+    belief: Belief
+    stage: int
+    estimate: FloatArray
     true_state: FloatArray | None = None
     reward: float | None = None
     motion: FloatArray | None = None
@@ -157,7 +156,7 @@ class TrialEndFact(NamedTuple):
     result : TrialResult or None
         None if the trial is not finished.
     belief, estimate, true_state
-        As in :class:`TaskFact`, after the last action.
+        As in :class:`TaskFact`, after the last action; None where the records end before that.
     """
 
     trial: int

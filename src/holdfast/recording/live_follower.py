@@ -122,7 +122,7 @@ class Follower:
         self._pending = self._answered = None
         if self._configuration.environment.object is None:
             self._simulated = SimulatedEnvironment(self._planner.problem, seed, number)
-        self._sink.trial_begins(TrialBeginFact(number, time_ns, beliefs_known=True))
+        self._sink.trial_begins(TrialBeginFact(number, time_ns))
         return trial
 
     def _finish(self, message: EndedMessage) -> None:

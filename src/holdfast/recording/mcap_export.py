@@ -138,7 +138,7 @@ class McapSink:
                 self._problem,
                 self._layout,
                 TASK_FRAME,
-                ESTIMATE_FRAME if fact.beliefs_known else None,
+                ESTIMATE_FRAME,
                 TRUTH_FRAME,
             )
             self._markers(now, "/holdfast/scene", markers, anew=True)
@@ -157,7 +157,7 @@ class McapSink:
             labels = "; ".join(self._choices[: len(fact.entropies)])
             self._array(now, "/holdfast/entropies", fact.entropies, labels)
         is_performed = fact.sensing_action < len(self._problem.sensing_actions)
-        if self._layout is not None and fact.before is not None and is_performed:
+        if self._layout is not None and is_performed:
             markers = sensing_markers(
                 self._problem, self._layout, TASK_FRAME, fact.before, fact.sensing_action
             )

@@ -86,14 +86,6 @@ class RecordedTrials:
         self._world_is_simulated = world_is_simulated
         self.planner = Planner(configuration.problem, configuration.planning)
 
-    def observations_known(self, trial: int) -> bool:
-        """Return whether a finished trial can be run again."""
-        return (
-            self._world_is_simulated
-            or self._journal.kept_steps(trial) is not None
-            or not any(self._journal.decisions(trial))
-        )
-
     def run(self, result: TrialResult, observer: TrialObserver) -> TrialResult | None:
         """Run a finished trial again; return None if its observations were not kept.
 

@@ -6,8 +6,7 @@ process, and every decision is compared, bit for bit, with the recorded one befo
 as a fact (:mod:`holdfast.recording.facts`).
 
 A simulated world is a function of the seed as well, so its true states are facts, too. What a
-robot's own world has shown is in the journal. Journals from before observations were kept yield the
-decisions and their times, and no beliefs.
+robot's own world has shown is in the journal.
 """
 
 from __future__ import annotations
@@ -26,11 +25,12 @@ from holdfast.config.loader import Configuration
 from holdfast.errors import (
     DecidedOtherwiseError,
     HoldfastError,
+    OutputError,
     UntrustedCodeError,
 )
 from holdfast.numerics.arrays import FloatArray, floats_or_none
 from holdfast.numerics.floating_mode import in_own_mode
-from holdfast.planning.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
+from holdfast.planning.outcome import SensingDecision, TaskDecision, TrialResult
 from holdfast.planning.planner import Planner, PlanningState, digest
 from holdfast.printable import one_line
 from holdfast.protocol.records import decisions_of
@@ -152,10 +152,6 @@ class RecordedRun:
         """Raise OutputError if a run has written to the journal meanwhile."""
         self._journal.require_unchanged()
 
-    def beliefs_known(self, trial: int) -> bool:
-        """Return whether a trial can be run again: its observations are known."""
-        return trial == self.unfinished or self._recorded.observations_known(trial)
-
     def replay(self, trials: Sequence[int], sinks: Sequence[FactSink]) -> Iterator[int]:
         """Write the facts of some trials to each sink, and yield each trial's number at its end.
 
@@ -164,7 +160,7 @@ class RecordedRun:
         Raises
         ------
         OutputError
-            If a trial is damaged.
+            If a trial is damaged, or of a robot's own world whose observations were not kept.
         HoldfastError
             If a trial is decided otherwise when it is run again.
         """
@@ -190,7 +186,11 @@ class RecordedRun:
         replay = _Replay(trial, list(decisions), times, output, result, self._recorded.planner)
         with self._named_otherwise():
             if self._recorded.run(result, replay) is None:
-                _write_decisions(result, decisions, times, output)
+                raise OutputError(
+                    f"{self.path}: trial {trial} cannot be computed again: this run is older than "
+                    "the keeping of what an environment of your own has shown; --trials leaves it "
+                    "out"
+                )
         return trial
 
     def _replay_unfinished(self, begun: UnfinishedTrial, output: _Output, clock: StepClock) -> int:
@@ -259,7 +259,7 @@ class _Replay(ComparedTrial):
     def trial_began(self, environment: Environment, state: PlanningState) -> None:
         self._state = state
         self._true_state = _true_state(environment)
-        begin = TrialBeginFact(self._trial, self._times.at(0, 0), True)
+        begin = TrialBeginFact(self._trial, self._times.at(0, 0))
         for sink in self._output.at(begin.time_ns, between_trials=True):
             sink.trial_begins(begin)
 
@@ -366,35 +366,6 @@ def _true_state(environment: Environment) -> FloatArray | None:
     # Only a simulated world knows its own state.
     state = getattr(environment, "state", None)
     return None if state is None else np.array(state, dtype=np.float64)
-
-
-def _write_decisions(
-    result: TrialResult, decisions: Decisions, times: TrialTimes, output: _Output
-) -> None:
-    """Write the facts that follow from the decisions of a trial alone."""
-    trial = result.trial
-    begin = TrialBeginFact(trial, times.at(0, 0), False)
-    for sink in output.at(begin.time_ns, between_trials=True):
-        sink.trial_begins(begin)
-    for decision in decisions:
-        step = decision.step
-        if isinstance(decision, SensingDecision):
-            chosen, state_digest = decision.sensing_action, decision.state_digest
-            decided_ns, observed_ns = times.at(step, 0), times.at(step, 1)
-            decider = times.deciders.get((step, "sensing"))
-            sensing = SensingFact(
-                trial, step, decided_ns, observed_ns, chosen, state_digest, decider
-            )
-            for sink in output.at(decided_ns):
-                sink.sensed(sensing)
-        else:
-            decider = times.deciders.get((step, "task"))
-            task = TaskFact(trial, step, times.at(step, 2), np.array(decision.action), decider)
-            for sink in output.at(task.time_ns):
-                sink.acted(task)
-    end = TrialEndFact(trial, times.at(result.steps, 0), result.steps, result)
-    for sink in output.at(end.time_ns):
-        sink.trial_ends(end)
 
 
 class _Output:

@@ -162,7 +162,7 @@ class RerunSink:
                 "scores/chosen", rr.Scalars(_finite(entropies[fact.sensing_action]))
             )
         is_performed = fact.sensing_action < len(self._problem.sensing_actions)
-        if self._layout is not None and fact.before is not None and is_performed:
+        if self._layout is not None and is_performed:
             self._sensing(fact.before, fact.sensing_action)
         self._at(fact.observed_ns, fact.trial, fact.step)
         self._belief(fact.after)
@@ -184,8 +184,7 @@ class RerunSink:
         self._at(fact.time_ns, fact.trial, fact.step)
         self._decider(fact.decider)
         self._place(fact.belief, fact.estimate, fact.true_state)
-        if fact.estimate is not None:
-            self._action(fact.estimate, fact.action)
+        self._action(fact.estimate, fact.action)
         self._flush()
 
     def observed_late(self, fact: LateFact) -> None:
