@@ -152,7 +152,7 @@ def test_another_decision_is_refused_and_named(tmp_path: Path) -> None:
             first,
             [*begun[:5], ActingRecord(acting.step, action)],
         ),
-        r"trial 2, step 0 \(the sensing action, or the state": (
+        r"trial 2, step 0 \(the state that": (
             first,
             [msgspec.structs.replace(sensed, digest=bytes(32)), *begun[1:]],
         ),

@@ -53,7 +53,8 @@ class CsvSink:
             ]
             self._trials, _, self._beliefs, self._events = map(_writer, self._files)
             self._close = stack.pop_all()
-        self._trials.writerow([*TRIAL_COLUMNS, "began", "ended"])
+        trial, *others = TRIAL_COLUMNS
+        self._trials.writerow([trial, "began", "ended", *others])
         self._steps = csv.DictWriter(
             self._files[1],
             [
@@ -120,7 +121,9 @@ class CsvSink:
             cells: list[object] = [known.get(column) for column in TRIAL_COLUMNS]
         else:
             cells = trial_cells(fact.result)
-        self._trials.writerow([*cells, _seconds(self._began_ns), _seconds(fact.time_ns)])
+        trial, *others = cells
+        times = _seconds(self._began_ns), _seconds(fact.time_ns)
+        self._trials.writerow([trial, *times, *others])
 
     def happened(self, fact: EventFact) -> None:
         """Write an event."""

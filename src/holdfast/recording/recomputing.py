@@ -23,9 +23,16 @@ from holdfast.planning.outcome import SensingDecision, TaskDecision, TrialResult
 from holdfast.planning.planner import Planner, PlanningState, digest
 from holdfast.protocol.records import decisions_of
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
-from holdfast.robot.environment import SimulatedEnvironment
+from holdfast.robot.environment import Environment, SimulatedEnvironment
 from holdfast.robot.recorded_trial import run_recorded_trial
-from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
+from holdfast.robot.trial import (
+    NULL_OBSERVER,
+    LateStep,
+    SensingStep,
+    TaskStep,
+    TrialObserver,
+    run_trial,
+)
 
 __all__ = ["ComparedTrial", "EarlierCode", "RecordedTrials", "compute_again", "read_earlier"]
 
@@ -124,7 +131,7 @@ class RecordedTrials:
 class ComparedTrial(TrialObserver):
     """Observes a trial that is run again, and compares its decisions with the recorded ones.
 
-    A decision that differs raises DecidedOtherwiseError.
+    A decision that differs raises DecidedOtherwiseError. What is the same goes on to ``observer``.
     """
 
     def __init__(
@@ -132,55 +139,75 @@ class ComparedTrial(TrialObserver):
         trial: int,
         expected: Sequence[SensingDecision | TaskDecision],
         result: TrialResult | None,
+        observer: TrialObserver = NULL_OBSERVER,
     ) -> None:
         self._trial = trial
         self._expected = expected
         self._result = result
         self.compared = 0
+        self._observer = observer
+
+    def trial_began(self, environment: Environment, state: PlanningState) -> None:
+        """Pass it on."""
+        self._observer.trial_began(environment, state)
+
+    def observed_late(self, step: LateStep) -> None:
+        """Pass it on: the next decision shows the state."""
+        self._observer.observed_late(step)
+
+    def reinitialised(self, state: PlanningState) -> None:
+        """Pass it on."""
+        self._observer.reinitialised(state)
 
     @in_own_mode
     def sensed(self, step: SensingStep) -> None:
         """Compare a sensing action, and the state after its observation."""
-        self.require(SensingDecision(step.before.step, step.sensing_action, digest(step.after)))
+        self._require(SensingDecision(step.before.step, step.sensing_action, digest(step.after)))
+        self._observer.sensed(step)
 
     @in_own_mode
     def acted(self, step: TaskStep) -> None:
         """Compare a task action."""
         action = np.array(step.executed, dtype=np.float64)
-        self.require(TaskDecision(step.state.step, tuple(action.tolist())))
+        self._require(TaskDecision(step.state.step, tuple(action.tolist())))
+        self._observer.acted(step)
 
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
         """Compare what is no decision, too: the digests of all states."""
-        del state
         if self._result is None or result.decisions != self._result.decisions:
             raise DecidedOtherwiseError(self._trial, result.steps, None)
+        self._observer.trial_ended(state, result)
 
-    def require(self, decision: SensingDecision | TaskDecision) -> None:
-        """Compare the next decision."""
+    def _require(self, decision: SensingDecision | TaskDecision) -> None:
         kept = self._expected[self.compared] if self.compared < len(self._expected) else None
-        if kept is None or not _same(kept, decision):
-            kind = "sensing" if isinstance(decision, SensingDecision) else "task"
+        kind: str | None = "task" if isinstance(decision, TaskDecision) else "sensing"
+        if isinstance(kept, TaskDecision) and isinstance(decision, TaskDecision):
+            # By their bits: 0.0 and -0.0 are different actions.
+            bits = [np.array(each.action).tobytes() for each in (kept, decision)]
+            same = kept.step == decision.step and bits[0] == bits[1]
+        else:
+            same = kept == decision
+            # A state that differs after the same choice is nobody's decision.
+            kind = None if kept is not None and kept[:2] == decision[:2] else kind
+        if not same:
             raise DecidedOtherwiseError(self._trial, decision.step, kind)
         self.compared += 1
 
 
-def _same(one: SensingDecision | TaskDecision, other: SensingDecision | TaskDecision) -> bool:
-    if isinstance(one, TaskDecision) and isinstance(other, TaskDecision):
-        # By their bits: 0.0 and -0.0 are different actions.
-        return one.step == other.step and (
-            np.array(one.action).tobytes() == np.array(other.action).tobytes()
-        )
-    return type(one) is type(other) and one == other
+class _Counting(TrialObserver):
+    """Counts decisions."""
 
+    def __init__(self, total: int, on_progress: Callable[[int, int], None]) -> None:
+        self._done = 0
+        self._total = total
+        self._on_progress = on_progress
 
-class _Counted(ComparedTrial):
-    """Tells how many decisions were compared."""
+    def sensed(self, step: object) -> None:
+        del step
+        self._done += 1
+        self._on_progress(self._done, self._total)
 
-    on_decision: Callable[[], None]
-
-    def require(self, decision: SensingDecision | TaskDecision) -> None:
-        super().require(decision)
-        self.on_decision()
+    acted = sensed
 
 
 def compute_again(
@@ -226,18 +253,11 @@ def compute_again(
     expected = {trial: list(each.decisions or ()) for trial, each in results.items()}
     so_far = [] if begun is None else list(decisions_of(begun.records))
     total = len(so_far) + sum(map(len, expected.values()))
-    done = 0
-
-    def count() -> None:
-        nonlocal done
-        done += 1
-        on_progress(done, total)
-
+    counting = _Counting(total, on_progress)
     computed: list[int] = []
     started = perf_counter()
     if begun is not None and so_far:
-        observer = _Counted(begun.trial, so_far, None)
-        observer.on_decision = count
+        observer = ComparedTrial(begun.trial, so_far, None, counting)
         trials.run_unfinished(begun, observer)
         if observer.compared < len(so_far):
             raise DecidedOtherwiseError(begun.trial, so_far[observer.compared].step, None)
@@ -245,8 +265,7 @@ def compute_again(
     for trial, result in results.items():
         if computed and perf_counter() - started > _FINISHED_S:
             break
-        observer = _Counted(trial, expected[trial], result)
-        observer.on_decision = count
+        observer = ComparedTrial(trial, expected[trial], result, counting)
         if trials.run(result, observer) is not None:
             computed.append(trial)
     if finished and not computed:

@@ -30,7 +30,7 @@ from holdfast.errors import (
 )
 from holdfast.numerics.arrays import FloatArray, floats_or_none
 from holdfast.numerics.floating_mode import in_own_mode
-from holdfast.planning.outcome import SensingDecision, TaskDecision, TrialResult
+from holdfast.planning.outcome import TaskDecision, TrialResult
 from holdfast.planning.planner import Planner, PlanningState, digest
 from holdfast.printable import one_line
 from holdfast.protocol.records import decisions_of
@@ -58,7 +58,7 @@ from holdfast.recording.step_times import (
 )
 from holdfast.recording.timings import rows_by_trial
 from holdfast.robot.environment import Environment
-from holdfast.robot.trial import LateStep, SensingStep, TaskStep
+from holdfast.robot.trial import LateStep, SensingStep, TaskStep, TrialObserver
 
 __all__ = ["RecordedRun"]
 
@@ -183,9 +183,10 @@ class RecordedRun:
         trial, decisions = result.trial, result.decisions
         assert decisions is not None
         times = self._times(trial, result.steps, clock)
-        replay = _Replay(trial, list(decisions), times, output, result, self._recorded.planner)
+        facts = _Facts(trial, times, output, result, self._recorded.planner)
+        compared = ComparedTrial(trial, list(decisions), result, facts)
         with self._named_otherwise():
-            if self._recorded.run(result, replay) is None:
+            if self._recorded.run(result, compared) is None:
                 raise OutputError(
                     f"{self.path}: trial {trial} cannot be computed again: this run is older than "
                     "the keeping of what an environment of your own has shown; --trials leaves it "
@@ -198,10 +199,10 @@ class RecordedRun:
         expected = list(decisions_of(begun.records))
         steps = sum(isinstance(decision, TaskDecision) for decision in expected)
         times = self._times(trial, steps, clock)
-        replay = _Replay(trial, expected, times, output, None, self._recorded.planner)
+        facts = _Facts(trial, times, output, None, self._recorded.planner)
         with self._named_otherwise():
-            self._recorded.run_unfinished(begun, replay)
-        replay.end_here()
+            self._recorded.run_unfinished(begun, ComparedTrial(trial, expected, None, facts))
+        facts.end_here()
         return trial
 
     @contextlib.contextmanager
@@ -235,19 +236,19 @@ class RecordedRun:
         return TrialTimes(times, deciders)
 
 
-class _Replay(ComparedTrial):
-    """Observes a trial that is run again: compares its decisions and writes its facts."""
+class _Facts(TrialObserver):
+    """Writes the facts of a trial that is run again."""
 
     def __init__(
         self,
         trial: int,
-        expected: Sequence[SensingDecision | TaskDecision],
         times: TrialTimes,
         output: _Output,
         result: TrialResult | None,
         planner: Planner,
     ) -> None:
-        super().__init__(trial, expected, result)
+        self._trial = trial
+        self._result = result
         self._planner = planner
         self._times = times
         self._output = output
@@ -266,8 +267,6 @@ class _Replay(ComparedTrial):
     @in_own_mode
     def sensed(self, step: SensingStep) -> None:
         number, after = step.before.step, step.after
-        state_digest = digest(after)
-        self.require(SensingDecision(number, step.sensing_action, state_digest))
         entropies = step.sensing_info.entropies
         info = step.observation_info
         fact = SensingFact(
@@ -276,7 +275,7 @@ class _Replay(ComparedTrial):
             decided_ns=self._times.at(number, 0),
             observed_ns=self._times.at(number, 1),
             sensing_action=step.sensing_action,
-            state_digest=state_digest,
+            state_digest=digest(after),
             decider=self._times.deciders.get((number, "sensing")),
             before=step.before.belief,
             after=after.belief,
@@ -297,7 +296,6 @@ class _Replay(ComparedTrial):
     def acted(self, step: TaskStep) -> None:
         number = step.state.step
         action = np.array(step.executed, dtype=np.float64)
-        self.require(TaskDecision(number, tuple(action.tolist())))
         fact = TaskFact(
             trial=self._trial,
             step=number,
@@ -343,7 +341,7 @@ class _Replay(ComparedTrial):
 
     @in_own_mode
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
-        super().trial_ended(state, result)
+        del result
         self._state = state
         self.end_here()
 

@@ -93,9 +93,9 @@ _BOOT = "boot"
 """Key of the note in which boot of the machine a robot may move."""
 
 _DECISIONS = {
-    "sensing": "the sensing action, or the state after its observation",
+    "sensing": "the sensing action",
     "task": "the task action",
-    None: "the state, or the end of the trial",
+    None: "the state that a decision led to",
 }
 
 _MAX_SUFFIX = 10_000
