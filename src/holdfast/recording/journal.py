@@ -21,7 +21,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -69,6 +69,8 @@ class Journal(JournalReader):
     ----------
     survives : {"process_crash", "power_cut"}
         What each appended step survives.
+    on_append : callable or None
+        Gets the trial and the records of each :meth:`append`, once they are written.
     """
 
     def __init__(
@@ -78,6 +80,7 @@ class Journal(JournalReader):
         self.survives = survives
         self._encode = msgspec.msgpack.Encoder().encode
         self._steps: _Steps | None = None
+        self.on_append: Callable[[int, Sequence[Record]], None] | None = None
         self._count: StepCount | None = None
         self._in_place: list[tuple[str, FileIdentity]] = []
 
@@ -341,6 +344,8 @@ class Journal(JournalReader):
         # Afterwards: a count that is too small does no harm.
         count.write(trial, sequence)
         self._steps = _Steps(trial, sequence)
+        if self.on_append is not None:
+            self.on_append(trial, records)
 
     def _count_from(self, trial: int, number: int) -> StepCount:
         """Begin to count, once what is in the journal was found to be enough to go on from."""
