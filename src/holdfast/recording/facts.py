@@ -9,10 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
+
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.belief import Belief
 from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import digest
 from holdfast.recording.run_clock import Stamp
+from holdfast.robot.trial import LateStep, SensingStep
 
 __all__ = [
     "SCORES",
@@ -53,6 +57,11 @@ class Decider(NamedTuple):
     waited_ms: float
     round_trip_ms: float | None
     computed_ms: float | None
+
+    @classmethod
+    def of(cls, answer: Any) -> Decider:
+        """Return that of a ``Timing``, or of a row of the table."""
+        return cls(*(getattr(answer, name) for name in cls._fields))
 
 
 class TrialBeginFact(NamedTuple):
@@ -97,6 +106,32 @@ class SensingFact(NamedTuple):
     resampled: bool | None = None
     effective_sample_size: float | None = None
     mahalanobis_distance: float | None = None
+
+    @classmethod
+    def of(
+        cls, step: SensingStep, decided_ns: int, observed_ns: int, decider: Decider | None
+    ) -> SensingFact:
+        """Return the fact of a step."""
+        before, after, entropies = step.before, step.after, step.sensing_info.entropies
+        info = step.observation_info
+        return cls(
+            trial=before.trial,
+            step=before.step,
+            decided_ns=decided_ns,
+            observed_ns=observed_ns,
+            sensing_action=step.sensing_action,
+            state_digest=digest(after),
+            decider=decider,
+            before=before.belief,
+            after=after.belief,
+            stage=before.stage,
+            entropies=None if entropies is None else np.array(entropies, dtype=np.float64),
+            observation=step.observation,
+            explained=info.explained,
+            resampled=info.resampled,
+            effective_sample_size=info.effective_sample_size,
+            mahalanobis_distance=info.mahalanobis_distance,
+        )
 
 
 class TaskFact(NamedTuple):
@@ -146,6 +181,15 @@ class LateFact(NamedTuple):
     observation: FloatArray
     after: Belief
     explained: bool
+
+    @classmethod
+    def of(cls, step: LateStep, time_ns: int) -> LateFact:
+        """Return the fact of a late observation."""
+        late, after = step.late, step.after
+        explained = step.observation_info.explained
+        return cls(
+            after.trial, after.step, time_ns, late.step, late.observation, after.belief, explained
+        )
 
 
 class TrialEndFact(NamedTuple):

@@ -52,6 +52,7 @@ from holdfast.recording.live_messages import (
 )
 from holdfast.recording.view_target import ViewTarget
 from holdfast.robot.environment import SimulatedEnvironment
+from holdfast.robot.trial import LateStep, SensingStep
 
 __all__ = ["Follower", "follow"]
 
@@ -95,16 +96,7 @@ class Follower:
                 self._fold(trial, record, message.time_ns)
         elif isinstance(message, TimingMessage):
             timing = message.timing
-            self._deciders[timing.step, timing.kind] = (
-                message.time_ns,
-                Decider(
-                    timing.service,
-                    timing.status,
-                    timing.waited_ms,
-                    timing.round_trip_ms,
-                    timing.computed_ms,
-                ),
-            )
+            self._deciders[timing.step, timing.kind] = message.time_ns, Decider.of(timing)
         elif isinstance(message, EndedMessage):
             self._finish(message)
         elif isinstance(message, EventMessage):
@@ -183,51 +175,20 @@ class Follower:
             found = trial.observe_late(late)
             if found is not None and not is_late:
                 self._sink.observed_late(
-                    LateFact(
-                        trial=trial.state.trial,
-                        step=record.step,
-                        time_ns=time_ns,
-                        taken=record.taken,
-                        observation=late.observation,
-                        after=trial.state.belief,
-                        explained=found[0].explained,
-                    )
+                    LateFact.of(LateStep(late, trial.state, found[0]), time_ns)
                 )
         elif isinstance(record, ReinitialisedRecord):
             trial.reinitialise()  # an event tells of it
 
     def _sensed(self, trial: Trial, record: ObservedRecord, time_ns: int, *, is_late: bool) -> None:
         before = trial.state
-        entropies = None
-        if not is_late:
-            entropies = self._planner.choose_sensing_action(before)[1].entropies
+        why = None if is_late else self._planner.choose_sensing_action(before)[1]
         observation = numbers_of(record.observation)
         info, _ = trial.observe(record.sensing_action, observation, record.sensing_ms)
-        decided = self._deciders.pop((before.step, "sensing"), None)
-        if is_late:
-            return
-        fact = SensingFact(
-            trial=before.trial,
-            step=before.step,
-            decided_ns=time_ns if decided is None else decided[0],
-            observed_ns=time_ns,
-            sensing_action=record.sensing_action,
-            state_digest=record.digest,
-            decider=None if decided is None else decided[1],
-            before=before.belief,
-            after=trial.state.belief,
-            stage=before.stage,
-            entropies=entropies,
-        )
-        if observation is not None:
-            fact = fact._replace(
-                observation=observation,
-                explained=info.explained,
-                resampled=info.resampled,
-                effective_sample_size=info.effective_sample_size,
-                mahalanobis_distance=info.mahalanobis_distance,
-            )
-        self._sink.sensed(fact)
+        decided_ns, decider = self._deciders.pop((before.step, "sensing"), (time_ns, None))
+        if why is not None:
+            step = SensingStep(before, record.sensing_action, why, observation, trial.state, info)
+            self._sink.sensed(SensingFact.of(step, decided_ns, time_ns, decider))
 
     def _acting(self, state: PlanningState, action: FloatArray, time_ns: int) -> None:
         """Show an action when it is ordered: how it went shows at the next one."""

@@ -31,7 +31,7 @@ from holdfast.errors import (
 from holdfast.numerics.arrays import FloatArray, floats_or_none
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.planning.outcome import TaskDecision, TrialResult
-from holdfast.planning.planner import Planner, PlanningState, digest
+from holdfast.planning.planner import Planner, PlanningState
 from holdfast.printable import one_line
 from holdfast.protocol.records import decisions_of
 from holdfast.recording.facts import (
@@ -219,10 +219,7 @@ class RecordedRun:
     def _times(self, trial: int, steps: int, clock: StepClock) -> TrialTimes:
         rows = self._rows.get(trial, {}) if self.has_times else {}
         times = clock.next_trial(steps, rows, self._ends.get(trial))
-        deciders = {
-            key: Decider(row.service, row.status, row.waited_ms, row.round_trip_ms, row.computed_ms)
-            for key, row in rows.items()
-        }
+        deciders = {key: Decider.of(row) for key, row in rows.items()}
         current: Decider | None = None
         for step in range(steps):
             asked = deciders.get((step, "task"))
@@ -266,30 +263,12 @@ class _Facts(TrialObserver):
 
     @in_own_mode
     def sensed(self, step: SensingStep) -> None:
-        number, after = step.before.step, step.after
-        entropies = step.sensing_info.entropies
-        info = step.observation_info
-        fact = SensingFact(
-            trial=self._trial,
-            step=number,
-            decided_ns=self._times.at(number, 0),
-            observed_ns=self._times.at(number, 1),
-            sensing_action=step.sensing_action,
-            state_digest=digest(after),
-            decider=self._times.deciders.get((number, "sensing")),
-            before=step.before.belief,
-            after=after.belief,
-            stage=step.before.stage,
-            entropies=None if entropies is None else np.array(entropies, dtype=np.float64),
-            observation=step.observation,
-            explained=info.explained,
-            resampled=info.resampled,
-            effective_sample_size=info.effective_sample_size,
-            mahalanobis_distance=info.mahalanobis_distance,
-        )
+        number, times = step.before.step, self._times
+        decider = times.deciders.get((number, "sensing"))
+        fact = SensingFact.of(step, times.at(number, 0), times.at(number, 1), decider)
         for sink in self._output.at(fact.decided_ns):
             sink.sensed(fact)
-        self._state = after
+        self._state = step.after
         self._sensed_step = number
 
     @in_own_mode
@@ -323,15 +302,7 @@ class _Facts(TrialObserver):
         moment = (number, 1) if self._sensed_step == number else (number - 1, 3)
         if self._state is not None:
             self._state = step.after
-        fact = LateFact(
-            trial=self._trial,
-            step=number,
-            time_ns=self._times.at(*moment),
-            taken=step.late.step,
-            observation=step.late.observation,
-            after=step.after.belief,
-            explained=step.observation_info.explained,
-        )
+        fact = LateFact.of(step, self._times.at(*moment))
         for sink in self._output.at(fact.time_ns):
             sink.observed_late(fact)
 
