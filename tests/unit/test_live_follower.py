@@ -31,11 +31,11 @@ from holdfast.recording.facts import (
     TrialBeginFact,
     TrialEndFact,
 )
-from holdfast.recording.live_follower import Follower
-from holdfast.recording.live_messages import (
+from holdfast.recording.live_follower import (
     EndedMessage,
     EventMessage,
     FinishMessage,
+    Follower,
     LostMessage,
     RecordsMessage,
     TimingMessage,

@@ -19,8 +19,7 @@ from holdfast.errors import ViewError
 from holdfast.protocol.events import Timing
 from holdfast.protocol.records import PausedRecord, PerformedRecord, Record
 from holdfast.recording import live_view
-from holdfast.recording.live_follower import _messages
-from holdfast.recording.live_messages import (
+from holdfast.recording.live_follower import (
     EndedMessage,
     EventMessage,
     FinishMessage,
@@ -29,6 +28,7 @@ from holdfast.recording.live_messages import (
     RecordsMessage,
     TimingMessage,
     ViewMessage,
+    _messages,
 )
 from holdfast.recording.live_view import LiveView
 from holdfast.recording.view_target import ViewTarget

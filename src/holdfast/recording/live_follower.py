@@ -3,6 +3,9 @@
 A belief is a function of the records, so this process comes to the robot's own beliefs without
 being sent any. To fold a record costs little. To compute the entropies of the alternatives again
 and to draw a step costs more, so both are left out for a record that is older than three seconds.
+
+Messages come through a pipe, each after its length. The robot's end never waits, so it writes what
+the pipe takes and keeps the rest.
 """
 
 from __future__ import annotations
@@ -12,15 +15,17 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeAlias
 
 import msgspec
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import HoldfastError
 from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.tracking import Trial
+from holdfast.protocol.events import Timing
 from holdfast.protocol.messages import decode_floats, numbers_of
 from holdfast.protocol.records import (
     ActingRecord,
@@ -40,26 +45,89 @@ from holdfast.recording.facts import (
     TrialBeginFact,
     TrialEndFact,
 )
-from holdfast.recording.live_messages import (
-    HEADER_BYTES,
-    EndedMessage,
-    EventMessage,
-    FinishMessage,
-    FollowerReport,
-    RecordsMessage,
-    TimingMessage,
-    ViewMessage,
-)
 from holdfast.recording.view_target import ViewTarget
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import LateStep, SensingStep
 
-__all__ = ["Follower", "follow"]
+__all__ = [
+    "HEADER_BYTES",
+    "EndedMessage",
+    "EventMessage",
+    "FinishMessage",
+    "Follower",
+    "FollowerReport",
+    "LostMessage",
+    "RecordsMessage",
+    "TimingMessage",
+    "ViewMessage",
+    "follow",
+]
 
 _LATE_NS = 3_000_000_000
 """A step that is older than this is not drawn."""
 
 _NICENESS = 10
+
+HEADER_BYTES = 4
+"""Of a message's length, little-endian."""
+
+
+class RecordsMessage(msgspec.Struct, array_like=True, frozen=True, tag=1):
+    """Records of a trial, once they are journalled; times are in nanoseconds since 1970."""
+
+    time_ns: int
+    trial: int
+    records: tuple[Record, ...]
+
+
+class TimingMessage(msgspec.Struct, array_like=True, frozen=True, tag=2):
+    """Who decided; it comes before the record of that decision."""
+
+    time_ns: int
+    timing: Timing
+
+
+class EndedMessage(msgspec.Struct, array_like=True, frozen=True, tag=3):
+    """A trial has ended, with the action of its last record."""
+
+    time_ns: int
+    result: TrialResult
+
+
+class EventMessage(msgspec.Struct, array_like=True, frozen=True, tag=4):
+    """An event, as a line of ``events.jsonl``."""
+
+    time_ns: int
+    line: str
+
+
+class LostMessage(msgspec.Struct, array_like=True, frozen=True, tag=5):
+    """What waited was too much and is lost: the next records are of another trial."""
+
+
+class FinishMessage(msgspec.Struct, array_like=True, frozen=True, tag=6):
+    """The run is over."""
+
+
+ViewMessage: TypeAlias = (
+    RecordsMessage | TimingMessage | EndedMessage | EventMessage | LostMessage | FinishMessage
+)
+
+
+class FollowerReport(msgspec.Struct, array_like=True, frozen=True):
+    """What the process that shows a run says: once when it is ready, once at its end.
+
+    Attributes
+    ----------
+    error : str or None
+        Why it shows nothing any more.
+    steps, left_out : int
+        Task actions that it was told of, and those that there was no time to show.
+    """
+
+    error: str | None = None
+    steps: int = 0
+    left_out: int = 0
 
 
 class Follower:

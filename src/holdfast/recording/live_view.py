@@ -26,8 +26,7 @@ from holdfast.errors import ViewError
 from holdfast.planning.outcome import TrialResult
 from holdfast.protocol.events import Timing
 from holdfast.protocol.records import Record
-from holdfast.recording.live_follower import follow
-from holdfast.recording.live_messages import (
+from holdfast.recording.live_follower import (
     HEADER_BYTES,
     EndedMessage,
     EventMessage,
@@ -37,6 +36,7 @@ from holdfast.recording.live_messages import (
     RecordsMessage,
     TimingMessage,
     ViewMessage,
+    follow,
 )
 from holdfast.runtime.log_lines import json_line
 from holdfast.runtime.workers import WorkerProcess, end_workers
