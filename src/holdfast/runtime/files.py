@@ -16,7 +16,6 @@ import errno
 import os
 import re
 import stat
-import time
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -30,7 +29,6 @@ __all__ = [
     "directory_beside",
     "move_into_place",
     "remember_directory",
-    "remove_unfinished",
     "remove_unfinished_of",
     "replace_file",
     "require_free",
@@ -43,7 +41,6 @@ _started_in: Path | None = None
 """Where the command was started; the code of a problem or robot may change the directory later."""
 
 _UNFINISHED = re.compile(r"\..+\.\d+\.tmp")
-_LONGEST_WRITE_S = 600.0
 _MAX_LINE = 1 << 20
 
 
@@ -144,20 +141,6 @@ def write_atomically(path: Path, content: bytes | Iterable[str]) -> None:
         pieces = (piece.encode() for piece in ((content,) if isinstance(content, str) else content))
     with _replacing(path) as file:
         file.writelines(pieces)
-
-
-def remove_unfinished(directory: Path, *, below: bool = False) -> None:
-    """Remove temporary files of killed writers; a young one may belong to a running writer.
-
-    The directory may be missing; with ``below`` its subdirectories are searched, too.
-    """
-    latest = time.time() - _LONGEST_WRITE_S
-    for path in directory.rglob(".*.tmp") if below else directory.glob(".*.tmp"):
-        if not _UNFINISHED.fullmatch(path.name):
-            continue
-        with contextlib.suppress(OSError):
-            if path.stat().st_mtime < latest:
-                path.unlink()
 
 
 def _unfinished(path: Path) -> Path:
