@@ -10,42 +10,24 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from tests.recordings import configuration_of, record_trial
+from tests.recordings import Journalling, configuration_of, record_trial
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import OutputError
 from holdfast.planning.outcome import TrialResult
-from holdfast.planning.planner import Planner, digest
+from holdfast.planning.planner import Planner
 from holdfast.planning.settings import EnvironmentSettings
 from holdfast.protocol.records import (
     ActingRecord,
     ObservedRecord,
-    PerformedRecord,
     Record,
 )
 from holdfast.recording import recomputing
 from holdfast.recording.recomputing import EarlierCode
 from holdfast.recording.run_directory import RunDirectory
-from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
+from holdfast.robot.trial import run_trial
 
 OLD = {"holdfast_version": "0.0.1", "holdfast_core": "0.0.1+abc"}
-
-
-class _Journalling(TrialObserver):
-    """Writes down what a robot writes down."""
-
-    def __init__(self) -> None:
-        self.records: list[Record] = []
-
-    def sensed(self, step: SensingStep) -> None:
-        data = np.asarray(step.observation, dtype="<f8").tobytes()
-        record = ObservedRecord(step.before.step, step.sensing_action, data, digest(step.after), 0)
-        self.records.append(record)
-
-    def acted(self, step: TaskStep) -> None:
-        data = np.asarray(step.executed, dtype="<f8").tobytes()
-        self.records.append(ActingRecord(step.state.step, data))
-        self.records.append(PerformedRecord(step.state.step, step.reward))
 
 
 def result_of(configuration: Configuration, trial: int) -> TrialResult:
@@ -55,7 +37,7 @@ def result_of(configuration: Configuration, trial: int) -> TrialResult:
 
 
 def records_of(configuration: Configuration, trial: int, count: int) -> list[Record]:
-    journalling = _Journalling()
+    journalling = Journalling()
     planner = Planner(configuration.problem, configuration.planning)
     run_trial(planner, configuration.simulator.seed, trial, observer=journalling, max_steps=30)
     return journalling.records[:count]

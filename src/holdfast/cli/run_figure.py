@@ -53,61 +53,53 @@ def draw_figure(
 
     The trials are in the journal already, so whatever prevents a figure becomes a remark.
     """
-    remarks: list[Remark] = []
     try:
-        for remark in _drawn(configuration, directory, recorder):
-            remarks.append(remark)  # noqa: PERF402 - what was found before an error is kept
+        return _drawn(configuration, directory, recorder)
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # noqa: BLE001 - matplotlib, the disk and the user's own code
         from holdfast.config.user_code import describe_problem_error
 
         why = describe_problem_error(configuration.problem_name, error)
-        remarks.append(Remark(f"no figure, because it cannot be drawn: {why}"))
-    # What was found of a service comes first.
-    return max(remarks, key=lambda each: each.exit_code, default=None)
+        return Remark(f"no figure, because it cannot be drawn: {why}")
 
 
 def _drawn(
     configuration: Configuration, directory: RunDirectory, recorder: Recorder
-) -> Iterator[Remark]:
-    """Draw, and yield remarks as they come."""
+) -> Remark | None:
     from holdfast.recording.run_directory import FIGURE_NAME
 
     trial, path = recorder.trial, directory.path / FIGURE_NAME
     if recorder.record.result is None:
         if configuration.environment.object is not None and path.exists():
-            return
+            return None
         result = next(each for each in directory.journal.results() if each.trial == trial)
         again_s = 1e-3 * result.mean_sensing_ms * result.sensing_decisions
         if again_s > _LONGEST_REPETITION_S:
-            yield Remark(
+            return Remark(
                 f"no figure, because trial {trial} would have to be run again for it, "
                 f"with {duration(again_s)} of sensing decisions"
             )
-            return
     try:
         with own_backend():
             from holdfast.recording.figure import trial_figure
     except ImportError as error:
         if error.name is None or error.name.split(".")[0] != "matplotlib":
             raise
-        yield Remark("no figure, because matplotlib is not installed: pip install matplotlib")
-        return
+        return Remark("no figure, because matplotlib is not installed: pip install matplotlib")
     if recorder.record.result is None:
         kept = msgspec.structs.replace(result, decisions=directory.journal.decisions(trial))
         try:
             if not repeat(configuration, directory.journal, kept, recorder):
-                yield Remark(
+                return Remark(
                     f"no figure, because trial {trial} ended in an earlier part of the run, which "
                     "did not keep its observations"
                 )
-                return
         except DecidedOtherwiseError as error:
-            yield _remark_on(error, configuration, directory)
-            return
+            return _remark_on(error, configuration, directory)
         recorder.record.result = result  # it alone has the reward of the last step
     trial_figure(configuration, recorder.record, path)
+    return None
 
 
 @contextlib.contextmanager
