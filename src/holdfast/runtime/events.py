@@ -35,7 +35,6 @@ __all__ = [
     "Event",
     "EventRates",
     "EventSink",
-    "NullEventLog",
     "severity",
 ]
 
@@ -93,16 +92,6 @@ class EventSink(Protocol):
     def close(self) -> None:
         """Ignore all further events; may be repeated."""
         ...
-
-
-class NullEventLog:
-    """Drops every event."""
-
-    def event(self, name: str, /, **fields: object) -> None:
-        """Drop an event."""
-
-    def close(self) -> None:
-        """Do nothing."""
 
 
 class _TokenBucket:
@@ -178,7 +167,7 @@ def _counted(name: str, fields: Mapping[str, object], omitted: int) -> Event:
 class BoundedEventLog:
     """Passes events to several sinks; limits the rate of those about a service.
 
-    So no service can fill a robot's log. Changes of status always pass.
+    So no service can fill a robot's log. Changes of status always pass. Without sinks it drops all.
     """
 
     def __init__(self, *sinks: EventSink, clock: Callable[[], float] = time.monotonic) -> None:
