@@ -23,7 +23,7 @@ from holdfast.protocol.records import (
     Record,
 )
 from holdfast.recording import recomputing
-from holdfast.recording.recomputing import EarlierCode
+from holdfast.recording.fingerprint import EarlierCode
 from holdfast.recording.run_directory import RunDirectory
 from holdfast.robot.trial import run_trial
 

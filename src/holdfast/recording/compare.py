@@ -21,8 +21,8 @@ import msgspec
 from holdfast.planning.outcome import Decisions, SensingDecision, TaskDecision
 from holdfast.printable import one_line
 from holdfast.protocol.records import ActingRecord, ObservedRecord, decisions_of
+from holdfast.recording.fingerprint import read_earlier
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
-from holdfast.recording.recomputing import read_earlier
 from holdfast.recording.run_directory import configuration_difference, recorded_configuration
 
 __all__ = ["Comparison", "Difference", "compare_runs"]

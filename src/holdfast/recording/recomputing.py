@@ -22,6 +22,7 @@ from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.planning.outcome import SensingDecision, TaskDecision, TrialResult
 from holdfast.planning.planner import Planner, PlanningState, digest
 from holdfast.protocol.records import decisions_of
+from holdfast.recording.fingerprint import EarlierCode, ranges_of
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.robot.environment import Environment, SimulatedEnvironment
 from holdfast.robot.recorded_trial import run_recorded_trial
@@ -34,46 +35,10 @@ from holdfast.robot.trial import (
     run_trial,
 )
 
-__all__ = ["ComparedTrial", "EarlierCode", "RecordedTrials", "compute_again", "read_earlier"]
+__all__ = ["ComparedTrial", "RecordedTrials", "compute_again"]
 
 _FINISHED_S = 30.0
 """No further finished trial is begun after this time."""
-
-
-class EarlierCode(msgspec.Struct, frozen=True, kw_only=True):
-    """What another version of holdfast decided in a run, before this one went on with it.
-
-    Attributes
-    ----------
-    holdfast : str
-        The version, with the digest of what decides in it.
-    finished : tuple of (int, int)
-        Ranges of finished trials: the first and the last of each.
-    unfinished : tuple of (int, int), or None
-        The trial that was begun, and how many of its decisions were there.
-    computed_again : tuple of int
-        Trials whose decisions the version that went on has computed, all with the same result.
-    """
-
-    holdfast: str
-    finished: tuple[tuple[int, int], ...]
-    unfinished: tuple[int, int] | None = None
-    computed_again: tuple[int, ...]
-
-    def decided(self) -> str:
-        """Return what was decided, in words."""
-        parts = [_trials(self.finished)] if self.finished else []
-        if self.unfinished is not None:
-            trial, count = self.unfinished
-            parts.append(f"the first {count:,} decisions of trial {trial}")
-        return f"holdfast {self.holdfast} decided {' and '.join(parts) or 'nothing yet'}"
-
-    def in_words(self) -> str:
-        """Return that, and why this version may go on."""
-        if not self.computed_again:
-            return self.decided()
-        again = _trials(_ranges(self.computed_again))
-        return f"{self.decided()}; this version decides the same (computed again: {again})"
 
 
 class RecordedTrials:
@@ -278,30 +243,7 @@ def compute_again(
     }
     return EarlierCode(
         holdfast=made_by,
-        finished=_ranges([trial for trial in finished if trial not in known]),
+        finished=ranges_of([trial for trial in finished if trial not in known]),
         unfinished=None if begun is None else (begun.trial, len(so_far)),
         computed_again=tuple(sorted(computed)),
     )
-
-
-def _trials(ranges: Sequence[tuple[int, int]]) -> str:
-    texts = [str(first) if first == last else f"{first} to {last}" for first, last in ranges]
-    return f"trial{'' if ranges[0][0] == ranges[-1][1] else 's'} {', '.join(texts)}"
-
-
-def _ranges(numbers: Sequence[int]) -> tuple[tuple[int, int], ...]:
-    """Return the first and the last of each row of numbers that follow each other."""
-    ranges: list[tuple[int, int]] = []
-    for number in numbers:
-        if ranges and number == ranges[-1][1] + 1:
-            ranges[-1] = ranges[-1][0], number
-        else:
-            ranges.append((number, number))
-    return tuple(ranges)
-
-
-def read_earlier(text: str | None) -> tuple[EarlierCode, ...]:
-    """Read the note of a journal about earlier code."""
-    if text is None:
-        return ()
-    return msgspec.json.decode(text, type=tuple[EarlierCode, ...])

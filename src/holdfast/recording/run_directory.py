@@ -27,7 +27,12 @@ from holdfast.config.source import SETTINGS, with_names_of_today
 from holdfast.config.user_code import describe_problem_error
 from holdfast.errors import DecidedOtherwiseError, OutputError, RebootedError
 from holdfast.planning.outcome import TrialResult
-from holdfast.recording.fingerprint import difference, fingerprint
+from holdfast.recording.fingerprint import (
+    EarlierCode,
+    difference,
+    fingerprint,
+    read_earlier,
+)
 from holdfast.recording.journal import Journal
 from holdfast.recording.journal_file import (
     JOURNAL_NAME,
@@ -37,7 +42,6 @@ from holdfast.recording.journal_file import (
     boot_id,
 )
 from holdfast.recording.journal_reader import JournalReader
-from holdfast.recording.recomputing import EarlierCode, compute_again, read_earlier
 from holdfast.recording.tables import RunSummary, SummaryBuilder, csv_lines
 from holdfast.recording.timings import count_answers, count_verified
 from holdfast.runtime.files import write_atomically
@@ -463,6 +467,8 @@ def _require_same_decisions(
             f"{START_ANEW}"
         )
     earlier = read_earlier(meta.get(_EARLIER_CODE))
+    from holdfast.recording.recomputing import compute_again  # few runs need it
+
     former = f"go on with the former, or {START_ANEW}"
     try:
         before_upgrade = compute_again(journal, configuration, found.made_by, earlier, on_progress)

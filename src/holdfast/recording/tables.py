@@ -18,7 +18,7 @@ import numpy as np
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
 from holdfast.printable import cell
-from holdfast.recording.recomputing import EarlierCode
+from holdfast.recording.fingerprint import EarlierCode
 from holdfast.recording.timings import AnswerCounts, VerificationCounts
 
 __all__ = ["RunSummary", "SummaryBuilder", "csv_lines", "trial_cells", "wilson_interval"]
