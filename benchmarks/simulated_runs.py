@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 import time
 
-from holdfast.recording.machine import machines
+from holdfast.config.source_digest import machines
 from holdfast_lab.simulation.schedule_draws import draw_schedule
 from holdfast_lab.simulation.world import Simulator
 

@@ -41,7 +41,7 @@ from holdfast.protocol.messages import (
     encode_floats,
 )
 from holdfast.protocol.service import Service
-from holdfast.runtime.events import NullEventLog
+from holdfast.runtime.events import BoundedEventLog
 from holdfast.service.shell import ServiceShell
 from holdfast.transport.contract import RobotTransport
 from holdfast.transport.endpoints import ServiceAddress
@@ -244,7 +244,7 @@ async def _in_process(wanted: Exchange) -> AsyncIterator[tuple[str, RobotTranspo
     shell = ServiceShell(
         Service(lambda _: problem, workers=1),
         network.service(_IN_PROCESS, "0"),
-        events=NullEventLog(),
+        events=BoundedEventLog(),
     )
     robot = network.robot([_IN_PROCESS])
     await shell.start()

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import re
 import tempfile
+import time
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -12,8 +15,8 @@ import pandas as pd
 
 from holdfast import __version__
 from holdfast.errors import OutputError
-from holdfast.recording.machine import describe
-from holdfast.runtime.files import remove_unfinished, write_atomically
+from holdfast.runtime.files import write_atomically
+from holdfast_lab.testbed.machine import describe
 from studies.errors import TaskError
 from studies.executors import Executor, LocalExecutor
 from studies.study import Report, Scale, Study
@@ -25,6 +28,7 @@ __all__ = ["ResultCache", "Workload", "compute", "write_report"]
 
 _CACHE = "cache"
 _CHECKSUM_BYTES = 4
+_LONGEST_WRITE_S = 600.0
 
 
 class _Kept(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
@@ -105,9 +109,9 @@ class Workload:
     def __init__(self, studies: Sequence[Study], scale: Scale, directory: Path) -> None:
         self._cache = ResultCache(directory / _CACHE)
         # Only where this program alone writes: the directory itself may have other files.
-        remove_unfinished(directory / _CACHE, below=True)
+        _remove_unfinished((directory / _CACHE).rglob(".*.tmp"))
         for study in studies:
-            remove_unfinished(directory / study.name)
+            _remove_unfinished((directory / study.name).glob(".*.tmp"))
         tasks = {task_key(task): task for study in studies for task in study.tasks(scale)}
         loaded = {key: self._cache.load(task) for key, task in tasks.items()}
         self._tables = {key: table for key, table in loaded.items() if table is not None}
@@ -217,6 +221,15 @@ def write_report(
     text = msgspec.json.format(msgspec.json.encode(origin), indent=2)
     write_atomically(origin_path, text + b"\n")
     return [*names, "origin.json"]
+
+
+def _remove_unfinished(files: Iterable[Path]) -> None:
+    """Remove temporary files of killed writers; a young one may belong to a running writer."""
+    latest = time.time() - _LONGEST_WRITE_S
+    for path in files:
+        with contextlib.suppress(OSError):
+            if re.fullmatch(r"\..+\.\d+\.tmp", path.name) and path.stat().st_mtime < latest:
+                path.unlink()
 
 
 def _check_room(directory: Path) -> None:

@@ -21,7 +21,7 @@ import msgspec
 import holdfast
 from holdfast import _kernel
 from holdfast.config.imports import follow_imports
-from holdfast.recording.machine import describe
+from holdfast_lab.testbed.machine import describe
 from studies.errors import TaskError
 
 if TYPE_CHECKING:

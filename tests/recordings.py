@@ -5,12 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
 from holdfast.config.loader import Configuration, load
 from holdfast.planning.outcome import Decisions, TrialResult
-from holdfast.planning.planner import Planner
+from holdfast.planning.planner import Planner, digest
+from holdfast.protocol.records import ActingRecord, ObservedRecord, PerformedRecord, Record
 from holdfast.recording.recorder import Recorder
-from holdfast.robot.trial import run_trial
+from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 
 
 def result_of(
@@ -87,3 +89,20 @@ def record_trial(configuration: Configuration, trial: int = 1) -> Recorder:
         observer=recorder,
     )
     return recorder
+
+
+class Journalling(TrialObserver):
+    """Writes down what a robot writes down."""
+
+    def __init__(self) -> None:
+        self.records: list[Record] = []
+
+    def sensed(self, step: SensingStep) -> None:
+        data = np.asarray(step.observation, dtype="<f8").tobytes()
+        record = ObservedRecord(step.before.step, step.sensing_action, data, digest(step.after), 0)
+        self.records.append(record)
+
+    def acted(self, step: TaskStep) -> None:
+        data = np.asarray(step.executed, dtype="<f8").tobytes()
+        self.records.append(ActingRecord(step.state.step, data))
+        self.records.append(PerformedRecord(step.state.step, step.reward))

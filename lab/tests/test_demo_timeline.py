@@ -9,9 +9,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from holdfast.errors import OutputError
 from holdfast.recording.compare import Comparison, Difference
-from holdfast.runtime.files import claim_directory
 from holdfast_lab.demo.command import account
 from holdfast_lab.demo.narrator import Activity, Change, DemoState, Mark
 from holdfast_lab.demo.scenario import Findings
@@ -155,26 +153,3 @@ def test_account_of_a_difference() -> None:
     text = account(findings(identical=False), Path("out"))
     assert "NOT those of the run without kills:\ndifferent: trial 1, step 9, sensing action" in text
     assert "identical" not in text
-
-
-class TestDirectory:
-    def test_the_default_is_numbered(self, tmp_path: Path) -> None:
-        claimed = [claim_directory(None, tmp_path / "runs", "demo") for _ in range(3)]
-        assert [path.name for path in claimed] == ["demo", "demo-2", "demo-3"]
-        assert all(path.is_dir() for path in claimed)
-
-    def test_what_is_there_is_kept(self, tmp_path: Path) -> None:
-        out = tmp_path / "a" / "out"
-        assert claim_directory(out, tmp_path, "demo") == out
-        assert claim_directory(out, tmp_path, "demo") == out
-        (out / "file").touch()
-        with pytest.raises(OutputError, match=r"out: holds files already.*--out"):
-            claim_directory(out, tmp_path, "demo")
-
-    def test_it_cannot_be_made(self, tmp_path: Path) -> None:
-        (tmp_path / "file").touch()
-        for out in (tmp_path / "file", tmp_path / "file" / "out"):
-            with pytest.raises(OutputError, match="cannot be made"):
-                claim_directory(out, tmp_path, "demo")
-        with pytest.raises(OutputError, match="cannot be made"):
-            claim_directory(None, tmp_path / "file", "demo")

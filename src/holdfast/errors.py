@@ -162,6 +162,7 @@ class DecidedOtherwiseError(RecordError):
             f"trial {trial}: the decision of step {step} differs when it is computed again: the "
             "problem is not deterministic, or a service decided differently"
         )
+        self.trial = trial
         self.step = step
         self.kind = kind
 

@@ -263,4 +263,4 @@ def test_keys_are_rotated_and_a_robot_is_revoked_where_they_are_mounted(
 def reboot(journal: Path) -> None:
     """Let a run have moved in another boot: that of a machine in a test cannot be changed."""
     with Journal.open(journal) as opened:
-        opened.set_meta("boot", "another")
+        opened.set_meta(boot="another")

@@ -25,7 +25,7 @@ OTHER_BOOT = f"""/opt/holdfast/robot/bin/python -c '
 from pathlib import Path
 from holdfast.recording.journal import Journal
 with Journal.open(Path("{RUN}/journal.sqlite")) as journal:
-    journal.set_meta("boot", "another")'"""
+    journal.set_meta(boot="another")'"""
 """Command that lets the robot have moved in another boot."""
 
 MOST_EXPOSED = 20

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 import holdfast
-from holdfast.recording.machine import machines
+from holdfast.config.source_digest import machines
 
 pytestmark = pytest.mark.skipif(
     machines() == "interpreted", reason="the machines of this installation are interpreted"
@@ -26,7 +26,7 @@ SEEDS = 300
 
 OUTCOMES = f"""
 import hashlib
-from holdfast.recording.machine import machines
+from holdfast.config.source_digest import machines
 from holdfast_lab.simulation.schedule_draws import draw_schedule
 from holdfast_lab.simulation.world import Simulator
 from holdfast.config.source_digest import core_version

@@ -19,7 +19,7 @@ from tests.ports import free_port
 
 from holdfast.config.loader import load
 from holdfast.robot.links import make_links
-from holdfast.runtime.events import NullEventLog
+from holdfast.runtime.events import BoundedEventLog
 from holdfast.transport.frames import FrameDecoder, decode_hello
 from holdfast_lab.testbed.proxy import Proxy
 
@@ -74,7 +74,7 @@ def test_a_run_and_its_service_announce_their_leases(line: Overheard, tmp_path: 
 def test_the_local_service_is_told_the_robots_lease() -> None:
     """It is the robot's own, so one setting says how long either may be silent."""
     overrides = {"offload.lease_ms": ROBOT_MS, "offload.services": ["tcp/127.0.0.1:1"]}
-    links = make_links(load(EXAMPLE, overrides=overrides), None, NullEventLog())
+    links = make_links(load(EXAMPLE, overrides=overrides), None, BoundedEventLog())
     try:
         assert links.launcher is not None and links.transport is not None
         command = links.launcher._command

@@ -299,7 +299,7 @@ class TestEpoch:
                 text = journal.meta()["configuration"]
                 here, there = f"{{port: {world.port}}}", f"{{port: {other.port}}}"
                 assert here in text
-                journal.set_meta("configuration", text.replace(here, there))
+                journal.set_meta(configuration=text.replace(here, there))
             other.become(world)
             newer = site.run(other_file, services=[cloud], out="newer", resume=True)
             newer.finish()

@@ -15,8 +15,7 @@ import pytest
 from tests.ports import free_port
 from tests.processes.faults import COMMAND, holdfast, rows_of, summary_of, wait_until
 
-from holdfast.config.source_digest import core_version
-from holdfast.recording.machine import machines
+from holdfast.config.source_digest import core_version, machines
 
 WITH_FIGURES = [sys.executable, "-c", "from holdfast.cli import main; main()"]
 

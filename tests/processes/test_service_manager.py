@@ -37,8 +37,10 @@ def test_without_a_manager_nothing_happens(monkeypatch: pytest.MonkeyPatch) -> N
 def test_its_variables_are_not_inherited(notified: socket.socket) -> None:
     manager = ServiceManager()
     assert "NOTIFY_SOCKET" not in os.environ
+    manager.starting(90.0)
     manager.ready()
     manager.stopping(2.5)
+    assert heard(notified) == ["EXTEND_TIMEOUT_USEC=90000000"]
     assert heard(notified) == ["READY=1"]
     assert heard(notified) == ["STOPPING=1", "EXTEND_TIMEOUT_USEC=2500000"]
     manager.close()

@@ -58,9 +58,6 @@ def test_in_process(reference: Path) -> None:
     run = open_run(reference, problem_directory=reference.parent)
     assert list(run.results["outcome"]) == ["truncated", "truncated"]
     for trial in run.read():
-        assert trial.motions is not None
-        assert trial.move_observations is not None
-        assert trial.observations is not None
         assert [motion.size for motion in trial.motions] == [1] * STEPS
         assert [shown.size for shown in trial.move_observations] == [1] * STEPS
         sizes = [shown.size for shown in trial.observations]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from holdfast.cli import added_commands
-from holdfast.cli.application import run_application
+from holdfast.cli.application import find_command
 from holdfast.errors import OptionError
 
 GREET = """\
@@ -60,6 +60,13 @@ def test_a_package_adds_a_command(packages: Path) -> None:
     assert (done.returncode, done.stdout) == (7, "hello --loudly world\n")
 
 
+def test_a_service_says_that_it_is_one(packages: Path) -> None:
+    """Else its log would end it, once nobody reads it."""
+    services = [find_command([name]).is_service for name in ("serve", "ros1-serve", "ros1-guard")]
+    assert services == [True, True, True]
+    assert not find_command(["run"]).is_service
+
+
 def test_the_help_lists_it_and_says_what_is_broken(packages: Path) -> None:
     done = holdfast(packages, "--help")
     assert done.returncode == 0
@@ -102,7 +109,7 @@ def test_without_its_package_a_command_says_what_to_install(
 ) -> None:
     monkeypatch.setattr(added_commands, "added_commands", dict)
     with pytest.raises(OptionError, match=f"{command} is in .*: pip install {folder}"):
-        run_application([command, "--quick"])
+        find_command([command, "--quick"])
 
 
 def test_own_commands_read_no_metadata(packages: Path) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from holdfast.config import registry
-from holdfast.config.user_code import moved
 from holdfast.errors import UnknownProblemError
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
@@ -66,14 +65,3 @@ def test_signature_keys_tell_one_problem_alone() -> None:
         told = [other for other, each in registry.BUILT_IN.items() if each.signature_keys <= keys]
         assert own.signature_keys <= keys
         assert told == [name]
-
-
-def test_runs_of_earlier_releases_find_what_has_moved() -> None:
-    """Their configurations name classes of packages that were in holdfast."""
-    found = registry.problem_class("holdfast.lab.studies.light_dark:LightDark")
-    assert found.__module__ == "studies.light_dark"
-    assert registry.problem_module("holdfast.lab.studies.light_dark:LightDark") == found.__module__
-    assert moved("holdfast.lab.testbed.world:WitnessedWorld") == (
-        "holdfast_lab.testbed.world:WitnessedWorld"
-    )
-    assert moved("holdfast.laboratory:Robot") == "holdfast.laboratory:Robot"

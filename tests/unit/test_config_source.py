@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from holdfast.config.problem_builder import find_problem
 from holdfast.config.source import Source, module_directory
 from holdfast.config.yaml_document import read
 from holdfast.errors import ConfigurationError
@@ -50,6 +51,18 @@ def test_an_unknown_section_is_refused() -> None:
         source("simlator: {}")
 
 
+def test_names_that_earlier_releases_had_are_those_of_today() -> None:
+    text = "problem: holdfast.lab.studies.x:X\nenvironment: {object: holdfast.lab.y:Y}"
+    named = source(text)
+    assert named.problem == "studies.x:X"
+    assert named.sections["environment"] == {"object": "holdfast_lab.y:Y"}
+    given = source(text, {"environment.object": "holdfast.lab.z:Z"})
+    assert given.sections["environment"]["object"] == "holdfast_lab.z:Z"
+    assert source("problem: holdfast.laboratory:R").problem == "holdfast.laboratory:R"
+    with pytest.raises(ConfigurationError, match="problem is 3"):
+        find_problem(source("problem: 3"), None)
+
+
 def test_the_directory_of_a_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "own").mkdir()
@@ -58,8 +71,6 @@ def test_the_directory_of_a_module(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     key = ("problem_directory",)
     assert module_directory(here, key, "own", "lamp_module.inner") == tmp_path / "own"
     assert module_directory(here, key, None, "lamp_module") is None
-    (tmp_path / "own" / "studies").mkdir()
-    assert module_directory(here, key, "own", "holdfast.lab.studies.lamps") == tmp_path / "own"
     for value, reason in (("none", "there is no directory"), (".", "there is no module lamp")):
         with pytest.raises(ConfigurationError, match=reason):
             module_directory(here, key, value, "lamp_module")

@@ -32,13 +32,18 @@ def test_rows(tmp_path: Path) -> None:
     belief = Belief(np.array([[0.1 + 0.2, 0.0, 1.0]]), np.array([1.0]))
     decider = Decider("local", "standard", 1.5, None, None)
     with CsvSink(tables, problem) as sink:
-        sink.trial_begins(TrialBeginFact(0, 1_000_000_000, True))
-        sink.sensed(SensingFact(0, 0, 1_500_000_000, 1_600_000_000, 2, bytes(32), decider, belief))
-        sink.acted(TaskFact(0, 0, 1_700_000_000, np.array([0.5, -0.0, 1e-300]), None))
-        sink.sensed(SensingFact(0, 1, 2_500_000_000, 2_600_000_000, 1, bytes(32), None))
+        sink.trial_begins(TrialBeginFact(0, 1_000_000_000))
+        sensed = SensingFact(
+            0, 0, 1_500_000_000, 1_600_000_000, 2, bytes(32), decider, belief, belief, 0
+        )
+        sink.sensed(sensed)
+        action, estimate = np.array([0.5, -0.0, 1e-300]), belief.states[0]
+        sink.acted(TaskFact(0, 0, 1_700_000_000, action, None, belief, 0, estimate))
+        again = sensed._replace(step=1, decided_ns=2_500_000_000, sensing_action=1, decider=None)
+        sink.sensed(again)
         sink.happened(EventFact(2_700_000_000, "status", {"status": "keep_alive"}))
         sink.trial_ends(TrialEndFact(0, 3_000_000_000, 1, None))
-        sink.trial_begins(TrialBeginFact(1, 3_500_000_000, False))
+        sink.trial_begins(TrialBeginFact(1, 3_500_000_000))
         sink.trial_ends(TrialEndFact(1, 4_000_000_000, 10, result_of(1)))
     assert sorted(path.name for path in tables.iterdir()) == sorted(TABLES)
     first, second = rows_of(tables / "steps.csv")
@@ -50,7 +55,8 @@ def test_rows(tmp_path: Path) -> None:
     # It ends in mid-step.
     assert (second["step"], second["sensing_action"], second["action_time"]) == ("1", "1", "")
     assert [row["outcome"] for row in rows_of(tables / "trials.csv")] == ["unfinished", "succeeded"]
-    (particle,) = rows_of(tables / "beliefs.csv")
-    assert float(particle[state_labels(problem)[0]]) == 0.1 + 0.2
+    particles = rows_of(tables / "beliefs.csv")
+    assert [row["when"] for row in particles] == ["sensing", "acting", "sensing"]
+    assert float(particles[0][state_labels(problem)[0]]) == 0.1 + 0.2
     (event,) = rows_of(tables / "events.csv")
     assert (event["event"], event["fields"]) == ("status", '{"status": "keep_alive"}')

@@ -11,7 +11,7 @@ import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -190,6 +190,20 @@ class TestSteps:
             assert unfinished is not None
             assert unfinished.records == records_of(0)
 
+    def test_a_listener_gets_records_that_are_written(self, path: Path) -> None:
+        with Journal.create(path, {}) as journal:
+
+            def listen(trial: int, records: Sequence[Record]) -> None:
+                unfinished = journal.unfinished()
+                assert unfinished is not None
+                assert (unfinished.trial, unfinished.records[-len(records) :]) == (trial, records)
+                told.append(trial)
+
+            told: list[int] = []
+            journal.on_append = listen
+            journal.append(TRIAL, records_of(0))
+            assert told == [TRIAL]
+
     def test_a_journal_with_steps_is_not_empty(self, path: Path) -> None:
         with Journal.create(path, {}) as journal:
             assert journal.is_empty()
@@ -356,7 +370,7 @@ class TestProcesses:
                 assert unfinished is not None
                 assert unfinished.records == records_of(0)
                 with pytest.raises(OutputError, match="readonly"):
-                    journal.set_meta("key", "value")
+                    journal.set_meta(key="value")
             assert content(path.parent) == before
         finally:
             path.parent.chmod(0o700)
@@ -414,7 +428,7 @@ class TestRun:
             with Journal.open(path) as journal:
                 assert journal.raise_epoch() == expected
         with Journal.open(path) as journal:
-            journal.set_meta("epoch", str(2**32 - 1))
+            journal.set_meta(epoch=str(2**32 - 1))
             with pytest.raises(OutputError, match="its epoch is '4294967295'"):
                 journal.raise_epoch()
 
@@ -459,7 +473,7 @@ class TestRun:
             assert unfinished is not None
             assert unfinished.same_boot
             assert unfinished.is_complete
-            journal.set_meta("steps_boot", "another")
+            journal.set_meta(steps_boot="another")
         with Journal.open(path) as journal:
             unfinished = journal.unfinished()
             assert unfinished is not None

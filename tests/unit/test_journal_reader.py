@@ -176,6 +176,6 @@ class TestJournal:
     def test_another_version_is_refused(self, tmp_path: Path) -> None:
         path = tmp_path / "journal.sqlite"
         with Journal.create(path, {}) as journal:
-            journal.set_meta("schema_version", "999")
+            journal.set_meta(schema_version="999")
         with pytest.raises(OutputError, match="schema version 999; this holdfast reads version 3"):
             Journal.open(path)

@@ -31,11 +31,11 @@ from holdfast.recording.facts import (
     TrialBeginFact,
     TrialEndFact,
 )
-from holdfast.recording.live_follower import Follower
-from holdfast.recording.live_messages import (
+from holdfast.recording.live_follower import (
     EndedMessage,
     EventMessage,
     FinishMessage,
+    Follower,
     LostMessage,
     RecordsMessage,
     TimingMessage,
@@ -208,7 +208,7 @@ def test_an_observation_that_comes_late(configuration: Configuration) -> None:
     follower.take(RecordsMessage(0, 0, (observed, acting, performed, late)))
     follower.take(FinishMessage())
     (sensed,) = facts.of(SensingFact)
-    assert (sensed.sensing_action, sensed.observation, sensed.explained) == (1, None, None)
+    assert (sensed.sensing_action, sensed.observation, sensed.explained) == (1, None, True)
     (came_late,) = facts.of(LateFact)
     assert (came_late.step, came_late.taken, came_late.explained) == (1, 0, came[0].explained)
     assert came_late.observation.tobytes() == shown.tobytes()

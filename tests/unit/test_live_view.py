@@ -19,9 +19,7 @@ from holdfast.errors import ViewError
 from holdfast.protocol.events import Timing
 from holdfast.protocol.records import PausedRecord, PerformedRecord, Record
 from holdfast.recording import live_view
-from holdfast.recording.journal import Journal
-from holdfast.recording.live_follower import _messages
-from holdfast.recording.live_messages import (
+from holdfast.recording.live_follower import (
     EndedMessage,
     EventMessage,
     FinishMessage,
@@ -30,8 +28,9 @@ from holdfast.recording.live_messages import (
     RecordsMessage,
     TimingMessage,
     ViewMessage,
+    _messages,
 )
-from holdfast.recording.live_view import LiveView, ShownJournal
+from holdfast.recording.live_view import LiveView
 from holdfast.recording.view_target import ViewTarget
 
 _MESSAGES = msgspec.msgpack.Decoder(list[ViewMessage])
@@ -203,26 +202,3 @@ def test_a_view_that_ends_is_told_once_and_the_run_goes_on(
 def test_a_viewer_that_is_not_there_is_an_error_before_the_run(views: Any) -> None:
     with pytest.raises(ViewError, match="there is no viewer"):
         views(refuse)
-
-
-def test_a_journals_records_are_shown_once_they_are_written(tmp_path: Path, views: Any) -> None:
-    class Told(LiveView):
-        def __init__(self) -> None:
-            self.told: list[tuple[int, list[Record]]] = []
-
-        def records(self, trial: int, records: Any) -> None:
-            # They are in the journal already.
-            found = journal.unfinished()
-            assert found is not None
-            assert list(found.records)[-len(records) :] == list(records)
-            self.told.append((trial, list(records)))
-
-    view = Told()
-    with Journal.create(tmp_path / "journal.sqlite", {"configuration": ""}) as journal:
-        shown = ShownJournal(journal, view)
-        assert shown.session() == journal.session()
-        assert shown.unfinished() is None
-        shown.append(0, [performed(0)])
-        assert shown.raise_epoch() == 1
-        assert shown.unfinished() is not None
-    assert view.told == [(0, [performed(0)])] * 2

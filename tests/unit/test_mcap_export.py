@@ -21,7 +21,7 @@ def test_facts_become_messages_in_their_order(tmp_path: Path) -> None:
     estimate = np.array([2.5, 2.0, 0.1])
     with McapSink(tmp_path / "run", load(EXAMPLE), {"seed": "9"}) as sink:
         assert sink.has_poses
-        sink.trial_begins(TrialBeginFact(0, 10, beliefs_known=True))
+        sink.trial_begins(TrialBeginFact(0, 10))
         sink.happened(EventFact(15, "holding", {"reason": "no answer"}))
         sink.trial_ends(TrialEndFact(0, 20, 3, None, belief, estimate))
     assert sink.file.exists()

@@ -9,13 +9,13 @@ from typing import Any
 import msgspec
 import pytest
 
-from holdfast.cli.application import run_application
+from holdfast.cli import run
 from holdfast.cli.overrides import combined, parse_assignment, parse_values
 from holdfast.config import loader
 from holdfast.config.loader import load
 from holdfast.config.problem_builder import schemas_of
 from holdfast.config.source import SETTINGS
-from holdfast.errors import HoldfastError
+from holdfast.errors import ConfigurationError, HoldfastError
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 
 SECTIONS: dict[str, type[msgspec.Struct]] = {
@@ -96,7 +96,7 @@ class TestEachKey:
     ) -> None:
         value = "3" if (section, key) == ("environment", "arguments") else "{not: allowed}"
         with pytest.raises(HoldfastError, match=rf"^{section}\.{key}(\.not)?, given instead of "):
-            run_application(["run", str(path), "--set", f"{section}.{key}={value}"])
+            run.main([str(path), "--set", f"{section}.{key}={value}"])
 
 
 OPTIONS = [
@@ -115,7 +115,7 @@ class TestAnOptionAndAnAssignment:
         self, option: str, given: str, key: str, other: str, path: Path
     ) -> None:
         with pytest.raises(HoldfastError) as refused:
-            run_application(["run", str(path), option, given, "--set", f"{key}={other}"])
+            run.main([str(path), option, given, "--set", f"{key}={other}"])
         assert str(refused.value) == (
             f"--set {key}={other} and {option} {given} contradict each other: both say what {key} "
             "is; leave one of them out"
@@ -126,10 +126,10 @@ class TestAnOptionAndAnAssignment:
     ) -> None:
         del other
         same = f"[{given}]" if option == "--service" else given
-        arguments = ["run", str(path), option, given, "--set", f"{key}={same}"]
+        arguments = [str(path), option, given, "--set", f"{key}={same}"]
         # Refused for another reason, for nothing shall run.
         with pytest.raises(HoldfastError, match="is_missing"):
-            run_application([*arguments, "--set", "simulator.is_missing=1"])
+            run.main([*arguments, "--set", "simulator.is_missing=1"])
 
 
 @pytest.mark.parametrize(
@@ -169,13 +169,27 @@ def test_assignments_that_are_refused(assignments: list[str], message: str) -> N
 def test_what_needs_a_service_is_refused_without_one(path: Path) -> None:
     for words in (["--recovery", "never"], ["--set", "recovery.launch=never"]):
         with pytest.raises(HoldfastError, match=f"^{' '.join(words)} needs --service"):
-            run_application(["run", str(path), *words])
+            run.main([str(path), *words])
 
 
 def test_what_needs_an_environment_is_refused_without_one(path: Path) -> None:
     for words in ("environment.directory=x", "environment.arguments={port: 3}"):
         with pytest.raises(HoldfastError, match=f"^--set {words} needs --environment"):
-            run_application(["run", str(path), "--set", words])
+            run.main([str(path), "--set", words])
+
+
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        (["-e", "dockin:Cart"], "--environment"),
+        (["--set", "environment.object=dockin:Cart"], "--set environment.object"),
+    ],
+)
+def test_a_class_that_is_not_there_is_a_complaint_about_the_option(
+    words: list[str], option: str, path: Path
+) -> None:
+    with pytest.raises(ConfigurationError, match=rf"^{option}: dockin:Cart: the module dockin "):
+        run.main([str(path), *words])
 
 
 @pytest.mark.parametrize(

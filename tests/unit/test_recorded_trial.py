@@ -7,12 +7,12 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from tests.recordings import configuration_of, record_trial
+from tests.recordings import Journalling, configuration_of, record_trial
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import RecordError
 from holdfast.planning.outcome import TrialResult
-from holdfast.planning.planner import Planner, digest
+from holdfast.planning.planner import Planner
 from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.planning.tracking import LateObservation
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
@@ -27,24 +27,7 @@ from holdfast.protocol.records import (
 from holdfast.recording.figure import trial_figure
 from holdfast.recording.recorder import Recorder
 from holdfast.robot.recorded_trial import run_recorded_trial
-from holdfast.robot.trial import NULL_OBSERVER, SensingStep, TaskStep, TrialObserver, run_trial
-
-
-class _Journalling(TrialObserver):
-    """Writes down what a robot writes down."""
-
-    def __init__(self) -> None:
-        self.records: list[Record] = []
-
-    def sensed(self, step: SensingStep) -> None:
-        data = np.asarray(step.observation, dtype="<f8").tobytes()
-        record = ObservedRecord(step.before.step, step.sensing_action, data, digest(step.after), 0)
-        self.records.append(record)
-
-    def acted(self, step: TaskStep) -> None:
-        data = np.asarray(step.executed, dtype="<f8").tobytes()
-        self.records.append(ActingRecord(step.state.step, data))
-        self.records.append(PerformedRecord(step.state.step, step.reward))
+from holdfast.robot.trial import NULL_OBSERVER, run_trial
 
 
 class TestRunRecordedTrial:
@@ -68,7 +51,7 @@ class TestRunRecordedTrial:
 
     @staticmethod
     def first(configuration: Configuration) -> tuple[list[Record], TrialResult]:
-        journalling = _Journalling()
+        journalling = Journalling()
         result = run_trial(
             Planner(configuration.problem, configuration.planning),
             configuration.simulator.seed,

@@ -228,6 +228,17 @@ class TestRuns:
         assert (difference.what, difference.second) == (what, value)
         assert difference.trial is None
 
+    def test_a_class_that_has_moved_since_is_the_same_problem(self, tmp_path: Path) -> None:
+        texts = [
+            CONFIGURATION.replace("peg_in_hole_2d", f"{module}.testbed.pegs:Peg")
+            for module in ("holdfast.lab", "holdfast_lab")
+        ]
+        first, second = (
+            run_of(tmp_path / str(number), [result_of(0)], configuration=text)
+            for number, text in enumerate(texts)
+        )
+        assert compare_runs(first, second).difference is None
+
     def test_other_versions_and_settings_are_noted(self, tmp_path: Path) -> None:
         first = run_of(tmp_path / "first", [result_of(0)])
         other = CONFIGURATION.replace("0.1", "0.2").replace("400.0", "500.0")

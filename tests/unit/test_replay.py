@@ -80,7 +80,6 @@ def test_facts_are_those_of_the_run(tmp_path: Path) -> None:
         sensing.sensing_action for sensing in record.sensing
     ]
     for fact, sensing in zip(sensed, record.sensing, strict=True):
-        assert fact.before is not None
         assert np.array_equal(fact.before.states, sensing.before)
     assert np.array_equal([fact.action for fact in acted], record.actions)
     for task, true_state in zip(acted, record.true_states, strict=False):

@@ -82,7 +82,7 @@ def values(rows: list[dict[str, Any]], name: str) -> list[Any]:
 def a_trial(sink: RerunSink, trial: int = 0, at: int = 10 * MS, particles: int = 2) -> None:
     before, after = belief_of(particles), belief_of(particles)
     estimate = np.array([2.5, 2.0, 0.1])
-    sink.trial_begins(TrialBeginFact(trial, at, beliefs_known=True))
+    sink.trial_begins(TrialBeginFact(trial, at))
     sink.sensed(
         SensingFact(
             trial, 0, at, at + MS, 2, bytes(32), DECIDER, before, after, 0,
@@ -178,7 +178,7 @@ def test_events(tmp_path: Path) -> None:
 def test_a_late_observation_and_the_choice_not_to_sense(tmp_path: Path) -> None:
     def happen(sink: RerunSink) -> None:
         belief = belief_of(2)
-        sink.sensed(SensingFact(0, 3, MS, 2 * MS, 3, bytes(32), None, belief, belief))
+        sink.sensed(SensingFact(0, 3, MS, 2 * MS, 3, bytes(32), None, belief, belief, 0))
         late = LateFact(0, 5, 3 * MS, 2, np.array([0.1]), belief, explained=False)
         sink.observed_late(late)
         sink.observed_late(late._replace(explained=True))
@@ -209,7 +209,7 @@ def test_endings(tmp_path: Path, outcome: dict[str, Any] | None, words: str) -> 
         result = msgspec.structs.replace(result_of(0), **outcome)
 
     def end(sink: RerunSink) -> None:
-        sink.trial_begins(TrialBeginFact(0, MS, beliefs_known=False))
+        sink.trial_begins(TrialBeginFact(0, MS))
         sink.trial_ends(TrialEndFact(0, 2 * MS, 1, result))
 
     rows, _ = shown(tmp_path, end)
@@ -256,7 +256,7 @@ class TestWithoutAPose:
 
 def test_space(tmp_path: Path) -> None:
     def end(sink: RerunSink) -> None:
-        sink.trial_begins(TrialBeginFact(0, MS, beliefs_known=True))
+        sink.trial_begins(TrialBeginFact(0, MS))
         state = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
         sink.trial_ends(TrialEndFact(0, 2 * MS, 1, None, belief_of(4, size=6), state))
 

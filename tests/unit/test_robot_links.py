@@ -11,13 +11,14 @@ from holdfast.config.loader import Configuration, load
 from holdfast.errors import HoldfastError, TransportError
 from holdfast.robot.links import RECOVERY_SERVICE, check_services, make_links
 from holdfast.robot.memo_cache import MemoizingPlanner
-from holdfast.runtime.events import NullEventLog
+from holdfast.runtime.events import BoundedEventLog
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
 
 
-class Events(NullEventLog):
+class Events(BoundedEventLog):
     def __init__(self) -> None:
+        super().__init__()
         self.names: list[str] = []
 
     def event(self, name: str, /, **fields: object) -> None:
@@ -29,7 +30,7 @@ def configuration(**changes: Any) -> Configuration:
 
 
 def test_without_services_the_planner_is_in_process() -> None:
-    links = make_links(configuration(), None, NullEventLog())
+    links = make_links(configuration(), None, BoundedEventLog())
     assert (links.transport, links.launcher) == (None, None)
     problem = configuration().problem
     first, second = (links.make_planner(problem, configuration().planning) for _ in range(2))
@@ -40,12 +41,12 @@ def test_without_services_the_planner_is_in_process() -> None:
 
 def test_with_services_there_is_a_local_one_unless_it_is_never_launched() -> None:
     changes = {"offload.services": ["tcp/127.0.0.1:7600"]}
-    links = make_links(configuration(**changes), None, NullEventLog())
+    links = make_links(configuration(**changes), None, BoundedEventLog())
     assert links.launcher is not None
     assert RECOVERY_SERVICE in links.launcher._command
     links.close()
     never = make_links(
-        configuration(**changes, **{"recovery.launch": "never"}), None, NullEventLog()
+        configuration(**changes, **{"recovery.launch": "never"}), None, BoundedEventLog()
     )
     assert never.launcher is None
     never.close()
@@ -62,5 +63,5 @@ def test_a_service_that_cannot_be_used_is_refused_with_its_key() -> None:
     with pytest.raises(TransportError, match=r"robot.yaml: offload.services\[1\]"):
         check_services(settings, "robot.yaml: ")
     with pytest.raises(HoldfastError):
-        make_links(settings, None, NullEventLog())
+        make_links(settings, None, BoundedEventLog())
     check_services(configuration())

@@ -42,7 +42,7 @@ from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
 from holdfast.robot.links import Links, make_links
 from holdfast.robot.process import RobotProcess
 from holdfast.robot.trial import run_trial
-from holdfast.runtime.events import NullEventLog
+from holdfast.runtime.events import BoundedEventLog
 
 PATIENCE_S = 30.0
 """Longest wait for what is sure to come; nothing is measured by it."""
@@ -73,7 +73,7 @@ class Robots:
 
     def make(self) -> RobotProcess:
         configuration = self.configuration
-        self.links = make_links(configuration, None, NullEventLog())
+        self.links = make_links(configuration, None, BoundedEventLog())
         return RobotProcess(
             configuration,
             self.links,

@@ -16,7 +16,7 @@ from holdfast.recording import journal_file
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
 from holdfast.robot.trial import run_trial
-from holdfast.runtime.events import NullEventLog
+from holdfast.runtime.events import BoundedEventLog
 from holdfast_ros.ros2.run_segment import Ending, RunSegment, SegmentResult, World
 
 PATIENCE_S = 60.0
@@ -48,7 +48,7 @@ class Segments:
             World(self.maker, lambda _: None),
             rate_hz=None,
             after_reboot=after_reboot,
-            sink=NullEventLog(),
+            sink=BoundedEventLog(),
             on_order=order,
             on_timing=lambda _: None,
             on_end=lambda _: None,

@@ -95,13 +95,6 @@ class TestRunDirectory:
             RunDirectory.resume(out, changed)
         RunDirectory.resume(out, self.of_own_problem(tmp_path, source)).close()
 
-    def test_resuming_with_another_holdfast_is_refused(self, tmp_path: Path) -> None:
-        configuration = configuration_of(tmp_path)
-        with RunDirectory.create(tmp_path / "out", configuration) as directory:
-            directory.journal.set_meta("holdfast_version", "0.0.1")
-        with pytest.raises(OutputError, match=r"by holdfast 0\.0\.1, this is .*--out"):
-            RunDirectory.resume(tmp_path / "out", configuration)
-
     def test_resuming_may_ask_for_more_trials_but_not_for_fewer_than_finished(
         self, tmp_path: Path
     ) -> None:

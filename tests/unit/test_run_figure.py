@@ -12,12 +12,14 @@ import pytest
 from tests.command_line import run_here
 from tests.recordings import configuration_of, record_trial
 
-from holdfast.cli.run_figure import Deviation, repeat, service_that_decided
+from holdfast.cli.run_figure import repeat, service_that_decided
+from holdfast.errors import DecidedOtherwiseError
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.protocol.events import Timing
 from holdfast.protocol.question import OWN_PLANNER
 from holdfast.recording.recorder import Recorder
+from holdfast.recording.run_directory import RunDirectory
 from holdfast.recording.timings import EventTable
 
 PEG = """
@@ -57,10 +59,17 @@ def result_of(tmp_path: Path) -> TrialResult:
     return result
 
 
-def repeated(tmp_path: Path, result: TrialResult) -> Deviation | None:
+def repeated(tmp_path: Path, result: TrialResult) -> tuple[int, str | None] | None:
+    """Return where and in which decision the trial differs."""
     configuration = configuration_of(tmp_path)
-    planner = Planner(configuration.problem, configuration.planning)
-    return repeat(configuration, result, None, Recorder(1, planner))
+    recorder = Recorder(1, Planner(configuration.problem, configuration.planning))
+    with RunDirectory.create(tmp_path / "run", configuration) as directory:
+        try:
+            assert repeat(configuration, directory.journal, result, recorder)
+        except DecidedOtherwiseError as error:
+            return error.step, error.kind
+    assert recorder.record.result is not None
+    return None
 
 
 def test_the_same_trial_has_no_deviation(tmp_path: Path) -> None:
@@ -68,21 +77,23 @@ def test_the_same_trial_has_no_deviation(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("byte", "deviation"),
+    ("byte", "differs"),
     [
-        pytest.param(9, Deviation(0, "sensing"), id="the first sensing action"),
-        pytest.param(13, Deviation(0, None), id="the state after it"),
-        pytest.param(45 + 9, Deviation(0, "task"), id="the first task action"),
-        pytest.param(-1, Deviation(30, None), id="the last state"),
+        pytest.param(9, (0, "sensing"), id="the first sensing action"),
+        pytest.param(13, (0, None), id="the state after it"),
+        pytest.param(45 + 9, (0, "task"), id="the first task action"),
+        pytest.param(-1, (30, None), id="the last state"),
     ],
 )
-def test_the_first_deviation_is_found(byte: int, deviation: Deviation, tmp_path: Path) -> None:
+def test_the_first_deviation_is_found(
+    byte: int, differs: tuple[int, str | None], tmp_path: Path
+) -> None:
     result = result_of(tmp_path)
     assert result.decisions is not None
     log = bytearray(result.decisions.log)
     log[byte] ^= 1
     kept = msgspec.structs.replace(result.decisions, log=bytes(log))
-    assert repeated(tmp_path, msgspec.structs.replace(result, decisions=kept)) == deviation
+    assert repeated(tmp_path, msgspec.structs.replace(result, decisions=kept)) == differs
 
 
 @pytest.mark.parametrize(
@@ -93,5 +104,6 @@ def test_the_service_that_decided_is_named(service: str, named: str | None, tmp_
     table = EventTable(tmp_path / "timings.csv", Timing)
     table.add(Timing(1, 0, "task", service, "standard", 1.0, 1.0, 1.0))
     table.close()
-    assert service_that_decided(Deviation(3, "task"), tmp_path / "timings.csv", 1) == named
-    assert service_that_decided(Deviation(3, None), tmp_path / "timings.csv", 1) is None
+    task, none = (DecidedOtherwiseError(1, 3, kind) for kind in ("task", None))
+    assert service_that_decided(task, tmp_path / "timings.csv") == named
+    assert service_that_decided(none, tmp_path / "timings.csv") is None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 
 from holdfast.protocol.status import Status
-from holdfast.runtime.events import BoundedEventLog, EventSink, NullEventLog, severity
+from holdfast.runtime.events import BoundedEventLog, EventSink, severity
 from holdfast.runtime.logs import EventLog
 
 
@@ -83,9 +83,9 @@ class TestOthers:
     def test_all_take_events_and_close(self) -> None:
         stream = io.StringIO()
         sinks: list[EventSink] = [
-            NullEventLog(),
+            BoundedEventLog(),
             EventLog(stream, component="robot"),
-            BoundedEventLog(NullEventLog(), EventLog(stream, component="robot")),
+            BoundedEventLog(BoundedEventLog(), EventLog(stream, component="robot")),
         ]
         for sink in sinks:
             sink.event("trial", trial=1)

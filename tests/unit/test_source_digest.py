@@ -291,7 +291,8 @@ class TestDifference:
 
     def test_core(self) -> None:
         there = {**HERE, "holdfast_core": "1.0+b"}
-        assert difference(there, HERE) == "it was made by holdfast 1.0+b, this is 1.0+a: other code"
+        words = "it was made by holdfast 1.0+b, this is 1.0+a: other code"
+        assert difference(there, HERE) == (words, "1.0+b", False)
 
     @pytest.mark.parametrize(
         ("there", "changed"),
@@ -299,7 +300,8 @@ class TestDifference:
     )
     def test_sources(self, there: dict[str, str], changed: str) -> None:
         differs = difference({**HERE, "problem_sources": json.dumps(there)}, HERE)
-        assert differs == f"the problem's source has changed since (module {changed})"
+        words = f"the problem's source has changed since (module {changed})"
+        assert differs == (words, "1.0+a", True)
 
     def test_a_journal_of_before_the_core_was_told(self) -> None:
         there = {"holdfast_version": "1.0", "problem_sources": json.dumps({"arm": "1"})}

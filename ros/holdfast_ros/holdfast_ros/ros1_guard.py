@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-__all__ = ["SUMMARY", "main"]
+__all__ = ["IS_SERVICE", "SUMMARY", "main"]
 
 SUMMARY = "Keep a ROS 1 master alive."
+IS_SERVICE = True
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-__all__ = ["SUMMARY", "main"]
+__all__ = ["IS_SERVICE", "SUMMARY", "main"]
 
 SUMMARY = "Decide for robots in ROS 1, as a service."
+IS_SERVICE = True
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -21,13 +21,7 @@ from types import TracebackType
 __all__ = ["main"]
 
 
-def _commands(arguments: Sequence[str]) -> int:
-    from holdfast.cli.application import run_application
-
-    return run_application(arguments)
-
-
-def main(application: Callable[[Sequence[str]], int] = _commands) -> None:
+def main(application: Callable[[Sequence[str]], int] | None = None) -> None:
     """Run the command line and exit.
 
     ``application`` is run with the arguments instead of the commands of ``holdfast``; it returns
@@ -50,10 +44,16 @@ def main(application: Callable[[Sequence[str]], int] = _commands) -> None:
     ignore_unwritable_stderr()
     sys.excepthook = _print_defect
     arguments = sys.argv[1:]
+    is_service = False
     try:
         allow_descriptors()
+        if application is None:
+            from holdfast.cli.application import find_command
+
+            application, is_service = find_command(arguments)
+            arguments = arguments[1:]
         # A service, and what guards one, go on when nobody reads their output.
-        if arguments[:1] in (["serve"], ["ros1-serve"], ["ros1-guard"]):
+        if is_service:
             sys.exit(application(arguments))
         end_with_reader()
         try:
@@ -65,7 +65,7 @@ def main(application: Callable[[Sequence[str]], int] = _commands) -> None:
         from holdfast.cli.exit_codes import EXIT_ERROR, print_error
         from holdfast.errors import RunError
 
-        print_error(error, arguments)
+        print_error(error, arguments, "service" if is_service else "robot")
         sys.exit(error.exit_code if isinstance(error, RunError) else EXIT_ERROR)
     except KeyboardInterrupt as interruption:
         from holdfast.cli.exit_codes import EXIT_SIGNAL, signal_of

@@ -11,6 +11,7 @@ The module has
 - ``main(arguments: Sequence[str]) -> int``: runs the command with the words behind its name and
   returns the exit code. An error of :mod:`holdfast.errors` ends it with one message.
 - ``SUMMARY: str``: its line in ``holdfast --help``.
+- ``IS_SERVICE = True``, if it is a service: it goes on when nobody reads its standard output.
 
 Both importing it and reading ``SUMMARY`` should be quick: libraries that are slow to load belong
 into ``main``. A command of holdfast itself goes before one of the same name in another package.

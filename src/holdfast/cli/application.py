@@ -1,21 +1,22 @@
 """All commands together, as ``holdfast --help`` lists them.
 
-A command is a module with ``main(arguments)``, which returns the exit code. Only the module of the
-command that is run is imported. Other packages add commands
-(:mod:`holdfast.cli.added_commands`).
+A command is a module with ``main(arguments)``, which returns the exit code; that of a service has
+``IS_SERVICE = True``, too. Only the module of the command that is run is imported. Other packages
+add commands (:mod:`holdfast.cli.added_commands`).
 """
 
 from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from types import ModuleType
 from typing import NamedTuple
 
 from holdfast.cli.exit_codes import EXIT_ERROR
 from holdfast.errors import OptionError
 
-__all__ = ["COMMANDS", "Command", "run_application"]
+__all__ = ["COMMANDS", "Command", "FoundCommand", "find_command"]
 
 
 class Command(NamedTuple):
@@ -63,29 +64,31 @@ Start with: holdfast run examples/peg_in_hole_2d.yaml
 """
 
 
-def run_application(arguments: Sequence[str]) -> int:
-    """Run one command and return its exit code.
+class FoundCommand(NamedTuple):
+    """What runs a command with its arguments and returns the exit code, and what it is.
+
+    A service goes on when nobody reads its output: its module has ``IS_SERVICE = True``.
+    """
+
+    run: Callable[[Sequence[str]], int]
+    is_service: bool = False
+
+
+def find_command(arguments: Sequence[str]) -> FoundCommand:
+    """Find the command that the first word names, and import its module.
 
     Raises
     ------
     HoldfastError
-        If the command fails in a way that is no defect.
-    SystemExit
-        If it ends early.
+        If there is none of that name, or its package is not here.
     """
     first = arguments[0] if arguments else ""
     if first in COMMANDS:
-        code: int = importlib.import_module(COMMANDS[first].module).main(arguments[1:])
-        return code
+        return _in_module(importlib.import_module(COMMANDS[first].module))
     if first in ("", "-h", "--help"):
-        (sys.stdout if first else sys.stderr).write(_help())
-        return 0 if first else EXIT_ERROR
+        return FoundCommand(_print_help if first else _explain)
     if first == "--version":
-        from holdfast.config.source_digest import core_version
-        from holdfast.recording.machine import machines
-
-        sys.stdout.write(f"holdfast {core_version()} ({machines()} state machines)\n")
-        return 0
+        return FoundCommand(_print_version)
     if first.endswith((".yaml", ".yml")):
         import shlex
 
@@ -95,8 +98,7 @@ def run_application(arguments: Sequence[str]) -> int:
 
     added = added_commands()
     if first in added:
-        added_code: int = load_command(added[first]).main(arguments[1:])
-        return added_code
+        return _in_module(load_command(added[first]))
     if first in _ELSEWHERE:
         package, folders = _ELSEWHERE[first]
         raise OptionError(
@@ -112,6 +114,28 @@ def run_application(arguments: Sequence[str]) -> int:
     hint = close_match(first, [*names, "--help", "--version"])
     hint = hint or f"; commands are {', '.join(names)}"
     raise OptionError(f"{first!r:.80} is no {what}{hint}")
+
+
+def _in_module(module: ModuleType) -> FoundCommand:
+    return FoundCommand(module.main, getattr(module, "IS_SERVICE", False))
+
+
+def _print_help(_: Sequence[str]) -> int:
+    sys.stdout.write(_help())
+    return 0
+
+
+def _explain(_: Sequence[str]) -> int:
+    """Print the help where no command was given."""
+    sys.stderr.write(_help())
+    return EXIT_ERROR
+
+
+def _print_version(_: Sequence[str]) -> int:
+    from holdfast.config.source_digest import core_version, machines
+
+    sys.stdout.write(f"holdfast {core_version()} ({machines()} state machines)\n")
+    return 0
 
 
 def _help() -> str:

@@ -44,7 +44,7 @@ EXIT_SIGNAL = 128
 """Added to the number of the signal that ended a run, as shells do it."""
 
 
-def print_error(error: HoldfastError, arguments: Sequence[str]) -> None:
+def print_error(error: HoldfastError, arguments: Sequence[str], component: str) -> None:
     """Print what ended a command on the standard error: as text, or as the last of its events."""
     if not wants_json(arguments):
         sys.stderr.write(f"holdfast: error: {printable(str(error))}\n")
@@ -59,7 +59,6 @@ def print_error(error: HoldfastError, arguments: Sequence[str]) -> None:
         fields["details"] = details
     if isinstance(error, RunError) and error.command:
         fields["resume_command"] = error.command
-    component = "service" if arguments[0].endswith("serve") else "robot"
     write_event(component, "error", **fields)
 
 

@@ -155,7 +155,7 @@ def _write(recorded: RecordedRun, trials: Sequence[int], options: ExportOptions)
     from holdfast.recording.csv_export import CsvSink
 
     mcap, tables = options.mcap, options.tables
-    notes = notes_about(recorded, trials)
+    notes = notes_about(recorded)
     with contextlib.ExitStack() as stack:
         made: list[tuple[Path, Path]] = []
         sinks: list[FactSink] = []
@@ -214,7 +214,7 @@ def replay_trials(
     recorded.require_unchanged()
 
 
-def notes_about(recorded: RecordedRun, trials: Sequence[int]) -> list[str]:
+def notes_about(recorded: RecordedRun) -> list[str]:
     """Return what a reader of the facts should know."""
     from holdfast.recording.run_directory import TIMINGS_NAME
     from holdfast.recording.step_times import UNTIMED_STEP_S
@@ -228,12 +228,6 @@ def notes_about(recorded: RecordedRun, trials: Sequence[int]) -> list[str]:
         notes.append(f"{why}, so every step takes {UNTIMED_STEP_S:g} s")
     else:
         notes += recorded.clock_notes
-    blind = [trial for trial in trials if not recorded.beliefs_known(trial)]
-    if blind:
-        notes.append(
-            f"no beliefs and observations of {counted(len(blind), 'trial')}: this run is older "
-            "than the keeping of what an environment of your own has shown"
-        )
     asked_for = recorded.configuration.simulator.num_trials
     finished = len(recorded.trials) - (recorded.unfinished is not None)
     if finished < asked_for:

@@ -21,6 +21,11 @@ class Override(NamedTuple):
     key: str
     value: Any
 
+    @property
+    def option(self) -> str:
+        """The words without the value."""
+        return f"--set {self.key}" if self.words.startswith("--set ") else self.words.split()[0]
+
 
 def parse_assignment(assignment: str) -> Override:
     """Read ``SECTION.KEY=VALUE``, as ``--set`` takes it; the value is YAML.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
@@ -19,24 +19,35 @@ from holdfast.cli.exit_codes import (
 )
 from holdfast.cli.run_figure import Remark, draw_figure
 from holdfast.cli.run_options import RunOptions
-from holdfast.cli.terminal import RunDisplay, counted, print_files, print_summary
+from holdfast.cli.terminal import (
+    RecomputingDisplay,
+    RunDisplay,
+    counted,
+    print_files,
+    print_summary,
+)
 from holdfast.errors import HoldfastError, InvalidValueError, RunError, UnwritableOutputError
 from holdfast.printable import printable
 from holdfast.recording.view_target import require_rerun
 from holdfast.runtime.files import require_free, shown_path
 
 if TYPE_CHECKING:
-    from holdfast.cli.robot_run import RobotFindings
     from holdfast.config.loader import Configuration
     from holdfast.planning.outcome import TrialResult
+    from holdfast.recording.run_directory import RunDirectory
     from holdfast.recording.tables import RunSummary
+    from holdfast.robot.environment_maker import EnvironmentMaker
+    from holdfast.runtime.events import EventSink
+    from holdfast.runtime.service_manager import ServiceManager
 
-__all__ = ["main"]
+__all__ = ["RobotFindings", "is_robot_run", "main"]
 
 _RUNS = Path("runs")
 _OF_SERVICES = ("recovery.launch", "offload.tls")
 """Keys without effect where no service is named."""
 
+_ENVIRONMENT = "environment.object"
+_MOST_FOR_A_DECISION_S = 90.0
 _OF_ENVIRONMENTS = ("environment.directory", "environment.arguments")
 """Keys without effect where no environment is named."""
 
@@ -57,7 +68,6 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _run(options: RunOptions) -> int:
-    from holdfast.cli.robot_run import RobotFindings, is_robot_run, run_as_robot
     from holdfast.planning.planner import Planner
     from holdfast.recording.belief_remarks import belief_remarks
     from holdfast.recording.recorder import Recorder
@@ -78,21 +88,33 @@ def _run(options: RunOptions) -> int:
     as_robot = is_robot_run(options, configuration)
     _require_effect(options, configuration, as_robot=as_robot)
     # Before a directory is claimed: a module that cannot be imported leaves nothing behind.
-    maker = load_environment(configuration) if as_robot else None
-    if options.resume_if_begun:
-        directory_path = _out_of_one_run(options)
-        directory = RunDirectory.resume_if_begun(directory_path, configuration)
-    elif options.resume:
-        directory_path = options.out or latest_default_directory(configuration, runs)
-        directory = RunDirectory.resume(directory_path, configuration)
+    named_by = next((each for each in options.overrides() if each.key == _ENVIRONMENT), None)
+    maker = (
+        load_environment(configuration, None if named_by is None else named_by.option)
+        if as_robot
+        else None
+    )
+    notes = _Notes(options)
+    if options.resume_if_begun or options.resume:
+        if options.resume_if_begun:
+            directory_path, open_run = _out_of_one_run(options), RunDirectory.resume_if_begun
+        else:
+            directory_path = options.out or latest_default_directory(configuration, runs)
+            open_run = RunDirectory.resume
+        with contextlib.closing(RecomputingDisplay(quiet=notes.is_quiet)) as recomputing:
+
+            def on_progress(done: int, total: int) -> None:
+                recomputing.show(done, total)
+                manager.starting(within_s=_MOST_FOR_A_DECISION_S)
+
+            directory = open_run(directory_path, configuration, on_progress)
     else:
         directory_path = options.out or claim_default_directory(configuration, runs)
         directory = RunDirectory.create(directory_path, configuration)
     with directory:
-        notes = _Notes(options)
-        display = RunDisplay(
-            configuration, directory.journal.results(), quiet=quiet or options.log == "json"
-        )
+        if directory.before_upgrade is not None:
+            notes.note(directory.before_upgrade.in_words())
+        display = RunDisplay(configuration, directory.journal.results(), quiet=notes.is_quiet)
         if options.resume_if_begun and (complete := directory.complete_summary()) is not None:
             manager.ready()  # otherwise it takes the end for a failed start
             manager.close()
@@ -114,7 +136,7 @@ def _run(options: RunOptions) -> int:
             display.start(directory_path)
             try:
                 if maker is not None:
-                    robot = run_as_robot(
+                    robot = _run_as_robot(
                         options, configuration, directory, maker, on_result, manager, notes.note
                     )
                 else:
@@ -203,6 +225,93 @@ def _run(options: RunOptions) -> int:
                 "deterministic; events.jsonl says where"
             )
         return _exit_code(summary) or (remark.exit_code if remark is not None else 0)
+
+
+class RobotFindings:
+    """An event sink, for what a robot's run finds besides its results.
+
+    Attributes
+    ----------
+    missed_ticks : int
+        Ticks of ``--rate`` that came late.
+    refusals : dict of str
+        Why a service was given up, by its name.
+    unreachable : dict of str
+        Why a service could not be reached the last time, by its name.
+    """
+
+    def __init__(self, on_first_hold: Callable[[], None] = lambda: None) -> None:
+        self._on_hold: Callable[[], None] | None = on_first_hold
+        self.missed_ticks = 0
+        self.refusals: dict[str, str] = {}
+        self.unreachable: dict[str, str] = {}
+
+    def event(self, name: str, /, **fields: object) -> None:
+        """Take an event."""
+        if name == "refused" and fields["final"]:
+            self.refusals[str(fields["service"])] = f"{fields['code']}: {fields['reason']}"
+        elif name == "unreachable":
+            self.unreachable[str(fields["service"])] = str(fields["reason"])
+        elif name == "holding" and self._on_hold is not None:
+            self._on_hold()
+            self._on_hold = None
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def is_robot_run(options: RunOptions, configuration: Configuration) -> bool:
+    """Return whether a run needs more than a batch of simulated trials does."""
+    return (
+        bool(configuration.offload.services)
+        or configuration.environment.object is not None
+        or options.rate is not None
+        or options.view_target() is not None
+    )
+
+
+def _run_as_robot(
+    options: RunOptions,
+    configuration: Configuration,
+    directory: RunDirectory,
+    maker: EnvironmentMaker,
+    on_result: Callable[[TrialResult], None],
+    manager: ServiceManager,
+    note: Callable[[str], None],
+) -> RobotFindings:
+    """Run the missing trials one after another, step by step, with services that may die."""
+    from holdfast.recording.robot_run import perform_trials
+    from holdfast.robot.health import RobotWatch
+    from holdfast.runtime.logs import EventLog
+
+    def hint() -> None:
+        if configuration.recovery.launch == "never":
+            note(
+                "the robot goes on when a service answers; with --recovery on_failure "
+                "(recovery.launch) it launches a local service that decides meanwhile"
+            )
+
+    view = None
+    if (target := options.view_target()) is not None:
+        from holdfast.recording.live_view import LiveView
+
+        view = LiveView(configuration, target, note)
+    findings = RobotFindings(hint)
+    sinks: list[EventSink] = [findings]
+    if not options.quiet:
+        sinks.insert(0, EventLog(sys.stderr, format=options.log, component="robot"))
+    findings.missed_ticks = perform_trials(
+        configuration,
+        directory,
+        maker,
+        on_result,
+        rate_hz=options.rate,
+        sinks=sinks,
+        after_reboot=options.after_reboot,
+        watch=lambda events: RobotWatch(manager, options.health, options.metrics, events),
+        view=view,
+    )
+    return findings
 
 
 def _out_of_one_run(options: RunOptions) -> Path:
@@ -296,7 +405,8 @@ class _Notes:
     def __init__(self, options: RunOptions) -> None:
         self._as_json = options.log == "json"
         self._quiet = options.quiet
-        self.on_terminal = not (self._quiet or self._as_json) and sys.stderr.isatty()
+        self.is_quiet = self._quiet or self._as_json
+        self.on_terminal = not self.is_quiet and sys.stderr.isatty()
 
     def note(self, text: str) -> None:
         """Print a note, unless the run is quiet."""

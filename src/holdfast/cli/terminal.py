@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ProgressLine",
+    "RecomputingDisplay",
     "RunDisplay",
     "counted",
     "duration",
@@ -202,6 +203,26 @@ class RunDisplay:
     def _note(self) -> str:
         share = f"{100.0 * self._successes / self._finished:.1f} %" if self._finished else "-"
         return f"success {share}" + (f", {self._failures:,} failed" if self._failures else "")
+
+
+class RecomputingDisplay:
+    """Shows how many recorded decisions were computed again; nothing if none is to be."""
+
+    def __init__(self, *, quiet: bool) -> None:
+        self._quiet = quiet
+        self._line: ProgressLine | None = None
+
+    def show(self, done: int, total: int) -> None:
+        """Show how many were, and of how many."""
+        if self._line is None:
+            self._line = progress_line(total, quiet=self._quiet, noun="decision")
+            self._line.start("another version began this run: its decisions, again", 0, "the same")
+        self._line.show(done, "the same")
+
+    def close(self) -> None:
+        """End, and leave the terminal as it was."""
+        if self._line is not None:
+            self._line.stop()
 
 
 def print_summary(summary: RunSummary) -> None:

@@ -79,7 +79,7 @@ def _view(options: ViewOptions) -> None:
     own = options.problem_directory
     with RecordedRun(options.run, "view", problem_directory=own) as recorded, ExitStack() as stack:
         trials = chosen_trials(recorded, options.trials)
-        notes = notes_about(recorded, trials)
+        notes = notes_about(recorded)
         made = None
         if save is not None:
             made = stack.enter_context(directory_beside(save)) / save.name

@@ -14,19 +14,17 @@ its settings.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import msgspec
-import msgspec.inspect
 
 from holdfast.config.problem_builder import build_from, find_problem, schemas_of
 from holdfast.config.reading import absolute_endpoint, read_bounded
 from holdfast.config.registry import names
-from holdfast.config.source import SECTIONS, SETTINGS, Source, module_directory
+from holdfast.config.source import SECTIONS, Source, module_directory, name_of_today
 from holdfast.config.yaml_document import MAX_BYTES, Document, read, write
 from holdfast.errors import ConfigurationError, InvalidValueError
 from holdfast.numerics.arrays import plain
@@ -45,9 +43,9 @@ from holdfast.planning.settings import (
 )
 from holdfast.problems.attributes import resolution_of, sensing_labels
 from holdfast.problems.problem import Problem
-from holdfast.validation import described, shown
+from holdfast.validation import shown
 
-__all__ = ["Configuration", "load", "settings_keys"]
+__all__ = ["Configuration", "load"]
 
 
 @dataclass(frozen=True)
@@ -181,17 +179,6 @@ def load(
     return _build(document, path, problem, plain({**given, **(overrides or {})}))
 
 
-def settings_keys() -> dict[str, str]:
-    """Return what is allowed and the default, for each ``section.key`` that no problem changes."""
-    keys = {}
-    for section, schema in SETTINGS.items():
-        defaults = msgspec.to_builtins(schema())
-        for item in msgspec.inspect.type_info(schema).fields:  # type: ignore[attr-defined]
-            default = json.dumps(defaults[item.encode_name])
-            keys[f"{section}.{item.encode_name}"] = f"{described(item.type)}; default {default}"
-    return keys
-
-
 def _content(path: Path) -> bytes:
     """Return the content of the file, at most one byte over the limit."""
     try:
@@ -216,7 +203,7 @@ def _build(
 ) -> Configuration:
     """Check everything and build the problem."""
     source = Source(document, path, overrides)
-    name, problem_class, directory = find_problem(source, problem_name)
+    name, problem_class, directory = find_problem(source, name_of_today(problem_name))
     source.schemas |= schemas_of(problem_class)
     particle_filter = source.section("particle_filter", ParticleFilterSettings)
     active_sensing = source.section("active_sensing", ActiveSensingSettings)

@@ -136,9 +136,7 @@ def problem_class(name: str, search_directory: Path | None = None) -> type[Any]:
 
 def problem_module(name: str) -> str | None:
     """Return the module of a problem's class; None for a name that is not registered."""
-    from holdfast.config.user_code import moved
-
-    place = moved(name) if ":" in name else None
+    place = name if ":" in name else None
     if name in BUILT_IN:
         place = BUILT_IN[name].place
     elif place is None and name:

@@ -14,7 +14,6 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from holdfast.config.user_code import moved
 from holdfast.config.yaml_document import Document
 from holdfast.errors import ConfigurationError
 from holdfast.planning.settings import (
@@ -36,7 +35,14 @@ from holdfast.validation import (
     shown,
 )
 
-__all__ = ["SECTIONS", "SETTINGS", "Source", "module_directory"]
+__all__ = [
+    "SECTIONS",
+    "SETTINGS",
+    "Source",
+    "module_directory",
+    "name_of_today",
+    "with_names_of_today",
+]
 
 SETTINGS: Mapping[str, type[msgspec.Struct]] = {
     "particle_filter": ParticleFilterSettings,
@@ -63,6 +69,9 @@ SECTIONS = (
     "environment",
 )
 """In the order in which a resolved configuration lists them."""
+
+_MOVED = {"holdfast.lab.studies.": "studies.", "holdfast.lab.": "holdfast_lab."}
+"""Packages whose classes runs of earlier releases name, and where they are now."""
 
 _ON_TOP = ("problem", "problem_directory")
 
@@ -107,6 +116,7 @@ class Source:
         for name in data:
             if name not in (*_ON_TOP, *SECTIONS):
                 raise self.unknown((name,), (*_ON_TOP, *SECTIONS))
+        data = with_names_of_today(data)
         self.problem: Any = data.get("problem")
         self.problem_directory: Any = data.get("problem_directory")
         self.sections: dict[str, dict[str, Any]] = {}
@@ -119,7 +129,9 @@ class Source:
             name, _, key = given.partition(".")
             if name not in SECTIONS:
                 raise self.unknown((name,), SECTIONS)
-            self.sections[name][key] = value
+            self.sections[name][key] = (
+                name_of_today(value) if given == "environment.object" else value
+            )
             self._overrides.add((name, key))
 
     def place(self, path: KeyPath) -> str:
@@ -184,13 +196,32 @@ class Source:
         return self.error(path, text)
 
 
+def with_names_of_today(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a configuration's data with the names that classes of earlier releases have now."""
+    named = {**data}
+    if "problem" in data:
+        named["problem"] = name_of_today(data["problem"])
+    environment = data.get("environment")
+    if isinstance(environment, Mapping) and "object" in environment:
+        named["environment"] = {**environment, "object": name_of_today(environment["object"])}
+    return named
+
+
+def name_of_today(name: Any) -> Any:
+    """Return ``module:Class`` with the module where the class is now."""
+    for old, new in _MOVED.items():
+        if isinstance(name, str) and name.startswith(old):
+            return new + name.removeprefix(old)
+    return name
+
+
 def module_directory(source: Source, key: KeyPath, value: str | None, module: str) -> Path | None:
     """Return the directory that holds a user's module, as ``value`` at ``key`` says.
 
     If it is None, that is the file's own, else the current one, for a resolved configuration stands
     in the directory of its run, far from the module; None if it is in neither.
     """
-    package = moved(module).partition(".")[0]
+    package = module.partition(".")[0]
     if value is not None:
         directory = source.directory_of(key) / value
         if not directory.is_dir():

@@ -17,14 +17,16 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import importlib.util
 import sys
 from collections.abc import Callable
+from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
 from holdfast import __version__, _kernel
 from holdfast.config.imports import follow_imports
 
-__all__ = ["core_version", "problem_digest", "problem_sources"]
+__all__ = ["core_version", "machines", "problem_digest", "problem_sources"]
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _DIGEST_SIZE = 8
@@ -53,6 +55,13 @@ def _core_files() -> frozenset[Path]:
     rooms = ("numerics", "problems", "planning", "config")
     folders = (_PACKAGE, *(_PACKAGE / room for room in rooms))
     return frozenset(path for folder in folders for path in folder.glob("*.py"))
+
+
+def machines() -> str:
+    """Return whether the state machines of sessions are ``compiled`` or ``interpreted``."""
+    found = importlib.util.find_spec("holdfast.protocol.robot")
+    origin = (found and found.origin) or ""
+    return "compiled" if origin.endswith(tuple(EXTENSION_SUFFIXES)) else "interpreted"
 
 
 def problem_digest(problem_class: type, named_in: str | None = None) -> str:

@@ -30,7 +30,6 @@ __all__ = [
     "find_class",
     "in_words",
     "is_users_file",
-    "moved",
     "registered_names",
 ]
 
@@ -46,18 +45,6 @@ _MAX_FRAMES = 5
 """Bounds on what an account has of a message, and of the frames at either end."""
 
 _PACKAGE_FOLDERS = frozenset({"site-packages", "dist-packages"})
-
-
-_MOVED = {"holdfast.lab.studies.": "studies.", "holdfast.lab.": "holdfast_lab."}
-"""Packages whose classes runs of earlier releases name, and where they are now."""
-
-
-def moved(name: str) -> str:
-    """Return where something is by now that an earlier release had as ``module:Class``."""
-    for old, new in _MOVED.items():
-        if name.startswith(old):
-            return new + name.removeprefix(old)
-    return name
 
 
 def is_users_file(name: str) -> bool:
@@ -179,7 +166,6 @@ def find_class(
         If the name is not registered, or the module or its class cannot be imported, whatever its
         import raises.
     """
-    name = moved(name)
     try:
         if ":" in name:
             found = _imported(name, search_directory)

@@ -10,21 +10,22 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import msgspec
 
 from holdfast.planning.outcome import Decisions, SensingDecision, TaskDecision
 from holdfast.printable import one_line
 from holdfast.protocol.records import ActingRecord, ObservedRecord, decisions_of
+from holdfast.recording.fingerprint import read_earlier
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.recording.run_directory import configuration_difference, recorded_configuration
 
-__all__ = ["Comparison", "Difference", "compare_runs", "difference_of_decisions"]
+__all__ = ["Comparison", "Difference", "compare_runs"]
 
 _ENDING = struct.Struct("<cQ32s")
 
@@ -146,6 +147,11 @@ def _difference_of_runs(
     versions = [meta.get("holdfast_version", "of an unknown version") for meta in (first, second)]
     if versions[0] != versions[1]:
         notes.append(f"made by holdfast {versions[0]} and by holdfast {versions[1]}")
+    for which, meta in (("first", first), ("second", second)):
+        notes.extend(
+            f"of the {which} run, {earlier.decided()}"
+            for earlier in read_earlier(meta.get("earlier_code"))
+        )
     if first.get("problem_sources") != second.get("problem_sources"):
         notes.append("the source of the problem differs")
     setting = configuration_difference(*texts)
@@ -185,7 +191,7 @@ def _compare_trials(
         result, counterpart = map(next, results)
         assert result.decisions is not None
         assert counterpart.decisions is not None
-        found = difference_of_decisions(result.decisions, counterpart.decisions, number)
+        found = _difference_of_decisions(result.decisions, counterpart.decisions, number)
         if found is not None:
             return found
         same["trials"] += 1
@@ -226,32 +232,27 @@ def _compare_unfinished(
 ) -> Difference | None:
     """Return where the same number of decisions of an unfinished trial first differ."""
     decided = [[] if each is None else list(decisions_of(each.records)) for each in begun]
-    for decision, counterpart in zip(*decided, strict=True):
-        found = _difference_of_decision(decision, counterpart)
+    for one, other in zip(*decided, strict=True):
+        found = _difference_of_decision(one, other, trial)
         if found is not None:
-            step, what, values = found
-            return Difference(what=what, trial=trial, step=step, first=values[0], second=values[1])
-        kind = "sensing_actions" if isinstance(decision, SensingDecision) else "task_actions"
-        same[kind] += 1
+            return found
+        same["sensing_actions" if isinstance(one, SensingDecision) else "task_actions"] += 1
     return None
 
 
-def difference_of_decisions(first: Decisions, second: Decisions, trial: int) -> Difference | None:
+def _difference_of_decisions(first: Decisions, second: Decisions, trial: int) -> Difference | None:
     """Return where two sequences of decisions of a trial first differ, None if they do not."""
     if first == second:
         return None
-    if first.action_size != second.action_size:
+    sizes = str(first.action_size), str(second.action_size)
+    if sizes[0] != sizes[1]:
         return Difference(
-            what="size of the task actions",
-            trial=trial,
-            first=str(first.action_size),
-            second=str(second.action_size),
+            what="size of the task actions", trial=trial, first=sizes[0], second=sizes[1]
         )
-    for decision, counterpart in zip_longest(first, second):
-        found = _difference_of_decision(decision, counterpart)
+    for pair in zip_longest(first, second):
+        found = _difference_of_decision(*pair, trial)
         if found is not None:
-            step, what, values = found
-            return Difference(what=what, trial=trial, step=step, first=values[0], second=values[1])
+            return found
     (steps, digest), (other_steps, other_digest) = _ending(first), _ending(second)
     if steps != other_steps:
         return Difference(
@@ -272,53 +273,43 @@ def _ending(decisions: Decisions) -> tuple[int, bytes]:
     return (steps, digest) if kind == b"E" else (0, b"")
 
 
+_Decision: TypeAlias = SensingDecision | TaskDecision
+
+
 def _difference_of_decision(
-    first: SensingDecision | TaskDecision | None, second: SensingDecision | TaskDecision | None
-) -> tuple[int, str, tuple[str, str]] | None:
-    """Return step, what differs and both values, None if nothing does."""
-    if isinstance(first, SensingDecision) and isinstance(second, SensingDecision):
-        if first == second:
-            return None
-        if first.step == second.step:
-            if first.sensing_action != second.sensing_action:
-                values = (str(first.sensing_action), str(second.sensing_action))
-                return first.step, "sensing action", values
-            return (
-                first.step,
-                "state digest after sensing",
-                (first.state_digest.hex(), second.state_digest.hex()),
-            )
-    if (
-        isinstance(first, TaskDecision)
-        and isinstance(second, TaskDecision)
-        and first.step == second.step
+    first: _Decision | None, second: _Decision | None, trial: int
+) -> Difference | None:
+    """Return what differs first in two decisions, None if nothing does."""
+    for (what, bits, text), (_, other_bits, other_text) in zip(
+        _parts(first), _parts(second), strict=False
     ):
-        # By their bits: 0.0 and -0.0 are different actions, and a NaN is equal to itself.
-        for index, pair in enumerate(zip(first.action, second.action, strict=True)):
-            if _bits(pair[0]) != _bits(pair[1]):
-                return first.step, f"task action[{index}]", _written(*pair)
-        return None
-    step = min(decision.step for decision in (first, second) if decision is not None)
-    return step, "next decision", (_named(first), _named(second))
+        if bits != other_bits:
+            texts = text, other_text
+            if text == other_text:  # as of two NaN
+                texts = f"{text} (0x{bits.hex()})", f"{text} (0x{other_bits.hex()})"
+            step = min(decision.step for decision in (first, second) if decision is not None)
+            return Difference(what=what, trial=trial, step=step, first=texts[0], second=texts[1])
+    return None
 
 
-def _bits(number: float) -> bytes:
-    return struct.pack(">d", number)
+def _parts(decision: _Decision | None) -> Iterator[tuple[str, bytes, str]]:
+    """Yield what a decision consists of: its name, its bits, and the words for a person.
 
-
-def _written(first: float, second: float) -> tuple[str, str]:
-    """Write numbers so that they look different: if their repr does not, as their bits too."""
-    if repr(first) != repr(second):
-        return repr(first), repr(second)
-    return f"{first!r} (0x{_bits(first).hex()})", f"{second!r} (0x{_bits(second).hex()})"
-
-
-def _named(decision: SensingDecision | TaskDecision | None) -> str:
+    By their bits, because 0.0 and -0.0 are different actions, and a NaN is equal to itself.
+    """
     if decision is None:
-        return "none, the trial ends"
-    if isinstance(decision, SensingDecision):
-        return f"sensing action {decision.sensing_action} at step {decision.step}"
-    return f"a task action at step {decision.step}"
+        yield "next decision", b"", "none, the trial ends"
+    elif isinstance(decision, SensingDecision):
+        step, action, digest = decision
+        where = f"sensing action {action} at step {step}"
+        yield "next decision", b"S" + step.to_bytes(8, "big"), where
+        yield "sensing action", action.to_bytes(8, "big"), str(action)
+        yield "state digest after sensing", digest, digest.hex()
+    else:
+        where = f"a task action at step {decision.step}"
+        yield "next decision", b"A" + decision.step.to_bytes(8, "big"), where
+        for index, value in enumerate(decision.action):
+            yield f"task action[{index}]", struct.pack(">d", value), repr(value)
 
 
 def _counted(count: int, noun: str) -> str:

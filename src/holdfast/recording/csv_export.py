@@ -16,6 +16,7 @@ from typing import Any, Self
 
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.belief import Belief
+from holdfast.planning.outcome import TRIAL_COLUMNS
 from holdfast.printable import cell
 from holdfast.problems.attributes import choice_labels
 from holdfast.problems.attributes import state_labels as declared_labels
@@ -29,6 +30,7 @@ from holdfast.recording.facts import (
     TrialBeginFact,
     TrialEndFact,
 )
+from holdfast.recording.tables import trial_cells
 
 __all__ = ["TABLES", "CsvSink"]
 
@@ -51,38 +53,28 @@ class CsvSink:
             ]
             self._trials, _, self._beliefs, self._events = map(_writer, self._files)
             self._close = stack.pop_all()
-        self._trials.writerow(
-            [
-                *("trial", "began", "ended", "seed", "outcome", "success", "steps", "reward"),
-                *("digest", "reason"),
-            ]
-        )
+        trial, *others = TRIAL_COLUMNS
+        self._trials.writerow([trial, "began", "ended", *others])
         self._steps = csv.DictWriter(
             self._files[1],
             [
-                "trial",
-                "step",
-                "stage",
-                "sensing_action",
-                "sensing_action_label",
-                "observation",
+                *(
+                    "trial",
+                    "step",
+                    "stage",
+                    "sensing_action",
+                    "sensing_action_label",
+                    "observation",
+                ),
                 *(f"entropy_{index}" for index in range(len(self._choices))),
-                "explained",
-                "mahalanobis_distance",
-                "effective_sample_size",
-                "resampled",
+                *("explained", "mahalanobis_distance", "effective_sample_size", "resampled"),
                 "state_digest",
                 *(f"estimate {label}" for label in self._labels),
                 *(f"true {label}" for label in self._labels),
                 *(f"action_{index}" for index in range(problem.action_size)),
-                "motion",
-                "move_observation",
-                "reward",
-                "sensing_time",
-                "observation_time",
-                "action_time",
-                *(f"sensing_{name}" for name in Decider._fields),
-                *(f"action_{name}" for name in Decider._fields),
+                *("motion", "move_observation", "reward"),
+                *("sensing_time", "observation_time", "action_time"),
+                *(f"{kind}_{name}" for kind in ("sensing", "action") for name in Decider._fields),
             ],
             lineterminator="\n",
         )
@@ -124,27 +116,14 @@ class CsvSink:
         if self._sensing is not None:
             self._write_step(fact.trial, fact.steps, None)
         self._write_belief(fact.trial, fact.steps, "end", fact.belief)
-        result = fact.result
-        self._trials.writerow(
-            [
-                fact.trial,
-                _seconds(self._began_ns),
-                _seconds(fact.time_ns),
-                *(
-                    (None, "unfinished", None, fact.steps, None, None, None)
-                    if result is None
-                    else (
-                        result.seed,
-                        result.outcome,
-                        int(result.success),
-                        result.steps,
-                        result.reward,
-                        cell(result.digest),
-                        cell(result.reason),
-                    )
-                ),
-            ]
-        )
+        if fact.result is None:
+            known = {"trial": fact.trial, "outcome": "unfinished", "steps": fact.steps}
+            cells: list[object] = [known.get(column) for column in TRIAL_COLUMNS]
+        else:
+            cells = trial_cells(fact.result)
+        trial, *others = cells
+        times = _seconds(self._began_ns), _seconds(fact.time_ns)
+        self._trials.writerow([trial, *times, *others])
 
     def happened(self, fact: EventFact) -> None:
         """Write an event."""

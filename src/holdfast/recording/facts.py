@@ -9,10 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
+
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.belief import Belief
 from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import digest
 from holdfast.recording.run_clock import Stamp
+from holdfast.robot.trial import LateStep, SensingStep
 
 __all__ = [
     "SCORES",
@@ -54,13 +58,17 @@ class Decider(NamedTuple):
     round_trip_ms: float | None
     computed_ms: float | None
 
+    @classmethod
+    def of(cls, answer: Any) -> Decider:
+        """Return that of a ``Timing``, or of a row of the table."""
+        return cls(*(getattr(answer, name) for name in cls._fields))
+
 
 class TrialBeginFact(NamedTuple):
-    """A trial begins; ``beliefs_known`` says whether its facts have beliefs."""
+    """A trial begins."""
 
     trial: int
     time_ns: int
-    beliefs_known: bool
 
 
 class SensingFact(NamedTuple):
@@ -76,7 +84,7 @@ class SensingFact(NamedTuple):
         When it was chosen, and when its observation was part of the belief.
     state_digest : bytes
         Of the planning state after the observation.
-    before, after : Belief or None
+    before, after : Belief
         The beliefs before and after the observation.
     entropies : array of shape (num_sensing_actions,) or None
         What was minimised, in nats; None if nothing was.
@@ -89,15 +97,41 @@ class SensingFact(NamedTuple):
     sensing_action: int
     state_digest: bytes
     decider: Decider | None
-    before: Belief | None = None
-    after: Belief | None = None
-    stage: int | None = None
+    before: Belief
+    after: Belief
+    stage: int
     entropies: FloatArray | None = None
     observation: FloatArray | None = None
     explained: bool | None = None
     resampled: bool | None = None
     effective_sample_size: float | None = None
     mahalanobis_distance: float | None = None
+
+    @classmethod
+    def of(
+        cls, step: SensingStep, decided_ns: int, observed_ns: int, decider: Decider | None
+    ) -> SensingFact:
+        """Return the fact of a step."""
+        before, after, entropies = step.before, step.after, step.sensing_info.entropies
+        info = step.observation_info
+        return cls(
+            trial=before.trial,
+            step=before.step,
+            decided_ns=decided_ns,
+            observed_ns=observed_ns,
+            sensing_action=step.sensing_action,
+            state_digest=digest(after),
+            decider=decider,
+            before=before.belief,
+            after=after.belief,
+            stage=before.stage,
+            entropies=None if entropies is None else np.array(entropies, dtype=np.float64),
+            observation=step.observation,
+            explained=info.explained,
+            resampled=info.resampled,
+            effective_sample_size=info.effective_sample_size,
+            mahalanobis_distance=info.mahalanobis_distance,
+        )
 
 
 class TaskFact(NamedTuple):
@@ -107,7 +141,7 @@ class TaskFact(NamedTuple):
     ----------
     action : array of shape (action_size,)
         As it was executed.
-    belief, estimate : Belief or None, array of shape (state_size,) or None
+    belief, estimate : Belief, array of shape (state_size,)
         From which it was chosen, and the state with which the policy was evaluated.
     true_state : array of shape (state_size,) or None
         Before the action.
@@ -120,9 +154,9 @@ class TaskFact(NamedTuple):
     time_ns: int
     action: FloatArray
     decider: Decider | None
-    belief: Belief | None = None
-    stage: int | None = None
-    estimate: FloatArray | None = None
+    belief: Belief
+    stage: int
+    estimate: FloatArray
     true_state: FloatArray | None = None
     reward: float | None = None
     motion: FloatArray | None = None
@@ -148,6 +182,15 @@ class LateFact(NamedTuple):
     after: Belief
     explained: bool
 
+    @classmethod
+    def of(cls, step: LateStep, time_ns: int) -> LateFact:
+        """Return the fact of a late observation."""
+        late, after = step.late, step.after
+        explained = step.observation_info.explained
+        return cls(
+            after.trial, after.step, time_ns, late.step, late.observation, after.belief, explained
+        )
+
 
 class TrialEndFact(NamedTuple):
     """A trial ends, or its records do.
@@ -157,7 +200,7 @@ class TrialEndFact(NamedTuple):
     result : TrialResult or None
         None if the trial is not finished.
     belief, estimate, true_state
-        As in :class:`TaskFact`, after the last action.
+        As in :class:`TaskFact`, after the last action; None where the records end before that.
     """
 
     trial: int

@@ -21,7 +21,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -69,6 +69,8 @@ class Journal(JournalReader):
     ----------
     survives : {"process_crash", "power_cut"}
         What each appended step survives.
+    on_append : callable or None
+        Gets the trial and the records of each :meth:`append`, once they are written.
     """
 
     def __init__(
@@ -78,6 +80,7 @@ class Journal(JournalReader):
         self.survives = survives
         self._encode = msgspec.msgpack.Encoder().encode
         self._steps: _Steps | None = None
+        self.on_append: Callable[[int, Sequence[Record]], None] | None = None
         self._count: StepCount | None = None
         self._in_place: list[tuple[str, FileIdentity]] = []
 
@@ -252,10 +255,10 @@ class Journal(JournalReader):
 
     # -- the run -------------------------------------------------------------------------------
 
-    def set_meta(self, key: str, value: str) -> None:
-        """Write a note about the run."""
+    def set_meta(self, **rows: str) -> None:
+        """Write notes about the run, all or none."""
         with self._transaction():
-            self._note({key: value})
+            self._note(rows)
 
     def _note(self, rows: dict[str, str]) -> None:
         self._connection.executemany(
@@ -281,7 +284,7 @@ class Journal(JournalReader):
         if not text.isdecimal() or not 0 <= int(text) < _MAX_EPOCH:
             raise self._damaged(f"its epoch is {text!r}, not from 0 to {_MAX_EPOCH - 1}")
         epoch = int(text) + 1
-        self.set_meta("epoch", str(epoch))
+        self.set_meta(epoch=str(epoch))
         self._move_log()
         return epoch
 
@@ -341,6 +344,8 @@ class Journal(JournalReader):
         # Afterwards: a count that is too small does no harm.
         count.write(trial, sequence)
         self._steps = _Steps(trial, sequence)
+        if self.on_append is not None:
+            self.on_append(trial, records)
 
     def _count_from(self, trial: int, number: int) -> StepCount:
         """Begin to count, once what is in the journal was found to be enough to go on from."""

@@ -3,6 +3,9 @@
 A belief is a function of the records, so this process comes to the robot's own beliefs without
 being sent any. To fold a record costs little. To compute the entropies of the alternatives again
 and to draw a step costs more, so both are left out for a record that is older than three seconds.
+
+Messages come through a pipe, each after its length. The robot's end never waits, so it writes what
+the pipe takes and keeps the rest.
 """
 
 from __future__ import annotations
@@ -12,15 +15,17 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeAlias
 
 import msgspec
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import HoldfastError
 from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.tracking import Trial
+from holdfast.protocol.events import Timing
 from holdfast.protocol.messages import decode_floats, numbers_of
 from holdfast.protocol.records import (
     ActingRecord,
@@ -40,25 +45,89 @@ from holdfast.recording.facts import (
     TrialBeginFact,
     TrialEndFact,
 )
-from holdfast.recording.live_messages import (
-    HEADER_BYTES,
-    EndedMessage,
-    EventMessage,
-    FinishMessage,
-    FollowerReport,
-    RecordsMessage,
-    TimingMessage,
-    ViewMessage,
-)
 from holdfast.recording.view_target import ViewTarget
 from holdfast.robot.environment import SimulatedEnvironment
+from holdfast.robot.trial import LateStep, SensingStep
 
-__all__ = ["Follower", "follow"]
+__all__ = [
+    "HEADER_BYTES",
+    "EndedMessage",
+    "EventMessage",
+    "FinishMessage",
+    "Follower",
+    "FollowerReport",
+    "LostMessage",
+    "RecordsMessage",
+    "TimingMessage",
+    "ViewMessage",
+    "follow",
+]
 
 _LATE_NS = 3_000_000_000
 """A step that is older than this is not drawn."""
 
 _NICENESS = 10
+
+HEADER_BYTES = 4
+"""Of a message's length, little-endian."""
+
+
+class RecordsMessage(msgspec.Struct, array_like=True, frozen=True, tag=1):
+    """Records of a trial, once they are journalled; times are in nanoseconds since 1970."""
+
+    time_ns: int
+    trial: int
+    records: tuple[Record, ...]
+
+
+class TimingMessage(msgspec.Struct, array_like=True, frozen=True, tag=2):
+    """Who decided; it comes before the record of that decision."""
+
+    time_ns: int
+    timing: Timing
+
+
+class EndedMessage(msgspec.Struct, array_like=True, frozen=True, tag=3):
+    """A trial has ended, with the action of its last record."""
+
+    time_ns: int
+    result: TrialResult
+
+
+class EventMessage(msgspec.Struct, array_like=True, frozen=True, tag=4):
+    """An event, as a line of ``events.jsonl``."""
+
+    time_ns: int
+    line: str
+
+
+class LostMessage(msgspec.Struct, array_like=True, frozen=True, tag=5):
+    """What waited was too much and is lost: the next records are of another trial."""
+
+
+class FinishMessage(msgspec.Struct, array_like=True, frozen=True, tag=6):
+    """The run is over."""
+
+
+ViewMessage: TypeAlias = (
+    RecordsMessage | TimingMessage | EndedMessage | EventMessage | LostMessage | FinishMessage
+)
+
+
+class FollowerReport(msgspec.Struct, array_like=True, frozen=True):
+    """What the process that shows a run says: once when it is ready, once at its end.
+
+    Attributes
+    ----------
+    error : str or None
+        Why it shows nothing any more.
+    steps, left_out : int
+        Task actions that it was told of, and those that there was no time to show.
+    """
+
+    error: str | None = None
+    steps: int = 0
+    left_out: int = 0
 
 
 class Follower:
@@ -95,16 +164,7 @@ class Follower:
                 self._fold(trial, record, message.time_ns)
         elif isinstance(message, TimingMessage):
             timing = message.timing
-            self._deciders[timing.step, timing.kind] = (
-                message.time_ns,
-                Decider(
-                    timing.service,
-                    timing.status,
-                    timing.waited_ms,
-                    timing.round_trip_ms,
-                    timing.computed_ms,
-                ),
-            )
+            self._deciders[timing.step, timing.kind] = message.time_ns, Decider.of(timing)
         elif isinstance(message, EndedMessage):
             self._finish(message)
         elif isinstance(message, EventMessage):
@@ -122,7 +182,7 @@ class Follower:
         self._pending = self._answered = None
         if self._configuration.environment.object is None:
             self._simulated = SimulatedEnvironment(self._planner.problem, seed, number)
-        self._sink.trial_begins(TrialBeginFact(number, time_ns, beliefs_known=True))
+        self._sink.trial_begins(TrialBeginFact(number, time_ns))
         return trial
 
     def _finish(self, message: EndedMessage) -> None:
@@ -183,51 +243,20 @@ class Follower:
             found = trial.observe_late(late)
             if found is not None and not is_late:
                 self._sink.observed_late(
-                    LateFact(
-                        trial=trial.state.trial,
-                        step=record.step,
-                        time_ns=time_ns,
-                        taken=record.taken,
-                        observation=late.observation,
-                        after=trial.state.belief,
-                        explained=found[0].explained,
-                    )
+                    LateFact.of(LateStep(late, trial.state, found[0]), time_ns)
                 )
         elif isinstance(record, ReinitialisedRecord):
             trial.reinitialise()  # an event tells of it
 
     def _sensed(self, trial: Trial, record: ObservedRecord, time_ns: int, *, is_late: bool) -> None:
         before = trial.state
-        entropies = None
-        if not is_late:
-            entropies = self._planner.choose_sensing_action(before)[1].entropies
+        why = None if is_late else self._planner.choose_sensing_action(before)[1]
         observation = numbers_of(record.observation)
         info, _ = trial.observe(record.sensing_action, observation, record.sensing_ms)
-        decided = self._deciders.pop((before.step, "sensing"), None)
-        if is_late:
-            return
-        fact = SensingFact(
-            trial=before.trial,
-            step=before.step,
-            decided_ns=time_ns if decided is None else decided[0],
-            observed_ns=time_ns,
-            sensing_action=record.sensing_action,
-            state_digest=record.digest,
-            decider=None if decided is None else decided[1],
-            before=before.belief,
-            after=trial.state.belief,
-            stage=before.stage,
-            entropies=entropies,
-        )
-        if observation is not None:
-            fact = fact._replace(
-                observation=observation,
-                explained=info.explained,
-                resampled=info.resampled,
-                effective_sample_size=info.effective_sample_size,
-                mahalanobis_distance=info.mahalanobis_distance,
-            )
-        self._sink.sensed(fact)
+        decided_ns, decider = self._deciders.pop((before.step, "sensing"), (time_ns, None))
+        if why is not None:
+            step = SensingStep(before, record.sensing_action, why, observation, trial.state, info)
+            self._sink.sensed(SensingFact.of(step, decided_ns, time_ns, decider))
 
     def _acting(self, state: PlanningState, action: FloatArray, time_ns: int) -> None:
         """Show an action when it is ordered: how it went shows at the next one."""

@@ -26,8 +26,7 @@ from holdfast.errors import ViewError
 from holdfast.planning.outcome import TrialResult
 from holdfast.protocol.events import Timing
 from holdfast.protocol.records import Record
-from holdfast.recording.live_follower import follow
-from holdfast.recording.live_messages import (
+from holdfast.recording.live_follower import (
     HEADER_BYTES,
     EndedMessage,
     EventMessage,
@@ -37,17 +36,16 @@ from holdfast.recording.live_messages import (
     RecordsMessage,
     TimingMessage,
     ViewMessage,
+    follow,
 )
 from holdfast.runtime.log_lines import json_line
 from holdfast.runtime.workers import WorkerProcess, end_workers
 
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
-    from holdfast.recording.journal import Journal
-    from holdfast.recording.journal_reader import UnfinishedTrial
     from holdfast.recording.view_target import ViewTarget
 
-__all__ = ["LiveView", "ShownJournal"]
+__all__ = ["LiveView"]
 
 _START_S = 60.0
 """Longest wait for the viewer, before the run begins."""
@@ -226,31 +224,3 @@ class LiveView:
         if not self._told:
             self._told = True
             self._on_note(text)
-
-
-class ShownJournal:
-    """A journal whose records are shown once they are written."""
-
-    def __init__(self, journal: Journal, view: LiveView) -> None:
-        self._journal = journal
-        self._view = view
-
-    def session(self) -> bytes:
-        """Return the run's identifier."""
-        return self._journal.session()
-
-    def raise_epoch(self) -> int:
-        """Return a number above all earlier ones."""
-        return self._journal.raise_epoch()
-
-    def append(self, trial: int, records: Sequence[Record]) -> None:
-        """Write records, and show them."""
-        self._journal.append(trial, records)
-        self._view.records(trial, records)
-
-    def unfinished(self) -> UnfinishedTrial | None:
-        """Return the unfinished trial, and show it."""
-        unfinished = self._journal.unfinished()
-        if unfinished is not None:
-            self._view.records(unfinished.trial, unfinished.records)
-        return unfinished

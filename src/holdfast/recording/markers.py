@@ -7,8 +7,9 @@ What a problem does not define is left out.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from holdfast.problems.attributes import sensing_labels, state_labels
 from holdfast.problems.problem import Problem, Scene
 from holdfast.recording.poses import POSE_COORDINATES, PoseLayout
 
-__all__ = ["Marker", "scene_markers", "sensing_markers"]
+__all__ = ["GrowingPath", "Marker", "scene_markers", "sensing_markers"]
 
 _AT_ORIGIN = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _OBSTACLE = (0.79, 0.80, 0.82, 0.6)
@@ -29,12 +30,18 @@ _ESTIMATE = (0.18, 0.43, 0.70, 1.0)
 _TRUTH = (0.07, 0.07, 0.07, 1.0)
 _SENSED = (0.91, 0.64, 0.09, 1.0)
 
+_Place = TypeVar("_Place")
+
 _THICKNESS = 0.02
 _LINE = 0.004
 _ARROW = 0.12
 _TEXT = 0.03
 """By the size of the scene: how thick a flat obstacle is, a line, an arrow's half length, a text's
 height."""
+
+_PATH_GROWTH = 20
+"""A path is shown anew when it is longer by this part of itself: all of them together take twenty
+times its length, not the square of it."""
 
 _ARC_POINTS = 25
 _DISC_POINTS = 49
@@ -57,6 +64,31 @@ class Marker(NamedTuple):
     points: tuple[tuple[float, ...], ...] = ()
     text: str = ""
     moves_with_frame: bool = False
+
+
+class GrowingPath(Generic[_Place]):
+    """The places of a trial so far; from ``most`` on every second, every fourth, ... is kept."""
+
+    def __init__(self, most: float = math.inf) -> None:
+        self.places: list[_Place] = []
+        self._most = most
+        self._count = 0
+        self._every = 1
+        self._next_length = 0
+
+    def add(self, place: _Place, *, last: bool) -> bool:
+        """Add a place, and return whether it is time to show the path."""
+        if self._count % self._every == 0 or last:
+            self.places.append(place)
+        self._count += 1
+        if len(self.places) > self._most:
+            self.places = self.places[::2]
+            self._every *= 2
+            self._next_length = 0
+        if len(self.places) < self._next_length and not last:
+            return False
+        self._next_length = len(self.places) + 1 + len(self.places) // _PATH_GROWTH
+        return True
 
 
 def scene_markers(

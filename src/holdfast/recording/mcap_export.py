@@ -33,7 +33,7 @@ from holdfast.recording.facts import (
     TrialBeginFact,
     TrialEndFact,
 )
-from holdfast.recording.markers import Marker, scene_markers, sensing_markers
+from holdfast.recording.markers import GrowingPath, Marker, scene_markers, sensing_markers
 from holdfast.recording.poses import pose_layout
 from holdfast.runtime.events import severity
 
@@ -50,10 +50,6 @@ TRUTH_FRAME = "truth"
 _NS_PER_S = 1_000_000_000
 _BAG_VERSION: Final = 8
 """Of rosbag2's metadata: the last one whose qualities of service Humble's rosbag2 reads as well."""
-
-_PATH_GROWTH = 20
-"""A path is written anew when it is longer by this part of itself: all of them together take twenty
-times its length, not the square of it."""
 
 _LEVELS = {"DEBUG": 10, "INFO": 20, "WARN": 30, "ERROR": 40}
 
@@ -102,7 +98,7 @@ class McapSink:
         self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         for key, value in notes.items():
             self._writer.set_custom_data(key, value)
-        self._paths: dict[str, _GrowingPath] = {}
+        self._paths: dict[str, GrowingPath[Any]] = {}
         self._belief_written: Belief | None = None
         self._has_frame = False
 
@@ -138,7 +134,7 @@ class McapSink:
                 self._problem,
                 self._layout,
                 TASK_FRAME,
-                ESTIMATE_FRAME if fact.beliefs_known else None,
+                ESTIMATE_FRAME,
                 TRUTH_FRAME,
             )
             self._markers(now, "/holdfast/scene", markers, anew=True)
@@ -157,7 +153,7 @@ class McapSink:
             labels = "; ".join(self._choices[: len(fact.entropies)])
             self._array(now, "/holdfast/entropies", fact.entropies, labels)
         is_performed = fact.sensing_action < len(self._problem.sensing_actions)
-        if self._layout is not None and fact.before is not None and is_performed:
+        if self._layout is not None and is_performed:
             markers = sensing_markers(
                 self._problem, self._layout, TASK_FRAME, fact.before, fact.sensing_action
             )
@@ -293,12 +289,10 @@ class McapSink:
             )
 
     def _extend_path(self, now: int, topic: str, pose: FloatArray, *, last: bool) -> None:
-        path = self._paths.setdefault(topic, _GrowingPath())
+        path = self._paths.setdefault(topic, GrowingPath())
         stamped = (_header(now), self._pose(pose))
-        path.poses.append(self._message("geometry_msgs/msg/PoseStamped", stamped))
-        if last or len(path.poses) >= path.next_length:
-            path.next_length = len(path.poses) + 1 + len(path.poses) // _PATH_GROWTH
-            self._write(now, topic, "nav_msgs/msg/Path", header=_header(now), poses=path.poses)
+        if path.add(self._message("geometry_msgs/msg/PoseStamped", stamped), last=last):
+            self._write(now, topic, "nav_msgs/msg/Path", header=_header(now), poses=path.places)
 
     def _transform(
         self, now: int, topic: str, parent: str, children: Mapping[str, FloatArray]
@@ -440,14 +434,6 @@ class McapSink:
 
 def _header(now: int, frame: str = TASK_FRAME) -> dict[str, Any]:
     return {"stamp": divmod(now, _NS_PER_S), "frame_id": frame}
-
-
-class _GrowingPath:
-    """The poses of a path so far, and how long it is when it is written next."""
-
-    def __init__(self) -> None:
-        self.poses: list[Any] = []
-        self.next_length = 1
 
 
 def _qos(*, latched: bool) -> Any:

@@ -2,8 +2,7 @@
 
 The journal holds decisions, not beliefs. Beliefs, estimates and entropies are a function of the
 decisions' inputs, so a trial is planned again when it is read, and must come to the same decisions.
-That takes as long as planning did. Where the world was the user's own and its observations were
-not kept, the decisions are all there is.
+That takes as long as planning did.
 """
 
 from __future__ import annotations
@@ -48,26 +47,26 @@ class TrialArrays:
         Executed task actions.
     sensing_steps, sensing_actions : array of shape (S,)
         The steps with a sensing action, and which action it was.
-    observations : tuple of S arrays, or None
+    observations : tuple of S arrays
         Each of shape ``(observation_size,)``; of size 0 if the choice was not to sense, or if it
-        never came. One that came late is here, too. None, as all below, where they are not known.
-    entropies : array of shape (S, num_choices) or None
+        never came. One that came late is here, too.
+    entropies : array of shape (S, num_choices)
         What was minimised, expected after each choice: the sensing actions and, if it may be
         chosen, not to sense. NaN where nothing was.
-    priors : tuple of S beliefs, or None
+    priors : tuple of S beliefs
         Before each observation.
-    beliefs : tuple of T + 1 beliefs, or None
+    beliefs : tuple of T + 1 beliefs
         From which each task action was chosen, and the last. (A trial that is not finished may
         lack the last.)
-    estimates : array of shape (T + 1, state_size) or None
+    estimates : array of shape (T + 1, state_size)
         The states that stood for these beliefs.
-    stages : array of shape (T,) or None
+    stages : array of shape (T,)
         Of each task action.
-    rewards : array of shape (T,) or None
+    rewards : array of shape (T,)
         NaN for a step without one.
     true_states : array of shape (T + 1, state_size) or None
-        Of a simulated world.
-    motions, move_observations : tuple of T arrays, or None
+        Of a simulated world; None for a robot's own.
+    motions, move_observations : tuple of T arrays
         What each move has shown; of size 0 for nothing.
     """
 
@@ -76,16 +75,16 @@ class TrialArrays:
     task_actions: FloatArray
     sensing_steps: IntArray
     sensing_actions: IntArray
-    observations: tuple[FloatArray, ...] | None
-    entropies: FloatArray | None
-    priors: tuple[Belief, ...] | None
-    beliefs: tuple[Belief, ...] | None
-    estimates: FloatArray | None
-    stages: IntArray | None
-    rewards: FloatArray | None
+    observations: tuple[FloatArray, ...]
+    entropies: FloatArray
+    priors: tuple[Belief, ...]
+    beliefs: tuple[Belief, ...]
+    estimates: FloatArray
+    stages: IntArray
+    rewards: FloatArray
     true_states: FloatArray | None
-    motions: tuple[FloatArray, ...] | None
-    move_observations: tuple[FloatArray, ...] | None
+    motions: tuple[FloatArray, ...]
+    move_observations: tuple[FloatArray, ...]
 
 
 @dataclass(frozen=True)
@@ -175,7 +174,6 @@ class _Collector:
 
     def __init__(self, num_choices: int) -> None:
         self._no_entropies = np.full(num_choices, np.nan)
-        self._beliefs_known = False
         self._sensing: list[SensingFact] = []
         self._late: dict[int, FloatArray] = {}
         self._tasks: list[TaskFact] = []
@@ -183,7 +181,7 @@ class _Collector:
 
     def trial_begins(self, fact: TrialBeginFact) -> None:
         """Forget the trial before."""
-        self._beliefs_known = fact.beliefs_known
+        del fact
         self._sensing, self._tasks, self._end, self._late = [], [], None, {}
 
     def sensed(self, fact: SensingFact) -> None:
@@ -212,8 +210,6 @@ class _Collector:
         actions = np.array([task.action for task in tasks]).reshape(-1, action_size)
         steps = np.array([each.step for each in sensing], dtype=np.int64)
         chosen = np.array([each.sensing_action for each in sensing], dtype=np.int64)
-        if not self._beliefs_known:
-            return TrialArrays(trial, end.result, actions, steps, chosen, *[None] * 10)
         entropies = [
             self._no_entropies if each.entropies is None else each.entropies for each in sensing
         ]
@@ -230,7 +226,7 @@ class _Collector:
                 _shown(self._late.get(each.step, each.observation)) for each in sensing
             ),
             entropies=np.array(entropies).reshape(-1, self._no_entropies.size),
-            priors=tuple(each.before for each in sensing if each.before is not None),
+            priors=tuple(each.before for each in sensing),
             beliefs=tuple(each.belief for each in ends if each.belief is not None),
             estimates=np.array([each.estimate for each in ends if each.estimate is not None]),
             stages=np.array([task.stage for task in tasks], dtype=np.int64),

@@ -6,8 +6,7 @@ process, and every decision is compared, bit for bit, with the recorded one befo
 as a fact (:mod:`holdfast.recording.facts`).
 
 A simulated world is a function of the seed as well, so its true states are facts, too. What a
-robot's own world has shown is in the journal. Journals from before observations were kept yield the
-decisions and their times, and no beliefs.
+robot's own world has shown is in the journal.
 """
 
 from __future__ import annotations
@@ -26,12 +25,13 @@ from holdfast.config.loader import Configuration
 from holdfast.errors import (
     DecidedOtherwiseError,
     HoldfastError,
+    OutputError,
     UntrustedCodeError,
 )
 from holdfast.numerics.arrays import FloatArray, floats_or_none
 from holdfast.numerics.floating_mode import in_own_mode
-from holdfast.planning.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
-from holdfast.planning.planner import Planner, PlanningState, digest
+from holdfast.planning.outcome import TaskDecision, TrialResult
+from holdfast.planning.planner import Planner, PlanningState
 from holdfast.printable import one_line
 from holdfast.protocol.records import decisions_of
 from holdfast.recording.facts import (
@@ -46,6 +46,7 @@ from holdfast.recording.facts import (
 )
 from holdfast.recording.fingerprint import difference, fingerprint
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
+from holdfast.recording.recomputing import ComparedTrial, RecordedTrials
 from holdfast.recording.run_clock import RunClock
 from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME, recorded_configuration
 from holdfast.recording.step_times import (
@@ -56,9 +57,8 @@ from holdfast.recording.step_times import (
     trial_ends,
 )
 from holdfast.recording.timings import rows_by_trial
-from holdfast.robot.environment import Environment, SimulatedEnvironment
-from holdfast.robot.recorded_trial import run_recorded_trial
-from holdfast.robot.trial import LateStep, SensingStep, TaskStep, TrialObserver, run_trial
+from holdfast.robot.environment import Environment
+from holdfast.robot.trial import LateStep, SensingStep, TaskStep, TrialObserver
 
 __all__ = ["RecordedRun"]
 
@@ -103,10 +103,12 @@ class RecordedRun:
             path = self._journal.path
             directory = path.parent
             self._meta = self._journal.meta()
-            self.configuration, self.world_is_simulated = _configuration(
+            self.configuration, simulated = _configuration(
                 self._meta, path, purpose, problem_directory
             )
-            self._planner = Planner(self.configuration.problem, self.configuration.planning)
+            self._recorded = RecordedTrials(
+                self._journal, self.configuration, world_is_simulated=simulated
+            )
             self._begun = self._journal.unfinished()
             self.unfinished = None if self._begun is None else self._begun.trial
             trials = self._journal.finished()
@@ -150,12 +152,6 @@ class RecordedRun:
         """Raise OutputError if a run has written to the journal meanwhile."""
         self._journal.require_unchanged()
 
-    def beliefs_known(self, trial: int) -> bool:
-        """Return whether a trial can be run again: its observations are known."""
-        if self.world_is_simulated or trial == self.unfinished:
-            return True
-        return self._journal.kept_steps(trial) is not None
-
     def replay(self, trials: Sequence[int], sinks: Sequence[FactSink]) -> Iterator[int]:
         """Write the facts of some trials to each sink, and yield each trial's number at its end.
 
@@ -164,7 +160,7 @@ class RecordedRun:
         Raises
         ------
         OutputError
-            If a trial is damaged.
+            If a trial is damaged, or of a robot's own world whose observations were not kept.
         HoldfastError
             If a trial is decided otherwise when it is run again.
         """
@@ -187,38 +183,26 @@ class RecordedRun:
         trial, decisions = result.trial, result.decisions
         assert decisions is not None
         times = self._times(trial, result.steps, clock)
-        simulator = self.configuration.simulator
-        replay = _Replay(trial, list(decisions), times, output, result, self._planner)
+        facts = _Facts(trial, times, output, result, self._recorded.planner)
+        compared = ComparedTrial(trial, list(decisions), result, facts)
         with self._named_otherwise():
-            if self.world_is_simulated:
-                run_trial(
-                    self._planner,
-                    simulator.seed,
-                    trial,
-                    max_steps=simulator.max_steps,
-                    observer=replay,
-                    reinitialised_after=decisions.reinitialised_after(),
+            if self._recorded.run(result, compared) is None:
+                raise OutputError(
+                    f"{self.path}: trial {trial} cannot be computed again: this run is older than "
+                    "the keeping of what an environment of your own has shown; --trials leaves it "
+                    "out"
                 )
-            elif (records := self._journal.kept_steps(trial)) is not None:
-                run_recorded_trial(self._planner, simulator.seed, trial, records, replay, result)
-            else:
-                _write_decisions(result, decisions, times, output)
         return trial
 
     def _replay_unfinished(self, begun: UnfinishedTrial, output: _Output, clock: StepClock) -> int:
-        trial, seed = begun.trial, self.configuration.simulator.seed
+        trial = begun.trial
         expected = list(decisions_of(begun.records))
         steps = sum(isinstance(decision, TaskDecision) for decision in expected)
-        simulated = None
-        if self.world_is_simulated:
-            simulated = SimulatedEnvironment(self.configuration.problem, seed, trial)
         times = self._times(trial, steps, clock)
-        replay = _Replay(trial, expected, times, output, None, self._planner)
+        facts = _Facts(trial, times, output, None, self._recorded.planner)
         with self._named_otherwise():
-            run_recorded_trial(
-                self._planner, seed, trial, begun.records, replay, simulated=simulated
-            )
-        replay.end_here()
+            self._recorded.run_unfinished(begun, ComparedTrial(trial, expected, None, facts))
+        facts.end_here()
         return trial
 
     @contextlib.contextmanager
@@ -229,16 +213,13 @@ class RecordedRun:
         except DecidedOtherwiseError as error:
             # Most likely the code has changed.
             changed = difference(self._meta, fingerprint(self.configuration))
-            because = "" if changed is None else f" ({changed})"
+            because = "" if changed is None else f" ({changed.words})"
             raise HoldfastError(f"{error}{because}; --trials leaves it out") from error
 
     def _times(self, trial: int, steps: int, clock: StepClock) -> TrialTimes:
         rows = self._rows.get(trial, {}) if self.has_times else {}
         times = clock.next_trial(steps, rows, self._ends.get(trial))
-        deciders = {
-            key: Decider(row.service, row.status, row.waited_ms, row.round_trip_ms, row.computed_ms)
-            for key, row in rows.items()
-        }
+        deciders = {key: Decider.of(row) for key, row in rows.items()}
         current: Decider | None = None
         for step in range(steps):
             asked = deciders.get((step, "task"))
@@ -252,25 +233,22 @@ class RecordedRun:
         return TrialTimes(times, deciders)
 
 
-class _Replay(TrialObserver):
-    """Observes a trial that is run again: compares its decisions and writes its facts."""
+class _Facts(TrialObserver):
+    """Writes the facts of a trial that is run again."""
 
     def __init__(
         self,
         trial: int,
-        expected: Sequence[SensingDecision | TaskDecision],
         times: TrialTimes,
         output: _Output,
         result: TrialResult | None,
         planner: Planner,
     ) -> None:
         self._trial = trial
+        self._result = result
         self._planner = planner
-        self._expected = expected
         self._times = times
         self._output = output
-        self._result = result
-        self._compared = 0
         self._steps = 0
         self._sensed_step = -1
         self._state: PlanningState | None = None
@@ -279,45 +257,24 @@ class _Replay(TrialObserver):
     def trial_began(self, environment: Environment, state: PlanningState) -> None:
         self._state = state
         self._true_state = _true_state(environment)
-        begin = TrialBeginFact(self._trial, self._times.at(0, 0), True)
+        begin = TrialBeginFact(self._trial, self._times.at(0, 0))
         for sink in self._output.at(begin.time_ns, between_trials=True):
             sink.trial_begins(begin)
 
     @in_own_mode
     def sensed(self, step: SensingStep) -> None:
-        number, after = step.before.step, step.after
-        state_digest = digest(after)
-        self._require(SensingDecision(number, step.sensing_action, state_digest))
-        entropies = step.sensing_info.entropies
-        info = step.observation_info
-        fact = SensingFact(
-            trial=self._trial,
-            step=number,
-            decided_ns=self._times.at(number, 0),
-            observed_ns=self._times.at(number, 1),
-            sensing_action=step.sensing_action,
-            state_digest=state_digest,
-            decider=self._times.deciders.get((number, "sensing")),
-            before=step.before.belief,
-            after=after.belief,
-            stage=step.before.stage,
-            entropies=None if entropies is None else np.array(entropies, dtype=np.float64),
-            observation=step.observation,
-            explained=info.explained,
-            resampled=info.resampled,
-            effective_sample_size=info.effective_sample_size,
-            mahalanobis_distance=info.mahalanobis_distance,
-        )
+        number, times = step.before.step, self._times
+        decider = times.deciders.get((number, "sensing"))
+        fact = SensingFact.of(step, times.at(number, 0), times.at(number, 1), decider)
         for sink in self._output.at(fact.decided_ns):
             sink.sensed(fact)
-        self._state = after
+        self._state = step.after
         self._sensed_step = number
 
     @in_own_mode
     def acted(self, step: TaskStep) -> None:
         number = step.state.step
         action = np.array(step.executed, dtype=np.float64)
-        self._require(TaskDecision(number, tuple(action.tolist())))
         fact = TaskFact(
             trial=self._trial,
             step=number,
@@ -345,15 +302,7 @@ class _Replay(TrialObserver):
         moment = (number, 1) if self._sensed_step == number else (number - 1, 3)
         if self._state is not None:
             self._state = step.after
-        fact = LateFact(
-            trial=self._trial,
-            step=number,
-            time_ns=self._times.at(*moment),
-            taken=step.late.step,
-            observation=step.late.observation,
-            after=step.after.belief,
-            explained=step.observation_info.explained,
-        )
+        fact = LateFact.of(step, self._times.at(*moment))
         for sink in self._output.at(fact.time_ns):
             sink.observed_late(fact)
 
@@ -363,8 +312,7 @@ class _Replay(TrialObserver):
 
     @in_own_mode
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
-        if self._result is None or result.decisions != self._result.decisions:
-            raise DecidedOtherwiseError(self._trial, result.steps, None)
+        del result
         self._state = state
         self.end_here()
 
@@ -382,56 +330,11 @@ class _Replay(TrialObserver):
         for sink in self._output.at(end.time_ns):
             sink.trial_ends(end)
 
-    def _require(self, decision: SensingDecision | TaskDecision) -> None:
-        kept = self._expected[self._compared] if self._compared < len(self._expected) else None
-        if kept is None or not _same(kept, decision):
-            kind = "sensing" if isinstance(decision, SensingDecision) else "task"
-            raise DecidedOtherwiseError(self._trial, decision.step, kind)
-        self._compared += 1
-
-
-def _same(one: SensingDecision | TaskDecision, other: SensingDecision | TaskDecision) -> bool:
-    if isinstance(one, TaskDecision) and isinstance(other, TaskDecision):
-        # By their bits: 0.0 and -0.0 are different actions.
-        return one.step == other.step and (
-            np.array(one.action).tobytes() == np.array(other.action).tobytes()
-        )
-    return type(one) is type(other) and one == other
-
 
 def _true_state(environment: Environment) -> FloatArray | None:
     # Only a simulated world knows its own state.
     state = getattr(environment, "state", None)
     return None if state is None else np.array(state, dtype=np.float64)
-
-
-def _write_decisions(
-    result: TrialResult, decisions: Decisions, times: TrialTimes, output: _Output
-) -> None:
-    """Write the facts that follow from the decisions of a trial alone."""
-    trial = result.trial
-    begin = TrialBeginFact(trial, times.at(0, 0), False)
-    for sink in output.at(begin.time_ns, between_trials=True):
-        sink.trial_begins(begin)
-    for decision in decisions:
-        step = decision.step
-        if isinstance(decision, SensingDecision):
-            chosen, state_digest = decision.sensing_action, decision.state_digest
-            decided_ns, observed_ns = times.at(step, 0), times.at(step, 1)
-            decider = times.deciders.get((step, "sensing"))
-            sensing = SensingFact(
-                trial, step, decided_ns, observed_ns, chosen, state_digest, decider
-            )
-            for sink in output.at(decided_ns):
-                sink.sensed(sensing)
-        else:
-            decider = times.deciders.get((step, "task"))
-            task = TaskFact(trial, step, times.at(step, 2), np.array(decision.action), decider)
-            for sink in output.at(task.time_ns):
-                sink.acted(task)
-    end = TrialEndFact(trial, times.at(result.steps, 0), result.steps, result)
-    for sink in output.at(end.time_ns):
-        sink.trial_ends(end)
 
 
 class _Output:

@@ -38,7 +38,7 @@ from holdfast.recording.facts import (
     TrialBeginFact,
     TrialEndFact,
 )
-from holdfast.recording.markers import Marker, scene_markers, sensing_markers
+from holdfast.recording.markers import GrowingPath, Marker, scene_markers, sensing_markers
 from holdfast.recording.rerun_blueprint import blueprint, drawn_layout, is_flat
 from holdfast.recording.rerun_streams import RerunStreams
 from holdfast.recording.view_target import ViewTarget
@@ -55,10 +55,6 @@ _BINS = 60
 
 _MAX_PATH = 2000
 """Places of a path that are kept; of a longer one every second, every fourth, ..."""
-
-_PATH_GROWTH = 20
-"""A path is logged anew when it is longer by this part of itself: all of them together take twenty
-times its length, not the square of it."""
 
 _TASK, _ESTIMATE, _TRUTH = "world", "world/estimate", "world/truth"
 
@@ -113,7 +109,7 @@ class RerunSink:
         self._labels = state_labels(problem)
         self._choices = choice_labels(problem)
         self._offset = self._last = 0
-        self._paths: dict[str, _Path] = {}
+        self._paths: dict[str, GrowingPath[FloatArray]] = {}
         self._states: dict[str, str] = {}
         self._move_error = False
         self._recording = RerunStreams(target)
@@ -162,7 +158,7 @@ class RerunSink:
                 "scores/chosen", rr.Scalars(_finite(entropies[fact.sensing_action]))
             )
         is_performed = fact.sensing_action < len(self._problem.sensing_actions)
-        if self._layout is not None and fact.before is not None and is_performed:
+        if self._layout is not None and is_performed:
             self._sensing(fact.before, fact.sensing_action)
         self._at(fact.observed_ns, fact.trial, fact.step)
         self._belief(fact.after)
@@ -184,8 +180,7 @@ class RerunSink:
         self._at(fact.time_ns, fact.trial, fact.step)
         self._decider(fact.decider)
         self._place(fact.belief, fact.estimate, fact.true_state)
-        if fact.estimate is not None:
-            self._action(fact.estimate, fact.action)
+        self._action(fact.estimate, fact.action)
         self._flush()
 
     def observed_late(self, fact: LateFact) -> None:
@@ -301,7 +296,7 @@ class RerunSink:
                     entity,
                     rr.Transform3D(translation=pose[:3], quaternion=rr.Quaternion(xyzw=pose[3:])),
                 )
-                path = self._paths.setdefault(entity, _Path())
+                path = self._paths.setdefault(entity, GrowingPath(_MAX_PATH))
                 if path.add(pose[:3], last=last):
                     self._recording.log(f"{entity}_path", rr.LineStrips3D([path.places]))
 
@@ -431,30 +426,6 @@ class RerunSink:
                 ),
                 static=True,
             )
-
-
-class _Path:
-    """The places of a trial, of which fewer are kept as it grows."""
-
-    def __init__(self) -> None:
-        self.places: list[FloatArray] = []
-        self._count = 0
-        self._every = 1
-        self._next_length = 0
-
-    def add(self, place: FloatArray, *, last: bool) -> bool:
-        """Add a place, and return whether it is time to show the path."""
-        if self._count % self._every == 0 or last:
-            self.places.append(place)
-        self._count += 1
-        if len(self.places) > _MAX_PATH:
-            self.places = self.places[::2]
-            self._every *= 2
-            self._next_length = 0
-        if len(self.places) < self._next_length and not last:
-            return False
-        self._next_length = len(self.places) + 1 + len(self.places) // _PATH_GROWTH
-        return True
 
 
 def _shape(marker: Marker, color: Sequence[int]) -> rr.AsComponents:

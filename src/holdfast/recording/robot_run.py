@@ -21,7 +21,7 @@ from holdfast.recording.run_directory import (
 )
 from holdfast.recording.timings import EventTable, count_verified
 from holdfast.robot.links import make_links
-from holdfast.robot.process import RobotProcess, StepJournal
+from holdfast.robot.process import RobotProcess
 from holdfast.runtime.events import BoundedEventLog
 from holdfast.runtime.logs import EventLog
 
@@ -103,14 +103,16 @@ def perform_trials(
         directory.allow_robot(after_reboot=after_reboot)
     with contextlib.ExitStack() as stack:
         log = _StampedLog(directory.path / EVENTS_NAME)
-        journal: StepJournal = directory.journal
         if view is not None:
-            from holdfast.recording.live_view import ShownJournal
-
             view.start()
-            journal, sinks = ShownJournal(directory.journal, view), [*sinks, view]
+            if (begun := directory.journal.unfinished()) is not None:
+                view.records(begun.trial, begun.records)
+            directory.journal.on_append = view.records
+            sinks = [*sinks, view]
         events = BoundedEventLog(log, *sinks)
         stack.callback(events.close)
+        if directory.before_upgrade is not None:
+            events.event("version_changed", reason=directory.before_upgrade.in_words())
         links = make_links(configuration, directory.path / RECOVERY_LOG_NAME, events)
         stack.callback(links.close)
         timings = EventTable(directory.path / TIMINGS_NAME, Timing)
@@ -136,7 +138,7 @@ def perform_trials(
         robot = RobotProcess(
             configuration,
             links,
-            journal,
+            directory.journal,
             maker,
             events,
             on_end,

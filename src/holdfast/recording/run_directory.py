@@ -2,9 +2,11 @@
 
 A run's directory is claimed before its first trial, so that a wrong path costs no computing. The
 journal is the source of ``trials.csv`` and ``summary.json``, which are made again when a run is
-resumed. A run is resumed only with the same configuration and code, because a table of trials that
-were decided in two ways would say nothing about either. Services and links may differ: they change
-times, never a decision.
+resumed. A run is resumed only with the same configuration and with code that decides the same,
+because a table of trials that were decided in two ways would say nothing about either. Another
+version of holdfast shows that by computing recorded decisions again
+(:mod:`holdfast.recording.recomputing`). Services and links may differ: they change times, never a
+decision.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import contextlib
 import itertools
 import stat
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,12 +23,24 @@ import msgspec
 
 from holdfast import __version__
 from holdfast.config.loader import Configuration
-from holdfast.errors import OutputError, RebootedError
+from holdfast.config.source import SETTINGS, with_names_of_today
+from holdfast.config.user_code import describe_problem_error
+from holdfast.errors import DecidedOtherwiseError, OutputError, RebootedError
 from holdfast.planning.outcome import TrialResult
-from holdfast.planning.settings import SelectorSettings
-from holdfast.recording.fingerprint import difference, fingerprint
+from holdfast.recording.fingerprint import (
+    EarlierCode,
+    difference,
+    fingerprint,
+    read_earlier,
+)
 from holdfast.recording.journal import Journal
-from holdfast.recording.journal_file import JOURNAL_NAME, JournalFile, Survives, boot_id
+from holdfast.recording.journal_file import (
+    JOURNAL_NAME,
+    START_ANEW,
+    JournalFile,
+    Survives,
+    boot_id,
+)
 from holdfast.recording.journal_reader import JournalReader
 from holdfast.recording.tables import RunSummary, SummaryBuilder, csv_lines
 from holdfast.recording.timings import count_answers, count_verified
@@ -76,8 +90,17 @@ OUTPUT_NAMES = (
 _SECTIONS_WITHOUT_DECISIONS = ("offload", "recovery", "lost")
 """Of what ``lost`` does to a belief, each time is in the journal."""
 
+_EARLIER_CODE = "earlier_code"
+"""Key of the note about what other versions have decided."""
+
 _BOOT = "boot"
 """Key of the note in which boot of the machine a robot may move."""
+
+_DECISIONS = {
+    "sensing": "the sensing action",
+    "task": "the task action",
+    None: "the state that a decision led to",
+}
 
 _MAX_SUFFIX = 10_000
 
@@ -87,6 +110,13 @@ class RunDirectory:
 
     Use :meth:`create`, :meth:`resume` or :meth:`resume_if_begun`, and close it or use it in a
     ``with`` statement.
+
+    Attributes
+    ----------
+    services_before : tuple of str, or None
+        Those of the part before; None for a new run.
+    before_upgrade : EarlierCode or None
+        What another version decided, if this is the first to go on after it.
     """
 
     def __init__(
@@ -95,12 +125,16 @@ class RunDirectory:
         configuration: Configuration,
         journal: Journal,
         services_before: tuple[str, ...] | None = None,
+        before_upgrade: EarlierCode | None = None,
     ) -> None:
         self.path = path
         self.configuration = configuration
         self.journal = journal
         self.services_before = services_before
-        self.earlier_wall_time_s = float(journal.meta().get("wall_time_s", "0"))
+        self.before_upgrade = before_upgrade
+        meta = journal.meta()
+        self.earlier_wall_time_s = float(meta.get("wall_time_s", "0"))
+        self.earlier_code = read_earlier(meta.get(_EARLIER_CODE))
 
     @classmethod
     def create(
@@ -152,15 +186,23 @@ class RunDirectory:
             raise
 
     @classmethod
-    def resume(cls, path: Path, configuration: Configuration) -> Self:
+    def resume(
+        cls,
+        path: Path,
+        configuration: Configuration,
+        on_progress: Callable[[int, int], None] = lambda *_: None,
+    ) -> Self:
         """Open the directory of a run that shall go on, perhaps to more trials than it had.
+
+        If another version of holdfast began it, recorded decisions are computed again first, and
+        must come out the same. ``on_progress`` gets how many were, and of how many.
 
         Raises
         ------
         OutputError
-            If it holds no run, one of other code or with another configuration, one with a trial
-            that the configuration does not ask for, one that is damaged, or one that is in use; or
-            if it cannot be written.
+            If it holds no run, one of code that decides otherwise or with another configuration,
+            one with a trial that the configuration does not ask for, one that is damaged, or one
+            that is in use; or if it cannot be written.
         """
         path = path.absolute()
         if not path.is_dir():
@@ -184,20 +226,25 @@ class RunDirectory:
         try:
             text = configuration.to_yaml()
             meta = journal.meta()
-            _require_same_code(path, meta, fingerprint(configuration))
             _require_same_configuration(path, meta.get("configuration", ""), text)
             _require_enough_trials(path, journal, configuration.simulator.num_trials)
+            before_upgrade = _require_same_decisions(path, journal, configuration, on_progress)
             if meta.get("configuration") != text:
-                journal.set_meta("configuration", text)
+                journal.set_meta(configuration=text)
                 write_atomically(path / CONFIGURATION_NAME, text)
             before = _services_in(meta.get("configuration", ""))
-            return cls(path, configuration, journal, before)
+            return cls(path, configuration, journal, before, before_upgrade)
         except BaseException:
             journal.close()
             raise
 
     @classmethod
-    def resume_if_begun(cls, path: Path, configuration: Configuration) -> Self:
+    def resume_if_begun(
+        cls,
+        path: Path,
+        configuration: Configuration,
+        on_progress: Callable[[int, int], None] = lambda *_: None,
+    ) -> Self:
         """Open the directory of a run that has begun, else claim it for a new one.
 
         A process that was killed while it claimed the directory leaves a journal without a trial,
@@ -214,7 +261,7 @@ class RunDirectory:
         if is_there:
             unused = _unused_journal(path, configuration.recovery.journal_survives)
             if unused is None:
-                return cls.resume(path, configuration)
+                return cls.resume(path, configuration, on_progress)
             # Whatever repeats the command does not begin it after a reboot, either.
             notes = {key: value for key, value in unused.meta().items() if key == _BOOT}
             unused.close()
@@ -249,7 +296,7 @@ class RunDirectory:
                 "may, and say so (--after-reboot)"
             )
         if before != now:
-            self.journal.set_meta(_BOOT, now)
+            self.journal.set_meta(**{_BOOT: now})
 
     def complete_summary(self) -> RunSummary | None:
         """Return ``summary.json`` if all trials are finished and it covers them all, else None.
@@ -272,7 +319,7 @@ class RunDirectory:
     def write_tables(self, wall_time_s: float) -> RunSummary:
         """Write ``trials.csv`` and ``summary.json``; the time of earlier parts is added."""
         total_s = self.earlier_wall_time_s + wall_time_s
-        self.journal.set_meta("wall_time_s", repr(total_s))
+        self.journal.set_meta(wall_time_s=repr(total_s))
         builder = SummaryBuilder()
 
         def added() -> Iterator[TrialResult]:
@@ -289,6 +336,7 @@ class RunDirectory:
             wall_time_s=total_s,
             answers=count_answers(self.path / TIMINGS_NAME, self.journal.finished()),
             verified=count_verified(self.path / VERIFICATION_NAME),
+            earlier_code=self.earlier_code,
         )
         write_atomically(self.path / SUMMARY_NAME, summary.to_json())
         return summary
@@ -399,13 +447,47 @@ def _require_plain_files(path: Path) -> None:
                 )
 
 
-def _require_same_code(path: Path, there: Mapping[str, str], here: Mapping[str, str]) -> None:
-    what = difference(there, here)
-    if what is not None:
+def _require_same_decisions(
+    path: Path,
+    journal: Journal,
+    configuration: Configuration,
+    on_progress: Callable[[int, int], None],
+) -> EarlierCode | None:
+    """Raise OutputError unless this code decides as the code that the journal is of.
+
+    Note in the journal, and return, what that code has decided; None if it is the same code.
+    """
+    meta, here = journal.meta(), fingerprint(configuration)
+    found = difference(meta, here)
+    if found is None:
+        return None
+    if found.is_the_problems:
         raise OutputError(
-            f"{path}: that run cannot go on: {what}, so the trials would not compare; "
-            "another directory (--out) starts anew"
+            f"{path}: that run cannot go on: {found.words}, so the trials would not compare; "
+            f"{START_ANEW}"
         )
+    earlier = read_earlier(meta.get(_EARLIER_CODE))
+    from holdfast.recording.recomputing import compute_again  # few runs need it
+
+    former = f"go on with the former, or {START_ANEW}"
+    try:
+        before_upgrade = compute_again(journal, configuration, found.made_by, earlier, on_progress)
+    except OutputError:  # of a journal that is damaged
+        raise
+    except DecidedOtherwiseError as error:
+        raise OutputError(
+            f"{path}: that run cannot go on: {found.words}, and it decides otherwise, first in "
+            f"trial {error.trial}, step {error.step} ({_DECISIONS[error.kind]}); {former}"
+        ) from error
+    except Exception as error:  # whatever the problem raises, which is anybody's code
+        why = describe_problem_error(configuration.problem_name, error)
+        raise OutputError(
+            f"{path}: that run cannot go on: {found.words}, and its decisions cannot be computed "
+            f"again: {why}; {former}"
+        ) from error
+    text = msgspec.json.encode((*earlier, before_upgrade)).decode()
+    journal.set_meta(**here, **{_EARLIER_CODE: text})
+    return before_upgrade
 
 
 def _require_same_configuration(path: Path, there: str, here: str) -> None:
@@ -430,7 +512,8 @@ def recorded_configuration(text: str, journal: Path | str = "a journal") -> Any:
     """Return a configuration from a journal, as plain data; somebody else may have written it."""
     from holdfast.config.yaml_document import read
 
-    return read(text.encode(), f"the configuration in {journal}").data
+    data = read(text.encode(), f"the configuration in {journal}").data
+    return with_names_of_today(data) if isinstance(data, Mapping) else data
 
 
 def _compared(configuration: Any) -> Any:
@@ -443,10 +526,11 @@ def _compared(configuration: Any) -> Any:
         kept["simulator"] = {
             key: value for key, value in kept["simulator"].items() if key != "num_trials"
         }
-    # A run from before a key existed lacks it, and its method does not use it.
-    if isinstance(kept.get("selector"), Mapping):
-        defaults = msgspec.json.decode(msgspec.json.encode(SelectorSettings()))
-        kept["selector"] = {**defaults, **kept["selector"]}
+    # A run from before a key existed lacks it, and its default is what was done then.
+    for name, schema in SETTINGS.items():
+        if isinstance(kept.get(name), Mapping):
+            defaults = msgspec.json.decode(msgspec.json.encode(schema()))
+            kept[name] = {**defaults, **kept[name]}
     environment = kept.pop("environment", None)
     if isinstance(environment, Mapping) and environment.get("object") is not None:
         kept["environment"] = world_of(environment)

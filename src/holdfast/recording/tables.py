@@ -9,16 +9,19 @@ from __future__ import annotations
 import hashlib
 from array import array
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
+from holdfast.printable import cell
+from holdfast.recording.fingerprint import EarlierCode
 from holdfast.recording.table_formats import csv_rows
 from holdfast.recording.timings import AnswerCounts, VerificationCounts
 
-__all__ = ["RunSummary", "SummaryBuilder", "csv_lines", "wilson_interval"]
+__all__ = ["RunSummary", "SummaryBuilder", "csv_lines", "trial_cells", "wilson_interval"]
 
 _NORMAL_QUANTILE_975 = 1.959963984540054
 
@@ -64,6 +67,8 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         also those of earlier processes of a run that was resumed.
     wall_time_s : float
         Over all parts of the run, without those that were killed.
+    earlier_code : tuple of EarlierCode
+        What other versions of holdfast decided before this one went on; only if one did.
     digest : str
         BLAKE2b-256 over the digests of the trials in order: equal exactly if all decisions of two
         runs are.
@@ -98,6 +103,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     sensing_ms_median: float | None
     sensing_ms_p99: float | None
     wall_time_s: float
+    earlier_code: tuple[EarlierCode, ...] | msgspec.UnsetType = msgspec.UNSET
     digest: str
 
     def to_json(self) -> str:
@@ -106,13 +112,19 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def csv_lines(results: Iterable[TrialResult]) -> Iterator[str]:
-    """Yield the lines of ``trials.csv``, the head first; only a reason may need quotes.
+    """Yield the lines of ``trials.csv``, the head first.
 
     Reading a number back gives the same number. None, such as the reward of a trial without one, is
     an empty cell.
     """
     rows = (tuple(getattr(result, column) for column in TRIAL_COLUMNS) for result in results)
     yield from csv_rows(TRIAL_COLUMNS, rows)
+
+
+def trial_cells(result: TrialResult) -> list[object]:
+    """Return the row of a trial, in the order of ``TRIAL_COLUMNS``."""
+    values = (getattr(result, column) for column in TRIAL_COLUMNS)
+    return [int(value) if isinstance(value, bool) else cell(value) for value in values]
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
@@ -133,51 +145,45 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     return low, high
 
 
-def _sum(total: float | None, reward: float | None) -> float | None:
-    return None if total is None or reward is None else total + reward
-
-
 def _mean(total: float | None, count: int) -> float | None:
     return None if total is None or not count else total / count
+
+
+_COUNTS = (
+    "sensing_decisions",
+    "missing_observations",
+    "unexplained_observations",
+    "lost",
+    "suspect_sensors",
+    "recoveries",
+)
+"""What the summary has of a trial's counts, under the same names: their sums."""
 
 
 class SummaryBuilder:
     """Adds up results, in the order of their trials."""
 
     def __init__(self) -> None:
+        self._sums = dict.fromkeys((*_COUNTS, "success", "failed", "steps"), 0)
         self._finished = 0
-        self._successes = 0
-        self._failures = 0
-        self._reward: float | None = 0.0
-        self._reward_of_successes: float | None = 0.0
-        self._steps = 0
-        self._sensing_decisions = 0
-        self._missing = 0
-        self._unexplained = 0
-        self._lost = 0
-        self._suspect_sensors = 0
+        # Of all trials, and of the successful ones; None as soon as one has none.
+        self._rewards: dict[bool, float | None] = {False: 0.0, True: 0.0}
         self._distinct: int | None = None
-        self._recoveries = 0
         self._sensing_ms = array("f")
         self._digest = hashlib.blake2b(digest_size=32)
 
     def add(self, result: TrialResult) -> None:
         """Add the next result."""
         self._finished += 1
-        self._reward = _sum(self._reward, result.reward)
-        if result.success:
-            self._successes += 1
-            self._reward_of_successes = _sum(self._reward_of_successes, result.reward)
-        self._failures += result.failed
-        self._steps += result.steps
-        self._sensing_decisions += result.sensing_decisions
-        self._missing += result.missing_observations
-        self._unexplained += result.unexplained_observations
-        self._lost += result.lost
-        self._suspect_sensors += result.suspect_sensors
+        for name in self._sums:
+            self._sums[name] += getattr(result, name)
+        for of_successes in (False, True) if result.success else (False,):
+            total = self._rewards[of_successes]
+            if total is not None:
+                total = None if result.reward is None else total + result.reward
+            self._rewards[of_successes] = total
         if (distinct := result.fewest_distinct_particles) is not None:
             self._distinct = min(distinct, self._distinct or distinct)
-        self._recoveries += result.recoveries
         self._sensing_ms.extend(result.sensing_ms)
         self._digest.update(bytes.fromhex(result.digest))
 
@@ -192,9 +198,12 @@ class SummaryBuilder:
         wall_time_s: float,
         answers: AnswerCounts | None = None,
         verified: VerificationCounts | None = None,
+        earlier_code: tuple[EarlierCode, ...] = (),
     ) -> RunSummary:
         """Return the summary."""
-        count = self._finished
+        count, sums = self._finished, self._sums
+        successes = sums["success"]
+        counts: dict[str, Any] = {name: sums[name] for name in _COUNTS}
         median = p99 = None
         if self._sensing_ms:
             quantiles = np.quantile(np.frombuffer(self._sensing_ms, dtype=np.float32), [0.5, 0.99])
@@ -205,24 +214,20 @@ class SummaryBuilder:
             holdfast_version=version,
             trials=trials,
             finished=count,
-            successes=self._successes,
-            failures=self._failures,
-            success_rate=self._successes / count if count else None,
-            success_rate_interval_95=wilson_interval(self._successes, count) if count else None,
-            mean_reward=_mean(self._reward, count),
-            mean_reward_of_successes=_mean(self._reward_of_successes, self._successes),
-            mean_steps=self._steps / count if count else None,
-            sensing_decisions=self._sensing_decisions,
-            missing_observations=self._missing,
-            unexplained_observations=self._unexplained,
-            lost=self._lost,
-            suspect_sensors=self._suspect_sensors,
+            successes=successes,
+            failures=sums["failed"],
+            success_rate=successes / count if count else None,
+            success_rate_interval_95=wilson_interval(successes, count) if count else None,
+            mean_reward=_mean(self._rewards[False], count),
+            mean_reward_of_successes=_mean(self._rewards[True], successes),
+            mean_steps=sums["steps"] / count if count else None,
+            **counts,
             fewest_distinct_particles=self._distinct,
-            recoveries=self._recoveries,
             **{} if answers is None else answers._asdict(),
             **{} if verified is None else verified._asdict(),
             sensing_ms_median=median,
             sensing_ms_p99=p99,
             wall_time_s=round(wall_time_s, 3),
+            earlier_code=earlier_code or msgspec.UNSET,
             digest=self._digest.hexdigest(),
         )

@@ -133,8 +133,10 @@ class EnvironmentMaker:
         return made
 
 
-def load_environment(configuration: Configuration) -> EnvironmentMaker:
+def load_environment(configuration: Configuration, option: str | None = None) -> EnvironmentMaker:
     """Find the environment that a configuration names.
+
+    ``option`` is what has named it instead of the file; messages then begin with that.
 
     Raises
     ------
@@ -153,7 +155,7 @@ def load_environment(configuration: Configuration) -> EnvironmentMaker:
     try:
         found = find_class(
             name,
-            what="environment.object",
+            what=option or "environment.object",
             group=GROUP,
             built_in=BUILT_IN,
             # Else, for a name without a module: where to look for what may have been meant, and
@@ -177,6 +179,8 @@ def load_environment(configuration: Configuration) -> EnvironmentMaker:
             max_missing_in_a_row=settings.max_missing_in_a_row,
         )
     except ConfigurationError as error:
+        if option is not None:
+            raise
         raise ConfigurationError(f"{configuration.path}: {error}") from error
 
 

@@ -10,7 +10,8 @@ service_suspected, unreachable, no_datagrams, insecure, credentials,
 late_replies, waiting, holding, resumed, busy, refused, malformed_reply, disagreement,
 wrong_answer, not_deterministic, verification_failed, distrusted,
 limits_unknown, verifying, prefetch_unused, unexplained, lost, sensor_suspect, reinitialised,
-late_unused, no_reading, resumed_trial, performed_unseen, trial, missed_ticks, stopped, note,
+late_unused, no_reading, version_changed, resumed_trial, performed_unseen, trial, missed_ticks,
+stopped, note,
 interrupted, offers.
 Of a service: ready, session_opened, session_taken_over, restored, state_diverged, refused, busy,
 evicted, robot_connected, robot_disconnected, link_refused, credentials, credentials_reloaded,
@@ -34,7 +35,6 @@ __all__ = [
     "Event",
     "EventRates",
     "EventSink",
-    "NullEventLog",
     "severity",
 ]
 
@@ -92,16 +92,6 @@ class EventSink(Protocol):
     def close(self) -> None:
         """Ignore all further events; may be repeated."""
         ...
-
-
-class NullEventLog:
-    """Drops every event."""
-
-    def event(self, name: str, /, **fields: object) -> None:
-        """Drop an event."""
-
-    def close(self) -> None:
-        """Do nothing."""
 
 
 class _TokenBucket:
@@ -177,7 +167,7 @@ def _counted(name: str, fields: Mapping[str, object], omitted: int) -> Event:
 class BoundedEventLog:
     """Passes events to several sinks; limits the rate of those about a service.
 
-    So no service can fill a robot's log. Changes of status always pass.
+    So no service can fill a robot's log. Changes of status always pass. Without sinks it drops all.
     """
 
     def __init__(self, *sinks: EventSink, clock: Callable[[], float] = time.monotonic) -> None:

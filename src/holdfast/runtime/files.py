@@ -16,7 +16,6 @@ import errno
 import os
 import re
 import stat
-import time
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -26,12 +25,10 @@ from holdfast.errors import OutputError
 __all__ = [
     "NewFile",
     "bounded_lines",
-    "claim_directory",
     "create_directory_atomically",
     "directory_beside",
     "move_into_place",
     "remember_directory",
-    "remove_unfinished",
     "remove_unfinished_of",
     "replace_file",
     "require_free",
@@ -40,13 +37,10 @@ __all__ = [
     "write_atomically",
 ]
 
-_MAX_DEFAULT_DIRECTORIES = 10_000
-
 _started_in: Path | None = None
 """Where the command was started; the code of a problem or robot may change the directory later."""
 
 _UNFINISHED = re.compile(r"\..+\.\d+\.tmp")
-_LONGEST_WRITE_S = 600.0
 _MAX_LINE = 1 << 20
 
 
@@ -149,20 +143,6 @@ def write_atomically(path: Path, content: bytes | Iterable[str]) -> None:
         file.writelines(pieces)
 
 
-def remove_unfinished(directory: Path, *, below: bool = False) -> None:
-    """Remove temporary files of killed writers; a young one may belong to a running writer.
-
-    The directory may be missing; with ``below`` its subdirectories are searched, too.
-    """
-    latest = time.time() - _LONGEST_WRITE_S
-    for path in directory.rglob(".*.tmp") if below else directory.glob(".*.tmp"):
-        if not _UNFINISHED.fullmatch(path.name):
-            continue
-        with contextlib.suppress(OSError):
-            if path.stat().st_mtime < latest:
-                path.unlink()
-
-
 def _unfinished(path: Path) -> Path:
     """Return the temporary path of a file or directory."""
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -228,27 +208,6 @@ def remove_unfinished_of(directory: Path) -> None:
         else:
             with _refusals(left, "removed"):
                 left.unlink()
-
-
-def claim_directory(out: Path | None, parent: Path, name: str) -> Path:
-    """Create an empty output directory for a command.
-
-    It is ``out``, which may exist if it is empty; or ``name`` in ``parent``, which is created if
-    missing, with a number if it exists.
-    """
-    parent = parent.absolute()
-    with _refusals(out or parent, "made"):
-        if out is not None:
-            out.mkdir(parents=True, exist_ok=True)
-            _require_empty(out, "--out")
-            return out
-        parent.mkdir(parents=True, exist_ok=True)
-        for number in range(1, _MAX_DEFAULT_DIRECTORIES):
-            path = parent / (f"{name}-{number}" if number > 1 else name)
-            with contextlib.suppress(FileExistsError):
-                path.mkdir()
-                return path
-    raise OutputError(f"{parent}: more than {_MAX_DEFAULT_DIRECTORIES} of {name}; give --out")
 
 
 def require_free(path: Path, option: str, *, directory: bool) -> None:

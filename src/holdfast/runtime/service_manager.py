@@ -80,6 +80,10 @@ class ServiceManager:
 
         check()
 
+    def starting(self, within_s: float) -> None:
+        """Report that the process has yet to be ready, and for how long it may go on so."""
+        self._send(f"EXTEND_TIMEOUT_USEC={within_s * 1e6:.0f}")
+
     def ready(self) -> None:
         """Report that the process is ready."""
         self._ready_is_pending = not self._send("READY=1")

@@ -172,7 +172,7 @@ def _plan_of(options: ChaosOptions) -> tuple[SeriesPlan, dict[FaultKind, str]]:
 
 def _run(options: ChaosOptions) -> bool:
     from holdfast.cli.terminal import counted, progress_line
-    from holdfast.runtime.files import claim_directory
+    from holdfast.runtime.output_directory import claim_directory
     from holdfast_lab.chaos.report import WIDE, summarise, text_of, write_report
     from holdfast_lab.chaos.series import Series
 

@@ -14,11 +14,11 @@ from pathlib import Path
 import msgspec
 
 from holdfast.cli.terminal import counted
-from holdfast.recording.machine import describe
 from holdfast.runtime.files import write_atomically
 from holdfast_lab.chaos.trial import TrialOutcome
 from holdfast_lab.testbed.fault_times import Spread, spread_of
 from holdfast_lab.testbed.faults import FaultKind
+from holdfast_lab.testbed.machine import describe
 
 __all__ = ["WIDE", "ChaosSummary", "KindRow", "kind_rows", "summarise", "text_of", "write_report"]
 

@@ -75,7 +75,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _run(out: Path | None, seed: int, *, quick: bool) -> Findings:
-    from holdfast.runtime.files import claim_directory
+    from holdfast.runtime.output_directory import claim_directory
     from holdfast_lab.demo.narrator import DemoState
     from holdfast_lab.demo.scenario import Demo, Plan
     from holdfast_lab.demo.timeline import make_show

@@ -11,16 +11,19 @@ when the node is configured, with key, value and limit.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
+import msgspec.inspect
 
-from holdfast.config.loader import Configuration, load, settings_keys
+from holdfast.config.loader import Configuration, load
+from holdfast.config.source import SETTINGS
 from holdfast.config.yaml_document import read
 from holdfast.errors import ConfigurationError
-from holdfast.validation import close_match, dotted, find_mismatch
+from holdfast.validation import close_match, described, dotted, find_mismatch
 
 __all__ = [
     "OWN",
@@ -126,7 +129,18 @@ class NodeParameters(NamedTuple):
 
 def known_parameters() -> dict[str, str]:
     """Return what each parameter means, by name; those of the problem's own sections excepted."""
-    return {**OWN, **settings_keys()}
+    return {**OWN, **_settings_keys()}
+
+
+def _settings_keys() -> dict[str, str]:
+    """Return what is allowed and the default, for each ``section.key`` that no problem changes."""
+    keys = {}
+    for section, schema in SETTINGS.items():
+        defaults = msgspec.to_builtins(schema())
+        for item in msgspec.inspect.type_info(schema).fields:  # type: ignore[attr-defined]
+            default = json.dumps(defaults[item.encode_name])
+            keys[f"{section}.{item.encode_name}"] = f"{described(item.type)}; default {default}"
+    return keys
 
 
 def in_parameters(text: str) -> str:
@@ -149,7 +163,7 @@ def read_parameters(values: Mapping[str, Any]) -> NodeParameters:
     if mismatch := find_mismatch(of_own, OwnParameters):
         raise ConfigurationError(f"{dotted(mismatch.path)} {mismatch.in_words()}")
     own = msgspec.convert(of_own, OwnParameters)
-    settings = settings_keys()
+    settings = _settings_keys()
     overrides: dict[str, Any] = {}
     for name, value in given.items():
         if name in OWN or name in _OF_ROS or name.startswith(_OF_ROS_SECTIONS):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from holdfast.cli.robot_run import RobotFindings, is_robot_run
+from holdfast.cli.run import RobotFindings, is_robot_run
 from holdfast.cli.run_options import RunOptions
 from holdfast.config.loader import load
 

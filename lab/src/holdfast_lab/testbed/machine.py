@@ -3,30 +3,29 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import os
 import platform
 import re
 import subprocess
 from datetime import UTC, datetime
-from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
+import numpy as np
+
+import holdfast
 from holdfast import __version__, _kernel
+from holdfast.config.source_digest import machines
+from holdfast.robot.trials import available_cores
 
-__all__ = ["commit", "describe", "kernel_hash", "machines"]
+__all__ = ["commit", "describe", "kernel_hash"]
 
-_HERE = Path(__file__).resolve().parent
+_HERE = Path(holdfast.__file__).resolve().parent
 _GIT_TIMEOUT_S = 10.0
 _SOURCES = ("src", "cpp", "cmake", "CMakeLists.txt")
 
 
 def describe() -> dict[str, str]:
     """Return the machine and the software, by name."""
-    import numpy as np  # ``holdfast --version`` asks this module, and needs neither
-
-    from holdfast.robot.trials import available_cores
-
     return {
         "processor": _processor(),
         "cores": f"{available_cores()} of {os.cpu_count()} usable",
@@ -45,13 +44,6 @@ def describe() -> dict[str, str]:
 def kernel_hash() -> str:
     """Return a short hash of the kernel's file, to notice that it was built again meanwhile."""
     return hashlib.blake2b(_kernel_bytes(), digest_size=6).hexdigest()
-
-
-def machines() -> str:
-    """Return whether the state machines of sessions are ``compiled`` or ``interpreted``."""
-    found = importlib.util.find_spec("holdfast.protocol.robot")
-    origin = (found and found.origin) or ""
-    return "compiled" if origin.endswith(tuple(EXTENSION_SUFFIXES)) else "interpreted"
 
 
 def _kernel_bytes() -> bytes:
