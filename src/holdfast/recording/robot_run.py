@@ -112,7 +112,6 @@ def perform_trials(
         events = BoundedEventLog(log, *sinks)
         stack.callback(events.close)
         links = make_links(configuration, directory.path / RECOVERY_LOG_NAME, events)
-        stack.callback(links.close)
         timings = EventTable(directory.path / TIMINGS_NAME, Timing)
         stack.callback(timings.close)
         earlier = verification = None

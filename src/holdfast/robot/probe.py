@@ -110,7 +110,7 @@ class AddressPath(LinkOwner):
             {}, name=self._robot, incarnation=os.urandom(8).hex(), lease_ms=_LEASE_MS
         )
         self._link = load_scheme(endpoint.protocol).make_link(
-            self, robot.settings, self.tls, role="robot", dialled=True
+            self, robot.settings, self.tls, role="robot"
         )
         await self._link.connect(self._stream)
         with contextlib.suppress(TimeoutError):

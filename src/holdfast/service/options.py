@@ -66,13 +66,6 @@ class ServeOptions(Options):
         metavar="ENDPOINT",
         help=f"Where robots can connect (default: tcp/{_DEFAULT_PLACE}, with --tls over TLS).",
     )
-    connect: tuple[str, ...] = option(
-        many=True,
-        read=absolute_endpoint,
-        metavar="ENDPOINT",
-        help="The local socket at which a robot listens for this service (unix/PATH). Then nothing "
-        "listens here without --listen.",
-    )
     name: str = option(metavar="NAME", default=DEFAULT_NAME, help="Name of the service.")
     tls: Path | None = option(
         read=location,
@@ -163,6 +156,8 @@ class ServeOptions(Options):
         help="Stop when standard input ends, as it does when the process that started this one "
         "dies.",
     )
+    # For a process that a robot launches: the descriptor of the connection to it.
+    robot: int | None = option(metavar="N", read=int, help="", hidden=True)
     # For the processes that a supervisor starts: its number, and the descriptors they inherit.
     supervised: tuple[int, int] | None = option(
         metavar="N,N", read=_descriptors, help="", hidden=True
@@ -190,14 +185,11 @@ def parse_options(arguments: Sequence[str]) -> ServeOptions:
         If an option cannot be used, or two do not go together.
     """
     options = ServeOptions.parse("serve", arguments)
-    if options.processes > 1:
-        for name, given in (
-            ("--connect", options.connect),
-            ("--until-stdin-closes", options.until_stdin_closes),
-        ):
-            if given:
-                raise InvalidValueError(f"{name}: goes with one process only, not with --processes")
-    if not options.listen and not options.connect:
+    if options.processes > 1 and options.until_stdin_closes:
+        raise InvalidValueError(
+            "--until-stdin-closes: goes with one process only, not with --processes"
+        )
+    if not options.listen and options.robot is None:
         options.listen = (f"{'tls' if options.tls else 'tcp'}/{_DEFAULT_PLACE}",)
     return options
 
@@ -216,23 +208,20 @@ def checked_endpoints(options: ServeOptions) -> list[Endpoint]:
     from holdfast.transport.endpoints import check_endpoint
 
     listen = []
-    for name, texts in (("--listen", options.listen), ("--connect", options.connect)):
-        listens = name == "--listen"
-        for text in texts:
-            try:
-                endpoint = check_endpoint(text, "service", listens=listens)
-            except TransportError as error:
-                raise TransportError(f"{name}: {error}") from None
-            # Of an encrypted one without credentials the transport says that they are missing.
-            if not (endpoint.is_loopback or options.insecure or endpoint.is_encrypted):
-                raise TransportError(
-                    f"{name}: endpoint {endpoint}: other machines can reach it, and no peer "
-                    f"proves its identity; use tls/... or udp/... with --tls DIR ('holdfast "
-                    f"keys DIR' makes the credentials), an address of this machine alone, as in "
-                    f"tcp/{_DEFAULT_PLACE}, or say --insecure"
-                )
-            if listens:
-                listen.append(endpoint)
+    for text in options.listen:
+        try:
+            endpoint = check_endpoint(text, "service")
+        except TransportError as error:
+            raise TransportError(f"--listen: {error}") from None
+        # Of an encrypted one without credentials the transport says that they are missing.
+        if not (endpoint.is_loopback or options.insecure or endpoint.is_encrypted):
+            raise TransportError(
+                f"--listen: endpoint {endpoint}: other machines can reach it, and no peer "
+                f"proves its identity; use tls/... or udp/... with --tls DIR ('holdfast "
+                f"keys DIR' makes the credentials), an address of this machine alone, as in "
+                f"tcp/{_DEFAULT_PLACE}, or say --insecure"
+            )
+        listen.append(endpoint)
     for name, address in (("--health", options.health), ("--metrics", options.metrics)):
         for endpoint in listen:
             if address is not None and _is_same_port(endpoint, address):

@@ -229,7 +229,7 @@ class _ServiceProcess:
             options.name,
             incarnation=self._incarnation,
             listen=options.listen,
-            connect=options.connect,
+            robot=None if options.robot is None else socket.socket(fileno=options.robot),
             shared=[socket.socket(fileno=each) for each in options.sockets],
             lease_ms=options.lease_ms,
             # Otherwise robots with many links would leave no descriptor for a new one.
@@ -303,8 +303,6 @@ class _ServiceProcess:
                 if supervised is None:
                     where: dict[str, object] = {"boot": self._incarnation, **watched, **offered}
                     where["listen"] = list(self._transport.endpoints)
-                    if options.connect:
-                        where["connect"] = list(options.connect)
                     _say_ready(options, where)
                     self._manager.watch(loop, self._status)
                     self._manager.ready()
@@ -371,7 +369,7 @@ class _ServiceProcess:
         it, to robots that have to prove who they are. If nothing is, the process ends as after
         SIGTERM: ``rosnode kill`` and a second node of the same name are to end a node.
         """
-        goes_on = bool(self._options.connect or self._transport.endpoints)
+        goes_on = bool(self._transport.endpoints)
         self._shell.note("ros_shutdown", reason=reason, goes_on=goes_on)
         if not goes_on:
             os.kill(os.getpid(), signal.SIGTERM)
@@ -527,11 +525,11 @@ def _say_ready(options: ServeOptions, where: Mapping[str, object]) -> None:
             "ready", service=options.name, pid=os.getpid(), **where
         )
         return
-    parts = [
-        f"{verb} {' and '.join(map(str, places))}"
-        for verb, key in (("is listening on", "listen"), ("is connecting to", "connect"))
-        if isinstance(places := where.get(key), list) and places
-    ]
+    places = where["listen"]
+    assert isinstance(places, list)
+    parts = [f"is listening on {' and '.join(map(str, places))}"] if places else []
+    if options.robot is not None:
+        parts.append("decides for the robot that has launched it")
     if "processes" in where:
         parts[-1] += f" with {where['processes']} processes"
     parts += [f"offers {what} at {where[what]}" for what in _OFFERED if what in where]

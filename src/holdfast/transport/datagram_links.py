@@ -573,10 +573,8 @@ class DatagramScheme(Scheme):
         tls: TlsStream | None,
         *,
         role: Role,
-        dialled: bool,
     ) -> Link:
         """Make the link of a new connection."""
-        del dialled
         assert tls is not None
         if role == "robot":
             return RobotDatagramLink(owner, settings, tls=tls)

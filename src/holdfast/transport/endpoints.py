@@ -29,7 +29,6 @@ __all__ = [
     "SCHEMES",
     "Endpoint",
     "Role",
-    "ServiceAddress",
     "TlsFiles",
     "check_credentials",
     "check_endpoint",
@@ -168,16 +167,6 @@ class Endpoint(NamedTuple):
         return all(each is not None and _is_loopback_address(each) for each in addresses)
 
 
-class ServiceAddress(NamedTuple):
-    """How a robot and a service find each other."""
-
-    endpoint: str
-    # Whether the robot listens there, at a local socket, and the service connects. A service that
-    # the robot launches does, so the robot need not poll for it.
-    listens: bool = False
-    name: str | None = None  # that the service must have; None accepts any
-
-
 def parse_endpoint(text: str) -> Endpoint:
     """Read ``PROTOCOL/HOST:PORT``, with an IPv6 address in brackets, or another endpoint.
 
@@ -265,24 +254,19 @@ def parse_host(host: str, before: str = "") -> str:
     return host
 
 
-def check_endpoint(text: str, role: Role, *, listens: bool) -> Endpoint:
-    """Read the endpoint at which the end of this role listens, or to which it connects.
+def check_endpoint(text: str, role: Role) -> Endpoint:
+    """Read the endpoint at which a service listens, or to which a robot connects.
 
     Raises
     ------
     TransportError
-        If it is malformed, has port 0 to connect to, or is one at which the other end listens.
+        If it is malformed, or has port 0 to connect to.
     """
     endpoint = parse_endpoint(text)
-    if not listens and endpoint.port == 0 and not endpoint.is_local_socket:
+    if role == "robot" and endpoint.port == 0 and not endpoint.is_local_socket:
         raise TransportError(
             f"endpoint {endpoint}: port 0 is for listening; to connect, give the port, "
             f"as in {endpoint._replace(port=7447)}"
-        )
-    if listens != (role == "service") and not endpoint.is_local_socket:
-        raise TransportError(
-            f"endpoint {endpoint}: there the service listens and the robot connects; a robot "
-            "listens at a local socket alone (unix/PATH), for the service that it launches"
         )
     return endpoint
 

@@ -27,7 +27,6 @@ from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
 from holdfast.transport.dialer import Dialer
 from holdfast.transport.endpoints import (
     Endpoint,
-    ServiceAddress,
     TlsFiles,
     check_credentials,
     check_endpoint,
@@ -36,7 +35,6 @@ from holdfast.transport.endpoints import (
 from holdfast.transport.frames import CALL, END, LAST, REPLY, Frame, Hello, encode_hello
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
-from holdfast.transport.listener import Listener
 from holdfast.transport.schemes import load_scheme
 from holdfast.transport.tls import ClientCredentials, TlsStream
 
@@ -56,9 +54,6 @@ _TAKES_NO_TLS = (
 
 _NO_DATAGRAMS = "none gets through, so everything goes on the TLS stream; is UDP filtered?"
 
-_MAX_WITHOUT_HELLO = 64
-"""Connections to a listening robot without a hello yet."""
-
 _MAX_REPORTED_REASONS = 8
 """Reasons that are not reported again; bounded, as a service may send a new one each time."""
 
@@ -72,8 +67,9 @@ class StreamRobotTransport:
 
     Parameters
     ----------
-    services : mapping of str to ServiceAddress
-        Where each service is, by the robot's name for it.
+    services : mapping of str to str or None
+        The endpoint of each service, by the robot's name for it. None for one that the robot
+        launches, whose connections come by :meth:`attach`.
     name : str
         The robot's; may be empty.
     lease_ms : float
@@ -99,7 +95,7 @@ class StreamRobotTransport:
 
     def __init__(
         self,
-        services: Mapping[str, ServiceAddress],
+        services: Mapping[str, str | None],
         *,
         name: str = "",
         incarnation: str = "0",
@@ -123,17 +119,18 @@ class StreamRobotTransport:
         self.on_event = on_event
         self._services: dict[str, _ServiceLinks] = {}
         credentials: ClientCredentials | None = None
-        for service, address in services.items():
-            endpoint = check_endpoint(address.endpoint, "robot", listens=address.listens)
+        for service, text in services.items():
+            if text is None:
+                self._services[service] = _ServiceLinks(self, service, None, None)
+                continue
+            endpoint = check_endpoint(text, "robot")
             check_credentials(endpoint, tls)
-            if address.name is not None:
-                check_name("name of a service", address.name)
             if credentials is None and tls is not None and endpoint.is_encrypted:
                 credentials = ClientCredentials(
                     tls, lambda reason: on_event("credentials", reason=reason)
                 )
             own = credentials if endpoint.is_encrypted else None
-            self._services[service] = _ServiceLinks(self, service, address, endpoint, own)
+            self._services[service] = _ServiceLinks(self, service, endpoint, own)
         self._started = False
         self._closed = False
 
@@ -143,23 +140,17 @@ class StreamRobotTransport:
         return link is not None and link.sends_datagrams
 
     def start(self, deliver: Callable[[TransportEvent], None]) -> None:
-        """Begin to connect and to deliver events; returns at once.
-
-        Raises
-        ------
-        TransportError
-            If the robot cannot listen where it should.
-        """
+        """Begin to connect and to deliver events; returns at once."""
         if self._started or self._closed:
             raise TransportError("this transport was started before; make another one")
         self._started = True
         self.calls.open(deliver)
-        try:
-            for service in self._services.values():
-                service.start()
-        except TransportError:
-            self._stop()
-            raise
+        for service in self._services.values():
+            service.start()
+
+    def attach(self, service: str, connection: socket.socket) -> None:
+        """Take the connection to a service that was launched now; it replaces the one before."""
+        self._service(service).attach(connection)
 
     def call(self, service: str, call: int, payload: bytes) -> None:
         """Send a request; never waits."""
@@ -211,19 +202,18 @@ class _ServiceLinks(LinkOwner):
         self,
         robot: StreamRobotTransport,
         name: str,
-        address: ServiceAddress,
-        endpoint: Endpoint,
+        endpoint: Endpoint | None,
         credentials: ClientCredentials | None,
     ) -> None:
         self._robot = robot
         self._name = name
-        self._address = address
+        self._endpoint = endpoint
         self._credentials = credentials
-        self._scheme = load_scheme(endpoint.protocol)
-        self._listener: Listener | None = None
+        self._scheme = None if endpoint is None else load_scheme(endpoint.protocol)
         self._dialer: Dialer | None = None
+        # To a launched process that has said nothing yet.
+        self._silent: socket.socket | None = None
         # The links with a known process, with the incarnation that was reported, the newest last.
-        # There are several only where the robot listens.
         self._links: dict[Link, str] = {}
         # A link to the next process, while the current one still owes replies; and its incarnation.
         self._successor: tuple[Link, str] | None = None
@@ -242,7 +232,6 @@ class _ServiceLinks(LinkOwner):
         self._reported_reasons: deque[str] = deque(maxlen=_MAX_REPORTED_REASONS)
         self._reported_blocked = False
         self._stopped = False
-        self._endpoint = endpoint  # where it listens or, for one that connects, the robot
 
     @property
     def current(self) -> Link | None:
@@ -251,9 +240,7 @@ class _ServiceLinks(LinkOwner):
         return None if link is None or link.ended else link
 
     def start(self) -> None:
-        if self._address.listens:
-            self._listener = Listener(self._endpoint, self._accepted)
-        else:
+        if self._endpoint is not None:
             self._dialer = Dialer(
                 self._endpoint,
                 self._make_link,
@@ -264,14 +251,32 @@ class _ServiceLinks(LinkOwner):
 
     def stop(self) -> list[asyncio.Future[None]]:
         self._stopped = True
-        if self._listener is not None:
-            self._listener.close()
+        self._drop_silent()
         if self._dialer is not None:
             self._dialer.stop()
         links = list(self._made)
         for link in links:
             link.end("", goodbye="")
         return [link.closed for link in links]
+
+    def attach(self, connection: socket.socket) -> None:
+        self._drop_silent()
+        self._silent = connection
+        # A process may take long to start, and no link waits so long for a hello.
+        asyncio.get_running_loop().add_reader(connection, self._heard_from, connection)
+
+    def _heard_from(self, connection: socket.socket) -> None:
+        asyncio.get_running_loop().remove_reader(connection)
+        self._silent = None
+        link = Link(self, self._robot.settings, speaks_first=False)
+        self._made[link] = None
+        link.begin(connection)
+
+    def _drop_silent(self) -> None:
+        if self._silent is not None:
+            asyncio.get_running_loop().remove_reader(self._silent)
+            self._silent.close()
+            self._silent = None
 
     def link_for_call(self) -> Link | None:
         """Return the link for a new call: the successor's, if there is one.
@@ -303,26 +308,14 @@ class _ServiceLinks(LinkOwner):
     # -- links -----------------------------------------------------------------------------------
 
     def _make_link(self) -> Link:
+        assert self._endpoint is not None and self._scheme is not None
         tls = None
         if self._credentials is not None:
             context = self._credentials.context()
             tls = TlsStream(context, self._endpoint.host, self._incarnation)
-        link = self._scheme.make_link(
-            self,
-            self._robot.settings,
-            tls,
-            role="robot",
-            dialled=not self._address.listens,
-        )
+        link = self._scheme.make_link(self, self._robot.settings, tls, role="robot")
         self._made[link] = None
         return link
-
-    def _accepted(self, connection: socket.socket, network: bytes) -> None:
-        del network
-        unknown = [link for link in self._made if link.hello is None and not link.ended]
-        if len(unknown) >= _MAX_WITHOUT_HELLO:
-            unknown[0].end("has said no hello, and others wait", abort=True)
-        self._make_link().begin(connection)
 
     def on_handshake(self, link: Link) -> None:
         if not self._handshake_is_enough or self._links:
@@ -334,12 +327,7 @@ class _ServiceLinks(LinkOwner):
 
     def refusal(self, link: Link, hello: Hello) -> str | None:
         del link
-        if hello.role != "service":
-            return "is a robot, and a service was expected"
-        wanted = self._address.name
-        if wanted is not None and hello.name != wanted:
-            return f"is the service {hello.name}, and {wanted} was expected"
-        return None
+        return None if hello.role == "service" else "is a robot, and a service was expected"
 
     def on_hello(self, link: Link, hello: Hello) -> None:
         incarnation = self._links.get(link)

@@ -44,11 +44,9 @@ class Scheme:
         tls: TlsStream | None,
         *,
         role: Role,
-        dialled: bool,
     ) -> Link:
-        """Make the link of a new connection; ``dialled`` if this end has opened it."""
-        del role
-        return Link(owner, settings, speaks_first=dialled, tls=tls)
+        """Make the link of a new connection, which the robot has opened."""
+        return Link(owner, settings, speaks_first=role == "robot", tls=tls)
 
     def close(self) -> None:
         """Close what the links of this end share. May be repeated."""

@@ -19,7 +19,6 @@ import msgspec
 from holdfast.errors import DEFECT, FrameError, TransportError, defect_fields
 from holdfast.transport.calls import too_large
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, IncomingCall
-from holdfast.transport.dialer import Dialer
 from holdfast.transport.endpoints import (
     REVOKED_FILE,
     Endpoint,
@@ -120,8 +119,10 @@ class StreamServiceTransport(LinkOwner):
 
     Parameters
     ----------
-    listen, connect : sequence of str
-        Endpoints at which robots connect, and of robots that listen.
+    listen : sequence of str
+        Endpoints at which robots connect.
+    robot : socket or None
+        The connection to the robot that has launched this service.
     shared : sequence of socket
         If given, a socket for each of ``listen`` that is bound there, for several processes.
     lease_ms : float
@@ -151,7 +152,7 @@ class StreamServiceTransport(LinkOwner):
         *,
         incarnation: str,
         listen: Sequence[str] = (),
-        connect: Sequence[str] = (),
+        robot: socket.socket | None = None,
         shared: Sequence[socket.socket] = (),
         lease_ms: float = 400.0,
         max_message_bytes: int = DEFAULT_MAX_MESSAGE_BYTES,
@@ -161,14 +162,13 @@ class StreamServiceTransport(LinkOwner):
     ) -> None:
         check_name("name of a service", name)
         check_name("incarnation of a service", incarnation)
-        self._listen = [check_endpoint(text, "service", listens=True) for text in listen]
-        self._connect = [check_endpoint(text, "service", listens=False) for text in connect]
-        for endpoint in (*self._listen, *self._connect):
+        self._listen = [check_endpoint(text, "service") for text in listen]
+        for endpoint in self._listen:
             check_credentials(endpoint, tls)
+        self._robot = robot
         self._shared: Sequence[socket.socket | None] = shared or [None] * len(listen)
         self._schemes = {
-            endpoint.protocol: load_scheme(endpoint.protocol)
-            for endpoint in (*self._listen, *self._connect)
+            endpoint.protocol: load_scheme(endpoint.protocol) for endpoint in self._listen
         }
         self._incarnation = incarnation
         self._max_links = MAX_LINKS if max_links is None else max_links
@@ -189,10 +189,7 @@ class StreamServiceTransport(LinkOwner):
         self._on_event = on_event
         self._deliver: Callable[[IncomingCall], None] | None = None
         self._started = False
-        self._takes_links = True
         self._listeners: list[Listener] = []
-        self._dialers: dict[Endpoint, Dialer] = {}
-        self._dialled: dict[Link, Dialer] = {}
         self._without_hello: dict[Link, bytes] = {}
         self._links: dict[Link, set[_StreamCall]] = {}
         self._closing: set[asyncio.Future[None]] = set()
@@ -223,10 +220,11 @@ class StreamServiceTransport(LinkOwner):
             self._stop_listening()
             raise
         self._listen = [listener.endpoint for listener in self._listeners]
-        for endpoint in self._connect:
-            dialer = Dialer(endpoint, partial(self._make_dialled, endpoint))
-            self._dialers[endpoint] = dialer
-            dialer.start()
+        if self._robot is not None:
+            link = Link(self, self._settings, speaks_first=True)
+            self._add(link, b"")
+            link.begin(self._robot)
+            self._robot = None
 
     def dismiss(self) -> asyncio.Future[None]:
         """Take no new links, and ask the robots to leave; the result is done when all have left.
@@ -250,9 +248,6 @@ class StreamServiceTransport(LinkOwner):
     def _stop_listening(self) -> None:
         for listener in self._listeners:
             listener.close()
-        for dialer in self._dialers.values():
-            dialer.stop()
-        self._takes_links = False
 
     async def close(self, timeout_s: float = 1.0) -> None:
         """End all calls, send what was to be sent, and close all links, within this time."""
@@ -265,6 +260,8 @@ class StreamServiceTransport(LinkOwner):
             await asyncio.wait(self._closing, timeout=timeout_s)
         for scheme in self._schemes.values():
             scheme.close()
+        if self._robot is not None:
+            self._robot.close()
 
     def _end(self, link: Link) -> None:
         """End a link in order, because this service ends."""
@@ -333,16 +330,19 @@ class StreamServiceTransport(LinkOwner):
             )
         self._revoked, self._trusted, self._context = revoked, trusted, context
 
-    def _make_link(self, endpoint: Endpoint, network: bytes = b"", *, dialled: bool) -> Link:
+    def _accepted(self, endpoint: Endpoint, connection: socket.socket, network: bytes) -> None:
         tls = None
         if endpoint.is_encrypted:
             from holdfast.transport.tls import TlsStream
 
             assert self._context is not None
             tls = TlsStream(self._context)
-        link = self._schemes[endpoint.protocol].make_link(
-            self, self._settings, tls, role="service", dialled=dialled
-        )
+        link = self._schemes[endpoint.protocol].make_link(self, self._settings, tls, role="service")
+        self._add(link, network)
+        link.begin(connection)
+
+    def _add(self, link: Link, network: bytes) -> None:
+        """Keep a new link, until it has ended."""
         if len(self._without_hello) >= _MAX_WITHOUT_HELLO:
             other = connection_to_drop(self._without_hello)
             del self._without_hello[other]
@@ -350,15 +350,6 @@ class StreamServiceTransport(LinkOwner):
         self._without_hello[link] = network
         self._closing.add(link.closed)
         link.closed.add_done_callback(self._closing.discard)
-        return link
-
-    def _make_dialled(self, endpoint: Endpoint) -> Link:
-        link = self._make_link(endpoint, dialled=True)
-        self._dialled[link] = self._dialers[endpoint]
-        return link
-
-    def _accepted(self, endpoint: Endpoint, connection: socket.socket, network: bytes) -> None:
-        self._make_link(endpoint, network, dialled=False).begin(connection)
 
     def on_handshake(self, link: Link) -> None:
         """Refuse a robot that is no longer trusted, before anything of it is read."""
@@ -397,10 +388,6 @@ class StreamServiceTransport(LinkOwner):
         """Take a robot's hello."""
         self._without_hello.pop(link, None)
         self._links[link] = set()
-        dialer = self._dialled.get(link)
-        if dialer is not None:
-            dialer.succeeded()
-            dialer.selected(link)
         self._report("robot_connected", robot=_name(link, hello), address=link.address)
 
     def on_frame(self, link: Link, frame: Frame) -> None:
@@ -436,12 +423,11 @@ class StreamServiceTransport(LinkOwner):
         """Note that a link has ended."""
         self._without_hello.pop(link, None)
         calls = self._links.pop(link, None)
-        was_there = calls is not None
         for call in calls or ():
             call.is_open = False
             if call.on_gone is not None:
                 call.on_gone()
-        if was_there and link.hello is not None:
+        if calls is not None and link.hello is not None:
             reason = link.reason or (_SAID_GOODBYE if link.said_goodbye else _NO_GOODBYE)
             robot = _name(link, link.hello)
             self._report("robot_disconnected", robot=robot, reason=reason, address=link.address)
@@ -449,11 +435,6 @@ class StreamServiceTransport(LinkOwner):
             fields = {"robot": link.peer.name} if link.peer is not None else {}
             self._report("link_refused", reason=link.reason, address=link.address, **fields)
         self._resolve_if_all_gone()
-        dialer = self._dialled.pop(link, None)
-        if dialer is not None:
-            dialer.ended(link)
-            if self._takes_links and (was_there or link.refused):
-                dialer.start(refused=link.refused)
 
     def _report(self, name: str, **fields: object) -> None:
         if self._on_event is not None:
