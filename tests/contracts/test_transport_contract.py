@@ -207,18 +207,6 @@ class TestEveryWire:
             e for e in inbox.events if isinstance(e, ReplyReceived | CallEnded) and e.call == 1
         ] == []
 
-    async def test_an_abandoned_number_can_be_used_again(self, wire: Wire) -> None:
-        calls = Received()
-        robot, inbox, _ = await connected(wire, calls)
-        robot.call("cloud", 1, b"old")
-        old = await calls.next()
-        robot.abandon(1)
-        robot.call("cloud", 1, b"new")
-        new = await calls.next()
-        echo(old)
-        echo(new)
-        assert await inbox.of_call(1) == [ReplyReceived(1, b"new"), CallEnded(1)]
-
     async def test_a_service_that_closes_ends_the_calls_that_it_has(self, wire: Wire) -> None:
         calls = Received()
         robot, inbox, service = await connected(wire, calls)

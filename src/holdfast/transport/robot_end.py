@@ -22,7 +22,7 @@ from holdfast.errors import (
     defect_fields,
 )
 from holdfast.protocol.events import TransportEvent
-from holdfast.transport.calls import CallTable, PendingCall, too_large
+from holdfast.transport.calls import CallTable, too_large
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
 from holdfast.transport.dialer import Dialer
 from holdfast.transport.endpoints import (
@@ -39,8 +39,6 @@ from holdfast.transport.schemes import load_scheme
 from holdfast.transport.tls import ClientCredentials, TlsStream
 
 __all__ = ["StreamRobotTransport"]
-
-_CALL_NUMBERS = 1 << 32
 
 _PAUSE_S = 0.004
 """Between time slices of services that send too much: the robot's own loop comes first."""
@@ -156,24 +154,24 @@ class StreamRobotTransport:
         """Send a request; never waits."""
         to = self._service(service)
         link = to.link_for_call()
-        pending = self.calls.begin(call, link)
-        if pending is None:
+        if not self.calls.begin(call, link):
             return
         if link is not None and len(payload) <= self.settings.max_message_bytes:
-            to.send(link, pending, payload)
+            link.send_message(CALL, call, payload)
             return
         loop = asyncio.get_running_loop()
         if len(payload) > self.settings.max_message_bytes:
             refusal = too_large(len(payload), self.settings.max_message_bytes)
-            loop.call_soon(self.calls.replied, pending, refusal)
-        loop.call_soon(self.calls.ended, pending)
+            loop.call_soon(self.calls.replied, call, refusal)
+        loop.call_soon(self.calls.ended, call)
 
     def abandon(self, call: int) -> None:
         """Abandon a call: nothing more of it is delivered, not even its end."""
-        pending = self.calls.abandon(call)
-        if pending is not None:
+        link = self.calls.abandon(call)
+        if isinstance(link, Link):
+            link.forget(call)
             for service in self._services.values():
-                service.forget(pending)
+                service.freed(link)
 
     async def close(self, timeout_s: float = 1.0) -> None:
         """Close all links, within this time whatever the other ends do. May be repeated."""
@@ -221,8 +219,6 @@ class _ServiceLinks(LinkOwner):
         self._has_no_successor = False
         # All links, the oldest first.
         self._made: dict[Link, None] = {}
-        self._calls: dict[Link, dict[int, PendingCall]] = {}
-        self._numbers = count()
         # From the last hello, and the name under which that process was reported.
         self._incarnation: str | None = None
         self._reported = ""
@@ -290,20 +286,10 @@ class _ServiceLinks(LinkOwner):
         asyncio.get_running_loop().call_soon(self._switch)
         return self._successor[0]
 
-    def send(self, link: Link, pending: PendingCall, payload: bytes) -> None:
-        number = next(self._numbers) % _CALL_NUMBERS
-        self._calls[link][number] = pending
-        link.send_message(CALL, number, payload)
-
-    def forget(self, pending: PendingCall) -> None:
-        link = pending.peer
-        if isinstance(link, Link):
-            for number, call in list(self._calls.get(link, {}).items()):
-                if call is pending:
-                    del self._calls[link][number]
-                    link.forget(number)
-            if link.said_goodbye and self._successor is not None:
-                asyncio.get_running_loop().call_soon(self._switch_if_free)
+    def freed(self, link: Link) -> None:
+        """Note that a call on a link was abandoned."""
+        if link.said_goodbye and link in self._links and self._successor is not None:
+            asyncio.get_running_loop().call_soon(self._switch_if_free)
 
     # -- links -----------------------------------------------------------------------------------
 
@@ -341,7 +327,6 @@ class _ServiceLinks(LinkOwner):
             self._dialer.succeeded()
         before = self.current
         if link not in self._links and before is not None and before.said_goodbye:
-            self._calls[link] = {}
             self._successor = link, incarnation
             if self._dialer is not None:
                 self._dialer.selected(link)
@@ -354,7 +339,6 @@ class _ServiceLinks(LinkOwner):
     def _appeared(self, link: Link, incarnation: str) -> None:
         is_news = incarnation not in self._links.values()
         self._links[link] = incarnation
-        self._calls.setdefault(link, {})
         self._has_no_successor = False
         if self._dialer is not None:
             self._dialer.selected(link)
@@ -368,7 +352,7 @@ class _ServiceLinks(LinkOwner):
         """
         for link, its_incarnation in list(self._links.items()):
             ending = link is not by and (link.without_stream or link.said_goodbye)
-            if ending and (its_incarnation != incarnation or not self._calls[link]):
+            if ending and (its_incarnation != incarnation or not self._robot.calls.to(link)):
                 link.end("", goodbye="")
 
     # -- a draining process ----------------------------------------------------------------------
@@ -381,7 +365,7 @@ class _ServiceLinks(LinkOwner):
             self._leave(link)
 
     def _leave(self, link: Link) -> None:
-        if not self._calls.get(link):
+        if not self._robot.calls.to(link):
             link.end("", goodbye="")
 
     def _all_failed(self, reason: str) -> None:
@@ -397,7 +381,7 @@ class _ServiceLinks(LinkOwner):
     def _switch_if_free(self) -> None:
         """Switch to the successor if the current process owes no replies."""
         current = self.current
-        if current is None or not self._calls.get(current):
+        if current is None or not self._robot.calls.to(current):
             self._switch()
 
     def _switch(self) -> None:
@@ -407,21 +391,19 @@ class _ServiceLinks(LinkOwner):
             self._replace_others(*successor)
 
     def on_frame(self, link: Link, frame: Frame) -> None:
-        calls = self._calls.get(link)
-        if calls is None:
+        calls = self._robot.calls
+        if link not in self._links and (self._successor is None or link is not self._successor[0]):
             raise FrameError("replies before it has a request")
         if frame.kind not in (REPLY, LAST, END):
             raise FrameError(f"is a service and sends a frame of kind {frame.kind}")
-        call = calls.get(frame.call)
-        if call is None:
+        if frame.call not in calls.to(link):
             return  # it has ended
         if frame.kind != END and not frame.skipped_bytes:
             link.has_answered = True
-            self._robot.calls.replied(call, frame.payload)
+            calls.replied(frame.call, frame.payload)
         if frame.kind != REPLY:
-            calls.pop(frame.call, None)
-            self._robot.calls.ended(call)
-            if calls:
+            calls.ended(frame.call)
+            if calls.to(link):
                 return
             if link.said_goodbye and self._successor is not None:
                 self._switch_if_free()
@@ -446,7 +428,6 @@ class _ServiceLinks(LinkOwner):
 
     def on_ended(self, link: Link) -> None:
         self._made.pop(link, None)
-        self._calls.pop(link, None)
         if self._successor is not None:
             if link is self._successor[0]:
                 self._successor = None
