@@ -544,7 +544,7 @@ class TestThreads:
             lambda: robot, PegInHole2D(), lambda event, _: events.append(event), "robot"
         )
         runner.begin()
-        assert runner.environment is robot
+        assert runner.world.environment is robot
         with pytest.raises(KeyboardInterrupt):
             runner.perform(0, ACTION)
         assert events == [EnvironmentReady(None, None)]
@@ -640,8 +640,8 @@ class TestMakePerformer:
         runner.begin(2)
         assert events == [EnvironmentReady(None, 2)]
         assert isinstance(runner, InlineRunner)
-        assert isinstance(runner.environment, SimulatedEnvironment)
-        assert runner.environment.state.tobytes() == lived.state.tobytes()
+        assert isinstance(runner.world.environment, SimulatedEnvironment)
+        assert runner.world.environment.state.tobytes() == lived.state.tobytes()
 
     def test_a_robot_is_performed_on_a_thread(self, threaded: Bench) -> None:
         class Own(Robot):
@@ -690,7 +690,7 @@ class TestShown:
     def test_an_ending_has_a_reason_of_one_line(self, bench: Bench) -> None:
         ending = Ending("failed", "hit\n  the \x1b[2Jwall " + 300 * "!")
         runner = bench.begin(Robot(is_done=False))
-        robot = bench.opened[-1].runner.environment
+        robot = bench.opened[-1].runner.world.environment
         assert isinstance(robot, Robot)
         robot.answers["is_done"] = ending
         runner.perform(0, ACTION)
