@@ -28,21 +28,6 @@ from holdfast.planning.settings import (
 from holdfast.problems.attributes import has_general_observations, has_own
 from holdfast.problems.problem import Problem
 
-__all__ = [
-    "ANY_MACHINE",
-    "COSTLY",
-    "FREE",
-    "TYPICAL_PROBLEM",
-    "CallCost",
-    "Cost",
-    "Price",
-    "Pricing",
-    "ProblemCost",
-    "cost_of_answer",
-    "cost_of_sensing",
-    "describe_cost",
-]
-
 COSTLY: Mapping[str, str] = {
     "particle_filter.num_particles": "every method",
     "active_sensing.num_observation_samples": "informed",

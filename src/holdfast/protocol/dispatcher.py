@@ -44,8 +44,6 @@ from holdfast.protocol.requests import OpenRequest, OpenRequests
 from holdfast.protocol.status import Cause
 from holdfast.protocol.verification import Verification
 
-__all__ = ["Dispatcher"]
-
 _LONGEST_SILENT_WAIT_S = 1.0
 """A longer wait is reported, unless a dead service takes longer to detect."""
 

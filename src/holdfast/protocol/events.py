@@ -21,38 +21,6 @@ from holdfast.planning.planner import PlanningState
 from holdfast.planning.tracking import LateObservation
 from holdfast.protocol.records import Record
 
-__all__ = [
-    "Abandon",
-    "Act",
-    "Acted",
-    "CallEnded",
-    "ComputeOwnAnswer",
-    "Effects",
-    "EndTrial",
-    "EnvironmentEvent",
-    "EnvironmentFailed",
-    "EnvironmentReady",
-    "Halt",
-    "Launch",
-    "LogEvent",
-    "OwnAnswer",
-    "Paused",
-    "Plan",
-    "Planned",
-    "RecoveryExited",
-    "ReplyReceived",
-    "RobotEffect",
-    "Send",
-    "Sense",
-    "Sensed",
-    "ServiceAppeared",
-    "ServiceVanished",
-    "Timing",
-    "TransportEvent",
-    "VerificationNoted",
-    "WriteRecords",
-]
-
 
 class ServiceAppeared(NamedTuple):
     """A service can be asked; another ``incarnation`` is another process, with another memory."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["ExpectedTime"]
-
 _TYPICAL_INERTIA = 16.0
 """A longer time raises the typical time by one such part of the difference."""
 

@@ -46,8 +46,6 @@ from holdfast.protocol.service_sessions import (
     Session,
 )
 
-__all__ = ["Lanes"]
-
 _OVERRUN = 5.0
 """So many times its lane's limit a job may compute; hardly any takes 3 times its estimate."""
 

@@ -13,8 +13,6 @@ from __future__ import annotations
 from holdfast.planning.settings import OffloadSettings, RecoverySettings
 from holdfast.protocol.question import Question
 
-__all__ = ["HedgingBudget", "RestartPolicy"]
-
 _HEDGING_BURST = 3.0
 """Hedges that may be made at once."""
 

@@ -32,41 +32,6 @@ from holdfast.planning.settings import PlanningSettings
 from holdfast.printable import one_line
 from holdfast.protocol.plain_data import check_plain_data
 
-__all__ = [
-    "CHECKSUM_SIZE",
-    "DIGEST_SIZE",
-    "MAX_ACTION_SIZE",
-    "MAX_CONFIGURATION_BYTES",
-    "MAX_INPUTS",
-    "MAX_TASK_ACTIONS",
-    "MAX_TEXT",
-    "MAX_WORD",
-    "PROTOCOL_VERSION",
-    "Busy",
-    "Input",
-    "Moved",
-    "NeedState",
-    "Observed",
-    "Progress",
-    "Refused",
-    "Reply",
-    "Request",
-    "SensingAnswer",
-    "SessionConfiguration",
-    "TaskAnswer",
-    "decode_floats",
-    "decode_reply",
-    "decode_request",
-    "encode",
-    "encode_floats",
-    "numbers_of",
-    "pack_configuration",
-    "settings_digest",
-    "unpack_configuration",
-    "with_checksum",
-]
-
-
 PROTOCOL_VERSION = 5
 """Raised when a message changes its form or meaning. All versions have the same checksum."""
 

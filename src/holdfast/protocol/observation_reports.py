@@ -17,8 +17,6 @@ from holdfast.planning.tracking import Trial
 from holdfast.problems.attributes import sensing_labels
 from holdfast.protocol.events import Effects, RobotEffect
 
-__all__ = ["ObservationReports", "held_error"]
-
 _MAX_REPORTS = 10
 """Bound on reports of each kind per trial; all are counted."""
 

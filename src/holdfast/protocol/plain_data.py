@@ -15,8 +15,6 @@ from typing import Final
 
 from holdfast.errors import MessageError
 
-__all__ = ["MAX_CONFIGURATION_DEPTH", "MAX_CONFIGURATION_VALUES", "check_plain_data"]
-
 MAX_CONFIGURATION_VALUES: Final = 10_000
 """Bound on a session configuration's values: the smallest take one byte each when encoded, and
 sixty in memory."""

@@ -36,16 +36,6 @@ from holdfast.protocol.messages import (
 )
 from holdfast.protocol.status import StatusTracker
 
-__all__ = [
-    "OWN_PLANNER",
-    "DecisionSource",
-    "InProcessSource",
-    "Provenance",
-    "Question",
-    "WrongAnswer",
-    "same_actions",
-]
-
 OWN_PLANNER = "in_process"
 """Name of the planner in the robot's own process, where services have names."""
 

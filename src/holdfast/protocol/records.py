@@ -28,23 +28,6 @@ from holdfast.protocol.messages import (
     numbers_of,
 )
 
-__all__ = [
-    "ActingRecord",
-    "LateRecord",
-    "LocalTookOverRecord",
-    "ObservedRecord",
-    "PausedRecord",
-    "PerformedRecord",
-    "Record",
-    "ReinitialisedRecord",
-    "TrialHistory",
-    "decisions_of",
-    "decode_record",
-    "encode_record",
-    "has_shown",
-    "replay",
-]
-
 
 class ObservedRecord(msgspec.Struct, array_like=True, frozen=True, tag=1):
     """An observation (little-endian float64), written before it is used.

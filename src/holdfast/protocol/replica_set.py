@@ -15,8 +15,6 @@ from collections.abc import Collection, Iterator, Sequence
 from holdfast.protocol.messages import Input
 from holdfast.protocol.question import Question
 
-__all__ = ["FailureDetector", "Replica", "ReplicaSet"]
-
 _LATE_IN_A_ROW = 3
 """After so many late replies in a row, the service is further away than the timeout."""
 

@@ -29,8 +29,6 @@ from holdfast.protocol.service_sessions import (
     Session,
 )
 
-__all__ = ["RequestQueue"]
-
 
 class _RoundRobin:
     """Tasks that wait, their owners by turns."""

@@ -35,9 +35,6 @@ from holdfast.protocol.question import Provenance, Question
 from holdfast.protocol.replica_set import Replica
 from holdfast.protocol.verification import Verification
 
-__all__ = ["OpenRequest", "OpenRequests"]
-
-
 _MAX_CALLS = 4
 """Bound on the open requests to one service."""
 

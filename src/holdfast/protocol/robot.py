@@ -55,8 +55,6 @@ from holdfast.protocol.records import (
 )
 from holdfast.protocol.status import Status
 
-__all__ = ["Robot"]
-
 _FROM_ENVIRONMENT = (Sensed, Acted, EnvironmentFailed)
 """Events that complete an order to the environment."""
 

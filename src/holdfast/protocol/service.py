@@ -67,8 +67,6 @@ from holdfast.protocol.service_sessions import (
     with_cores,
 )
 
-__all__ = ["Service"]
-
 _INERTIA_OF_ONE = 4.0
 """Of the mean times of one session, whose decisions are alike."""
 

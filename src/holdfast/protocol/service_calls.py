@@ -28,8 +28,6 @@ from holdfast.protocol.service_jobs import EndCall, SendReply, ServiceEffect
 from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
 from holdfast.protocol.service_sessions import CachedAnswer, PendingTask, WaitingCall
 
-__all__ = ["WaitingCalls"]
-
 _PROGRESS_TOGETHER = 0.8
 """Calls this far into the interval get their progress together with those due: fewer wakeups."""
 

@@ -55,17 +55,6 @@ from holdfast.protocol.messages import (
 )
 from holdfast.protocol.service_limits import ServiceLimits
 
-__all__ = [
-    "Computed",
-    "EndCall",
-    "Job",
-    "JobResult",
-    "ProblemPool",
-    "SendReply",
-    "ServiceEffect",
-    "StartJob",
-]
-
 _COSTS_PER_PROBLEM = 128
 """So many costs are kept for each problem of which instances are; they take little memory."""
 

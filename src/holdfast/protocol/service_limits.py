@@ -6,8 +6,6 @@ import msgspec
 
 from holdfast.protocol.messages import MAX_INPUTS
 
-__all__ = ["ServiceLimits", "ServiceStatistics"]
-
 
 class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
     """Limits of a service, beyond which robots are turned away or their sessions dropped.

@@ -29,25 +29,6 @@ from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.messages import Request, SessionConfiguration, pack_configuration
 from holdfast.protocol.service_limits import ServiceLimits
 
-__all__ = [
-    "BRIEF",
-    "FIRST",
-    "LONG",
-    "MEDIUM",
-    "NEW",
-    "PREFETCHED",
-    "REQUESTED",
-    "CachedAnswer",
-    "ForgottenEpochs",
-    "Owner",
-    "PendingTask",
-    "Session",
-    "SessionKey",
-    "SessionTable",
-    "WaitingCall",
-    "with_cores",
-]
-
 _LEAST_EPOCHS = 4096
 """Epochs of forgotten sessions are remembered at least for so many."""
 

@@ -14,8 +14,6 @@ from types import MappingProxyType
 
 from holdfast.errors import IllegalTransitionError
 
-__all__ = ["MEANINGS", "TRANSITIONS", "Cause", "Status", "StatusTracker", "diagram", "next_status"]
-
 
 class Status(Enum):
     """Which service decides."""

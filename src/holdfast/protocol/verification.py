@@ -43,8 +43,6 @@ from holdfast.protocol.question import (
     same_actions,
 )
 
-__all__ = ["Verification"]
-
 MAX_OPEN_CHECKS = 64
 """Bound on the questions that wait for the own planner; further ones are left out and counted."""
 

@@ -17,8 +17,6 @@ from holdfast.protocol.events import ComputeOwnAnswer, OwnAnswer
 from holdfast.protocol.messages import MAX_TASK_ACTIONS
 from holdfast.runtime.pool import ThreadPool
 
-__all__ = ["AnswerChecker"]
-
 
 class AnswerChecker:
     """Answers questions with a planner; all methods are called on the loop's thread.

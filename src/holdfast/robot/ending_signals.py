@@ -13,8 +13,6 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 
-__all__ = ["ending_signals"]
-
 
 @contextlib.contextmanager
 def ending_signals(

@@ -20,8 +20,6 @@ from holdfast.robot.late_sensing import SenseInBackground
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
 
-__all__ = ["EnvironmentMaker", "load_environment"]
-
 GROUP = "holdfast.environments"
 """Entry points by which packages register their environments."""
 

@@ -29,9 +29,6 @@ from holdfast.robot.environment import CheckedEnvironment, Environment, MissingR
 from holdfast.robot.environment_maker import EnvironmentMaker
 from holdfast.runtime.pool import ThreadPool
 
-__all__ = ["EnvironmentRunner", "InlineRunner", "ThreadedRunner", "make_runner"]
-
-
 Deliver: TypeAlias = Callable[[EnvironmentEvent, float], None]
 """Takes an event and its time, in seconds; it must not block."""
 

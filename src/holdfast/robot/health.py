@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from holdfast.robot.metrics import RobotMetrics
     from holdfast.runtime.monitoring import HttpAddress, MonitoringServers, Pages
 
-__all__ = ["Condition", "RobotWatch"]
-
 
 class Condition(NamedTuple):
     """A robot's condition: in a word, and the trial, None between two trials.

@@ -22,8 +22,6 @@ from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.messages import MAX_TASK_ACTIONS
 from holdfast.runtime.pool import ThreadPool
 
-__all__ = ["InProcessPlanner"]
-
 _BRIEF_S = 0.001
 """Work that may take longer goes to a thread: the loop handles no event meanwhile."""
 

@@ -28,8 +28,6 @@ from holdfast.transport.contract import RobotTransport
 if TYPE_CHECKING:
     from holdfast.transport.endpoints import TlsFiles
 
-__all__ = ["RECOVERY_SERVICE", "Links", "check_services", "make_links"]
-
 RECOVERY_SERVICE = "cloud_active_sensing_recovery"
 """The name of the local service (the thesis's)."""
 

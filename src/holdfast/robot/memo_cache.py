@@ -22,8 +22,6 @@ from holdfast.planning.planner import ObservationInfo, Planner, PlanningState
 from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
 
-__all__ = ["MemoCache", "MemoizingPlanner"]
-
 _Result = TypeVar("_Result")
 
 _MAX_RESULTS = 512

@@ -30,8 +30,6 @@ from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.schemes import load_scheme
 from holdfast.transport.tls import TlsStream
 
-__all__ = ["AddressPath", "account_of", "in_thread", "interface_of"]
-
 _GREETING_S: Final = 3.0
 """For the handshake and the other end's hello."""
 

@@ -65,8 +65,6 @@ from holdfast.robot.links import RECOVERY_SERVICE, Links
 from holdfast.robot.session_configuration import session_configuration_of
 from holdfast.runtime.events import EventSink
 
-__all__ = ["RobotProcess", "StepJournal"]
-
 _LAST_VERIFICATION_S = 10.0
 """Longest wait for unfinished verifications once all trials are finished."""
 

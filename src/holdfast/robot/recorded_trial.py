@@ -26,8 +26,6 @@ from holdfast.protocol.records import (
 from holdfast.robot.environment import Environment, SimulatedEnvironment
 from holdfast.robot.trial import LateStep, SensingStep, TaskStep, TrialObserver
 
-__all__ = ["run_recorded_trial"]
-
 
 def run_recorded_trial(
     planner: Planner,

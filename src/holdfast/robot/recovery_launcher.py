@@ -22,8 +22,6 @@ from holdfast.runtime.files import started_in
 from holdfast.runtime.pool import ThreadPool
 from holdfast.runtime.process_ends import how_it_ended
 
-__all__ = ["RecoveryLauncher"]
-
 
 class RecoveryLauncher:
     """Starts the local service, watches it, and ends it; all on the thread of an event loop.

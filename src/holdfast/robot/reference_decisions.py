@@ -24,8 +24,6 @@ from holdfast.protocol.messages import (
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.session_configuration import session_configuration_of
 
-__all__ = ["ReferenceDecision", "answer_in", "reference_decisions"]
-
 
 class ReferenceDecision(NamedTuple):
     """A decision and the time that it took."""

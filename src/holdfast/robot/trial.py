@@ -34,15 +34,6 @@ from holdfast.robot.environment import (
     require_methods,
 )
 
-__all__ = [
-    "NULL_OBSERVER",
-    "LateStep",
-    "SensingStep",
-    "TaskStep",
-    "TrialObserver",
-    "run_trial",
-]
-
 
 class SensingStep(NamedTuple):
     """A sensing action, its observation, and the states before and after it.

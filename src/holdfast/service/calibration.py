@@ -26,8 +26,6 @@ from holdfast.problems.attributes import has_general_observations, has_own
 from holdfast.problems.problem import Problem
 from holdfast.protocol.decision_cost import TYPICAL_PROBLEM, CallCost, ProblemCost
 
-__all__ = ["measure_problem", "measure_slowness"]
-
 _REFERENCE_S = 0.46e-3
 """Time of :func:`_work` on the machine on which the cost model's constants were measured."""
 

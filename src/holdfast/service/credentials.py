@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
     from holdfast.transport.service_end import StreamServiceTransport
 
-__all__ = ["ServiceCredentials"]
-
 _CHECK_INTERVAL_S = 1.0
 
 

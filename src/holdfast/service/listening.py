@@ -17,8 +17,6 @@ from holdfast.runtime.addresses import why_not_bound
 from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.listener import listen, remove_socket_file
 
-__all__ = ["SharedEndpoints"]
-
 
 class SharedEndpoints:
     """Endpoints at which several processes listen.

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from holdfast.runtime.monitoring import HttpAddress
     from holdfast.transport.endpoints import Endpoint
 
-__all__ = ["DEFAULT_NAME", "ServeOptions", "checked_endpoints", "http_address", "parse_options"]
-
 DEFAULT_NAME = "cloud_active_sensing"
 """The name of the service in the cloud (the thesis's)."""
 

@@ -17,8 +17,6 @@ from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.problems.problem import Problem
 from holdfast.protocol.messages import SessionConfiguration
 
-__all__ = ["ProblemFactory"]
-
 
 class ProblemFactory:
     """Builds the problems that a service decides for.

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from holdfast.service.shell import ServiceShell
     from holdfast.service.supervisor import Supervised
 
-__all__ = ["Extension", "main", "serve"]
-
 _SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while another waits for it."""
 

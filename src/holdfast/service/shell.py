@@ -47,8 +47,6 @@ from holdfast.runtime.events import EventRates, EventSink
 from holdfast.runtime.pool import ThreadPool
 from holdfast.transport.contract import IncomingCall, ServiceTransport
 
-__all__ = ["DecisionHook", "ServiceShell"]
-
 DecisionHook: TypeAlias = Callable[[Literal["task", "sensing"], float, float], None]
 
 _BRIEF_S = 0.001

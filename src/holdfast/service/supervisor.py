@@ -35,8 +35,6 @@ from holdfast.service.metrics import ServiceReport, summed
 if TYPE_CHECKING:
     from holdfast.service.listening import SharedEndpoints
 
-__all__ = ["Supervised", "Supervisor"]
-
 _REPORT_EVERY_S = 1.0
 
 _SILENT_S = 10.0

@@ -17,8 +17,6 @@ from holdfast.protocol.events import (
     TransportEvent,
 )
 
-__all__ = ["CallTable", "too_large"]
-
 
 def too_large(size_bytes: int, max_message_bytes: int) -> bytes:
     """Return the reply to a request that is larger than allowed."""

@@ -15,8 +15,6 @@ from typing import Protocol
 
 from holdfast.protocol.events import TransportEvent
 
-__all__ = ["DEFAULT_MAX_MESSAGE_BYTES", "IncomingCall", "RobotTransport", "ServiceTransport"]
-
 DEFAULT_MAX_MESSAGE_BYTES = 64 * 1024 * 1024
 """Default bound on a message: a state of a million particles fills 56 MB."""
 

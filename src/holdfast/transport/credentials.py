@@ -20,14 +20,6 @@ from holdfast.errors import CredentialsError, CredentialsGoneError, TransportErr
 from holdfast.transport.endpoints import AUTHORITY_FILE, REVOKED_FILE, Role, TlsFiles
 from holdfast.transport.revocation import refuse_revoked
 
-__all__ = [
-    "EXPIRES_SOON_DAYS",
-    "LoadedCredentials",
-    "date_text",
-    "load_credentials",
-    "warn_if_open",
-]
-
 EXPIRES_SOON_DAYS = 14
 """With fewer days left, loading a certificate warns."""
 

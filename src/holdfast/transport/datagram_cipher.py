@@ -28,18 +28,6 @@ from holdfast.errors import KeysExhaustedError, TransportError
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
-__all__ = [
-    "KNOWN_AFTER",
-    "LOSS_SAMPLE",
-    "MAX_DATAGRAMS",
-    "OVERHEAD",
-    "WINDOW",
-    "AssociationKeys",
-    "DatagramCipher",
-    "ReplayWindow",
-    "require_cryptography",
-]
-
 _HEADER = struct.Struct(">II")
 _NONCE_PREFIX = bytes(4)
 _TAG_BYTES = 16

@@ -64,8 +64,6 @@ from holdfast.transport.return_path import SECRET_BYTES, ReturnPath
 from holdfast.transport.schemes import Scheme
 from holdfast.transport.tls import TlsStream
 
-__all__ = ["DatagramScheme", "RobotDatagramLink", "ServiceDatagramLink"]
-
 _KEYS: Final = struct.Struct(">I32s32sH")
 """Association, both keys, and the service's port; 0 is the stream's."""
 

@@ -13,15 +13,6 @@ from typing import Any, Final
 
 from holdfast.transport.datagram_cipher import AssociationKeys
 
-__all__ = [
-    "DATAGRAMS_AT_ONCE",
-    "LARGEST_DATAGRAM",
-    "QUOTED_BYTES",
-    "DatagramSocket",
-    "connected_socket",
-    "reported_errors",
-]
-
 LARGEST_DATAGRAM: Final = 2048
 DATAGRAMS_AT_ONCE: Final = 64
 """Read before the event loop serves other sockets."""

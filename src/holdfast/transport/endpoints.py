@@ -19,24 +19,6 @@ from holdfast.errors import TransportError
 from holdfast.printable import did_you_mean
 from holdfast.runtime.addresses import host_and_port
 
-__all__ = [
-    "AUTHORITY_FILE",
-    "CERTIFICATE_FILE",
-    "KEY_FILE",
-    "MAX_SOCKET_PATH_BYTES",
-    "NEXT_KEY_FILE",
-    "REVOKED_FILE",
-    "SCHEMES",
-    "Endpoint",
-    "Role",
-    "TlsFiles",
-    "check_credentials",
-    "check_endpoint",
-    "check_name",
-    "parse_endpoint",
-    "parse_host",
-]
-
 Role: TypeAlias = Literal["robot", "service"]
 """Of an end of a link."""
 

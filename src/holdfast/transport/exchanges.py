@@ -48,21 +48,6 @@ import msgspec
 from holdfast.transport.datagram_cipher import KNOWN_AFTER, LOSS_SAMPLE, OVERHEAD
 from holdfast.transport.redundancy import MAX_TIMEOUT_S, Paths, RedundantSender, RoundTripEstimator
 
-__all__ = [
-    "ECHO",
-    "KEEP_ALIVE_S",
-    "MAX_CACHED_REQUESTS",
-    "MAX_DATAGRAM_BYTES",
-    "MAX_PAYLOAD_BYTES",
-    "MAX_REORDERED_BYTES",
-    "MESSAGE_OVERHEAD",
-    "PROBE",
-    "ReceivedReply",
-    "ReceivedRequest",
-    "RobotExchange",
-    "ServiceExchange",
-]
-
 _REQUEST, _REPLY, _WORKING, PROBE, ECHO, _HEDGE = range(1, 7)
 
 _REQUEST_HEAD: Final = struct.Struct(">IIH")

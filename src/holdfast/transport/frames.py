@@ -21,30 +21,6 @@ from holdfast.errors import FrameError, TransportError
 from holdfast.printable import one_line
 from holdfast.transport.endpoints import Role, check_name
 
-__all__ = [
-    "CALL",
-    "END",
-    "GOODBYE",
-    "HEADER_BYTES",
-    "HELLO",
-    "KEYS",
-    "LAST",
-    "MAGIC",
-    "MAX_HELLO_BYTES",
-    "MESSAGE",
-    "PING",
-    "REPLY",
-    "WIRE_VERSION",
-    "Frame",
-    "FrameDecoder",
-    "Hello",
-    "decode_hello",
-    "encode_frame",
-    "encode_goodbye",
-    "encode_hello",
-    "read_goodbye",
-]
-
 WIRE_VERSION: Final = 1
 """Of the frames and the hello; the protocol's messages have another version."""
 

@@ -65,18 +65,6 @@ if TYPE_CHECKING:
     from cryptography import x509
     from cryptography.hazmat.primitives.asymmetric import ec
 
-__all__ = [
-    "AUTHORITY_DAYS",
-    "DEFAULT_DAYS",
-    "Issued",
-    "KeyRing",
-    "MadeCredentials",
-    "alone_in",
-    "list_credentials",
-    "make_credentials",
-    "revoke_credentials",
-]
-
 DEFAULT_DAYS = 365
 """Days for which a certificate is valid unless said otherwise."""
 

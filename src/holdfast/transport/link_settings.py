@@ -11,8 +11,6 @@ from typing import Final, Protocol
 
 from holdfast.transport.frames import HEADER_BYTES
 
-__all__ = ["SLICE_S", "FairScheduler", "LinkSettings", "MemoryBudget"]
-
 _RECEIVED_AT_ONCE_BYTES: Final = 256 * 1024
 
 SLICE_S: Final = 0.001

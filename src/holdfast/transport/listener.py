@@ -25,14 +25,6 @@ from holdfast.runtime.addresses import why_not_bound
 from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.links import OPENING_TIMEOUT_S
 
-__all__ = [
-    "MAX_SILENT",
-    "Listener",
-    "connection_to_drop",
-    "listen",
-    "remove_socket_file",
-]
-
 _BACKLOG: Final = 1024
 """Connections that wait to be accepted."""
 

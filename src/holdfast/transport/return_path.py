@@ -18,8 +18,6 @@ from __future__ import annotations
 import os
 from typing import Any, Final, NamedTuple
 
-__all__ = ["SECRET_BYTES", "Probe", "ReturnPath"]
-
 SECRET_BYTES: Final = 8
 
 _PROBE_INTERVAL_S: Final = 0.002

@@ -22,8 +22,6 @@ from holdfast.transport.endpoints import REVOKED_FILE
 if TYPE_CHECKING:
     import ssl
 
-__all__ = ["refuse_revoked", "revoked_serials"]
-
 _MAX_LIST_BYTES = 16 << 20
 """Of a list: about 400,000 certificates."""
 

@@ -38,8 +38,6 @@ from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.schemes import load_scheme
 from holdfast.transport.tls import ClientCredentials, TlsStream
 
-__all__ = ["StreamRobotTransport"]
-
 _PAUSE_S = 0.004
 """Between time slices of services that send too much: the robot's own loop comes first."""
 

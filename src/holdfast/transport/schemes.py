@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from holdfast.transport.link_settings import LinkSettings
     from holdfast.transport.tls import TlsStream
 
-__all__ = ["Scheme", "load_scheme"]
-
 
 def load_scheme(name: str) -> Scheme:
     """Import and make the implementation of a scheme, for one end of a transport.

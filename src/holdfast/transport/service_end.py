@@ -47,8 +47,6 @@ if TYPE_CHECKING:
 
     from holdfast.transport.tls import PeerCertificate
 
-__all__ = ["MAX_LINKS", "MAX_UNKNOWN", "StreamServiceTransport"]
-
 MAX_LINKS: Final = 4096
 """Of robots, at the same time. Above it the owner of the most links loses one."""
 

@@ -26,18 +26,6 @@ from holdfast.errors import FrameError, TransportError
 from holdfast.transport.endpoints import AUTHORITY_FILE, NEXT_KEY_FILE, TlsFiles
 from holdfast.transport.revocation import refuse_revoked
 
-__all__ = [
-    "REMEDIES",
-    "ClientCredentials",
-    "PeerCertificate",
-    "TlsStream",
-    "client_context",
-    "common_name",
-    "describe_certificate_error",
-    "make_context",
-    "server_context",
-]
-
 _ANY_INCARNATION = "holdfast"
 
 _KEY_EXCHANGE = "prime256v1"
