@@ -12,16 +12,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Hashable
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
-
-_SHARED = ("init", "observe", "advance", "observe_move", "reinitialise", "digest")
-"""Functions of a planner that lead from state to state."""
 
 _MAX_RESULTS = 512
 """A few turns of the longest interval between two sensing steps."""
@@ -38,7 +35,7 @@ class MemoCache:
 
     def once(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return what the function returns, computed unless it is cached."""
-        key = (function.__name__, *(_key_of(each) for each in arguments if each is not None))
+        key = key_of(function, arguments)
         if (known := self._results.get(key)) is not None:
             return known[1]
         result = function(*arguments)
@@ -55,13 +52,27 @@ class MemoCache:
 class MemoizingPlanner(Planner):
     """A planner that shares its results with others through a cache."""
 
+    shared: ClassVar[tuple[str, ...]] = (
+        "init",
+        "observe",
+        "advance",
+        "observe_move",
+        "reinitialise",
+        "digest",
+    )
+
     def __init__(self, problem: Problem, settings: PlanningSettings, cache: MemoCache) -> None:
         super().__init__(problem, settings)
-        for name in _SHARED:
+        for name in self.shared:
             setattr(self, name, partial(cache.once, getattr(self, name)))
 
 
-def _key_of(argument: Any) -> Hashable:
+def key_of(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Hashable:
+    """Return what identifies a call."""
+    return (function.__name__, *(_part_of(each) for each in arguments if each is not None))
+
+
+def _part_of(argument: Any) -> Hashable:
     """Return a state's identity, a whole number, or the bits of what was done or shown."""
     if isinstance(argument, PlanningState):
         return id(argument)
