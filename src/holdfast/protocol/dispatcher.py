@@ -52,31 +52,20 @@ class Dispatcher(DecisionSource):
     """Gets one question at a time answered by the services.
 
     It lives as long as the run.
-
-    Parameters
-    ----------
-    services : sequence of str
-        The cloud's services in order of preference, at least one.
-    local_service_name : str or None
-        Name of the local service; None if there is none.
-    secret : bytes
-        Known only to this robot; selects the answers that are recomputed.
-    distrusted : collection of str
-        Services that answered wrongly earlier in this run.
     """
 
     def __init__(
         self,
-        services: Sequence[str],
-        local_service_name: str | None,
+        services: Sequence[str],  # the cloud's services in order of preference, at least one
+        local_service_name: str | None,  # name of the local service; None if there is none
         offload: OffloadSettings,
         recovery_settings: RecoverySettings,
         session: bytes,
         epoch: int,
         session_configuration: SessionConfiguration,
         problem: Problem,
-        secret: bytes,
-        distrusted: Collection[str] = (),
+        secret: bytes,  # known only to this robot; selects the answers that are recomputed
+        distrusted: Collection[str] = (),  # services that answered wrongly earlier in this run
     ) -> None:
         super().__init__()
         timeout_s = 1e-3 * offload.detection_timeout_ms

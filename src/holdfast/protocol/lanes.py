@@ -60,25 +60,19 @@ class Lanes:
     ----------
     workers : int
         Brief tasks that may run at a time.
-
-    Attributes
-    ----------
-    max_running : int
-        Tasks that may run at a time.
-    limits_s : tuple of float
-        Bounds on the estimated time of a task in each lane.
     """
 
     def __init__(self, workers: int, limits: ServiceLimits) -> None:
         self._limits = limits
         fewer = max(1, workers - 1)
-        self.max_running = workers + 4 * fewer
+        self.max_running = workers + 4 * fewer  # tasks that may run at a time
         self._fewer = fewer
         self._lanes = [
             *(RequestQueue(fewer, limits, room=0.5) for _ in (NEW, FIRST)),
             *(RequestQueue(number, limits) for number in (workers, fewer, fewer)),
         ]
         brief_s = limits.max_brief_s
+        # Bounds on the estimated time of a task in each lane.
         self.limits_s = (brief_s, brief_s, brief_s, limits.max_medium_s, limits.max_decision_s)
 
     @property

@@ -24,13 +24,7 @@ _MOST_TIME = 8
 
 
 class RestartPolicy:
-    """Decides when the local service's process is (re)started.
-
-    Attributes
-    ----------
-    number : int
-        Of the last launch; 0 before the first.
-    """
+    """Decides when the local service's process is (re)started."""
 
     def __init__(self, settings: RecoverySettings) -> None:
         self._timeout_s = 1e-3 * settings.launch_timeout_ms
@@ -40,7 +34,7 @@ class RestartPolicy:
         self._launch_after: float | None = None
         self._failures = 0
         self._late = 0
-        self.number = 0
+        self.number = 0  # of the last launch; 0 before the first
 
     @property
     def pending(self) -> bool:

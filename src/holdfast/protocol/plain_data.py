@@ -54,12 +54,9 @@ def check_plain_data(sections: Iterable[bytes], where: str) -> None:
 
     ``where`` names the sections in errors.
 
-    Raises
-    ------
-    MessageError
-        ``malformed``: a value or key that a file does not have, or more than
-        :data:`MAX_CONFIGURATION_DEPTH` levels. ``too_large``: more than
-        :data:`MAX_CONFIGURATION_VALUES` in all sections.
+    Raises MessageError: ``malformed``: a value or key that a file does not have, or more than
+    :data:`MAX_CONFIGURATION_DEPTH` levels. ``too_large``: more than
+    :data:`MAX_CONFIGURATION_VALUES` in all sections.
     """
     count = 0
     for data in sections:

@@ -56,20 +56,13 @@ def same_actions(first: Sequence[FloatArray], second: Sequence[FloatArray]) -> b
 
 
 class WrongAnswer(NamedTuple):
-    """A service's answer that differs from the own planner's.
-
-    Attributes
-    ----------
-    kind : {"task", "sensing"}
-    step : int
-        Of the first action that differs.
-    answered, own : str
-        The service's action, and the own planner's; of sensing actions with the state's digest.
-    """
+    """A service's answer that differs from the own planner's."""
 
     service: str
-    kind: str
-    step: int
+    kind: str  # task or sensing
+    step: int  # of the first action that differs
+    # answered, own: the service's action, and the own planner's; of sensing actions with the
+    # state's digest.
     answered: str
     own: str
 
@@ -80,27 +73,6 @@ class Question:
     The question itself never changes. Its answer is written by
     :class:`~holdfast.protocol.verification.Verification` where services answer, else by
     :class:`InProcessSource`; the robot writes ``needed_at`` and ``num_ordered``.
-
-    Attributes
-    ----------
-    inputs, num_inputs
-        The latest of this trial, and how many there were.
-    task_count : int
-        Task actions in the answer.
-    sensing_step : int or None
-        Step of the answer's sensing action; None if it is too far away.
-    needed_at : float or None
-        Since when the robot waits for the answer; None if it does not.
-    num_ordered : int
-        Task actions of the answer that are performed or ordered.
-    task_actions, sensing
-        What the robot follows; None until it arrives.
-    check_decided : bool
-        Whether a check by the own planner was ordered, or left out.
-    own : OwnAnswer or None
-        The own planner's answer.
-    differing : list of WrongAnswer
-        Answers that differ from it, until the own planner has decided a second time.
     """
 
     def __init__(
@@ -113,21 +85,26 @@ class Question:
     ) -> None:
         self.state = state
         self.digest = digest[:DIGEST_SIZE]
+        # inputs, num_inputs: the latest of this trial, and how many there were.
         self.inputs = inputs
         self.num_inputs = num_inputs
+        # Since when the robot waits for the answer; None if it does not.
         self.needed_at: float | None = None
-        self.num_ordered = 0
+        self.num_ordered = 0  # task actions of the answer that are performed or ordered
+        # task_actions, sensing: what the robot follows; None until it arrives.
         self.task_actions: Sequence[FloatArray] | None = None
         self.sensing: SensingAnswer | None = None
         self.task_provenance: Provenance | None = None
         self.sensing_provenance: Provenance | None = None
-        self.check_decided = False
-        self.own: OwnAnswer | None = None
+        self.check_decided = False  # whether a check by the own planner was ordered, or left out
+        self.own: OwnAnswer | None = None  # the own planner's answer
+        # Answers that differ from it, until the own planner has decided a second time.
         self.differing: list[WrongAnswer] = []
         self._checkpoint: bytes | None = None
+        # Step of the answer's sensing action; None if it is too far away.
         self.sensing_step: int | None
         if planner.needs_sensing(state):
-            self.task_count = 0
+            self.task_count = 0  # task actions in the answer
             self.sensing_step = state.step
         elif planner.moves_show:
             self.task_count = 1
@@ -165,10 +142,7 @@ class Question:
     def read_tasks(self, reply: TaskAnswer, action_size: int) -> list[FloatArray]:
         """Return the task actions of a reply.
 
-        Raises
-        ------
-        MessageError
-            If the reply cannot answer this question.
+        Raises MessageError if the reply cannot answer this question.
         """
         if reply.count != self.task_count:
             raise MessageError(
@@ -180,10 +154,7 @@ class Question:
     def check_sensing(self, reply: SensingAnswer, num_choices: int) -> None:
         """Check the sensing action of a reply.
 
-        Raises
-        ------
-        MessageError
-            If the reply cannot answer this question.
+        Raises MessageError if the reply cannot answer this question.
         """
         if reply.step != self.sensing_step:
             raise MessageError(
@@ -202,27 +173,16 @@ class DecisionSource:
     :class:`~holdfast.protocol.dispatcher.Dispatcher` asks services; :class:`InProcessSource` asks
     only the robot's own planner. What only services need does nothing here: there is no service to
     be lost, timed or verified.
-
-    Attributes
-    ----------
-    effects : Effects
-        To be carried out in order; the robot appends its own.
-    question : Question or None
-        The current question, answered or not.
-    tracker : StatusTracker
-        Which service decides.
-    holding_since : float or None
-        Since when the robot holds still because no service is usable.
-    stopped : bool
-        Whether this source has stopped the run.
     """
 
     def __init__(self) -> None:
+        # To be carried out in order; the robot appends its own.
         self.effects: Effects[RobotEffect] = Effects()
-        self.question: Question | None = None
-        self.tracker = StatusTracker()
+        self.question: Question | None = None  # the current question, answered or not
+        self.tracker = StatusTracker()  # which service decides
+        # Since when the robot holds still because no service is usable.
         self.holding_since: float | None = None
-        self.stopped = False
+        self.stopped = False  # whether this source has stopped the run
 
     @property
     def num_unverified(self) -> int:

@@ -68,13 +68,6 @@ class FailureDetector:
     ----------
     detection_timeout_s : float
         Longest accepted silence while something is awaited.
-
-    Attributes
-    ----------
-    incarnation : str or None
-        Of the present process; None if the service is absent. ``seen`` says if it ever was present.
-    suspicion : str or None
-        Why the service is not trusted; None if it is.
     """
 
     def __init__(self, detection_timeout_s: float) -> None:
@@ -83,8 +76,10 @@ class FailureDetector:
         self._longest_silence_s = 0.0
         self._awaited = 0
         self._last_sign = 0.0
+        # Of the present process; None if the service is absent. ``seen`` says if it ever was
+        # present.
         self.incarnation: str | None = None
-        self.suspicion: str | None = None
+        self.suspicion: str | None = None  # why the service is not trusted; None if it is
         self.seen = False
 
     @property
@@ -369,32 +364,16 @@ class Replica:
 
 
 class ReplicaSet:
-    """All services that a robot may ask.
-
-    Parameters
-    ----------
-    cloud : sequence of str
-        Names in order of preference.
-    local : str or None
-        Name of the local service.
-    startup_timeout_s : float
-        For so long after :meth:`start`, absent services may be coming up.
-    distrusted : collection of str
-        Services that answered wrongly earlier in this run.
-
-    Attributes
-    ----------
-    startup_until : float or None
-        When the services must have come up.
-    """
+    """All services that a robot may ask."""
 
     def __init__(
         self,
-        cloud: Sequence[str],
-        local: str | None,
+        cloud: Sequence[str],  # names in order of preference
+        local: str | None,  # name of the local service
         detection_timeout_s: float,
+        # For so long after :meth:`start`, absent services may be coming up.
         startup_timeout_s: float = 0.0,
-        distrusted: Collection[str] = (),
+        distrusted: Collection[str] = (),  # services that answered wrongly earlier in this run
     ) -> None:
         timeout_s = detection_timeout_s
         self.cloud = [Replica(name, timeout_s, late_after_s=timeout_s) for name in cloud]
@@ -409,7 +388,7 @@ class ReplicaSet:
                     "run; name another service, or begin anew in another directory"
                 )
         self._startup_timeout_s = startup_timeout_s
-        self.startup_until: float | None = None
+        self.startup_until: float | None = None  # when the services must have come up
 
     def __iter__(self) -> Iterator[Replica]:
         return iter(self._by_name.values())

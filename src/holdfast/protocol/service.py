@@ -75,28 +75,18 @@ _NO_ROOM_RETRY_MS = 100.0
 
 
 class Service:
-    """Answers the requests of many robots.
-
-    Parameters
-    ----------
-    make_problem : callable
-        Builds the problem of a session configuration; raises the robot's mistakes as errors of
-        :mod:`holdfast.errors`. Jobs call it, several at a time.
-    workers : int
-        Brief jobs that may run at a time.
-    describe_error : callable, optional
-        Turns an error of a problem's code into a message.
-    pricing : Pricing, optional
-        How fast this machine is.
-    """
+    """Answers the requests of many robots."""
 
     def __init__(
         self,
+        # Builds the problem of a session configuration; raises the robot's mistakes as errors of
+        # :mod:`holdfast.errors`. Jobs call it, several at a time.
         make_problem: Callable[[SessionConfiguration], Problem],
-        workers: int,
+        workers: int,  # brief jobs that may run at a time
         limits: ServiceLimits | None = None,
+        # Turns an error of a problem's code into a message.
         describe_error: Callable[[BaseException], str] | None = None,
-        pricing: Pricing = ANY_MACHINE,
+        pricing: Pricing = ANY_MACHINE,  # how fast this machine is
     ) -> None:
         if workers < 1:
             raise InvalidValueError(f"workers {workers}: a service needs at least 1")
@@ -144,23 +134,15 @@ class Service:
 
     def receive(
         self,
-        call: int,
+        call: int,  # unique; used in effects
+        # What :func:`~holdfast.protocol.messages.decode_request` returned or raised.
         request: Request | MessageError,
         size: int,
         now: float,
+        # Name in the robot's verified certificate. It reaches only sessions of this owner.
         owner: Owner = None,
     ) -> list[ServiceEffect]:
-        """Handle a request, which callers decode outside their lock.
-
-        Parameters
-        ----------
-        call : int
-            Unique; used in effects.
-        request : Request or MessageError
-            What :func:`~holdfast.protocol.messages.decode_request` returned or raised.
-        owner : str or None, optional
-            Name in the robot's verified certificate. It reaches only sessions of this owner.
-        """
+        """Handle a request, which callers decode outside their lock."""
         if isinstance(request, MessageError):
             self._calls.send_refused(call, 0, request.code, str(request))
             return self._effects.take()

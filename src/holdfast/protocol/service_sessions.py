@@ -85,36 +85,20 @@ class PendingTask:
     The service creates and drops tasks; :class:`RequestQueue` writes ``urgent``, ``running`` and
     ``started_at``, and has a waiting task carry a newer request; :class:`WaitingCalls` writes
     ``calls``.
-
-    Parameters
-    ----------
-    digest : bytes
-        Of the part's state.
-    request, state
-        The request names the state; without one (the robot has not asked yet) it is ``state``.
-    size : int
-        Bytes of the request.
-    since : float
-        When it was queued; of one that carries a newer request, the first of them.
-
-    Attributes
-    ----------
-    lane : int
-        Where it waits and runs (:mod:`~holdfast.protocol.lanes`).
-    num_bytes : float
-        Estimated memory, unless it is brief.
     """
 
     def __init__(
         self,
         session: Session,
-        digest: bytes,
+        digest: bytes,  # of the part's state
         *,
         sensing: bool,
-        since: float,
+        since: float,  # when it was queued; of one that carries a newer request, the first of them
+        # request, state: the request names the state; without one (the robot has not asked yet) it
+        # is ``state``.
         request: Request | None = None,
         state: PlanningState | None = None,
-        size: int = 0,
+        size: int = 0,  # bytes of the request
     ) -> None:
         self.session = session
         self.digest = digest
@@ -126,8 +110,9 @@ class PendingTask:
         self.slot = PREFETCHED if request is None else REQUESTED
         self.urgent = request is not None
         self.calls: dict[int, WaitingCall] = {}
+        # Where it waits and runs (:mod:`~holdfast.protocol.lanes`).
         self.lane = session.lane_of(request)
-        self.num_bytes = 0.0
+        self.num_bytes = 0.0  # estimated memory, unless it is brief
         self.cost_s = self._expected_s()
         self.running = False
         self.started_at = since
@@ -190,40 +175,6 @@ class Session:
     :class:`SessionTable` writes ``served``, ``closed`` and ``num_bytes``, and drops states and
     answers; :class:`~holdfast.protocol.service.Service` and
     :class:`~holdfast.protocol.lanes.Lanes` write all else.
-
-    Attributes
-    ----------
-    number : int
-        Of the newest request in this epoch; -1 before the first.
-    configuration : bytes
-        Packed session configuration.
-    problem_key : bytes
-        Digest that identifies the problem among those kept for reuse.
-    built, built_in : bool
-        Whether the problem was built before, and whether it is part of holdfast.
-    known : ProblemCost or None
-        What its problem's functions take, if they were measured for another session of its owner.
-    is_brief : bool
-        Whether no decision was estimated to be too long for the lane of brief ones.
-    overran : bool
-        Whether its last decision took much longer than was estimated.
-    restored_trial : int or None
-        The last trial of which a state came from a checkpoint.
-    price : Price or None
-        What its decisions cost; None before the first.
-    planning : PlanningSettings
-        With the threads that a decision has when it is computed alone.
-    served : bool
-        Whether the robot got an answer.
-    acknowledged, ahead : PlanningState or None
-        The state last asked about, and that at the next sensing step.
-    answers, pending : dict
-        Cached parts of answers, oldest first, and tasks that wait or run, by the digest of their
-        state.
-    num_bytes : int
-        Counted size of states and answers.
-    used_at : float
-        Time of the last request or result.
     """
 
     def __init__(
@@ -236,11 +187,12 @@ class Session:
     ) -> None:
         self.key = key
         self.epoch = request.epoch
-        self.number = -1
+        self.number = -1  # of the newest request in this epoch; -1 before the first
         # Packed, it is one object instead of thousands, all of which the collector would look at
         # again and again while nobody else has the interpreter.
         self.configuration = pack_configuration(configuration)
-        # With its code's digests: a robot with other code must be refused.
+        # Identifies the problem among those kept for reuse. With its code's digests: a robot with
+        # other code must be refused.
         self.problem_key = _digest_of(
             (
                 configuration.problem,
@@ -250,27 +202,35 @@ class Session:
                 configuration.state_space_planner,
             )
         )
+        # built, built_in: whether the problem was built before, and whether it is part of holdfast.
         self.built = False
+        # What its problem's functions take, if they were measured for another session of its owner.
         self.known: ProblemCost | None = None
+        # Whether no decision was estimated to be too long for the lane of brief ones.
         self.is_brief = True
-        self.overran = False
+        self.overran = False  # whether its last decision took much longer than was estimated
+        # The last trial of which a state came from a checkpoint.
         self.restored_trial: int | None = None
-        self.price: Price | None = None
+        self.price: Price | None = None  # what its decisions cost; None before the first
         self.built_in = configuration.problem in BUILT_IN
         # The number of threads changes no result, so the service may choose it.
         most = min(configuration.planning.active_sensing.num_cores, _MAX_THREADS)
+        # With the threads that a decision has when it is computed alone.
         self.planning = with_cores(configuration.planning, most)
         self.seed = configuration.seed
-        self.served = False
+        self.served = False  # whether the robot got an answer
+        # acknowledged, ahead: the state last asked about, and that at the next sensing step.
         self.acknowledged: PlanningState | None = None
         self.ahead: PlanningState | None = None
         self.ahead_digest = b""
+        # answers, pending: cached parts of answers, oldest first, and tasks that wait or run, by
+        # the digest of their state.
         self.answers: OrderedDict[bytes, CachedAnswer] = OrderedDict()
         self.pending: dict[bytes, PendingTask] = {}
         self.task_time = task_time
         self.sensing_time = sensing_time
-        self.num_bytes = 0
-        self.used_at = 0.0
+        self.num_bytes = 0  # counted size of states and answers
+        self.used_at = 0.0  # time of the last request or result
         self.closed = False
 
     @property

@@ -54,25 +54,16 @@ class Verification:
     """Takes answers, has some recomputed and finds the service that was wrong.
 
     It alone writes into the answer of a question that services answer.
-
-    Parameters
-    ----------
-    share : float
-        Of the questions that services answer, from 0 to 1.
-    secret : bytes
-        Of the robot; selects the questions, together with their digests.
-    exempt : str or None
-        A service that is not sampled: the local one, which runs the same code on the same machine.
-    planner : Planner
-        Computes the task actions of a service that are outside the limits.
     """
 
     def __init__(
         self,
-        share: float,
-        secret: bytes,
+        share: float,  # of the questions that services answer, from 0 to 1
+        secret: bytes,  # of the robot; selects the questions, together with their digests
+        # A service that is not sampled: the local one, which runs the same code on the same
+        # machine.
         exempt: str | None,
-        planner: Planner,
+        planner: Planner,  # computes the task actions of a service that are outside the limits
         effects: Effects[RobotEffect],
     ) -> None:
         self._share = share
@@ -100,10 +91,7 @@ class Verification:
     ) -> None:
         """Take task actions of a service; the robot follows the first that come.
 
-        Raises
-        ------
-        HoldfastError
-            If they are outside the limits and the own planner fails.
+        Raises HoldfastError if they are outside the limits and the own planner fails.
         """
         actions, provenance = self._within_limits(question, actions, provenance)
         followed = question.task_actions

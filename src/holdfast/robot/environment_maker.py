@@ -43,37 +43,21 @@ class EnvironmentMaker:
     - ``performed``: the task actions that were performed in this trial before that. A world that
       has died with the process performs them again.
 
-    Parameters
-    ----------
-    name : str
-        For messages.
-    timeout_ms : float
-        Longest time that one call of the environment may take.
-    environment_class : type, optional
-        The user's class; None for a world that is simulated from the problem.
-    arguments : mapping, optional
-        Keyword arguments for the class.
-    sense_in_background : bool
-        Whether the robot goes on while it senses.
-    max_missing_in_a_row : int
-        How often in a row sensing may give no reading.
-
-    Raises
-    ------
-    ConfigurationError
-        If the class does not take the arguments.
+    Raises ConfigurationError if the class does not take the arguments.
     """
 
     def __init__(
         self,
-        name: str,
+        name: str,  # for messages
         problem: Problem,
         seed: int,
-        timeout_ms: float,
+        timeout_ms: float,  # longest time that one call of the environment may take
+        # The user's class; None for a world that is simulated from the problem.
         environment_class: type[Any] | None = None,
-        arguments: Mapping[str, Any] | None = None,
+        arguments: Mapping[str, Any] | None = None,  # keyword arguments for the class
         *,
-        sense_in_background: bool = False,
+        sense_in_background: bool = False,  # whether the robot goes on while it senses
+        # How often in a row sensing may give no reading.
         max_missing_in_a_row: int = EnvironmentSettings().max_missing_in_a_row,
     ) -> None:
         self.name = name
@@ -134,10 +118,7 @@ class EnvironmentMaker:
 def load_environment(configuration: Configuration) -> EnvironmentMaker:
     """Find the environment that a configuration names.
 
-    Raises
-    ------
-    ConfigurationError
-        If the class cannot be imported or does not take the arguments.
+    Raises ConfigurationError if the class cannot be imported or does not take the arguments.
     """
     settings = configuration.environment
     seed, timeout_ms = configuration.simulator.seed, settings.timeout_ms

@@ -30,23 +30,18 @@ class InProcessPlanner:
     """Computes the parts of an answer; all methods are called on the loop's thread.
 
     ``deliver`` and ``failed`` (for an error of the problem's code) are called there, too.
-
-    Parameters
-    ----------
-    make_planner : callable
-        Builds the planner with its own instance of the problem, because the loop's thread uses the
-        robot's instance at the same time. Called on a thread, with the first question.
-    may_be_brief : bool
-        Whether work that was brief before is expected to be brief again. User code may take any
-        time at any call.
     """
 
     def __init__(
         self,
+        # Builds the planner with its own instance of the problem, because the loop's thread uses
+        # the robot's instance at the same time. Called on a thread, with the first question.
         make_planner: Callable[[], Planner],
         deliver: Callable[[Planned], None],
         failed: Callable[[BaseException], None],
         *,
+        # Whether work that was brief before is expected to be brief again. User code may take any
+        # time at any call.
         may_be_brief: bool,
     ) -> None:
         self._make_planner = make_planner

@@ -46,11 +46,8 @@ class Links(NamedTuple):
 def check_services(configuration: Configuration, source: str | None = "") -> None:
     """Check what can be checked of the services before a run: endpoints and credentials.
 
-    Raises
-    ------
-    HoldfastError
-        If one of them cannot be used; the message names its key, after ``source``. None leaves the
-        key out, too, of services that were not given by it.
+    Raises HoldfastError if one of them cannot be used; the message names its key, after ``source``.
+    None leaves the key out, too, of services that were not given by it.
     """
     offload = configuration.offload
     if not offload.services:
@@ -76,10 +73,7 @@ def check_services(configuration: Configuration, source: str | None = "") -> Non
 def make_links(configuration: Configuration, log_path: Path | None, events: EventSink) -> Links:
     """Make the links that a configuration asks for.
 
-    Raises
-    ------
-    HoldfastError
-        If an endpoint or the credentials cannot be used.
+    Raises HoldfastError if an endpoint or the credentials cannot be used.
     """
     offload = configuration.offload
     if not offload.services:

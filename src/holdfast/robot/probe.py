@@ -129,10 +129,7 @@ class AddressPath(LinkOwner):
     async def ask(self, request: Request) -> list[Reply]:
         """Send a request under a number of its own; return all replies but progress reports.
 
-        Raises
-        ------
-        HoldfastError
-            If the link ends, or what comes is no reply.
+        Raises HoldfastError if the link ends, or what comes is no reply.
         """
         replies: list[Reply] = []
         number = next(self._numbers)

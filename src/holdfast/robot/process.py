@@ -125,37 +125,26 @@ _Happening: TypeAlias = (
 
 
 class RobotProcess:
-    """Runs the trials of a configuration, one after another.
-
-    Parameters
-    ----------
-    links : Links
-        Their transport is closed at the end. Without one the robot's own planner decides.
-    on_result, on_timing, on_verified : callable
-        Store the result of each trial, the times of each decision, and the result of each verified
-        answer.
-    rate_hz : float or None
-        Task actions a second; None acts as soon as possible.
-    distrusted : collection of str
-        Services that answered wrongly earlier in the run.
-    on_order : callable
-        Gets each order to the environment and the state in which it was decided, on the event loop;
-        it must return at once.
-    """
+    """Runs the trials of a configuration, one after another."""
 
     def __init__(
         self,
         configuration: Configuration,
+        # Their transport is closed at the end. Without one the robot's own planner decides.
         links: Links,
         journal: StepJournal,
         maker: EnvironmentMaker,
         events: EventSink,
+        # on_result, on_timing, on_verified: store the result of each trial, the times of each
+        # decision, and the result of each verified answer.
         on_result: Callable[[TrialResult], None],
         on_timing: Callable[[Timing], None],
         on_verified: Callable[[VerificationNoted], None],
-        rate_hz: float | None = None,
-        distrusted: Collection[str] = (),
+        rate_hz: float | None = None,  # task actions a second; None acts as soon as possible
+        distrusted: Collection[str] = (),  # services that answered wrongly earlier in the run
         watch: RobotWatch | None = None,
+        # Gets each order to the environment and the state in which it was decided, on the event
+        # loop; it must return at once.
         on_order: Callable[[PlanningState, Act | Sense], None] | None = None,
     ) -> None:
         self._watch = watch
@@ -264,13 +253,10 @@ class RobotProcess:
     def run(self, finished: Collection[int]) -> None:
         """Run all trials that are not finished, on a new event loop.
 
-        Raises
-        ------
-        HoldfastError
-            If the robot holds still and cannot go on; the journal has everything to resume.
-        KeyboardInterrupt
-            After Ctrl-C or another ending signal, once the journal is written; or what the caller's
-            handler of that signal raises. Other threads than the main one use :meth:`pause`.
+        Raises HoldfastError if the robot holds still and cannot go on; the journal has everything
+        to resume. After Ctrl-C or another ending signal, once the journal is written,
+        KeyboardInterrupt or what the caller's handler of that signal raises. Other threads than the main one
+        use :meth:`pause`.
         """
         self._finished = set(finished)
         self._loop = loop = asyncio.new_event_loop()

@@ -47,10 +47,7 @@ def answer_in(replies: Iterable[Reply]) -> set[object]:
 def reference_decisions(configuration: Configuration) -> list[ReferenceDecision]:
     """Decide in a simulated world: twice, if the first decision leads to a sensing action.
 
-    Raises
-    ------
-    HoldfastError
-        If the problem's code fails.
+    Raises HoldfastError if the problem's code fails.
     """
     decisions: list[ReferenceDecision] = []
 

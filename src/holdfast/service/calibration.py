@@ -66,11 +66,8 @@ def measure_problem(problem: Problem) -> ProblemCost:
 
     A function that is slow is asked once, of few states: a robot chooses the problem's model.
 
-    Raises
-    ------
-    HoldfastError
-        If no initial state can be drawn. The decision that is asked for would fail as well, but
-        only after as many attempts for each of its particles.
+    Raises HoldfastError if no initial state can be drawn. The decision that is asked for would fail
+    as well, but only after as many attempts for each of its particles.
     """
     own: dict[str, Any] = {}
     refused: HoldfastError | None = None

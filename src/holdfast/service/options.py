@@ -177,10 +177,7 @@ class ServeOptions(Options):
 def parse_options(arguments: Sequence[str]) -> ServeOptions:
     """Read what follows ``serve`` on the command line.
 
-    Raises
-    ------
-    HoldfastError
-        If an option cannot be used, or two do not go together.
+    Raises HoldfastError if an option cannot be used, or two do not go together.
     """
     options = ServeOptions.parse("serve", arguments)
     if options.processes > 1 and options.until_stdin_closes:
@@ -195,13 +192,9 @@ def parse_options(arguments: Sequence[str]) -> ServeOptions:
 def checked_endpoints(options: ServeOptions) -> list[Endpoint]:
     """Return where to listen.
 
-    Raises
-    ------
-    TransportError
-        If an endpoint is malformed or cannot be used so, or is one that other machines can reach
-        although they do not have to prove who they are; the message names the option.
-    InvalidValueError
-        If health or metrics are to be offered at the same port.
+    Raises TransportError if an endpoint is malformed or cannot be used so, or is one that other
+    machines can reach although they do not have to prove who they are; the message names the
+    option; InvalidValueError if health or metrics are to be offered at the same port.
     """
     from holdfast.transport.endpoints import check_endpoint
 

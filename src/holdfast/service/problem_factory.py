@@ -55,14 +55,9 @@ class ProblemFactory:
     def __call__(self, session_configuration: SessionConfiguration) -> Problem:
         """Build the problem that an opening names.
 
-        Raises
-        ------
-        UnknownProblemError
-            If this service does not know it.
-        OtherCodeError
-            If the robot's holdfast or problem is other code than this service's.
-        ConfigurationError
-            If its settings do not fit.
+        Raises UnknownProblemError if this service does not know it; OtherCodeError if the robot's
+        holdfast or problem is other code than this service's; ConfigurationError if its settings do
+        not fit.
         """
         with self._lock:
             return self._build(session_configuration)

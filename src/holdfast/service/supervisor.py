@@ -132,10 +132,7 @@ class Supervisor:
         read their credentials again unless it is one of the ``ending`` signals. ``ready`` is called
         once, when all of them serve.
 
-        Raises
-        ------
-        ServiceProcessError
-            If one of them cannot serve; the message says why.
+        Raises ServiceProcessError if one of them cannot serve; the message says why.
         """
 
         def stop(number: signal.Signals) -> None:

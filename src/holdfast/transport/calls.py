@@ -46,10 +46,7 @@ class CallTable:
     def begin(self, number: int, peer: object) -> bool:
         """Add a call to a peer; return False if the table is closed.
 
-        Raises
-        ------
-        InvalidValueError
-            If a call of this number is in flight.
+        Raises InvalidValueError if a call of this number is in flight.
         """
         if self._deliver is None:
             return False

@@ -30,11 +30,6 @@ class RobotTransport(Protocol):
         already there is delivered as :class:`~holdfast.protocol.events.ServiceAppeared` as well.
         One that is gone is delivered as :class:`~holdfast.protocol.events.ServiceVanished`, then
         the ends of its calls.
-
-        Raises
-        ------
-        TransportError
-            If the robot is to listen somewhere and cannot; the message names the endpoint.
         """
         ...
 
@@ -95,10 +90,7 @@ class ServiceTransport(Protocol):
     async def start(self, deliver: Callable[[IncomingCall], None]) -> None:
         """Listen and deliver calls; returns when robots can connect.
 
-        Raises
-        ------
-        TransportError
-            If it cannot listen there; the message names the endpoint.
+        Raises TransportError if it cannot listen there; the message names the endpoint.
         """
         ...
 

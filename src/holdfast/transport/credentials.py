@@ -42,13 +42,10 @@ def load_credentials(
 
     It warns if others can read the key, or the certificate expires soon.
 
-    Raises
-    ------
-    CredentialsError
-        If the peer would refuse them: a file is missing, unreadable or malformed, the key belongs
-        to another certificate, the certificate is not valid now, was signed by another authority,
-        is for the other role, or has not exactly one common name. The kind is
-        CredentialsGoneError for what is missing, unreadable, expired or revoked.
+    Raises CredentialsError if the peer would refuse them: a file is missing, unreadable or
+    malformed, the key belongs to another certificate, the certificate is not valid now, was signed
+    by another authority, is for the other role, or has not exactly one common name. The kind is
+    CredentialsGoneError for what is missing, unreadable, expired or revoked.
     """
     directory = Path(directory)
     files = TlsFiles.of(directory)

@@ -138,10 +138,7 @@ class DatagramCipher:
     def encrypt(self, message: bytes) -> bytes:
         """Return a datagram, with the next counter.
 
-        Raises
-        ------
-        KeysExhaustedError
-            After :data:`MAX_DATAGRAMS`.
+        Raises KeysExhaustedError after :data:`MAX_DATAGRAMS`.
         """
         counter = self._counter
         if counter >= MAX_DATAGRAMS:

@@ -60,10 +60,7 @@ def reported_errors(opened: socket.socket) -> Iterator[tuple[bytes, bool]]:
 class DatagramSocket:
     """A socket at one address, on the port of the stream if that is free.
 
-    Raises
-    ------
-    OSError
-        If the system has none left.
+    Raises OSError if the system has none left.
     """
 
     def __init__(self, address: Any) -> None:

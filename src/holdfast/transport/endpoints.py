@@ -152,10 +152,7 @@ class Endpoint(NamedTuple):
 def parse_endpoint(text: str) -> Endpoint:
     """Read ``PROTOCOL/HOST:PORT``, with an IPv6 address in brackets, or another endpoint.
 
-    Raises
-    ------
-    TransportError
-        If it is none, or its protocol is not in :data:`SCHEMES`.
+    Raises TransportError if it is none, or its protocol is not in :data:`SCHEMES`.
     """
     protocol, slash, place = text.partition("/")
     if protocol[:-1] in SCHEMES and protocol.endswith(":") and place.startswith("/"):
@@ -205,10 +202,7 @@ def parse_host(host: str, before: str = "") -> str:
 
     ``before`` precedes the host in the examples of error messages.
 
-    Raises
-    ------
-    TransportError
-        If it is malformed.
+    Raises TransportError if it is malformed.
     """
     if host.startswith("[") and host.endswith("]"):
         inner = host[1:-1]
@@ -239,10 +233,7 @@ def parse_host(host: str, before: str = "") -> str:
 def check_endpoint(text: str, role: Role) -> Endpoint:
     """Read the endpoint at which a service listens, or to which a robot connects.
 
-    Raises
-    ------
-    TransportError
-        If it is malformed, or has port 0 to connect to.
+    Raises TransportError if it is malformed, or has port 0 to connect to.
     """
     endpoint = parse_endpoint(text)
     if role == "robot" and endpoint.port == 0 and not endpoint.is_local_socket:
@@ -265,10 +256,7 @@ def check_name(what: str, name: str) -> None:
 def check_credentials(endpoint: Endpoint, tls: TlsFiles | None) -> None:
     """Check that there are credentials exactly where the protocol needs them.
 
-    Raises
-    ------
-    TransportError
-        If they are missing, or would not be used.
+    Raises TransportError if they are missing, or would not be used.
     """
     if endpoint.is_encrypted and tls is None:
         raise TransportError(

@@ -103,13 +103,7 @@ def read_goodbye(payload: bytes) -> str:
 
 
 def decode_hello(payload: bytes) -> Hello:
-    """Decode the peer's hello.
-
-    Raises
-    ------
-    FrameError
-        If it is of another version, or malformed.
-    """
+    """Decode the peer's hello; raise FrameError if it is of another version, or malformed."""
     version = _decoded(payload, _Version)
     if version.version != WIRE_VERSION:
         raise FrameError(

@@ -157,31 +157,18 @@ class MemoryBudget:
 
 
 class LinkSettings:
-    """What all links of one end have in common.
-
-    Parameters
-    ----------
-    hello : callable
-        Returns this end's first bytes.
-    lease_ms : float
-        This end sends something several times in this time.
-    pauses_for_readers : bool
-        Whether reading pauses while the other end does not read.
-    max_unsent_bytes : float
-        Bound on the bytes of all links together that wait for the other ends to read.
-    pause_s : float
-        Of the :class:`FairScheduler`.
-    """
+    """What all links of one end have in common."""
 
     def __init__(
         self,
-        hello: Callable[[], bytes],
-        lease_ms: float,
+        hello: Callable[[], bytes],  # returns this end's first bytes
+        lease_ms: float,  # this end sends something several times in this time
         max_message_bytes: int,
         *,
-        pauses_for_readers: bool,
+        pauses_for_readers: bool,  # whether reading pauses while the other end does not read
+        # Bound on the bytes of all links together that wait for the other ends to read.
         max_unsent_bytes: float = math.inf,
-        pause_s: float = 0.0,
+        pause_s: float = 0.0,  # of the :class:`FairScheduler`
     ) -> None:
         self.hello = hello
         self.lease_ms = lease_ms

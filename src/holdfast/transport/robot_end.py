@@ -61,43 +61,29 @@ def _unheard(_name: str, **_fields: object) -> None:
 class StreamRobotTransport:
     """The robot's end: see :class:`~holdfast.transport.contract.RobotTransport`.
 
-    Parameters
-    ----------
-    services : mapping of str to str or None
-        The endpoint of each service, by the robot's name for it. None for one that the robot
-        launches, whose connections come by :meth:`attach`.
-    name : str
-        The robot's; may be empty.
-    lease_ms : float
-        After this much silence services consider this robot lost. A service's own lease is in its
-        hello.
-    max_message_bytes : int
-        A larger request is refused here, a larger reply is dropped.
-    tls : TlsFiles or None
-        The robot's credentials, for ``tls`` and ``udp``.
-    on_event : callable
-        Called for the log: ``defect`` with ``service``, ``reason`` and ``traceback``, when an
-        exception that no code here expects has ended a link; ``unreachable`` with ``service`` and
-        ``reason``, the rest of a sentence about a service that cannot be reached, refuses this
-        robot or is another one (recent reasons are not repeated until it has appeared);
-        ``no_datagrams`` with ``service`` and ``reason``, once for each; ``credentials`` with
-        ``reason``, when replaced ones cannot be used.
-
-    Raises
-    ------
-    TransportError
-        If an endpoint, a name or the credentials cannot be used.
+    Raises TransportError if an endpoint, a name or the credentials cannot be used.
     """
 
     def __init__(
         self,
+        # The endpoint of each service, by the robot's name for it. None for one that the robot
+        # launches, whose connections come by :meth:`attach`.
         services: Mapping[str, str | None],
         *,
-        name: str = "",
+        name: str = "",  # the robot's; may be empty
         incarnation: str = "0",
+        # After this much silence services consider this robot lost. A service's own lease is in its
+        # hello.
         lease_ms: float = 400.0,
+        # A larger request is refused here, a larger reply is dropped.
         max_message_bytes: int = DEFAULT_MAX_MESSAGE_BYTES,
-        tls: TlsFiles | None = None,
+        tls: TlsFiles | None = None,  # the robot's credentials, for ``tls`` and ``udp``
+        # Called for the log: ``defect`` with ``service``, ``reason`` and ``traceback``, when an
+        # exception that no code here expects has ended a link; ``unreachable`` with ``service`` and
+        # ``reason``, the rest of a sentence about a service that cannot be reached, refuses this
+        # robot or is another one (recent reasons are not repeated until it has appeared);
+        # ``no_datagrams`` with ``service`` and ``reason``, once for each; ``credentials`` with
+        # ``reason``, when replaced ones cannot be used.
         on_event: Callable[..., None] = _unheard,
     ) -> None:
         if name:

@@ -22,10 +22,7 @@ if TYPE_CHECKING:
 def load_scheme(name: str) -> Scheme:
     """Import and make the implementation of a scheme, for one end of a transport.
 
-    Raises
-    ------
-    TransportError
-        If it needs a package that is not installed.
+    Raises TransportError if it needs a package that is not installed.
     """
     module, _, class_name = SCHEMES[name].implementation.partition(":")
     made: Scheme = getattr(importlib.import_module(module), class_name)()

@@ -115,33 +115,8 @@ class _StreamCall(msgspec.Struct, eq=False):
 class StreamServiceTransport(LinkOwner):
     """The service's end: see :class:`~holdfast.transport.contract.ServiceTransport`.
 
-    Parameters
-    ----------
-    listen : sequence of str
-        Endpoints at which robots connect.
-    robot : socket or None
-        The connection to the robot that has launched this service.
-    shared : sequence of socket
-        If given, a socket for each of ``listen`` that is bound there, for several processes.
-    lease_ms : float
-        After this much silence robots consider this service lost. A robot's own lease is in its
-        hello.
-    max_message_bytes : int
-        A larger request is refused and not kept.
-    max_links : int or None
-        Of robots, at the same time; None: :data:`MAX_LINKS`.
-    tls : TlsFiles or None
-        The service's credentials, for ``tls`` and ``udp``.
-    on_event : callable or None
-        Called for the log: ``defect`` with ``robot``, ``reason`` and ``traceback``, when an
-        exception that no code here expects has ended a link; ``link_refused`` with ``reason`` and,
-        if known, ``robot``; ``robot_connected`` with ``robot``; ``robot_disconnected`` with
-        ``robot`` and ``reason``. Each has the robot's ``address``, None over a local socket.
-
-    Raises
-    ------
-    TransportError
-        If an endpoint, the name, the incarnation or the credentials cannot be used.
+    Raises TransportError if an endpoint, the name, the incarnation or the credentials cannot be
+    used.
     """
 
     def __init__(
@@ -149,13 +124,22 @@ class StreamServiceTransport(LinkOwner):
         name: str,
         *,
         incarnation: str,
-        listen: Sequence[str] = (),
+        listen: Sequence[str] = (),  # endpoints at which robots connect
+        # The connection to the robot that has launched this service.
         robot: socket.socket | None = None,
+        # If given, a socket for each of ``listen`` that is bound there, for several processes.
         shared: Sequence[socket.socket] = (),
+        # After this much silence robots consider this service lost. A robot's own lease is in its
+        # hello.
         lease_ms: float = 400.0,
+        # A larger request is refused and not kept.
         max_message_bytes: int = DEFAULT_MAX_MESSAGE_BYTES,
-        max_links: int | None = None,
-        tls: TlsFiles | None = None,
+        max_links: int | None = None,  # of robots, at the same time; None: :data:`MAX_LINKS`
+        tls: TlsFiles | None = None,  # the service's credentials, for ``tls`` and ``udp``
+        # Called for the log: ``defect`` with ``robot``, ``reason`` and ``traceback``, when an
+        # exception that no code here expects has ended a link; ``link_refused`` with ``reason``
+        # and, if known, ``robot``; ``robot_connected`` with ``robot``; ``robot_disconnected`` with
+        # ``robot`` and ``reason``. Each has the robot's ``address``, None over a local socket.
         on_event: Callable[..., None] | None = None,
     ) -> None:
         check_name("name of a service", name)
@@ -201,10 +185,7 @@ class StreamServiceTransport(LinkOwner):
     async def start(self, deliver: Callable[[IncomingCall], None]) -> None:
         """Listen and deliver calls; returns when robots can connect.
 
-        Raises
-        ------
-        TransportError
-            If it cannot listen there; the message names the endpoint.
+        Raises TransportError if it cannot listen there; the message names the endpoint.
         """
         if self._started:
             raise TransportError("this transport was started before; make another one")
@@ -294,10 +275,8 @@ class StreamServiceTransport(LinkOwner):
 
         Links end if their certificate is now revoked, or its authority was replaced.
 
-        Raises
-        ------
-        TransportError
-            If the files cannot be used; then the previous credentials stay in use.
+        Raises TransportError if the files cannot be used; then the previous credentials stay in
+        use.
         """
         if self._tls is None:
             return 0

@@ -203,12 +203,8 @@ class TlsStream:
     def receive(self, data: bytes) -> bytes:
         """Take bytes of the stream; return those of messages.
 
-        Raises
-        ------
-        ssl.SSLError
-            If the handshake fails at either end.
-        FrameError
-            If the peer does not speak TLS at all.
+        Raises ssl.SSLError if the handshake fails at either end; FrameError if the peer does not
+        speak TLS at all.
         """
         if not self._has_first_byte:
             self._has_first_byte = True
