@@ -54,13 +54,7 @@ _OVERDUE = 4.0
 
 
 class Lanes:
-    """The tasks that wait or run.
-
-    Parameters
-    ----------
-    workers : int
-        Brief tasks that may run at a time.
-    """
+    """The tasks that wait or run; so many brief ones at a time as there are workers."""
 
     def __init__(self, workers: int, limits: ServiceLimits) -> None:
         self._limits = limits
@@ -166,22 +160,10 @@ class Lanes:
         return next((lane for lane in self._lanes if lane.runs(job)), None)
 
     def postpone(self, task: PendingTask, cost: Cost | None, now: float) -> bool:
-        """Queue a task again in another lane, if a call waits for it.
+        """Queue a task again in another lane, if a call waits for it; return whether there is room.
 
-        Parameters
-        ----------
-        cost : Cost or None
-            The estimate; None if the task took longer than that.
-
-        Returns
-        -------
-        bool
-            Whether there is room. (A prefetch has always room, at most one for each session.)
-
-        Raises
-        ------
-        MessageError
-            If it has used up the time of a long one.
+        It has taken longer than estimated if there is no ``cost``. (A prefetch has always room, at
+        most one for each session.) Raises MessageError if it has used up the time of a long one.
         """
         session, limits = task.session, self._limits
         if cost is None and task.lane == LONG:

@@ -73,10 +73,7 @@ class RestartPolicy:
     def failed(self, now: float, *, late: bool = False) -> None:
         """Schedule another launch: at once the first time, then after growing delays.
 
-        Parameters
-        ----------
-        late : bool
-            Whether the last was not seen in time; the next one gets more time.
+        After one that was not seen in time (``late``) the next one gets more time.
         """
         self._late += late
         if self._launch_after is not None:

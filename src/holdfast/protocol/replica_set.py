@@ -63,16 +63,11 @@ class FailureDetector:
       stopped or is cut off. A service of which nothing is awaited may be silent for any time;
     - *calls that end without an answer*: the process is gone;
     - *deadlines*: a decision that takes too long is of no use even with signs of life.
-
-    Parameters
-    ----------
-    detection_timeout_s : float
-        Longest accepted silence while something is awaited.
     """
 
     def __init__(self, detection_timeout_s: float) -> None:
         self._usual_timeout_s = detection_timeout_s
-        self._timeout_s = detection_timeout_s
+        self._timeout_s = detection_timeout_s  # accepted silence while something is awaited
         self._longest_silence_s = 0.0
         self._awaited = 0
         self._last_sign = 0.0
@@ -171,58 +166,34 @@ class FailureDetector:
 
 
 class Replica:
-    """One service, as far as the robot knows it.
-
-    Parameters
-    ----------
-    late_after_s : float
-        The first reply to a request is late after this time; ``late_s`` are those late in a row.
-
-    Attributes
-    ----------
-    last_incarnation : str or None
-        Of the process seen last.
-    opened : bool
-        Whether it knows the session.
-    acknowledged : tuple of int or None
-        Trial and number of inputs of the latest state that it is known to hold.
-    num_diverged : int
-        Times in a row that it came to another state than the robot from the same observations.
-    num_refusals : list of int
-        Of the task and of the sensing part, since it last gave that part: a problem's code can fail
-        in one part only.
-    complaint : str or None
-        Text of the last of these.
-    refusal, refusal_code : str or None, str
-        Why it is no longer asked.
-    distrusted : str or None
-        Why it is no longer asked, not even after a restart.
-    retry_at, backoff_s : float
-        It is not asked before that time, and then delayed by so much.
-    """
+    """One service, as far as the robot knows it."""
 
     def __init__(
         self, name: str, detection_timeout_s: float, late_after_s: float = math.inf
     ) -> None:
         self.name = name
         self.detector = FailureDetector(detection_timeout_s)
-        self.last_incarnation: str | None = None
-        self.late_after_s = late_after_s
+        self.last_incarnation: str | None = None  # of the process seen last
+        self.late_after_s = late_after_s  # the first reply to a request is late after this time
         self.late_at = -math.inf
-        self.late_s: list[float] = []
-        self.distrusted: str | None = None
+        self.late_s: list[float] = []  # first replies late in a row
+        self.distrusted: str | None = None  # why it is not asked, not even after a restart
         self.forget()
 
     def forget(self) -> None:
         """Reset what was known of the previous process."""
-        self.opened = False
+        self.opened = False  # whether it knows the session
+        # Trial and number of inputs of the latest state that it is known to hold.
         self.acknowledged: tuple[int, int] | None = None
+        # Times in a row that it came to another state than the robot from the same observations.
         self.num_diverged = 0
+        # Of the task and of the sensing part, since it last gave that part: a problem's code can
+        # fail in one part only. And the text of the last.
         self.num_refusals = [0, 0]
         self.complaint: str | None = None
-        self.refusal = self.distrusted
+        self.refusal = self.distrusted  # why it is no longer asked
         self.refusal_code = "" if self.refusal is None else _WRONG_ANSWER
-        self.retry_at = 0.0
+        self.retry_at = 0.0  # it is not asked before, and then delayed by the following
         self.backoff_s = _FIRST_RETRY_S
         self.num_busy = 0
 
@@ -243,12 +214,9 @@ class Replica:
     # -- what it says ----------------------------------------------------------------------------
 
     def note_first_reply(self, sent_at: float, now: float) -> float | None:
-        """Record the time to the first reply of a request.
+        """Record the time to the first reply; return the shortest of several late in a row, once.
 
-        Returns
-        -------
-        float or None
-            The shortest of these times in seconds, once, when several in a row were late.
+        In seconds; None otherwise.
         """
         after_s = now - sent_at
         if len(self.late_s) == _LATE_IN_A_ROW:
@@ -267,12 +235,7 @@ class Replica:
     def note_answer(self, question: Question, now: float, *, sensing: bool, restored: bool) -> None:
         """Record a part of an answer: it lives and holds the question's state.
 
-        Parameters
-        ----------
-        sensing : bool
-            Whether it is the sensing part.
-        restored : bool
-            Whether the request carried the state.
+        ``restored`` if the request carried the state.
         """
         self.detector.heard(now)
         self.opened = True
@@ -301,13 +264,7 @@ class Replica:
         self.acknowledged = None
 
     def note_refusal(self, code: str, text: str, now: float, *, sensing: bool) -> bool:
-        """Record a refusal, which delays it; return whether it is no longer asked.
-
-        Parameters
-        ----------
-        sensing : bool
-            Whether it refuses the sensing part.
-        """
+        """Record a refusal, which delays it; return whether it is no longer asked."""
         most = _MAX_REFUSALS
         if code == _OUT_OF_MEMORY:
             most = _MAX_OUT_OF_MEMORY
@@ -333,17 +290,7 @@ class Replica:
     ) -> tuple[tuple[Input, ...], bytes | None]:
         """Return what a request must carry for the service to reach the question's state.
 
-        Parameters
-        ----------
-        whole_state : bool
-            Whether it needs the whole state in any case.
-
-        Returns
-        -------
-        inputs : tuple of Input
-            From the state that it holds to the question's.
-        checkpoint : bytes or None
-            The whole state, where that is better.
+        The inputs since the state that it holds; or, where that is better, the whole state.
         """
         state = question.state
         known = self.acknowledged

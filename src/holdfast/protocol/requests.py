@@ -247,17 +247,10 @@ class OpenRequests:
     # -- replies -----------------------------------------------------------------------------------
 
     def take(self, call: OpenRequest, payload: bytes, now: float) -> Reply | None:
-        """Record what a reply to an open request says.
+        """Record what a reply to an open request says; return it, or None if it is invalid.
 
-        Returns
-        -------
-        Reply or None
-            The reply; None if it is invalid.
-
-        Raises
-        ------
-        HoldfastError
-            If another process of the robot has taken over, or the own planner fails.
+        Raises HoldfastError if another process of the robot has taken over, or the own planner
+        fails.
         """
         replica = call.replica
         try:

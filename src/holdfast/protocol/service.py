@@ -318,12 +318,7 @@ class Service:
     ) -> tuple[bool, PendingTask | None]:
         """Answer as far as the cache goes.
 
-        Returns
-        -------
-        known : bool
-            Whether it has the answer, or will have it.
-        task : PendingTask or None
-            For which the call waits.
+        Returns whether it has the answer, or will have it; and the task for which the call waits.
         """
         task = session.pending.get(request.digest)
         if task is not None:

@@ -383,13 +383,8 @@ def _code_of(error: HoldfastError) -> str:
 class ProblemPool:
     """Problem instances that no job is using, and what problems cost.
 
-    Each instance is used by one job at a time, since it may keep buffers.
-
-    Parameters
-    ----------
-    max_problems : int
-        Distinct problems of which instances are kept; the least recently released goes first. What
-        a problem costs is kept for many times as many.
+    Each instance is used by one job at a time, since it may keep buffers. Instances are kept of so
+    many distinct problems, the least recently released going first; costs of many times as many.
     """
 
     def __init__(self, max_problems: int) -> None:

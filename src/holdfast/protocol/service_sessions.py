@@ -283,10 +283,7 @@ class Session:
 class ForgottenEpochs:
     """Epochs of forgotten sessions, remembered so that a replaced process stays replaced.
 
-    Parameters
-    ----------
-    most : int
-        So many are kept; beyond that the oldest of the owner with the most is dropped.
+    Above the ``most`` that are kept, the oldest of the owner with the most is dropped.
     """
 
     def __init__(self, most: int) -> None:

@@ -149,17 +149,7 @@ class Verification:
         return actions, provenance
 
     def outside_limits(self, actions: FloatArray) -> str | None:
-        """Describe task actions that the problem's ``execute`` would change.
-
-        Parameters
-        ----------
-        actions : array of shape (count, action_size)
-
-        Returns
-        -------
-        str or None
-            None if all are within the limits.
-        """
+        """Describe what of the task actions, one a row, the problem's ``execute`` would change."""
         limited = checked.executed_action(self._planner.problem, actions)
         # An action on a limit may be moved by a rounding error.
         slack = 1e-9 * np.maximum(1.0, np.abs(limited))
@@ -206,18 +196,10 @@ class Verification:
         self._effects.append(ComputeOwnAnswer(self._number, question.state, again))
 
     def decided(self, event: OwnAnswer, current: Question | None) -> bool:
-        """Take the own planner's answer.
+        """Take the own planner's answer; return whether the current question remains usable.
 
-        Parameters
-        ----------
-        current : Question or None
-            The robot's current question; this answer may belong to an earlier one.
-
-        Returns
-        -------
-        bool
-            Whether the current question remains usable: False if the performed actions differ from
-            the correct ones.
+        Not if the performed actions differ from the right ones. The answer may belong to an earlier
+        question.
         """
         question = self._asked.pop(event.number, None)
         if question is None:

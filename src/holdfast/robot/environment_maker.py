@@ -80,19 +80,10 @@ class EnvironmentMaker:
     ) -> Environment:
         """Make the environment of a trial.
 
-        Parameters
-        ----------
-        resumed : bool, optional
-            Whether the robot's process has died in the middle of this trial.
-        performed : sequence of array, optional
-            Task actions that were performed in this trial before that. A simulated world has died
-            with the process and performs them again; a real one stands where they led to.
-
-        Raises
-        ------
-        EnvironmentFailedError
-            If the object lacks one of the three methods. Whatever the user's constructor raises is
-            passed on.
+        Of the task actions that were performed before the robot's process died: a simulated world
+        has died with it and performs them again; a real one stands where they led to. Raises
+        EnvironmentFailedError if the object lacks one of the three methods, and whatever the user's
+        constructor raises.
         """
         if self._class is None:
             return SimulatedEnvironment.after(self.problem, self._seed, trial, performed)

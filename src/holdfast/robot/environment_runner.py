@@ -15,17 +15,16 @@ import asyncio
 import functools
 from collections.abc import Callable, Sequence
 from time import monotonic
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from holdfast.config.user_code import account_of_user_error
 from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.numerics.arrays import FloatArray
-from holdfast.problems.problem import Problem
 from holdfast.protocol.events import (
     EnvironmentEvent,
     EnvironmentFailed,
 )
-from holdfast.robot.environment import CheckedEnvironment, Environment, MissingReadings
+from holdfast.robot.environment import CheckedEnvironment, MissingReadings
 from holdfast.robot.environment_maker import EnvironmentMaker
 from holdfast.runtime.pool import ThreadPool
 
@@ -45,21 +44,8 @@ def make_runner(
     performed: Sequence[FloatArray] = (),
 ) -> EnvironmentRunner:
     """Return the runner of a trial in the configuration's environment."""
-
-    def make() -> Environment:
-        return maker(trial, resumed=resumed, performed=performed)
-
-    if maker.simulated:
-        return InlineRunner(make, maker.problem, deliver, maker.name, resumed=resumed)
-    return ThreadedRunner(
-        make,
-        maker.problem,
-        deliver,
-        maker.name,
-        maker.timeout_ms,
-        resumed=resumed,
-        missing=MissingReadings(maker.max_missing_in_a_row),
-    )
+    kind = InlineRunner if maker.simulated else ThreadedRunner
+    return kind(maker, trial, deliver, resumed=resumed, performed=performed)
 
 
 class _Call(NamedTuple):
@@ -84,20 +70,20 @@ class EnvironmentRunner(abc.ABC):
 
     def __init__(
         self,
-        make: Callable[[], Environment],
-        problem: Problem,
+        maker: EnvironmentMaker,
+        trial: int,
         deliver: Deliver,
-        name: str,
         *,
         resumed: bool = False,
-        missing: MissingReadings | None = None,
+        performed: Sequence[FloatArray] = (),
     ) -> None:
-        self._make = make
+        self._make = functools.partial(maker, trial, resumed=resumed, performed=performed)
         self._deliver = deliver
-        self._name = name
+        self._name = maker.name
         self._resumed = resumed
         # Read when a call takes too long, too.
-        self.world = CheckedEnvironment(problem, name, missing)
+        missing = MissingReadings(maker.max_missing_in_a_row)
+        self.world = CheckedEnvironment(maker.problem, maker.name, missing)
         self._failed: EnvironmentFailed | None = None
         self._closed = False
 
@@ -206,18 +192,10 @@ class ThreadedRunner(EnvironmentRunner):
     """
 
     def __init__(
-        self,
-        make: Callable[[], Environment],
-        problem: Problem,
-        deliver: Deliver,
-        name: str,
-        timeout_ms: float,
-        *,
-        resumed: bool = False,
-        missing: MissingReadings | None = None,
+        self, maker: EnvironmentMaker, trial: int, deliver: Deliver, **resumption: Any
     ) -> None:
-        super().__init__(make, problem, deliver, name, resumed=resumed, missing=missing)
-        self._timeout_ms = timeout_ms
+        super().__init__(maker, trial, deliver, **resumption)
+        self._timeout_ms = maker.timeout_ms
         self._thread = ThreadPool(1, "environment")
         self._current: _Call | None = None
         self._timer: asyncio.TimerHandle | None = None

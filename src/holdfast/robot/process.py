@@ -254,9 +254,9 @@ class RobotProcess:
         """Run all trials that are not finished, on a new event loop.
 
         Raises HoldfastError if the robot holds still and cannot go on; the journal has everything
-        to resume. After Ctrl-C or another ending signal, once the journal is written,
-        KeyboardInterrupt or what the caller's handler of that signal raises. Other threads than the main one
-        use :meth:`pause`.
+        to resume. After Ctrl-C or another ending signal, once the journal is written, raises
+        KeyboardInterrupt or what the caller's handler of that signal raises. Other threads than the
+        main one use :meth:`pause`.
         """
         self._finished = set(finished)
         self._loop = loop = asyncio.new_event_loop()

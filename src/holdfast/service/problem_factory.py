@@ -22,19 +22,9 @@ class ProblemFactory:
     """Builds the problems that a service decides for.
 
     Registered problems are known by name. A robot must not be able to load a class from an
-    arbitrary file, so such a class is known only if the service's operator has named it.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Problems to load at once; ``module:Class`` is allowed.
-    directory : Path or None
-        Searched first for their modules.
-
-    Raises
-    ------
-    UnknownProblemError
-        If one of the names does not lead to a problem.
+    arbitrary file, so such a class is known only if the service's operator has named it: ``names``
+    are loaded at once, their modules looked for in ``directory`` first. Raises UnknownProblemError
+    if one does not lead to a problem.
     """
 
     def __init__(self, names: Sequence[str] = (), directory: Path | None = None) -> None:

@@ -85,16 +85,9 @@ def serve(options: ServeOptions, make_extension: Callable[[], Extension] | None 
     ``make_extension`` is called once the options are checked; it raises a HoldfastError if there
     can be none.
 
-    Returns
-    -------
-    int
-        0 after SIGTERM or the end of standard input, 130 after SIGINT, 129 after SIGHUP. With
-        credentials, SIGHUP reloads them instead.
-
-    Raises
-    ------
-    HoldfastError
-        If an option cannot be used; the message says which and why.
+    Returns 0 after SIGTERM or the end of standard input, 130 after SIGINT, 129 after SIGHUP. With
+    credentials, SIGHUP reloads them instead. Raises HoldfastError if an option cannot be used; the
+    message says which and why.
     """
     # Importing modules leaves no garbage to collect.
     gc.disable()

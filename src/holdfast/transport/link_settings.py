@@ -114,13 +114,8 @@ class MemoryBudget:
     the link that has held something for longest. So an owner that takes much cannot end the links
     of owners that take little.
 
-    Parameters
-    ----------
-    max_bytes : float
-    reason : str
-        Why a link is ended, as the rest of a sentence about the other end.
-    measure : callable, optional
-        What a link holds now, where that shrinks without a :meth:`note`.
+    ``reason`` says why a link is ended, as the rest of a sentence about the other end; ``measure``
+    what a link holds now, where that shrinks without a :meth:`note`.
     """
 
     def __init__(
