@@ -264,10 +264,10 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     assert all(lanes[number].num_running <= most[number] for number in most)
     assert statistics.waiting == len(waiting)
     for lane in lanes:
-        check_lane(lane, [task for task in waiting if queue._of(task) is lane])
+        check_lane(lane, [task for task in waiting if queue[task.lane] is lane])
     for number, lane in enumerate(lanes):
         requested = [
-            task for task in waiting if task.request is not None and queue._of(task) is lane
+            task for task in waiting if task.request is not None and queue[task.lane] is lane
         ]
         room = limits["max_waiting"] if number > FIRST else (limits["max_waiting"] + 1) // 2
         # One owner finds room, if another has taken that of all.

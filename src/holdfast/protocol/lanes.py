@@ -31,7 +31,6 @@ import math
 
 from holdfast.errors import MessageError
 from holdfast.protocol.decision_cost import Cost, describe_cost
-from holdfast.protocol.messages import Request
 from holdfast.protocol.request_queue import RequestQueue
 from holdfast.protocol.service_jobs import Job
 from holdfast.protocol.service_limits import ServiceLimits
@@ -41,7 +40,6 @@ from holdfast.protocol.service_sessions import (
     MEDIUM,
     NEW,
     REQUESTED,
-    Owner,
     PendingTask,
     Session,
 )
@@ -69,6 +67,9 @@ class Lanes:
         # Bounds on the estimated time of a task in each lane.
         self.limits_s = (brief_s, brief_s, brief_s, limits.max_medium_s, limits.max_decision_s)
 
+    def __getitem__(self, number: int) -> RequestQueue:
+        return self._lanes[number]
+
     @property
     def num_waiting(self) -> int:
         """Tasks not yet begun."""
@@ -79,18 +80,6 @@ class Lanes:
         """Tasks that workers have."""
         return sum(lane.num_running for lane in self._lanes)
 
-    def is_overloaded(self, now: float, owner: Owner, lane: int) -> bool:
-        """Return whether a new request that begins in this lane is to be turned away."""
-        return self._lanes[lane].is_overloaded(now, owner)
-
-    def wait_s(self, now: float, owner: Owner, lane: int) -> float:
-        """Estimate the wait of a new request that begins in this lane."""
-        return self._lanes[lane].wait_s(now, owner)
-
-    def _of(self, task: PendingTask) -> RequestQueue:
-        """Return the lane of a task."""
-        return self._lanes[task.lane]
-
     def is_alone(self, task: PendingTask) -> bool:
         """Return whether a task that is to be started may have all cores."""
         if task.lane == LONG and self._fewer == 1:
@@ -100,24 +89,6 @@ class Lanes:
     def most_s(self, task: PendingTask) -> float:
         """Return how long a job of a task may compute."""
         return (_OVERDUE if task.lane == LONG else _OVERRUN) * self.limits_s[task.lane]
-
-    # -- waiting ---------------------------------------------------------------------------------
-
-    def enqueue(self, task: PendingTask) -> None:
-        """Queue a task in its lane."""
-        self._of(task).enqueue(task)
-
-    def replace(self, task: PendingTask, request: Request, *, sensing: bool, size: int) -> None:
-        """Give a waiting task's turn to a newer request."""
-        self._of(task).replace(task, request, sensing=sensing, size=size)
-
-    def remove(self, task: PendingTask) -> None:
-        """Remove a task that was not begun."""
-        self._of(task).remove(task)
-
-    def promote(self, task: PendingTask) -> None:
-        """Make a prefetch urgent: its robot waits for it now."""
-        self._of(task).promote(task)
 
     def release_held(self, session: Session) -> None:
         """Queue a session's tasks that were held back behind those that have run."""
@@ -136,27 +107,8 @@ class Lanes:
                 return task
         return None
 
-    def handed_out(self, task: PendingTask, job: Job, now: float) -> None:
-        """Note that a worker has a task."""
-        self._of(task).handed_out(task, job, now)
-
-    def started(self, job: Job, now: float) -> None:
-        """Note that a worker starts its task only now, if it was not forgotten."""
-        lane = self._running_in(job)
-        if lane is not None:
-            lane.started(job, now)
-
-    def end(self, job: Job) -> PendingTask:
-        """Note that a worker is free; return its task."""
-        lane = self._running_in(job)
-        assert lane is not None
-        return lane.end(job)
-
-    def runs(self, job: Job) -> bool:
-        """Return whether a worker has a job of these tasks."""
-        return self._running_in(job) is not None
-
-    def _running_in(self, job: Job) -> RequestQueue | None:
+    def with_job(self, job: Job) -> RequestQueue | None:
+        """Return the lane of which a worker has a job; None if it was forgotten."""
         return next((lane for lane in self._lanes if lane.runs(job)), None)
 
     def postpone(self, task: PendingTask, cost: Cost | None, now: float) -> bool:
@@ -181,10 +133,10 @@ class Lanes:
             return True  # nobody awaits it
         fits = cost.seconds <= limits.max_medium_s and cost.num_bytes <= limits.max_medium_bytes
         task.move_to(MEDIUM if fits else LONG, cost)
-        if task.slot == REQUESTED and self._of(task).is_overloaded(now, session.owner):
+        if task.slot == REQUESTED and self[task.lane].is_overloaded(now, session.owner):
             return False
         session.pending[task.digest] = task
-        self.enqueue(task)
+        self[task.lane].enqueue(task)
         return True
 
     # -- what nobody awaits, or takes too long ---------------------------------------------------
@@ -199,10 +151,10 @@ class Lanes:
             if task.lane == LONG:
                 # Further calls that ask for the same do not wait for this one.
                 task.session.remove_task(task)
-                self._of(task).job_of(task).cancel()
+                self[task.lane].job_of(task).cancel()
             return False
         task.session.remove_task(task)
-        self.remove(task)
+        self[task.lane].remove(task)
         return True
 
     def cancel_all(self) -> None:

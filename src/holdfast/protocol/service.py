@@ -152,13 +152,15 @@ class Service:
 
     def started(self, job: Job, now: float) -> None:
         """Note that a job that was handed out starts only now."""
-        self._queue.started(job, now)
+        if (lane := self._queue.with_job(job)) is not None:
+            lane.started(job, now)
 
     def finished(self, job: Job, outcome: JobResult, now: float) -> list[ServiceEffect]:
         """Handle the result of a job that was handed out."""
-        if not self._queue.runs(job):
+        lane = self._queue.with_job(job)
+        if lane is None:
             return []  # handed out before everything was forgotten
-        task = self._queue.end(job)
+        task = lane.end(job)
         session = task.session
         is_awaited = session.pending.get(task.digest) is task
         session.remove_task(task)
@@ -284,7 +286,7 @@ class Service:
         )
         session.known = self._problems.cost_of(session.owner, session.problem_key)
         lane = session.lane_of(request)
-        if self._queue.is_overloaded(now, key[0], lane):
+        if self._queue[lane].is_overloaded(now, key[0]):
             self._sessions.note_epoch(key, request.epoch)
             self._reject_busy(call, request.number, key, lane, now)
             return None
@@ -323,7 +325,7 @@ class Service:
         task = session.pending.get(request.digest)
         if task is not None:
             if task.request is None and not task.running:
-                self._queue.promote(task)
+                self._queue[task.lane].promote(task)
             self._statistics.attached += 1
             self._calls.attach(task, call, request.number, now)
             return True, task
@@ -377,7 +379,7 @@ class Service:
             ),
             None,
         )
-        if waiting is None and self._queue.is_overloaded(now, session.owner, lane):
+        if waiting is None and self._queue[lane].is_overloaded(now, session.owner):
             self._reject_busy(call, request.number, session.key, lane, now)
             return None
         if waiting is not None:
@@ -385,13 +387,13 @@ class Service:
             self._calls.end(waiting)
             self._statistics.superseded += 1
             session.remove_task(waiting)
-            self._queue.replace(waiting, request, sensing=sensing, size=size)
+            self._queue[lane].replace(waiting, request, sensing=sensing, size=size)
             task = waiting
         else:
             task = PendingTask(
                 session, request.digest, sensing=sensing, since=now, request=request, size=size
             )
-            self._queue.enqueue(task)
+            self._queue[lane].enqueue(task)
         session.pending[task.digest] = task
         self._calls.attach(task, call, request.number, now)
         return task
@@ -410,7 +412,7 @@ class Service:
         digest, state = session.ahead_digest, session.ahead
         task = PendingTask(session, digest, sensing=True, since=now, state=state)
         session.pending[digest] = task
-        self._queue.enqueue(task)
+        self._queue[task.lane].enqueue(task)
         return task
 
     def _dispatch(self, now: float) -> None:
@@ -454,7 +456,7 @@ class Service:
             # A long one would have to build it again.
             building_counts=task.lane != LONG,
         )
-        self._queue.handed_out(task, job, now)
+        self._queue[task.lane].handed_out(task, job, now)
         self._effects.append(StartJob(job, expected_s, task.lane <= BRIEF))
 
     # -- outcomes --------------------------------------------------------------------------------
@@ -551,7 +553,7 @@ class Service:
         least_ms: float = 1.0,
     ) -> None:
         owner, session = key
-        wait_ms = max(least_ms, 1e3 * self._queue.wait_s(now, owner, lane))
+        wait_ms = max(least_ms, 1e3 * self._queue[lane].wait_s(now, owner))
         self._calls.send_busy(call, number, session, wait_ms, self._queue.num_waiting)
 
     # -- sessions --------------------------------------------------------------------------------
