@@ -1,9 +1,7 @@
 """Five lanes for the tasks of a service, so that none has to wait for what takes much longer.
 
 A robot chooses how long its decisions take, and a new identity costs nothing without a certificate.
-In one queue a few decisions that take seconds, or many robots that nobody has seen before, would
-keep all others waiting. So tasks of different kinds have different threads, and the system divides
-the cores between these:
+So tasks of different kinds have different threads, and the system divides the cores between these:
 
 - *New*: of sessions with a problem that their owner has not brought before, and states that come
   from outside (checkpoints).
@@ -13,16 +11,15 @@ the cores between these:
 - *Medium* and *long*: what is estimated to take too long for the first three, or for the fourth.
 
 A job first estimates what it costs (:mod:`~holdfast.protocol.decision_cost`); if that is too much
-for its lane, nothing is computed, and the task moves. An estimate can be wrong, or made wrong: a
-belief may hold states for which the problem's functions take a thousand times as long as for those
-that were measured. So a job ends by itself once it has computed for several times its lane's
-limit, and it is computed anew as a long one, as are the session's next ones until one takes less.
-Building a problem and measuring it count, but not in the long lane, which would do it again.
+for its lane, the task moves. An estimate can be made wrong: for some beliefs the problem's
+functions take a thousand times as long as for those that were measured. So a job ends by itself
+once it has computed for several times its lane's limit, and it is computed anew as a long one, as
+are the session's next ones until one takes less. Building a problem and measuring it count, but not
+in the long lane, which would do it again.
 
-The lanes go by cost and not by owner, because without certificates all robots are one owner, and
-nothing tells them apart. Each lane is a :class:`~holdfast.protocol.request_queue.RequestQueue`.
-Long decisions share a bound on memory, and new and first ones have half of the room for what waits
-each.
+The lanes go by cost and not by owner, because without certificates all robots are one owner. Each
+is a :class:`~holdfast.protocol.request_queue.RequestQueue`. Long decisions share a bound on memory,
+and new and first ones have half of the room for what waits each.
 """
 
 from __future__ import annotations
