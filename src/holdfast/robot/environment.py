@@ -39,7 +39,6 @@ __all__ = [
     "CheckedEnvironment",
     "Environment",
     "Later",
-    "MissingReadings",
     "ObservationSizes",
     "SimulatedEnvironment",
     "is_no_reading",
@@ -218,41 +217,6 @@ def is_no_reading(numbers: FloatArray) -> bool:
     return bool(numbers.size) and bool(np.isnan(numbers).all())
 
 
-class MissingReadings:
-    """Tells no reading from an observation, and bounds how many come without one in a row.
-
-    Parameters
-    ----------
-    max_in_a_row : int
-        ``environment.max_missing_in_a_row``.
-    """
-
-    def __init__(self, max_in_a_row: int = EnvironmentSettings().max_missing_in_a_row) -> None:
-        self._max_in_a_row = max_in_a_row
-        self._in_a_row = 0
-
-    def is_missing(self, called: str, shown: object) -> bool:
-        """Return whether sensing has given no reading: None, or NaN in every component.
-
-        Raises
-        ------
-        EnvironmentFailedError
-            If it has given none too often in a row; ``called`` is the method in the message.
-        """
-        if shown is not None:
-            numbers = real_numbers(shown)
-            if numbers is None or not is_no_reading(numbers):
-                self._in_a_row = 0
-                return False
-        self._in_a_row += 1
-        if self._in_a_row > self._max_in_a_row:
-            raise EnvironmentFailedError(
-                f"{called} gave no reading {self._in_a_row} times in a row; "
-                f"environment.max_missing_in_a_row allows {self._max_in_a_row}"
-            )
-        return True
-
-
 class ObservationSizes(dict[int, "int | None"]):
     """Numbers that a problem expects of each sensing action; None where it does not say."""
 
@@ -290,12 +254,13 @@ class CheckedEnvironment:
         self,
         problem: Problem,
         name: str,
-        missing: MissingReadings | None = None,
+        max_missing_in_a_row: int = EnvironmentSettings().max_missing_in_a_row,
         environment: Environment | None = None,
     ) -> None:
         self._sizes = ObservationSizes(problem)
         self._name = self.method = name
-        self._missing = MissingReadings() if missing is None else missing
+        self._max_missing_in_a_row = max_missing_in_a_row
+        self._missing_in_a_row = 0
         self.environment = environment
         self.performed: Acted | None = None
 
@@ -328,7 +293,7 @@ class CheckedEnvironment:
                     "could return the observation when it is there"
                 )
             return Sensed(step, None)
-        if self._missing.is_missing(self.called, shown):
+        if self._is_missing(shown):
             return Sensed(step, None, no_reading=True)
         size = self._sizes[sensing_action]
         need = f"an array of shape ({size or 'n'},), of {_NUMBERS}, or None"
@@ -410,12 +375,26 @@ class CheckedEnvironment:
             if not isinstance(entry, tuple | list) or len(entry) != 2:
                 raise self._unusable(value, need)
             step = self._count(entry[0])
-            if self._missing.is_missing(self.called, entry[1]):
+            if self._is_missing(entry[1]):
                 no_reading.append(step)
                 continue
             of_shape = f"{need} with observations of shape (n,), of {_NUMBERS}"
             late.append(LateObservation(step, self._array(entry[1], value, of_shape)))
         return tuple(late), tuple(no_reading)
+
+    def _is_missing(self, shown: object) -> bool:
+        """Return whether sensing has given no reading; raise if it has too often in a row."""
+        numbers = None if shown is None else real_numbers(shown)
+        if shown is not None and (numbers is None or not is_no_reading(numbers)):
+            self._missing_in_a_row = 0
+            return False
+        self._missing_in_a_row += 1
+        if self._missing_in_a_row > self._max_missing_in_a_row:
+            raise EnvironmentFailedError(
+                f"{self.called} gave no reading {self._missing_in_a_row} times in a row; "
+                f"environment.max_missing_in_a_row allows {self._max_missing_in_a_row}"
+            )
+        return True
 
     def _count(self, value: object) -> int:
         number = real_numbers(value)

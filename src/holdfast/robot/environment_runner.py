@@ -24,7 +24,7 @@ from holdfast.protocol.events import (
     EnvironmentEvent,
     EnvironmentFailed,
 )
-from holdfast.robot.environment import CheckedEnvironment, MissingReadings
+from holdfast.robot.environment import CheckedEnvironment
 from holdfast.robot.environment_maker import EnvironmentMaker
 from holdfast.runtime.pool import ThreadPool
 
@@ -82,8 +82,7 @@ class EnvironmentRunner(abc.ABC):
         self._name = maker.name
         self._resumed = resumed
         # Read when a call takes too long, too.
-        missing = MissingReadings(maker.max_missing_in_a_row)
-        self.world = CheckedEnvironment(maker.problem, maker.name, missing)
+        self.world = CheckedEnvironment(maker.problem, maker.name, maker.max_missing_in_a_row)
         self._failed: EnvironmentFailed | None = None
         self._closed = False
 

@@ -29,7 +29,6 @@ from holdfast.planning.tracking import LateObservation, Trial
 from holdfast.robot.environment import (
     CheckedEnvironment,
     Environment,
-    MissingReadings,
     SimulatedEnvironment,
     require_methods,
 )
@@ -157,9 +156,8 @@ def run_trial(
     missed = EnvironmentSettings(max_missing_in_a_row=max_missing_in_a_row)
     missed = check_settings(missed, EnvironmentSettings, "environment")
     track = Trial(planner, seed, trial, lost.false_alarm_rate)
-    missing = MissingReadings(missed.max_missing_in_a_row)
-    name = type(environment).__name__
-    world = CheckedEnvironment(planner.problem, name, missing, environment)
+    name, most = type(environment).__name__, missed.max_missing_in_a_row
+    world = CheckedEnvironment(planner.problem, name, most, environment)
     observer.trial_began(environment, track.state)
     ending = world.ready(resumed=False).ending
     while ending is None and track.state.step < max_steps:
