@@ -23,7 +23,6 @@ from holdfast.protocol.events import (
     CallEnded,
     Launch,
     OwnAnswer,
-    Planned,
     RecoveryExited,
     ReplyReceived,
     ServiceAppeared,
@@ -134,9 +133,7 @@ class Dispatcher(DecisionSource):
 
     # -- what happens ----------------------------------------------------------------------------
 
-    def handle(
-        self, event: TransportEvent | OwnAnswer | Planned | RecoveryExited, now: float
-    ) -> None:
+    def handle(self, event: TransportEvent | OwnAnswer | RecoveryExited, now: float) -> None:
         """Handle an event of the transport, the own planner or the local service's process."""
         if isinstance(event, ReplyReceived):
             call = self._calls.get(event.call)

@@ -11,8 +11,7 @@ sent or performed that a restarted robot would not know of.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Generic, NamedTuple, TypeAlias, TypeVar
+from typing import Generic, Literal, NamedTuple, TypeAlias, TypeVar
 
 from holdfast.errors import HoldfastError
 from holdfast.numerics.arrays import FloatArray
@@ -110,23 +109,12 @@ class OwnAnswer(NamedTuple):
 
     number: int
     actions: tuple[FloatArray, ...] = ()  # task actions up to the next sensing step
-    sensing_action: int | None = None  # of that step; None if it is too far away
+    sensing_action: int | None = None  # of that step; None if it is too far away, or not asked
     ahead_digest: bytes = b""  # of the state in which the sensing action was chosen
     computed_s: float = 0.0
-    failure: str | None = None  # why there is no answer
-
-
-class Planned(NamedTuple):
-    """The result of a :class:`Plan`."""
-
-    number: int
+    failure: HoldfastError | None = None  # why there is no answer
     # To which the task actions lead, or in which the sensing action was chosen.
-    ahead: PlanningState
-    actions: Sequence[FloatArray] = ()
-    ahead_digest: bytes = b""  # of that state, for a sensing part
-    sensing_action: int | None = None  # None for a task part
-    computed_s: float = 0.0
-    error: HoldfastError | None = None  # why there is no answer
+    ahead: PlanningState | None = None
 
 
 class RecoveryExited(NamedTuple):
@@ -172,22 +160,17 @@ class Act(NamedTuple):
 
 
 class ComputeOwnAnswer(NamedTuple):
-    """Have the robot's own planner answer a question, to verify what services have answered."""
+    """Have the robot's own planner answer a question, or a part of it.
 
-    number: int
+    Without services, part by part; else all of it, to verify what services have answered.
+    """
+
+    number: int  # of the question; a part with an older number is of no use
     state: PlanningState
     # Whether it was answered before. It then goes before others, and is computed with a new
     # instance of the problem.
-    again: bool
-
-
-class Plan(NamedTuple):
-    """Have the planner of a robot without services compute a part of an answer."""
-
-    # Of the question. Results with an older number are of no use.
-    number: int
-    state: PlanningState
-    sensing: bool  # whether to choose this state's sensing action; else the task actions from there
+    again: bool = False
+    part: Literal["task", "sensing"] | None = None
 
 
 class VerificationNoted(NamedTuple):
@@ -251,7 +234,6 @@ RobotEffect: TypeAlias = (
     | Sense
     | Act
     | ComputeOwnAnswer
-    | Plan
     | Launch
     | LogEvent
     | Timing

@@ -11,17 +11,16 @@ What answers is a :class:`DecisionSource`: services, or the robot's own planner.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from holdfast.errors import HoldfastError, MessageError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.planner import Planner, PlanningState, encode_checkpoint
 from holdfast.protocol.events import (
+    ComputeOwnAnswer,
     Effects,
     Halt,
     OwnAnswer,
-    Plan,
-    Planned,
     RecoveryExited,
     RobotEffect,
     TransportEvent,
@@ -203,9 +202,7 @@ class DecisionSource:
     def recompute(self) -> None:
         """Have the own planner answer the question too."""
 
-    def handle(
-        self, event: TransportEvent | OwnAnswer | Planned | RecoveryExited, now: float
-    ) -> None:
+    def handle(self, event: TransportEvent | OwnAnswer | RecoveryExited, now: float) -> None:
         """Handle an event of the transport, of a planner or of the local service's process."""
         raise NotImplementedError
 
@@ -229,8 +226,8 @@ class DecisionSource:
 class InProcessSource(DecisionSource):
     """Decisions without services.
 
-    Its only effects are :class:`Plan` and :class:`Halt`; the shell computes each :class:`Plan` and
-    passes the result back to :meth:`handle`.
+    The own planner computes the parts of an answer, and the shell passes them back to
+    :meth:`handle`.
     """
 
     def __init__(self) -> None:
@@ -243,24 +240,26 @@ class InProcessSource(DecisionSource):
         self.question = question
         self._number += 1
         self._asked_at = now
-        self.effects.append(Plan(self._number, question.state, question.task_count == 0))
+        self._compute("sensing" if question.task_count == 0 else "task", question.state)
 
-    def handle(
-        self, event: TransportEvent | OwnAnswer | Planned | RecoveryExited, now: float
-    ) -> None:
+    def _compute(self, part: Literal["task", "sensing"], state: PlanningState) -> None:
+        self.effects.append(ComputeOwnAnswer(self._number, state, part=part))
+
+    def handle(self, event: TransportEvent | OwnAnswer | RecoveryExited, now: float) -> None:
         """Take a part of the answer; results of earlier questions are ignored."""
         question = self.question
-        if not isinstance(event, Planned) or event.number != self._number or question is None:
+        if not isinstance(event, OwnAnswer) or event.number != self._number or question is None:
             return
-        if event.error is not None:
-            self.stop(event.error)
+        if event.failure is not None:
+            self.stop(event.failure)
             return
         source = Provenance(OWN_PLANNER, now - self._asked_at, event.computed_s)
         if event.sensing_action is None:
             question.task_actions = event.actions
             question.task_provenance = source
             if question.sensing_step is not None:
-                self.effects.append(Plan(self._number, event.ahead, sensing=True))
+                assert event.ahead is not None
+                self._compute("sensing", event.ahead)
         else:
             assert question.sensing_step is not None
             digest = event.ahead_digest[:DIGEST_SIZE]

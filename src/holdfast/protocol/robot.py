@@ -32,7 +32,6 @@ from holdfast.protocol.events import (
     Halt,
     OwnAnswer,
     Paused,
-    Planned,
     RecoveryExited,
     RobotEffect,
     Sense,
@@ -227,7 +226,7 @@ class Robot:
 
     def handle(
         self,
-        event: TransportEvent | EnvironmentEvent | OwnAnswer | Planned | RecoveryExited,
+        event: TransportEvent | EnvironmentEvent | OwnAnswer | RecoveryExited,
         now: float,
     ) -> list[RobotEffect]:
         """Handle an event."""

@@ -209,7 +209,7 @@ class Verification:
             return True
         if event.failure is not None:
             self._effects.report(
-                "verification_failed", step=question.state.step, reason=event.failure
+                "verification_failed", step=question.state.step, reason=str(event.failure)
             )
             for kind, service in question.followed():
                 self._note(question, service, kind, "failed")

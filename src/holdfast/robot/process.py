@@ -24,7 +24,7 @@ from holdfast.config.loader import Configuration
 from holdfast.config.user_code import account_of_user_error, describe_problem_error
 from holdfast.errors import DEFECT, HeldError, HoldfastError, TrialError, defect_fields
 from holdfast.planning.outcome import TrialResult
-from holdfast.planning.planner import Planner, PlanningState
+from holdfast.planning.planner import PlanningState
 from holdfast.problems.problem import Problem
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.events import (
@@ -40,8 +40,6 @@ from holdfast.protocol.events import (
     LogEvent,
     OwnAnswer,
     Paused,
-    Plan,
-    Planned,
     RecoveryExited,
     RobotEffect,
     Send,
@@ -55,13 +53,12 @@ from holdfast.protocol.question import DecisionSource, InProcessSource
 from holdfast.protocol.records import Record, TrialHistory, replay
 from holdfast.protocol.robot import Robot
 from holdfast.protocol.status import Status
-from holdfast.robot.answer_check import AnswerChecker
 from holdfast.robot.ending_signals import ending_signals
 from holdfast.robot.environment_maker import EnvironmentMaker
 from holdfast.robot.environment_runner import EnvironmentRunner, make_runner
 from holdfast.robot.health import Condition, RobotWatch
-from holdfast.robot.in_process_planner import InProcessPlanner
 from holdfast.robot.links import RECOVERY_SERVICE, Links
+from holdfast.robot.own_planner import OwnPlanner
 from holdfast.robot.session_configuration import session_configuration_of
 from holdfast.runtime.events import EventSink
 
@@ -120,7 +117,7 @@ class _Interrupted(NamedTuple):
 
 
 _Happening: TypeAlias = (
-    TransportEvent | EnvironmentEvent | OwnAnswer | Planned | RecoveryExited | _Interrupted
+    TransportEvent | EnvironmentEvent | OwnAnswer | RecoveryExited | _Interrupted
 )
 
 
@@ -200,14 +197,9 @@ class RobotProcess:
         def another_problem() -> Problem:
             return Configuration.from_plain(configuration.plain()).problem
 
-        self._verifier = AnswerChecker(
-            lambda: Planner(another_problem(), configuration.planning),
-            functools.partial(describe_problem_error, configuration.problem_name),
-            self._happens,
-            self._fail,
-        )
-        self._in_process = InProcessPlanner(
+        self._own = OwnPlanner(
             lambda: links.make_planner(another_problem(), configuration.planning),
+            functools.partial(describe_problem_error, configuration.problem_name),
             self._happens,
             self._fail,
             may_be_brief=":" not in configuration.problem_name,
@@ -292,8 +284,7 @@ class RobotProcess:
                 self._runner.close()
             if self._transport is not None:
                 loop.run_until_complete(self._transport.close())
-            self._in_process.close()
-            self._verifier.close()
+            self._own.close()
             if self._launcher is not None:
                 self._launcher.close()
             loop.close()
@@ -364,7 +355,7 @@ class RobotProcess:
             if wake and not self._ended:
                 self._now = max(self._now, now)
                 self._carry_out(self._robot.wake(self._now))
-            while not self._ended and (self._happened or self._in_process.compute_brief()):
+            while not self._ended and (self._happened or self._own.compute_brief()):
                 if now - began > self._turn_s:
                     self._go_on_soon()
                     break
@@ -479,13 +470,11 @@ class RobotProcess:
                 self._on_timing(effect)
                 if self._watch is not None:
                     self._watch.timed(effect)
-            elif isinstance(effect, Plan):
-                self._in_process.ask(effect)
             elif isinstance(effect, Send):
                 assert self._transport is not None
                 self._transport.call(effect.service, effect.call, effect.payload)
             elif isinstance(effect, ComputeOwnAnswer):
-                self._verifier.ask(effect)
+                self._own.ask(effect)
             elif isinstance(effect, VerificationNoted):
                 self._on_verified(effect)
             elif isinstance(effect, Abandon):
