@@ -89,14 +89,12 @@ class Environment(Protocol):
         None, or NaN in every component, is no reading: the belief stays as it is. Or :data:`LATER`:
         the robot goes on, and ``late_observations`` returns it when it is there.
         """
-        ...
 
     def perform(self, task_action: FloatArray) -> float | MoveResult | None:
         """Perform a task action and return its reward, or None where there is none.
 
         A :class:`~holdfast.planning.outcome.MoveResult` also says what the move has shown.
         """
-        ...
 
     def is_done(self) -> Done:
         """Return True if the task has succeeded, False if it goes on, or ``"failed"``.
@@ -105,7 +103,6 @@ class Environment(Protocol):
         what it was to handle. An :class:`~holdfast.planning.outcome.Ending` also says why, and may
         say that the trial was cut off.
         """
-        ...
 
 
 class SimulatedEnvironment(KeepsReadOnly):

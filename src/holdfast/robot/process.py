@@ -94,19 +94,15 @@ class StepJournal(Protocol):
 
     def session(self) -> bytes:
         """Return the run's identifier, 16 bytes."""
-        ...
 
     def raise_epoch(self) -> int:
         """Return a number above all earlier ones, once it is on the disk."""
-        ...
 
     def append(self, trial: int, records: Sequence[Record]) -> None:
         """Write records of the unfinished trial; they are safe when this returns."""
-        ...
 
     def unfinished(self) -> _TrialInProgress | None:
         """Return the trial that has not ended, if there is one."""
-        ...
 
 
 class _Interrupted(NamedTuple):

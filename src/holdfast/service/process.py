@@ -52,7 +52,6 @@ class Extension(Protocol):
     @property
     def is_busy(self) -> bool:
         """Whether it owes answers."""
-        ...
 
     def start(
         self, on_event: Callable[..., None], on_shutdown: Callable[[str], None]
@@ -63,15 +62,12 @@ class Extension(Protocol):
         this to end; both from any thread. A start that raises a HoldfastError has released
         everything.
         """
-        ...
 
     def take_no_more(self) -> None:
         """Finish open requests and refuse new ones."""
-        ...
 
     def close(self, timeout_s: float) -> None:
         """Stop; wait at most this long for a running computation. May be repeated."""
-        ...
 
 
 def main(arguments: Sequence[str]) -> int:
