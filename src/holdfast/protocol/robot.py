@@ -92,7 +92,7 @@ class Robot:
         self._computed_ms = 0.0
         self._timed_provenance: Provenance | None = None
         self._unwritten: list[Record] = []
-        # Whether this process has used an answer.
+        # has_decided: whether this process has used an answer.
         self._pausing = self._stopped = self.has_decided = False
         self._next_tick: float | None = None
         self._asleep_until: float | None = None

@@ -15,7 +15,7 @@ calls. A part is identified by the digest of its state, so equal questions share
 from __future__ import annotations
 
 import hashlib
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -322,40 +322,19 @@ class ForgottenEpochs:
                 del self._of[owner]
 
 
-class _Holding:
-    """What all sessions take, or all of one owner."""
-
-    def __init__(self) -> None:
-        self.sessions = 0
-        self.state_bytes = 0
-        self.configuration_bytes = 0
-
-    def count(self, session: Session, sign: int) -> None:
-        """Add a session without states, or subtract it."""
-        self.sessions += sign
-        self.configuration_bytes += sign * len(session.configuration)
-
-
 class SessionTable:
     """All sessions, least recently used first."""
 
     def __init__(self, limits: ServiceLimits) -> None:
         self._limits = limits
         self._sessions: OrderedDict[SessionKey, Session] = OrderedDict()
-        self._holdings: dict[Owner, _Holding] = {}
+        # What each owner holds, and all together.
+        self._num_of: Counter[Owner] = Counter()
+        self._configuration_bytes_of: Counter[Owner] = Counter()
+        self._state_bytes_of: Counter[Owner] = Counter()
+        self.configuration_bytes = self.state_bytes = 0
         self._epochs = ForgottenEpochs(max(4 * limits.max_sessions, _LEAST_EPOCHS))
-        self._total = _Holding()
         self._num_unserved = 0
-
-    @property
-    def state_bytes(self) -> int:
-        """Bytes of all states and answers, as counted by :meth:`update_size`."""
-        return self._total.state_bytes
-
-    @property
-    def configuration_bytes(self) -> int:
-        """Bytes of all packed session configurations."""
-        return self._total.configuration_bytes
 
     def __len__(self) -> int:
         return len(self._sessions)
@@ -377,10 +356,7 @@ class SessionTable:
     def add(self, session: Session) -> None:
         """Add a session."""
         self._sessions[session.key] = session
-        self._num_unserved += not session.served
-        self._holdings.setdefault(session.owner, _Holding())
-        for holding in self._holdings_with(session):
-            holding.count(session, 1)
+        self._count(session, 1)
         self._epochs.forget(session.key)
 
     def use(self, session: Session, now: float) -> None:
@@ -392,13 +368,20 @@ class SessionTable:
         """Drop all of a session but its epoch. Nothing may wait for it."""
         session.closed = True
         del self._sessions[session.key]
-        self._num_unserved -= not session.served
         self._count_state(session, 0)
-        for holding in self._holdings_with(session):
-            holding.count(session, -1)
-        if not self._holdings[session.owner].sessions:
-            del self._holdings[session.owner]
+        self._count(session, -1)
         self.note_epoch(session.key, session.epoch)
+
+    def _count(self, session: Session, sign: int) -> None:
+        """Count a session without states, or count it no more."""
+        owner, num_bytes = session.owner, sign * len(session.configuration)
+        self._num_unserved += sign * (not session.served)
+        self._num_of[owner] += sign
+        self._configuration_bytes_of[owner] += num_bytes
+        self.configuration_bytes += num_bytes
+        if not self._num_of[owner]:
+            for held in (self._num_of, self._configuration_bytes_of, self._state_bytes_of):
+                del held[owner]
 
     def note_epoch(self, key: SessionKey, epoch: int) -> None:
         """Remember the epoch of a robot without a session."""
@@ -425,19 +408,12 @@ class SessionTable:
             owner = session.owner
             return self._first_unused(lambda each: each.owner == owner)
         only_unserved = 2 * self._num_unserved >= self._limits.max_sessions
-        if self._is_full:
-            return self._unused_of_most(
-                lambda holding: holding.sessions, only_unserved=only_unserved
-            )
-        return self._unused_of_most(
-            lambda holding: holding.configuration_bytes, only_unserved=only_unserved
-        )
+        held = self._num_of if self._is_full else self._configuration_bytes_of
+        return self._unused_of_most(held, only_unserved=only_unserved)
 
     def _is_full_for(self, owner: Owner) -> bool:
-        most, holding = self._limits.max_sessions_per_robot, self._holdings.get(owner)
-        if owner is None or most is None or holding is None:
-            return False
-        return holding.sessions >= most
+        most = self._limits.max_sessions_per_robot
+        return owner is not None and most is not None and self._num_of[owner] >= most
 
     @property
     def _is_full(self) -> bool:
@@ -449,21 +425,16 @@ class SessionTable:
             > self._limits.max_configuration_bytes
         )
 
-    def _unused_of_most(
-        self, amount: Callable[[_Holding], int], *, only_unserved: bool
-    ) -> Session | None:
+    def _unused_of_most(self, held: Counter[Owner], *, only_unserved: bool) -> Session | None:
         """Return the least recently used session without tasks, of the owners that hold the most.
 
         These hold at least half of the largest holding: among near equals the same one is not
         dropped each time. If all of these have tasks, it is one of the others.
         """
-        holdings = self._holdings
-        if len(holdings) > 1:
-            least = max(map(amount, holdings.values())) / 2
+        if len(self._num_of) > 1:
+            least = max(held.values()) / 2
             found = self._first_unused(
-                lambda each: (
-                    amount(holdings[each.owner]) >= least and not (only_unserved and each.served)
-                )
+                lambda each: held[each.owner] >= least and not (only_unserved and each.served)
             )
             if found is not None:
                 return found
@@ -501,7 +472,7 @@ class SessionTable:
 
     def largest_evictable(self) -> Session | None:
         """Return the session without tasks to be dropped for its memory; None if there is none."""
-        return self._unused_of_most(lambda holding: holding.state_bytes, only_unserved=False)
+        return self._unused_of_most(self._state_bytes_of, only_unserved=False)
 
     def drop_states(self, session: Session) -> None:
         """Drop a session's states and answers; the robot will send its state each time."""
@@ -510,12 +481,9 @@ class SessionTable:
         self._count_state(session, 0)
 
     def _count_state(self, session: Session, num_bytes: int) -> None:
-        for holding in self._holdings_with(session):
-            holding.state_bytes += num_bytes - session.num_bytes
+        self._state_bytes_of[session.owner] += num_bytes - session.num_bytes
+        self.state_bytes += num_bytes - session.num_bytes
         session.num_bytes = num_bytes
-
-    def _holdings_with(self, session: Session) -> tuple[_Holding, _Holding]:
-        return self._total, self._holdings[session.owner]
 
 
 def _digest_of(data: object) -> bytes:
