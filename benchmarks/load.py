@@ -46,7 +46,6 @@ from holdfast.protocol.messages import (
     encode,
 )
 from holdfast.robot.session_configuration import session_configuration_of
-from holdfast.transport.endpoints import ServiceAddress
 from holdfast.transport.robot_end import StreamRobotTransport
 
 _SERVICE = "cloud"
@@ -170,7 +169,7 @@ class _Link:
 
     def __init__(self, fleet: _Fleet, endpoint: str) -> None:
         self._fleet = fleet
-        self._transport = StreamRobotTransport({_SERVICE: ServiceAddress(endpoint)})
+        self._transport = StreamRobotTransport({_SERVICE: endpoint})
         self._asked: dict[int, _Robot] = {}
         self._number = 0
         self.appeared = asyncio.Event()

@@ -212,7 +212,6 @@ def run_robot(
     """
     links = make_links(configuration, directory / "recovery.log", notebook)
     with contextlib.ExitStack() as stack:
-        stack.callback(links.close)
         run = stack.enter_context(RunDirectory.create(directory / "run", configuration))
 
         def on_result(result: TrialResult) -> None:

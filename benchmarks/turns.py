@@ -31,7 +31,7 @@ from holdfast.protocol.messages import (
     encode_floats,
 )
 from holdfast.robot.environment import SimulatedEnvironment
-from holdfast.transport.endpoints import ServiceAddress, TlsFiles
+from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.robot_end import StreamRobotTransport
 
 __all__ = ["Asked", "Asker", "Caller", "Turn", "decided_in_process", "recorded_turns"]
@@ -174,7 +174,7 @@ class Caller:
     """
 
     def __init__(self, endpoint: str, tls: TlsFiles | None = None) -> None:
-        self._transport = StreamRobotTransport({endpoint: ServiceAddress(endpoint)}, tls=tls)
+        self._transport = StreamRobotTransport({endpoint: endpoint}, tls=tls)
         self._endpoint = endpoint
         self._number = 0
         self._replies: list[tuple[float, Reply]] = []

@@ -44,7 +44,6 @@ from holdfast.protocol.service import Service
 from holdfast.runtime.events import BoundedEventLog
 from holdfast.service.shell import ServiceShell
 from holdfast.transport.contract import RobotTransport
-from holdfast.transport.endpoints import ServiceAddress
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast_lab.errors import NoProgressError, ProcessEndedError
 from holdfast_lab.testbed.driver import Testbed
@@ -267,7 +266,7 @@ async def _over_tcp(wanted: Exchange) -> AsyncIterator[tuple[str, RobotTransport
             testbed.start_services()
         except (NoProgressError, ProcessEndedError) as error:
             raise TaskError(str(error)) from error
-        addresses = {service.endpoint: ServiceAddress(service.endpoint)}
+        addresses = {service.endpoint: service.endpoint}
         transport = StreamRobotTransport(addresses, lease_ms=_LEASE_MS)
         try:
             yield service.endpoint, transport

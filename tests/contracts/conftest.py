@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,7 +17,6 @@ from tests.contracts.wires import (
 )
 
 from holdfast.transport.endpoints import TlsFiles
-from holdfast.transport.private_socket import PrivateSocket
 
 
 @pytest.fixture(scope="session")
@@ -37,8 +37,8 @@ def service_tls(authority: Authority) -> TlsFiles:
 @pytest.fixture
 def socket_directory() -> Iterator[Path]:
     """Pytest's own directories have paths too long for a socket."""
-    with PrivateSocket() as place:
-        yield Path(place.endpoint.removeprefix("unix/")).parent
+    with tempfile.TemporaryDirectory(prefix="h") as directory:
+        yield Path(directory)
 
 
 @pytest.fixture(params=WIRES)
@@ -51,8 +51,8 @@ def wire(
     match request.param:
         case "in_process":
             return InProcessWire()
-        case "robot_listens":
-            return StreamWire("unix", socket_directory, robot_listens=True)
+        case "launched":
+            return StreamWire("unix", socket_directory, launched=True)
         case "tls" | "udp":
             return StreamWire(
                 request.param, socket_directory, robot_tls=robot_tls, service_tls=service_tls

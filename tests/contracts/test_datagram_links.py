@@ -24,7 +24,7 @@ from holdfast.transport import datagram_links as datagram_links
 from holdfast.transport.contract import IncomingCall
 from holdfast.transport.datagram_cipher import AssociationKeys, DatagramCipher
 from holdfast.transport.datagram_links import RobotDatagramLink, ServiceDatagramLink
-from holdfast.transport.endpoints import ServiceAddress, TlsFiles
+from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.exchanges import MAX_PAYLOAD_BYTES
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.service_end import StreamServiceTransport
@@ -131,9 +131,7 @@ class TestWhatGoesWhichWay:
             "cloud", incarnation="b1", listen=[f"udp/0.0.0.0:{port}"], tls=service_tls
         )
         await service.start(echo)
-        robot = StreamRobotTransport(
-            {"cloud": ServiceAddress(f"udp/127.0.0.1:{port}")}, tls=robot_tls
-        )
+        robot = StreamRobotTransport({"cloud": f"udp/127.0.0.1:{port}"}, tls=robot_tls)
         robot.start(Inbox())
         await until(lambda: robot.sends_datagrams("cloud"))
         await robot.close()
@@ -417,7 +415,7 @@ class TestEnds:
         closed: list[tuple[str, str]] = []
         with Proxy(entry, target, "filtered"):
             robot = StreamRobotTransport(
-                {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")},
+                {"cloud": f"udp/127.0.0.1:{entry}"},
                 tls=robot_tls,
                 on_event=lambda event, **fields: closed.append((event, fields["service"])),
             )
@@ -464,7 +462,7 @@ class TestEnds:
         entry = free_port()
         with Proxy(entry, target, "seed", datagrams=True) as proxy:
             robot = StreamRobotTransport(
-                {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")}, tls=robot_tls, lease_ms=3.6e6
+                {"cloud": f"udp/127.0.0.1:{entry}"}, tls=robot_tls, lease_ms=3.6e6
             )
             udp.ends.insert(0, robot)
             inbox = Inbox()
@@ -520,7 +518,7 @@ class TestWhatGoesTogether:
         await udp.service("cloud", "b1").start(echo)
         refusals: list[str] = []
         robot = StreamRobotTransport(
-            {"cloud": ServiceAddress(udp.endpoint("cloud").replace("udp", "tls"))},
+            {"cloud": udp.endpoint("cloud").replace("udp", "tls")},
             tls=robot_tls,
             on_event=lambda _, **fields: refusals.append(fields["reason"]),
         )
@@ -541,7 +539,7 @@ class TestWhatGoesTogether:
         monkeypatch.setitem(sys.modules, "cryptography.hazmat.primitives.ciphers.aead", None)
         with pytest.raises(TransportError, match="pip install cryptography"):
             if end == "robot":
-                StreamRobotTransport({"c": ServiceAddress("udp/127.0.0.1:1")}, tls=robot_tls)
+                StreamRobotTransport({"c": "udp/127.0.0.1:1"}, tls=robot_tls)
             else:
                 StreamServiceTransport(
                     "cloud", incarnation="b1", listen=["udp/127.0.0.1:0"], tls=service_tls
@@ -549,6 +547,6 @@ class TestWhatGoesTogether:
 
     def test_without_credentials(self) -> None:
         with pytest.raises(TransportError, match="udp needs credentials"):
-            StreamRobotTransport({"cloud": ServiceAddress("udp/127.0.0.1:1")})
+            StreamRobotTransport({"cloud": "udp/127.0.0.1:1"})
         with pytest.raises(TransportError, match="udp needs credentials"):
             StreamServiceTransport("cloud", incarnation="b1", listen=["udp/127.0.0.1:0"])

@@ -29,7 +29,7 @@ from holdfast.protocol.events import (
 )
 from holdfast.transport import dialer, frames
 from holdfast.transport.dialer import Dialer
-from holdfast.transport.endpoints import ServiceAddress, TlsFiles
+from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.service_end import StreamServiceTransport
 
@@ -362,7 +362,7 @@ class TestRedialling:
             tls=tls.service_tls if services == "tls" else None,
         )
         robot = StreamRobotTransport(
-            {"cloud": ServiceAddress(f"{robots}/{place}")},
+            {"cloud": f"{robots}/{place}"},
             tls=tls.robot_tls if robots == "tls" else None,
         )
         inbox = Inbox()

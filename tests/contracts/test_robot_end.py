@@ -257,11 +257,10 @@ class TestHandshakeIsEnough:
 ROBOT_THAT_STANDS_STILL = """
 import asyncio, os, signal, sys
 from holdfast.protocol.events import CallEnded, ServiceAppeared, ServiceVanished
-from holdfast.transport.endpoints import ServiceAddress
 from holdfast.transport.robot_end import StreamRobotTransport
 
 async def main():
-    robot = StreamRobotTransport({"cloud": ServiceAddress(sys.argv[1])}, lease_ms=60_000.0)
+    robot = StreamRobotTransport({"cloud": sys.argv[1]}, lease_ms=60_000.0)
     events = asyncio.Queue()
     robot.start(events.put_nowait)
     print(await events.get(), flush=True)
@@ -336,11 +335,10 @@ async def test_what_came_while_a_robot_stood_still_is_read_before_anybody_is_giv
 ROBOT_THAT_ENDS = """
 import asyncio, sys
 from holdfast.protocol.events import ServiceAppeared
-from holdfast.transport.endpoints import ServiceAddress
 from holdfast.transport.robot_end import StreamRobotTransport
 
 async def main():
-    robot = StreamRobotTransport({"cloud": ServiceAddress(sys.argv[1])})
+    robot = StreamRobotTransport({"cloud": sys.argv[1]})
     seen = asyncio.Event()
 
     def deliver(event):

@@ -30,7 +30,7 @@ from holdfast.protocol.events import (
 )
 from holdfast.transport import service_end
 from holdfast.transport.contract import IncomingCall
-from holdfast.transport.endpoints import ServiceAddress, TlsFiles
+from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.tls import client_context
 
@@ -71,7 +71,7 @@ class TestCertificates:
             echo(call)
 
         await tls.service("cloud", "b1").start(serve)
-        address = ServiceAddress(tls.endpoint("cloud"))
+        address = tls.endpoint("cloud")
         refusals: list[tuple[str, str]] = []
         for files in (foreign, stranger):
             outsider = StreamRobotTransport(
@@ -93,7 +93,7 @@ class TestCertificates:
             assert expected in refusals[0][1]
         bare = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         bare.load_verify_locations(robot_tls.authority)
-        host, _, port = address.endpoint.removeprefix("tls/").rpartition(":")
+        host, _, port = address.removeprefix("tls/").rpartition(":")
         with pytest.raises(ssl.SSLError, match="CERTIFICATE_REQUIRED"):
             reader, writer = await asyncio.open_connection(host, int(port), ssl=bare)
             writer.write(HELLO)

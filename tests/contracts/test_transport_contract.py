@@ -207,18 +207,6 @@ class TestEveryWire:
             e for e in inbox.events if isinstance(e, ReplyReceived | CallEnded) and e.call == 1
         ] == []
 
-    async def test_an_abandoned_number_can_be_used_again(self, wire: Wire) -> None:
-        calls = Received()
-        robot, inbox, _ = await connected(wire, calls)
-        robot.call("cloud", 1, b"old")
-        old = await calls.next()
-        robot.abandon(1)
-        robot.call("cloud", 1, b"new")
-        new = await calls.next()
-        echo(old)
-        echo(new)
-        assert await inbox.of_call(1) == [ReplyReceived(1, b"new"), CallEnded(1)]
-
     async def test_a_service_that_closes_ends_the_calls_that_it_has(self, wire: Wire) -> None:
         calls = Received()
         robot, inbox, service = await connected(wire, calls)
@@ -331,8 +319,8 @@ class TestEveryWire:
         assert await inbox.of_call(1) == [ReplyReceived(1, b"small"), CallEnded(1)]
 
     async def test_a_robot_that_goes_hinders_nobody(self, wire: Wire) -> None:
-        if isinstance(wire, StreamWire) and wire.robot_listens:
-            pytest.skip("only one robot can listen at an endpoint")
+        if isinstance(wire, StreamWire) and wire.launched:
+            pytest.skip("a launched service has one robot")
         calls = Received()
         robot, _, _ = await connected(wire, calls)
         other, inbox = wire.robot("cloud"), Inbox()
@@ -348,6 +336,8 @@ class TestEveryWire:
         assert await inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
 
     async def test_a_robot_that_returns_sees_the_service(self, wire: Wire) -> None:
+        if isinstance(wire, StreamWire) and wire.launched:
+            pytest.skip("the robot's next process launches another one")
         robot, _, _ = await connected(wire)
         await robot.close()
         again, inbox = wire.robot("cloud"), Inbox()
@@ -411,7 +401,7 @@ class TestEveryWire:
         assert [e for e in inbox.events if isinstance(e, CallEnded)] == []
 
 
-@pytest.mark.parametrize("kind", ["tcp", "tls", "udp", "unix", "robot_listens"])
+@pytest.mark.parametrize("kind", ["tcp", "tls", "udp", "unix", "launched"])
 class TestProcesses:
     @pytest.fixture
     def wire(
@@ -419,8 +409,8 @@ class TestProcesses:
     ) -> StreamWire:
         if kind in ("tls", "udp"):
             wire = StreamWire(kind, socket_directory, robot_tls=robot_tls, service_tls=service_tls)
-        elif kind == "robot_listens":
-            wire = StreamWire("unix", socket_directory, robot_listens=True)
+        elif kind == "launched":
+            wire = StreamWire("unix", socket_directory, launched=True)
         else:
             wire = StreamWire(kind, socket_directory)
         wire.lease_ms = LEASE_MS
@@ -428,9 +418,10 @@ class TestProcesses:
 
     @pytest.fixture
     def start(self, wire: StreamWire) -> Start:
-        direction = "connect" if wire.robot_listens else "listen"
         return lambda incarnation: service_process(
-            wire.endpoint("cloud"), incarnation, direction, tls=wire.service_tls
+            wire.connection("cloud") if wire.launched else wire.endpoint("cloud"),
+            incarnation,
+            tls=wire.service_tls,
         )
 
     async def test_kill_in_mid_call_ends_the_call_and_the_next_process_is_seen(
@@ -467,6 +458,8 @@ class TestProcesses:
             await inbox.wait_for(ServiceVanished("cloud", "b1"), CallEnded(1))
             robot.call("cloud", 2, b"echo")
             assert await inbox.of_call(2) == [CallEnded(2)]
+            if wire.launched:
+                return  # the robot replaces it
             process.send_signal(signal.SIGCONT)
             await inbox.wait(lambda _: inbox.count(ServiceAppeared("cloud", "b1")) == 2)
             assert await answered(robot, inbox, itertools.count(3))
@@ -502,6 +495,8 @@ class TestProcesses:
     async def test_a_service_that_goes_on_just_when_it_was_given_up_answers_again(
         self, wire: StreamWire, start: Start
     ) -> None:
+        if wire.launched:
+            pytest.skip("its robot launches another one")
         robot, inbox = wire.robot("cloud"), Inbox()
         robot.start(inbox)
         numbers = itertools.count()
@@ -509,7 +504,7 @@ class TestProcesses:
             for k in range(1, 4):
                 await inbox.appeared(times=k)
                 stop(process.pid)
-                robot.call("cloud", next(numbers), bytes(0 if wire.robot_listens else MAX_BYTES))
+                robot.call("cloud", next(numbers), bytes(MAX_BYTES))
                 await inbox.wait(lambda _, k=k: inbox.count(ServiceVanished("cloud", "b1")) >= k)  # type: ignore[misc]
                 process.send_signal(signal.SIGCONT)
                 await inbox.appeared(times=k + 1)

@@ -25,7 +25,6 @@ from tests.contracts.wires import (
     refusal_of,
     saying,
     slow_proxy,
-    unreachable_into,
     until,
 )
 
@@ -37,9 +36,9 @@ from holdfast.protocol.events import (
     ServiceVanished,
     TransportEvent,
 )
-from holdfast.transport import frames, links, robot_end, service_end
+from holdfast.transport import frames, links, service_end
 from holdfast.transport.contract import IncomingCall
-from holdfast.transport.endpoints import ServiceAddress, TlsFiles
+from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.service_end import StreamServiceTransport
 
@@ -48,7 +47,7 @@ class TestStreams:
     async def test_port_0_becomes_a_port(self) -> None:
         service = StreamServiceTransport("cloud", incarnation="b1", listen=["tcp/127.0.0.1:0"])
         await service.start(echo)
-        robot = StreamRobotTransport({"cloud": ServiceAddress(service.endpoints[0])})
+        robot = StreamRobotTransport({"cloud": service.endpoints[0]})
         inbox = Inbox()
         robot.start(inbox)
         await inbox.wait_for(ServiceAppeared("cloud", "b1"))
@@ -56,52 +55,18 @@ class TestStreams:
         await robot.close()
         await service.close()
 
-    async def test_a_service_that_takes_no_more_links_does_not_look_for_robots(
-        self, socket_directory: Path
-    ) -> None:
-        wire = StreamWire("unix", socket_directory, robot_listens=True)
-        robot, inbox, service = await connected(wire)
-        assert isinstance(service, StreamServiceTransport)
-        (dialer,) = service._dialers.values()
-        robot.call("cloud", 1, b"")
-        await inbox.of_call(1)
-        service.dismiss()
-        await until(lambda: len(wire.events) == 2)
-        assert dialer._next is None
-        await wire.close_on_loop()
-
     async def test_a_host_name_is_looked_up(self, tcp: StreamWire) -> None:
         await tcp.service("cloud", "b1").start(echo)
         endpoint = tcp.endpoint("cloud").replace("127.0.0.1", "localhost")
-        robot, inbox = StreamRobotTransport({"cloud": ServiceAddress(endpoint)}), Inbox()
+        robot, inbox = StreamRobotTransport({"cloud": endpoint}), Inbox()
         tcp.ends.append(robot)
         robot.start(inbox)
         await inbox.wait_for(ServiceAppeared("cloud", "b1"))
 
-    async def test_a_name_that_was_asked_for_must_be_the_service_s(self, tcp: StreamWire) -> None:
-        await tcp.service("cloud", "b1").start(echo)
-        endpoint = tcp.endpoint("cloud")
-        refusals: list[tuple[str, str]] = []
-        robot = StreamRobotTransport(
-            {
-                "right": ServiceAddress(endpoint, name="cloud"),
-                "wrong": ServiceAddress(endpoint, name="other"),
-            },
-            on_event=unreachable_into(refusals),
-        )
-        tcp.ends.append(robot)
-        inbox = Inbox()
-        robot.start(inbox)
-        await inbox.wait_for(ServiceAppeared("right", "b1"))
-        await until(lambda: bool(refusals))
-        assert refusals == [("wrong", "is the service cloud, and other was expected")]
-        robot.call("wrong", 1, b"")
-        assert await inbox.of_call(1) == [CallEnded(1)]
-
-    async def test_of_two_services_at_a_listening_robot_the_newest_is_called(
+    async def test_of_two_launched_processes_the_newest_is_called(
         self, socket_directory: Path
     ) -> None:
-        wire = StreamWire("unix", socket_directory, robot_listens=True)
+        wire = StreamWire("unix", socket_directory, launched=True)
         robot, inbox, _ = await connected(wire, saying(b"old"))
         newer = wire.service("cloud", "b2")
         await newer.start(saying(b"new"))
@@ -116,17 +81,16 @@ class TestStreams:
 
     async def test_a_robot_remembers_the_last_few_reasons(self, socket_directory: Path) -> None:
         """A peer may say another one in each goodbye, for as long as it likes."""
-        wire = StreamWire("unix", socket_directory, robot_listens=True)
+        wire = StreamWire("unix", socket_directory, launched=True)
         robot = wire.robot("cloud")
         robot.start(Inbox())
-        endpoint = wire.endpoint("cloud")
         texts = ["is 0", "is 0", *(f"is {number}" for number in range(1, 20)), "is 0", "is 0"]
         reported = [text for at, text in enumerate(texts) if at not in (1, len(texts) - 1)]
         for text in texts:
-            with await Visitor(endpoint).connect() as visitor:
-                await visitor.say(frames.MAGIC + frames.encode_goodbye(text))
-                await visitor.hear()
-        await until(lambda: len(wire.refusals) >= len(reported), lambda: wire.refusals)
+            with wire.connection("cloud") as service:
+                service.sendall(frames.MAGIC + frames.encode_goodbye(text))
+                await until(lambda: not robot._services["cloud"]._silent)
+                await until(lambda: not robot._services["cloud"]._made)
         assert [reason for _, reason in wire.refusals] == [
             f"refuses this end, which {text}" for text in reported
         ]
@@ -240,16 +204,16 @@ class TestStreams:
 
     def test_the_right_credentials_or_none(self, robot_tls: TlsFiles, tmp_path: Path) -> None:
         with pytest.raises(TransportError, match=r"tls needs credentials.*--tls"):
-            StreamRobotTransport({"cloud": ServiceAddress("tls/localhost:7447")})
+            StreamRobotTransport({"cloud": "tls/localhost:7447"})
         with pytest.raises(TransportError, match=r"tcp does not use the credentials"):
-            StreamRobotTransport({"cloud": ServiceAddress("tcp/localhost:7447")}, tls=robot_tls)
+            StreamRobotTransport({"cloud": "tcp/localhost:7447"}, tls=robot_tls)
         missing = TlsFiles(robot_tls.authority, tmp_path / "missing.pem", robot_tls.key)
         with pytest.raises(TransportError, match=r"missing\.pem: cannot be read: No such file"):
-            StreamRobotTransport({"cloud": ServiceAddress("tls/localhost:7447")}, tls=missing)
+            StreamRobotTransport({"cloud": "tls/localhost:7447"}, tls=missing)
 
     def test_a_robot_connects_to_a_port(self) -> None:
         with pytest.raises(TransportError, match="port 0 is for listening"):
-            StreamRobotTransport({"cloud": ServiceAddress("tcp/127.0.0.1:0")})
+            StreamRobotTransport({"cloud": "tcp/127.0.0.1:0"})
 
     async def test_a_transport_is_started_once(self, tcp: StreamWire) -> None:
         robot, _, service = await connected(tcp)
@@ -264,7 +228,7 @@ class TestStreams:
         await tcp.service("cloud", "b1").start(echo_of_size)
         port = int(tcp.endpoint("cloud").rpartition(":")[2])
         with slow_proxy(port, bytes_per_second=100_000) as slow_port:
-            address = ServiceAddress(f"tcp/127.0.0.1:{slow_port}")
+            address = f"tcp/127.0.0.1:{slow_port}"
             robot = StreamRobotTransport({"cloud": address}, lease_ms=600.0)
             inbox = Inbox()
             robot.start(inbox)
@@ -611,23 +575,3 @@ class TestPeers:
         await until(lambda: bool(tcp.refusals))
         assert "which is one too many: 1 robots are connected" in tcp.refusals[0][1]
         assert inbox.events == []
-
-    async def test_connections_that_say_nothing_keep_no_service_out(
-        self, socket_directory: Path
-    ) -> None:
-        wire = StreamWire("unix", socket_directory, robot_listens=True)
-        robot, inbox = wire.robot("cloud"), Inbox()
-        robot.start(inbox)
-        async with contextlib.AsyncExitStack() as stack:
-            stack.push_async_callback(wire.close_on_loop)
-            for _ in range(200):
-                visitor = stack.enter_context(Visitor(wire.endpoint("cloud")))
-                visitor.socket.setblocking(True)
-                visitor.socket.connect(visitor.address)
-                visitor.socket.sendall(frames.MAGIC[:1])
-            links_made = robot._services["cloud"]._made
-            for _ in range(100):
-                await asyncio.sleep(0)
-                assert sum(not link.ended for link in links_made) <= robot_end._MAX_WITHOUT_HELLO
-            await wire.service("cloud", "b1").start(echo)
-            await inbox.wait_for(ServiceAppeared("cloud", "b1"))

@@ -37,7 +37,7 @@ from holdfast.protocol.events import (
 from holdfast.protocol.messages import Refused, decode_reply
 from holdfast.transport import frames
 from holdfast.transport.contract import IncomingCall, RobotTransport, ServiceTransport
-from holdfast.transport.endpoints import ServiceAddress, TlsFiles
+from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.service_end import StreamServiceTransport
 from holdfast_lab.testbed.in_process import InProcessNetwork
@@ -162,7 +162,7 @@ class InProcessWire:
 
 
 class StreamWire:
-    """One endpoint for each name; the services listen at it or, at a local socket, the robot."""
+    """One endpoint for each name; or the service inherits its connection to the robot."""
 
     def __init__(
         self,
@@ -171,13 +171,14 @@ class StreamWire:
         *,
         robot_tls: TlsFiles | None = None,
         service_tls: TlsFiles | None = None,
-        robot_listens: bool = False,
+        launched: bool = False,
     ) -> None:
         self.protocol = protocol
         self.directory = directory
         self.robot_tls = robot_tls
         self.service_tls = service_tls
-        self.robot_listens = robot_listens
+        self.launched = launched
+        self._unattached: list[tuple[str, socket.socket]] = []
         # What is closed or killed is found at once; a machine that stands still is no lost link.
         self.lease_ms = PATIENT["lease_ms"]
         self._endpoints: dict[str, str] = {}
@@ -194,7 +195,7 @@ class StreamWire:
         self, *services: str, max_message_bytes: int = MAX_BYTES, name: str = ""
     ) -> StreamRobotTransport:
         robot = StreamRobotTransport(
-            {name: ServiceAddress(self.endpoint(name), self.robot_listens) for name in services},
+            {name: None if self.launched else self.endpoint(name) for name in services},
             name=name,
             lease_ms=self.lease_ms,
             max_message_bytes=max_message_bytes,
@@ -202,15 +203,28 @@ class StreamWire:
             on_event=unreachable_into(self.refusals),
         )
         self.ends.append(robot)
+        for each, connection in self._unattached:
+            robot.attach(each, connection)
+        self._unattached.clear()
         return robot
 
+    def connection(self, name: str) -> socket.socket:
+        """Return a launched service's end of its connection to the robot."""
+        ours, theirs = socket.socketpair()
+        ours.setblocking(False)
+        robots = [end for end in self.ends if isinstance(end, StreamRobotTransport)]
+        if robots:
+            robots[-1].attach(name, ours)
+        else:
+            self._unattached.append((name, ours))
+        return theirs
+
     def service(self, name: str, incarnation: str) -> StreamServiceTransport:
-        endpoints = [self.endpoint(name)]
         service = StreamServiceTransport(
             name,
             incarnation=incarnation,
-            listen=[] if self.robot_listens else endpoints,
-            connect=endpoints if self.robot_listens else [],
+            listen=[] if self.launched else [self.endpoint(name)],
+            robot=self.connection(name) if self.launched else None,
             lease_ms=self.lease_ms,
             max_message_bytes=MAX_BYTES,
             tls=self.service_tls,
@@ -302,7 +316,7 @@ class Authority:
         return builder.sign(self._key, hashes.SHA256())
 
 
-WIRES = ["in_process", "tcp", "tls", "udp", "unix", "robot_listens"]
+WIRES = ["in_process", "tcp", "tls", "udp", "unix", "launched"]
 
 
 def echo(call: IncomingCall) -> None:
@@ -435,7 +449,7 @@ def assert_matches(text: str, pattern: str) -> None:
 
 
 SERVICE = """
-import asyncio, sys, threading
+import asyncio, socket, sys, threading
 from pathlib import Path
 from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.service_end import StreamServiceTransport
@@ -454,11 +468,12 @@ def serve(call):
         call.reply(b"begun")  # and is never heard of again
 
 async def main():
-    endpoint, incarnation, direction, lease_ms, *files = sys.argv[1:]
+    endpoint, incarnation, lease_ms, *files = sys.argv[1:]
     tls = TlsFiles(*map(Path, files)) if files else None
     service = StreamServiceTransport(
         "cloud", incarnation=incarnation, lease_ms=float(lease_ms), tls=tls,
-        **{direction: [endpoint]},
+        **({"robot": socket.socket(fileno=int(endpoint))} if endpoint.isdigit()
+           else {"listen": [endpoint]}),
     )
     await service.start(serve)
     print("ready", flush=True)
@@ -475,19 +490,23 @@ asyncio.run(main())
 
 @contextlib.asynccontextmanager
 async def service_process(
-    endpoint: str,
+    endpoint: str | socket.socket,
     incarnation: str,
-    direction: str = "listen",
     *,
     lease_ms: float = LEASE_MS,
     tls: TlsFiles | None = None,
 ) -> AsyncIterator[subprocess.Popen[bytes]]:
     files = [] if tls is None else [str(tls.authority), str(tls.certificate), str(tls.key)]
+    inherited = endpoint.fileno() if isinstance(endpoint, socket.socket) else None
+    where = str(endpoint if inherited is None else inherited)
     process = subprocess.Popen(
-        [sys.executable, "-c", SERVICE, endpoint, incarnation, direction, str(lease_ms), *files],
+        [sys.executable, "-c", SERVICE, where, incarnation, str(lease_ms), *files],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
+        pass_fds=[] if inherited is None else [inherited],
     )
+    if isinstance(endpoint, socket.socket):
+        endpoint.close()
     try:
         assert process.stdout is not None
         ready = await asyncio.get_running_loop().run_in_executor(None, process.stdout.readline)

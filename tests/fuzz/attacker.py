@@ -57,7 +57,6 @@ from holdfast.planning.settings import OffloadSettings
 from holdfast.protocol.messages import encode
 from holdfast.transport.credentials import load_credentials
 from holdfast.transport.datagram_links import RobotDatagramLink
-from holdfast.transport.endpoints import ServiceAddress
 from holdfast.transport.robot_end import StreamRobotTransport
 
 __all__ = ["TRANSPORTS", "WAYS", "attacked", "main"]
@@ -239,7 +238,7 @@ async def _send_datagrams(target: Target, chance: random.Random) -> None:
     calls = itertools.count(1)
     while target.goes_on:
         robot = StreamRobotTransport(
-            {"cloud": ServiceAddress(target.endpoint)},
+            {"cloud": target.endpoint},
             incarnation=chance.randbytes(4).hex(),
             tls=load_credentials(target.keys, "robot").files,
         )

@@ -237,13 +237,15 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     assert sessions._num_unserved == sum(not session.served for session in kept)
     # Owners.
     owners = {session.owner for session in kept}
-    assert set(sessions._holdings) == owners
+    assert set(sessions._num_of) == set(sessions._configuration_bytes_of) == owners
+    assert set(sessions._state_bytes_of) <= owners
     for owner in owners:
         theirs = [session for session in kept if session.owner == owner]
-        holding = sessions._holdings[owner]
-        assert holding.sessions == len(theirs)
-        assert holding.state_bytes == sum(session.num_bytes for session in theirs)
-        assert holding.configuration_bytes == sum(len(session.configuration) for session in theirs)
+        assert sessions._num_of[owner] == len(theirs)
+        states = sum(session.num_bytes for session in theirs)
+        assert sessions._state_bytes_of[owner] == states
+        configurations = sum(len(session.configuration) for session in theirs)
+        assert sessions._configuration_bytes_of[owner] == configurations
         if owner is not None and limits["max_sessions_per_robot"] is not None:
             assert len(theirs) <= limits["max_sessions_per_robot"]
     # States.
@@ -264,10 +266,10 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     assert all(lanes[number].num_running <= most[number] for number in most)
     assert statistics.waiting == len(waiting)
     for lane in lanes:
-        check_lane(lane, [task for task in waiting if queue._of(task) is lane])
+        check_lane(lane, [task for task in waiting if queue[task.lane] is lane])
     for number, lane in enumerate(lanes):
         requested = [
-            task for task in waiting if task.request is not None and queue._of(task) is lane
+            task for task in waiting if task.request is not None and queue[task.lane] is lane
         ]
         room = limits["max_waiting"] if number > FIRST else (limits["max_waiting"] + 1) // 2
         # One owner finds room, if another has taken that of all.

@@ -75,10 +75,7 @@ def test_the_local_service_is_told_the_robots_lease() -> None:
     """It is the robot's own, so one setting says how long either may be silent."""
     overrides = {"offload.lease_ms": ROBOT_MS, "offload.services": ["tcp/127.0.0.1:1"]}
     links = make_links(load(EXAMPLE, overrides=overrides), None, BoundedEventLog())
-    try:
-        assert links.launcher is not None and links.transport is not None
-        command = links.launcher._command
-        assert command[command.index("--lease-ms") + 1] == str(ROBOT_MS)
-        asyncio.run(links.transport.close())
-    finally:
-        links.close()
+    assert links.launcher is not None and links.transport is not None
+    command = links.launcher._command
+    assert command[command.index("--lease-ms") + 1] == str(ROBOT_MS)
+    asyncio.run(links.transport.close())

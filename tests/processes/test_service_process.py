@@ -41,8 +41,7 @@ from holdfast.protocol.messages import (
     encode,
     with_checksum,
 )
-from holdfast.transport.endpoints import ServiceAddress, TlsFiles
-from holdfast.transport.private_socket import PrivateSocket
+from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.robot_end import StreamRobotTransport
 
 PATIENCE_S = 30.0
@@ -156,21 +155,21 @@ class End:
 
     def __init__(
         self,
-        endpoint: str,
+        endpoint: str | None,
         *,
-        listens: bool = False,
+        connection: socket.socket | None = None,
         tls: TlsFiles | None = None,
-        name: str | None = None,
     ) -> None:
         self.events: SimpleQueue[TransportEvent] = SimpleQueue()
         self.loop = asyncio.new_event_loop()
-        address = ServiceAddress(endpoint, listens=listens, name=name)
         self.transport = StreamRobotTransport(
-            {"service": address}, lease_ms=PATIENT["lease_ms"], tls=tls
+            {"service": endpoint}, lease_ms=PATIENT["lease_ms"], tls=tls
         )
         self.thread = threading.Thread(target=self.loop.run_forever, daemon=True)
         self.thread.start()
         self.on_loop(self.transport.start, self.events.put)
+        if connection is not None:
+            self.on_loop(self.transport.attach, "service", connection)
         self.calls = 0
 
     def on_loop(self, function: Callable[..., None], *arguments: object) -> None:
@@ -225,12 +224,19 @@ def in_work(end: End, robot: Robot) -> TransportEvent:
 
 
 @contextlib.contextmanager
-def robots_end(endpoint: str, **options: Any) -> Iterator[End]:
+def robots_end(endpoint: str | None = None, **options: Any) -> Iterator[End]:
     end = End(endpoint, **options)
     try:
         yield end
     finally:
         end.close()
+
+
+def connection() -> tuple[socket.socket, socket.socket]:
+    """Return the robot's end and that of the service which it launches."""
+    ours, theirs = socket.socketpair()
+    ours.setblocking(False)
+    return ours, theirs
 
 
 def run_turns(end: End, robot: Robot, turns: int) -> None:
@@ -365,12 +371,14 @@ class TestServing:
                     run_turns(end, Robot(key=key), 2)
 
 
-class TestConnecting:
-    def test_to_a_robot_that_listens_until_that_dies(self) -> None:
-        with PrivateSocket() as local, robots_end(local.endpoint, listens=True) as end:
-            arguments = ["--connect", local.endpoint, "--until-stdin-closes"]
-            with served(*arguments, stdin=subprocess.PIPE) as service:
-                assert service.ready_line.split()[1:] == ["is", "connecting", "to", local.endpoint]
+class TestLaunched:
+    def test_it_decides_for_its_robot_until_that_dies(self) -> None:
+        ours, theirs = connection()
+        with theirs, robots_end(connection=ours) as end:
+            inherited = theirs.fileno()
+            arguments = [f"--robot={inherited}", "--until-stdin-closes"]
+            with served(*arguments, stdin=subprocess.PIPE, pass_fds=[inherited]) as service:
+                assert service.ready_line.endswith(" decides for the robot that has launched it\n")
                 end.appeared()
                 run_turns(end, Robot(), 2)
                 assert service.process.stdin is not None
@@ -404,11 +412,13 @@ class TestEnding:
 
     def test_nobody_reads_what_it_says(self) -> None:
         """A closed terminal is no reason to stop deciding."""
-        with PrivateSocket() as local, robots_end(local.endpoint, listens=True) as end:
+        ours, theirs = connection()
+        with theirs, robots_end(connection=ours) as end:
             reading, writing = os.pipe()
             os.close(reading)
             process = subprocess.Popen(
-                [*COMMAND, "--connect", local.endpoint],
+                [*COMMAND, f"--robot={theirs.fileno()}"],
+                pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=writing,
                 stderr=writing,
@@ -584,10 +594,12 @@ sys.exit(service_process.main(["--listen", "tcp/127.0.0.1:0", "--until-stdin-clo
 
 
 def test_whoever_sees_the_service_can_use_it() -> None:
+    ours, theirs = connection()
+    number = theirs.fileno()
     with (
-        PrivateSocket() as local,
-        robots_end(local.endpoint, listens=True) as end,
-        served("--connect", local.endpoint, ready=False) as service,
+        theirs,
+        robots_end(connection=ours) as end,
+        served(f"--robot={number}", ready=False, pass_fds=[number]) as service,
     ):
         end.appeared()
         (reply,) = end.ask(encode(Robot().request()))

@@ -23,7 +23,6 @@ from tests.processes.faults import (
 from holdfast.protocol.events import CallEnded, ServiceVanished
 from holdfast.transport.credentials import load_credentials
 from holdfast.transport.datagram_links import RobotDatagramLink
-from holdfast.transport.endpoints import ServiceAddress
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast_lab.testbed.bad_line import Impairment
 from holdfast_lab.testbed.proxy import Proxy
@@ -131,7 +130,7 @@ async def test_a_killed_service_is_known_by_its_closed_port(site: Site, keys: Pa
         ).start()
         with Proxy(entry, target, "held open") as stream:
             robot = StreamRobotTransport(
-                {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")},
+                {"cloud": f"udp/127.0.0.1:{entry}"},
                 tls=load_credentials(keys / "ours" / "robot", "robot").files,
                 lease_ms=3.6e6,
             )

@@ -9,6 +9,7 @@ from tests.command_line import run_here
 
 from holdfast.cli import keys
 from holdfast.transport import key_ring
+from holdfast.transport.authority import AUTHORITY_DAYS
 
 
 @pytest.mark.parametrize(
@@ -30,4 +31,4 @@ def test_bad_options(
 
 def test_limits_that_are_stated_twice_agree() -> None:
     assert key_ring.DEFAULT_DAYS == keys._DEFAULT_DAYS
-    assert key_ring.AUTHORITY_DAYS == keys._MAX_DAYS
+    assert AUTHORITY_DAYS == keys._MAX_DAYS

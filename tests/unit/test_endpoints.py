@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-import stat
 from pathlib import Path
 
 import pytest
@@ -15,7 +14,6 @@ from holdfast.transport.endpoints import (
     check_credentials,
     parse_endpoint,
 )
-from holdfast.transport.private_socket import PrivateSocket
 
 
 @pytest.mark.parametrize(
@@ -130,23 +128,3 @@ def test_credentials_go_with_the_protocols_that_use_them(tmp_path: Path) -> None
         check_credentials(tls, None)
     with pytest.raises(TransportError, match="tcp does not use the credentials"):
         check_credentials(tcp, files)
-
-
-def test_a_private_socket_is_private_and_goes_away() -> None:
-    with PrivateSocket() as place:
-        path = Path(parse_endpoint(place.endpoint).host)
-        assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
-        path.touch()
-    assert not path.parent.exists()
-    place.remove()
-
-
-def test_a_private_socket_that_would_be_too_long_says_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    deep = tmp_path / ("x" * 100)
-    deep.mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(deep))
-    with pytest.raises(TransportError, match="at most 107; set TMPDIR"):
-        PrivateSocket()
-    assert list(deep.iterdir()) == []

@@ -25,7 +25,7 @@ from holdfast.protocol.events import (
     EnvironmentReady,
     Sensed,
 )
-from holdfast.robot.environment import LATER, Environment, MissingReadings, SimulatedEnvironment
+from holdfast.robot.environment import LATER, Environment, SimulatedEnvironment
 from holdfast.robot.environment_maker import EnvironmentMaker
 from holdfast.robot.environment_runner import (
     EnvironmentRunner,
@@ -78,6 +78,19 @@ class Robot:
         self.closed.set()
 
 
+class Made(EnvironmentMaker):
+    """Makes one environment."""
+
+    def __init__(
+        self, make: Callable[[], Environment], problem: Any, timeout_ms: float, max_missing: int
+    ) -> None:
+        super().__init__("robot", problem, 0, timeout_ms, max_missing_in_a_row=max_missing)
+        self._make = make
+
+    def __call__(self, trial: int, **_: Any) -> Environment:
+        return self._make()
+
+
 class Bench:
     """A runner under test on an event loop, and the queue of its events."""
 
@@ -98,25 +111,12 @@ class Bench:
         resumed: bool = False,
         timeout_ms: float = 1e3 * PATIENCE_S,
         problem: Any = None,
-        missing: MissingReadings | None = None,
+        max_missing: int = 9,
     ) -> OnLoop:
         make = environment if callable(environment) else lambda: environment
-        problem = problem or PegInHole2D()
-        runner: EnvironmentRunner
-        if self.kind == "inline":
-            runner = InlineRunner(
-                make, problem, self.deliver, "robot", resumed=resumed, missing=missing
-            )
-        else:
-            runner = ThreadedRunner(
-                make,
-                problem,
-                self.deliver,
-                "robot",
-                timeout_ms,
-                resumed=resumed,
-                missing=missing,
-            )
+        maker = Made(make, problem or PegInHole2D(), timeout_ms, max_missing)
+        kind = InlineRunner if self.kind == "inline" else ThreadedRunner
+        runner = kind(maker, 0, self.deliver, resumed=resumed)
         return self.drive(runner)
 
     def drive(self, runner: EnvironmentRunner) -> OnLoop:
@@ -540,11 +540,10 @@ class TestThreads:
 
         events: list[EnvironmentEvent] = []
         robot = Robot(perform=interrupt)
-        runner = InlineRunner(
-            lambda: robot, PegInHole2D(), lambda event, _: events.append(event), "robot"
-        )
+        maker = Made(lambda: robot, PegInHole2D(), 1e3 * PATIENCE_S, 9)
+        runner = InlineRunner(maker, 0, lambda event, _: events.append(event))
         runner.begin()
-        assert runner.environment is robot
+        assert runner.world.environment is robot
         with pytest.raises(KeyboardInterrupt):
             runner.perform(0, ACTION)
         assert events == [EnvironmentReady(None, None)]
@@ -640,8 +639,8 @@ class TestMakePerformer:
         runner.begin(2)
         assert events == [EnvironmentReady(None, 2)]
         assert isinstance(runner, InlineRunner)
-        assert isinstance(runner.environment, SimulatedEnvironment)
-        assert runner.environment.state.tobytes() == lived.state.tobytes()
+        assert isinstance(runner.world.environment, SimulatedEnvironment)
+        assert runner.world.environment.state.tobytes() == lived.state.tobytes()
 
     def test_a_robot_is_performed_on_a_thread(self, threaded: Bench) -> None:
         class Own(Robot):
@@ -690,7 +689,7 @@ class TestShown:
     def test_an_ending_has_a_reason_of_one_line(self, bench: Bench) -> None:
         ending = Ending("failed", "hit\n  the \x1b[2Jwall " + 300 * "!")
         runner = bench.begin(Robot(is_done=False))
-        robot = bench.opened[-1].runner.environment
+        robot = bench.opened[-1].runner.world.environment
         assert isinstance(robot, Robot)
         robot.answers["is_done"] = ending
         runner.perform(0, ACTION)
@@ -730,7 +729,7 @@ class TestShown:
     def test_too_many_in_a_row_stop_the_run(self, bench: Bench) -> None:
         """An observation, late or not, begins the count anew; what is still to come does not."""
         robot = self.late_robot()
-        runner = bench.begin(robot, missing=MissingReadings(2))
+        runner = bench.begin(robot, max_missing=2)
 
         def sense(shown: Any) -> EnvironmentEvent:
             robot.answers["perform_sensing"] = shown

@@ -11,7 +11,7 @@ import pytest
 
 from holdfast.config.registry import problem_class
 from holdfast.errors import EnvironmentFailedError
-from holdfast.robot.environment import MissingReadings
+from holdfast.robot.environment import is_no_reading
 from holdfast_ros.executive import DecideCode, DecideRequest, DecisionHandover, ExecutiveEnvironment
 
 FOREVER_S = 60.0
@@ -157,7 +157,7 @@ def test_nan_is_no_reading(robot: Robot) -> None:
     sensed = robot.ask(ExecutiveEnvironment(meeting).perform_sensing, 0)
     assert meeting.call(DecideRequest(), FOREVER_S).code == DecideCode.OK
     meeting.call(DecideRequest(0, 1, np.array([np.nan])), 0.0)
-    assert MissingReadings().is_missing("decide", sensed.result())
+    assert is_no_reading(np.asarray(sensed.result()))
     meeting.end(DecideCode.ENDED, "over")
 
 

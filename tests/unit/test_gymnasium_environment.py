@@ -17,7 +17,7 @@ import holdfast as hf
 from holdfast.config.loader import load
 from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
 from holdfast.planning.outcome import MoveResult
-from holdfast.robot.environment import Environment, MissingReadings
+from holdfast.robot.environment import Environment, is_no_reading
 from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
 
@@ -243,7 +243,7 @@ class TestWhatIsShown:
 
     def test_a_function_may_have_no_reading(self) -> None:
         environment = counter(sensing=lambda *_: None, sensing_noise=[[0.1, 0.2], [0.1, 0.2]])
-        assert MissingReadings().is_missing("counter", environment.perform_sensing(1))
+        assert is_no_reading(environment.perform_sensing(1))
 
     def test_dictionaries_are_flattened_as_gymnasium_does(self) -> None:
         environment = counter(sensing=[[0, 2, 3]])

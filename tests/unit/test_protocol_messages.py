@@ -18,7 +18,6 @@ from tests.fuzz.odd_values import STORMS, OddValues, replaced
 from holdfast.config import yaml_document
 from holdfast.errors import MessageError
 from holdfast.planning.settings import PlanningSettings
-from holdfast.protocol import messages
 from holdfast.protocol.messages import (
     CHECKSUM_SIZE,
     DIGEST_SIZE,
@@ -407,7 +406,3 @@ def test_numbers_that_are_not_finite_are_refused(number: float) -> None:
         decode_floats(encode_floats([0.0, number]), 2)
     with pytest.raises(MessageError):
         decode_floats(encode_floats([0.0]), 2)
-
-
-def test_every_message_is_listed() -> None:
-    assert {type(reply).__name__ for reply in REPLIES} < set(messages.__all__)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.ports import free_port
 
 from holdfast.protocol.events import RecoveryExited
 from holdfast.robot.recovery_launcher import RecoveryLauncher
@@ -19,10 +19,12 @@ PATIENCE_S = 60.0
 
 @pytest.fixture
 def launcher() -> Iterator[RecoveryLauncher]:
-    arguments = ["--listen", f"tcp/127.0.0.1:{free_port()}", "--until-stdin-closes"]
-    made = RecoveryLauncher(arguments)
+    connections: list[socket.socket] = []
+    made = RecoveryLauncher([], connections.append)
     yield made
     made.close()
+    for connection in connections:
+        connection.close()
 
 
 class Exits(asyncio.Queue[RecoveryExited]):
@@ -71,7 +73,7 @@ async def test_a_service_that_is_replaced_or_closed_is_not_reported(
 async def test_one_that_refuses_its_options_says_why_in_its_log(tmp_path: Path) -> None:
     exits = Exits()
     log = tmp_path / "recovery.log"
-    launcher = RecoveryLauncher(["--no-such-option"], log)
+    launcher = RecoveryLauncher(["--no-such-option"], socket.socket.close, log)
     launcher.launch(1, exits.put_nowait)
     assert await exits.next() == (1, f"ended with exit code 2; see {log}")
     assert "--no-such-option" in log.read_text()
@@ -80,6 +82,6 @@ async def test_one_that_refuses_its_options_says_why_in_its_log(tmp_path: Path) 
 
 async def test_a_log_that_cannot_be_written_is_the_reason(tmp_path: Path) -> None:
     exits = Exits()
-    launcher = RecoveryLauncher([], tmp_path / "missing" / "recovery.log")
+    launcher = RecoveryLauncher([], socket.socket.close, tmp_path / "missing" / "recovery.log")
     launcher.launch(7, exits.put_nowait)
     assert await exits.next() == (7, "cannot be started: No such file or directory")

@@ -36,7 +36,6 @@ def test_without_services_the_planner_is_in_process() -> None:
     first, second = (links.make_planner(problem, configuration().planning) for _ in range(2))
     assert isinstance(first, MemoizingPlanner)
     assert first.init(3, 0) is second.init(3, 0)
-    links.close()
 
 
 def test_with_services_there_is_a_local_one_unless_it_is_never_launched() -> None:
@@ -44,17 +43,15 @@ def test_with_services_there_is_a_local_one_unless_it_is_never_launched() -> Non
     links = make_links(configuration(**changes), None, BoundedEventLog())
     assert links.launcher is not None
     assert RECOVERY_SERVICE in links.launcher._command
-    links.close()
     never = make_links(
         configuration(**changes, **{"recovery.launch": "never"}), None, BoundedEventLog()
     )
     assert never.launcher is None
-    never.close()
 
 
 def test_a_link_without_encryption_to_another_machine_is_reported() -> None:
     events = Events()
-    make_links(configuration(**{"offload.services": ["tcp/192.0.2.1:7600"]}), None, events).close()
+    make_links(configuration(**{"offload.services": ["tcp/192.0.2.1:7600"]}), None, events)
     assert events.names == ["insecure"]
 
 

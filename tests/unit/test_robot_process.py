@@ -22,10 +22,10 @@ from holdfast.planning.planner import Planner, PlanningState
 from holdfast.protocol.events import (
     Act,
     Acted,
+    ComputeOwnAnswer,
     LogEvent,
+    OwnAnswer,
     Paused,
-    Plan,
-    Planned,
     RecoveryExited,
     RobotEffect,
     Sense,
@@ -36,7 +36,7 @@ from holdfast.protocol.question import InProcessSource
 from holdfast.protocol.records import PausedRecord
 from holdfast.protocol.status import Status
 from holdfast.recording.run_directory import RunDirectory
-from holdfast.robot import in_process_planner
+from holdfast.robot import own_planner
 from holdfast.robot import process as robot_process
 from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
 from holdfast.robot.links import Links, make_links
@@ -363,14 +363,14 @@ def test_a_defect_of_its_own_planner_ends_the_run(
     robots: Robots, monkeypatch: pytest.MonkeyPatch, part: str
 ) -> None:
     """It would wait for ever: nothing else can decide."""
-    answer = in_process_planner._answer
+    answer = own_planner._answer
 
-    def fail(planner: Planner, plan: Plan) -> Planned:
-        if plan.sensing == (part == "sensing"):
+    def fail(planner: Planner, plan: ComputeOwnAnswer) -> OwnAnswer:
+        if plan.part == part:
             raise ZeroDivisionError("a defect")
         return answer(planner, plan)
 
-    monkeypatch.setattr(in_process_planner, "_answer", fail)
+    monkeypatch.setattr(own_planner, "_answer", fail)
     with pytest.raises(TrialError, match=r"(?s)trial 0 .*ZeroDivisionError: a defect"):
         robots.run()
 
@@ -378,10 +378,10 @@ def test_a_defect_of_its_own_planner_ends_the_run(
 def test_what_its_own_planner_refuses_is_said_and_ends_the_run(
     robots: Robots, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(planner: Planner, plan: Plan) -> Planned:
+    def refuse(planner: Planner, plan: ComputeOwnAnswer) -> OwnAnswer:
         raise ProblemError("policy gives nan")
 
-    monkeypatch.setattr(in_process_planner, "_answer", refuse)
+    monkeypatch.setattr(own_planner, "_answer", refuse)
     with pytest.raises(ProblemError, match="policy gives nan"):
         robots.run()
     assert ("stopped", {"reason": "policy gives nan"}) in robots.told
@@ -460,21 +460,21 @@ def test_what_takes_long_is_computed_on_a_thread_while_the_robot_goes_on(
     """What is brief is not, but for the first of its kind: nobody knows how long that takes."""
     computed_on: list[str] = []
     told_on: set[str] = set()
-    answer, handle = in_process_planner._answer, InProcessSource.handle
+    answer, handle = own_planner._answer, InProcessSource.handle
 
-    def noted(planner: Planner, plan: Plan) -> Planned:
+    def noted(planner: Planner, plan: ComputeOwnAnswer) -> OwnAnswer:
         computed_on.append(threading.current_thread().name)
         return answer(planner, plan)
 
-    def told(self: InProcessSource, event: TransportEvent | Planned, now: float) -> None:
+    def told(self: InProcessSource, event: TransportEvent | OwnAnswer, now: float) -> None:
         told_on.add(threading.current_thread().name)
         handle(self, event, now)
 
-    monkeypatch.setattr(in_process_planner, "_BRIEF_S", PATIENCE_S if brief else 0.0)
-    monkeypatch.setattr(in_process_planner, "_answer", noted)
+    monkeypatch.setattr(own_planner, "_BRIEF_S", PATIENCE_S if brief else 0.0)
+    monkeypatch.setattr(own_planner, "_answer", noted)
     monkeypatch.setattr(InProcessSource, "handle", told)
     robots.run()
-    here, thread = threading.current_thread().name, "holdfast-in-process-planner-0"
+    here, thread = threading.current_thread().name, "holdfast-own-planner-0"
     assert told_on == {here}
     assert set(computed_on[:1]) == {thread}
     assert set(computed_on[4:]) == ({here} if brief else {thread})

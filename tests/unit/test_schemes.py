@@ -1,4 +1,4 @@
-"""The table of schemes: each has an implementation, and says who may listen."""
+"""The table of schemes: each has an implementation."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import sys
 
 import pytest
 
-from holdfast.errors import TransportError
-from holdfast.transport.endpoints import SCHEMES, Endpoint, check_endpoint
+from holdfast.transport.endpoints import SCHEMES
 from holdfast.transport.schemes import Scheme, load_scheme
 
 
@@ -21,17 +20,6 @@ def test_each_is_implemented_by_a_class_with_the_same_methods(name: str) -> None
         if not method.startswith("_"):
             assert inspect.signature(getattr(type(scheme), method)) == inspect.signature(base)
     scheme.close()
-
-
-@pytest.mark.parametrize("name", SCHEMES)
-def test_who_may_listen(name: str) -> None:
-    endpoint = str(Endpoint(name, "there", 0))
-    check_endpoint(endpoint, "service", listens=True)
-    if SCHEMES[name].place == "path":
-        check_endpoint(endpoint, "robot", listens=True)
-    else:
-        with pytest.raises(TransportError, match=f"endpoint {name}/there.*the service listens"):
-            check_endpoint(endpoint, "robot", listens=True)
 
 
 def test_what_no_endpoint_uses_is_not_imported() -> None:

@@ -32,7 +32,6 @@ from holdfast.transport.key_ring import make_credentials
         (["--problem", "nix"], ["nix"]),
         (["--tls", "/nowhere"], ["/nowhere"]),
         (["--lis", "tcp/127.0.0.1:0"], ["--lis"]),
-        (["--processes", "2", "--connect", "tcp/127.0.0.1:1"], ["--connect"]),
         (["--processes", "2", "--until-stdin-closes"], ["--until-stdin-closes"]),
         (["--listen", "ros1/cloud"], ["--listen", "ros1 is not allowed", "ros1-serve"]),
         (["--processes", "2", "--health", "here"], ["here"]),

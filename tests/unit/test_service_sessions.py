@@ -404,7 +404,7 @@ class TestTheTable:
         table.forget(sessions[1])
         assert table.state_bytes == 0
         assert table.configuration_bytes == len(sessions[0].configuration)
-        assert set(table._holdings) == {"anna"}
+        assert set(table._num_of) == {"anna"}
 
     def test_what_was_not_used_for_long(self) -> None:
         table = self.table(max_idle_s=10.0)

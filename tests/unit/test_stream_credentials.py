@@ -23,7 +23,7 @@ from holdfast.protocol.events import (
 )
 from holdfast.transport.contract import IncomingCall
 from holdfast.transport.credentials import load_credentials
-from holdfast.transport.endpoints import ServiceAddress, TlsFiles
+from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.frames import (
     CALL,
     GOODBYE,
@@ -58,7 +58,7 @@ class Robot:
         self.events: list[TransportEvent] = []
         self.refusals: list[str] = []
         self.transport = StreamRobotTransport(
-            {"cloud": ServiceAddress(endpoint)},
+            {"cloud": endpoint},
             lease_ms=LEASE_MS,
             tls=TlsFiles.of(directory),
             on_event=lambda _, **fields: self.refusals.append(fields["reason"]),

@@ -22,7 +22,7 @@ from holdfast.errors import CredentialsError
 from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared
 from holdfast.transport.contract import IncomingCall
 from holdfast.transport.credentials import load_credentials
-from holdfast.transport.endpoints import Role, ServiceAddress, TlsFiles
+from holdfast.transport.endpoints import Role, TlsFiles
 from holdfast.transport.key_ring import make_credentials
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.service_end import StreamServiceTransport
@@ -282,7 +282,7 @@ class Ends:
         """Connect as a robot and ask; return the replies, or why it is refused."""
         said: asyncio.Queue[object] = asyncio.Queue()
         robot = StreamRobotTransport(
-            {"cloud": ServiceAddress(endpoint)},
+            {"cloud": endpoint},
             lease_ms=LEASE_MS,
             tls=self.files(name),
             on_event=lambda _, **fields: said.put_nowait(fields["reason"]),

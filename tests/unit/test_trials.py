@@ -9,7 +9,7 @@ import pytest
 from tests.unit.test_trial import configuration_of, failing_configuration, one
 
 from holdfast.config.loader import Configuration, load
-from holdfast.errors import InvalidValueError, ProblemError, TrialCrashError
+from holdfast.errors import EnvironmentFailedError, InvalidValueError, TrialCrashError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
@@ -157,7 +157,8 @@ class TestManyTrials:
                 return reward if self.step == 3 else 0.0
 
         environment = Rewarding(configuration.problem, configuration.simulator.seed, 0)
-        with pytest.raises(ProblemError, match=rf"the reward of step 2 is {reward}; it must be"):
+        needed = f"perform returned {reward}; it must return a finite number, the reward"
+        with pytest.raises(EnvironmentFailedError, match=needed):
             run_trial(
                 Planner(configuration.problem, configuration.planning),
                 configuration.simulator.seed,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tests.robot_world import LOCAL, PLANNING, PROBLEM, World
 
-from holdfast.errors import ProblemError, ServiceRefusedError
+from holdfast.errors import HoldfastError, ProblemError, ServiceRefusedError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.planner import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
@@ -248,7 +248,11 @@ def test_a_planner_that_fails_the_second_time_acquits_nobody() -> None:
     honest = world.own
 
     def own(effect: ComputeOwnAnswer) -> OwnAnswer:
-        return OwnAnswer(effect.number, failure="gone") if effect.again else honest(effect)
+        return (
+            OwnAnswer(effect.number, failure=HoldfastError("gone"))
+            if effect.again
+            else honest(effect)
+        )
 
     world.own = own
     world.start()
@@ -287,7 +291,7 @@ def test_who_was_wrong_before_the_robot_was_resumed_is_not_asked() -> None:
 
 def test_a_failed_verification_is_told_and_stops_nobody() -> None:
     world = World(verify_share=1.0)
-    world.own = lambda effect: OwnAnswer(effect.number, failure="MemoryError")
+    world.own = lambda effect: OwnAnswer(effect.number, failure=HoldfastError("MemoryError"))
     world.start()
     world.run()
     world.assert_same_as_without_faults()
@@ -394,7 +398,7 @@ def test_a_part_that_comes_after_the_own_answer_is_compared_as_well() -> None:
     assert question.sensing.sensing_action == 1
     (asked,) = asked_of(effects)
     assert asked.again
-    verification.decided(OwnAnswer(asked.number, failure="MemoryError"), question)
+    verification.decided(OwnAnswer(asked.number, failure=HoldfastError("MemoryError")), question)
     assert [each.kind for each in verification.take_wrong()] == ["sensing"]
 
 

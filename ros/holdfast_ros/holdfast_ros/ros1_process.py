@@ -15,8 +15,8 @@ __all__ = ["Ros1ServeOptions", "main"]
 class Ros1ServeOptions(ServeOptions):
     """Offer a service in ROS 1, at the address of ROS_MASTER_URI and the like.
 
-    It needs no ROS here. With --listen or --connect it serves other robots as well, as holdfast
-    serve does; without, nothing but the node listens.
+    It needs no ROS here. With --listen it serves other robots as well, as holdfast serve
+    does; without, nothing but the node listens.
     """
 
     configuration: Path | None = option(

@@ -76,7 +76,7 @@ def main(arguments: Sequence[str]) -> int:
     if options.tls is not None:
         offload = msgspec.structs.replace(offload, tls=str(options.tls))
     services = options.service or offload.services
-    endpoints = [check_endpoint(service, "robot", listens=False) for service in services]
+    endpoints = [check_endpoint(service, "robot") for service in services]
     if offload.tls is not None:
         for endpoint in endpoints:
             check_credentials(endpoint, TlsFiles.of(Path(offload.tls)))

@@ -28,21 +28,6 @@ from holdfast.planning.settings import (
 from holdfast.problems.attributes import has_general_observations, has_own
 from holdfast.problems.problem import Problem
 
-__all__ = [
-    "ANY_MACHINE",
-    "COSTLY",
-    "FREE",
-    "TYPICAL_PROBLEM",
-    "CallCost",
-    "Cost",
-    "Price",
-    "Pricing",
-    "ProblemCost",
-    "cost_of_answer",
-    "cost_of_sensing",
-    "describe_cost",
-]
-
 COSTLY: Mapping[str, str] = {
     "particle_filter.num_particles": "every method",
     "active_sensing.num_observation_samples": "informed",
@@ -80,36 +65,20 @@ class CallCost(NamedTuple):
 
 
 class ProblemCost(NamedTuple):
-    """Seconds that a problem's functions take.
+    """Seconds that a problem's functions take."""
 
-    Attributes
-    ----------
-    initial, move, stage : CallCost
-        Time of ``initial_states``, ``move`` and ``next_stage``.
-    act : CallCost
-        Time of ``policy`` and ``execute`` together.
-    sense : CallCost
-        Time of the mean and variance of one sensing action's observation; with a general
-        likelihood, of drawing an observation and evaluating it.
-    judge : CallCost
-        Time of ``reward`` and ``is_goal`` together.
-    path_step : CallCost
-        Time of one step of a noise-free path.
-    known_return : CallCost or None
-        Time of ``known_state_return``; None without one.
-    observation_size : int
-        Numbers in the largest observation.
-    """
-
+    # initial, move, stage: time of ``initial_states``, ``move`` and ``next_stage``.
     initial: CallCost
     move: CallCost
     stage: CallCost
-    act: CallCost
+    act: CallCost  # time of ``policy`` and ``execute`` together
+    # Time of the mean and variance of one sensing action's observation; with a general likelihood,
+    # of drawing an observation and evaluating it.
     sense: CallCost
-    judge: CallCost
-    path_step: CallCost
-    known_return: CallCost | None
-    observation_size: int
+    judge: CallCost  # time of ``reward`` and ``is_goal`` together
+    path_step: CallCost  # time of one step of a noise-free path
+    known_return: CallCost | None  # time of ``known_state_return``; None without one
+    observation_size: int  # numbers in the largest observation
 
 
 TYPICAL_PROBLEM = ProblemCost(
@@ -141,17 +110,10 @@ class Price(NamedTuple):
 
 
 class Pricing(NamedTuple):
-    """What a service knows of the machine that it runs on.
+    """What a service knows of the machine that it runs on."""
 
-    Attributes
-    ----------
-    slowness : float
-        How many times as long it takes as the one for which the model was made.
-    measure : callable or None
-        Measures a problem's functions. None takes what is typical.
-    """
-
-    slowness: float = 1.0
+    slowness: float = 1.0  # how many times as long it takes as the one for which the model was made
+    # Measures a problem's functions. None takes what is typical.
     measure: Callable[[Problem], ProblemCost] | None = None
 
     def price_of(
@@ -406,24 +368,12 @@ def cost_of_answer(
     own: ProblemCost = TYPICAL_PROBLEM,
     slowness: float = 1.0,
     *,
-    steps: float,
-    inputs: float,
-    begins: bool,
-    num_bytes: float,
+    steps: float,  # by which it is rolled forward, those of the task part included
+    inputs: float,  # observations to be folded in
+    begins: bool,  # whether it begins with the initial belief
+    num_bytes: float,  # size of the request
 ) -> Cost:
-    """Return the most that it takes to reach a state.
-
-    Parameters
-    ----------
-    steps : float
-        By which it is rolled forward, those of the task part included.
-    inputs : float
-        Observations to be folded in.
-    begins : bool
-        Whether it begins with the initial belief.
-    num_bytes : float
-        Size of the request.
-    """
+    """Return the most that it takes to reach a state."""
     sizes = _Sizes(problem, planning, own, slowness)
     particles, size = sizes.particles, float(own.observation_size)
     seconds = (2.0 * _PYTHON + 2.0 * sizes.state_bytes + 4.0 * num_bytes) * sizes.unit_s

@@ -23,7 +23,6 @@ from holdfast.protocol.events import (
     CallEnded,
     Launch,
     OwnAnswer,
-    Planned,
     RecoveryExited,
     ReplyReceived,
     ServiceAppeared,
@@ -44,8 +43,6 @@ from holdfast.protocol.requests import OpenRequest, OpenRequests
 from holdfast.protocol.status import Cause
 from holdfast.protocol.verification import Verification
 
-__all__ = ["Dispatcher"]
-
 _LONGEST_SILENT_WAIT_S = 1.0
 """A longer wait is reported, unless a dead service takes longer to detect."""
 
@@ -54,31 +51,20 @@ class Dispatcher(DecisionSource):
     """Gets one question at a time answered by the services.
 
     It lives as long as the run.
-
-    Parameters
-    ----------
-    services : sequence of str
-        The cloud's services in order of preference, at least one.
-    local_service_name : str or None
-        Name of the local service; None if there is none.
-    secret : bytes
-        Known only to this robot; selects the answers that are recomputed.
-    distrusted : collection of str
-        Services that answered wrongly earlier in this run.
     """
 
     def __init__(
         self,
-        services: Sequence[str],
-        local_service_name: str | None,
+        services: Sequence[str],  # the cloud's services in order of preference, at least one
+        local_service_name: str | None,  # name of the local service; None if there is none
         offload: OffloadSettings,
         recovery_settings: RecoverySettings,
         session: bytes,
         epoch: int,
         session_configuration: SessionConfiguration,
         problem: Problem,
-        secret: bytes,
-        distrusted: Collection[str] = (),
+        secret: bytes,  # known only to this robot; selects the answers that are recomputed
+        distrusted: Collection[str] = (),  # services that answered wrongly earlier in this run
     ) -> None:
         super().__init__()
         timeout_s = 1e-3 * offload.detection_timeout_ms
@@ -147,9 +133,7 @@ class Dispatcher(DecisionSource):
 
     # -- what happens ----------------------------------------------------------------------------
 
-    def handle(
-        self, event: TransportEvent | OwnAnswer | Planned | RecoveryExited, now: float
-    ) -> None:
+    def handle(self, event: TransportEvent | OwnAnswer | RecoveryExited, now: float) -> None:
         """Handle an event of the transport, the own planner or the local service's process."""
         if isinstance(event, ReplyReceived):
             call = self._calls.get(event.call)

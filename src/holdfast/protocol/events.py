@@ -11,8 +11,7 @@ sent or performed that a restarted robot would not know of.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Generic, NamedTuple, TypeAlias, TypeVar
+from typing import Generic, Literal, NamedTuple, TypeAlias, TypeVar
 
 from holdfast.errors import HoldfastError
 from holdfast.numerics.arrays import FloatArray
@@ -20,38 +19,6 @@ from holdfast.planning.outcome import Ending, TrialResult
 from holdfast.planning.planner import PlanningState
 from holdfast.planning.tracking import LateObservation
 from holdfast.protocol.records import Record
-
-__all__ = [
-    "Abandon",
-    "Act",
-    "Acted",
-    "CallEnded",
-    "ComputeOwnAnswer",
-    "Effects",
-    "EndTrial",
-    "EnvironmentEvent",
-    "EnvironmentFailed",
-    "EnvironmentReady",
-    "Halt",
-    "Launch",
-    "LogEvent",
-    "OwnAnswer",
-    "Paused",
-    "Plan",
-    "Planned",
-    "RecoveryExited",
-    "ReplyReceived",
-    "RobotEffect",
-    "Send",
-    "Sense",
-    "Sensed",
-    "ServiceAppeared",
-    "ServiceVanished",
-    "Timing",
-    "TransportEvent",
-    "VerificationNoted",
-    "WriteRecords",
-]
 
 
 class ServiceAppeared(NamedTuple):
@@ -96,70 +63,41 @@ class Sensed(NamedTuple):
 
 
 class Acted(NamedTuple):
-    """A task action was performed; all numbers are finite.
-
-    Attributes
-    ----------
-    reward : float or None
-        None if the environment gives none.
-    motion, observation : array or None
-        What the move has shown.
-    late : tuple of LateObservation
-        Observations of earlier steps that have come meanwhile.
-    no_reading : tuple of int
-        Earlier steps of which it is known now that no observation will come.
-    """
+    """A task action was performed; all numbers are finite."""
 
     step: int
-    reward: float | None
+    reward: float | None  # None if the environment gives none
     ending: Ending | None
+    # motion, observation: what the move has shown.
     motion: FloatArray | None = None
     observation: FloatArray | None = None
-    late: tuple[LateObservation, ...] = ()
+    late: tuple[LateObservation, ...] = ()  # observations of earlier steps that have come meanwhile
+    # Earlier steps of which it is known now that no observation will come.
     no_reading: tuple[int, ...] = ()
 
 
 class EnvironmentReady(NamedTuple):
-    """The environment of a trial was made.
+    """The environment of a trial was made."""
 
-    Attributes
-    ----------
-    ending : Ending or None
-        How its task has ended; None if it goes on.
-    steps_performed : int or None
-        Task actions performed in this trial, counted by the environment; None if it does not count.
-    last : Acted or None
-        What the last of these has shown; of a resumed trial, if the environment can still tell.
-    late : tuple of LateObservation
-        Of a resumed trial: observations that have come meanwhile.
-    """
-
-    ending: Ending | None
+    ending: Ending | None  # how its task has ended; None if it goes on
+    # Task actions performed in this trial, counted by the environment; None if it does not count.
     steps_performed: int | None
+    # What the last of these has shown; of a resumed trial, if the environment can still tell.
     last: Acted | None = None
+    # Of a resumed trial: observations that have come meanwhile.
     late: tuple[LateObservation, ...] = ()
 
 
 class EnvironmentFailed(NamedTuple):
-    """The environment raised, returned something invalid, or timed out; it cannot be used again.
-
-    Attributes
-    ----------
-    what : str
-        The method, or the environment's name if it could not be made.
-    action_in_doubt : bool
-        Whether the step's task action was begun without an :class:`Acted`.
-    performed : Acted or None
-        The step's task action, if it was performed and what came after failed.
-    counts_steps : bool
-        Whether the environment counts its steps, so that it can be asked later.
-    """
+    """The environment raised, returned something invalid, or timed out; it cannot be used again."""
 
     step: int
-    what: str
+    what: str  # the method, or the environment's name if it could not be made
     text: str
-    action_in_doubt: bool
+    action_in_doubt: bool  # whether the step's task action was begun without an :class:`Acted`
+    # The step's task action, if it was performed and what came after failed.
     performed: Acted | None = None
+    # Whether the environment counts its steps, so that it can be asked later.
     counts_steps: bool = True
 
 
@@ -167,50 +105,16 @@ EnvironmentEvent: TypeAlias = EnvironmentReady | Sensed | Acted | EnvironmentFai
 
 
 class OwnAnswer(NamedTuple):
-    """The result of a :class:`ComputeOwnAnswer`.
-
-    Attributes
-    ----------
-    actions : tuple of array
-        Task actions up to the next sensing step.
-    sensing_action : int or None
-        Of that step; None if it is too far away.
-    ahead_digest : bytes
-        Of the state in which the sensing action was chosen.
-    failure : str or None
-        Why there is no answer.
-    """
+    """The result of a :class:`ComputeOwnAnswer`."""
 
     number: int
-    actions: tuple[FloatArray, ...] = ()
-    sensing_action: int | None = None
-    ahead_digest: bytes = b""
+    actions: tuple[FloatArray, ...] = ()  # task actions up to the next sensing step
+    sensing_action: int | None = None  # of that step; None if it is too far away, or not asked
+    ahead_digest: bytes = b""  # of the state in which the sensing action was chosen
     computed_s: float = 0.0
-    failure: str | None = None
-
-
-class Planned(NamedTuple):
-    """The result of a :class:`Plan`.
-
-    Attributes
-    ----------
-    ahead : PlanningState
-        To which the task actions lead, or in which the sensing action was chosen.
-    ahead_digest : bytes
-        Of that state, for a sensing part.
-    sensing_action : int or None
-        None for a task part.
-    error : HoldfastError or None
-        Why there is no answer.
-    """
-
-    number: int
-    ahead: PlanningState
-    actions: Sequence[FloatArray] = ()
-    ahead_digest: bytes = b""
-    sensing_action: int | None = None
-    computed_s: float = 0.0
-    error: HoldfastError | None = None
+    failure: HoldfastError | None = None  # why there is no answer
+    # To which the task actions lead, or in which the sensing action was chosen.
+    ahead: PlanningState | None = None
 
 
 class RecoveryExited(NamedTuple):
@@ -256,51 +160,28 @@ class Act(NamedTuple):
 
 
 class ComputeOwnAnswer(NamedTuple):
-    """Have the robot's own planner answer a question, to verify what services have answered.
+    """Have the robot's own planner answer a question, or a part of it.
 
-    Attributes
-    ----------
-    again : bool
-        Whether it was answered before. It then goes before others, and is computed with a new
-        instance of the problem.
+    Without services, part by part; else all of it, to verify what services have answered.
     """
 
-    number: int
+    number: int  # of the question; a part with an older number is of no use
     state: PlanningState
-    again: bool
-
-
-class Plan(NamedTuple):
-    """Have the planner of a robot without services compute a part of an answer.
-
-    Attributes
-    ----------
-    number : int
-        Of the question. Results with an older number are of no use.
-    sensing : bool
-        Whether to choose this state's sensing action; else the task actions from there.
-    """
-
-    number: int
-    state: PlanningState
-    sensing: bool
+    # Whether it was answered before. It then goes before others, and is computed with a new
+    # instance of the problem.
+    again: bool = False
+    part: Literal["task", "sensing"] | None = None
 
 
 class VerificationNoted(NamedTuple):
-    """A part of a service's answer was compared with the own planner's; for the tables only.
-
-    Attributes
-    ----------
-    kind : {"question", "task", "sensing"}
-    verdict : {"asked", "left_out", "same", "different", "not_deterministic", "failed"}
-        Of a question: whether it will be recomputed, or too many wait. Of a part: the comparison;
-        the last two mean that the own planner disagrees with itself, or failed.
-    """
+    """A part of a service's answer was compared with the own planner's; for the tables only."""
 
     trial: int
     step: int
     service: str
-    kind: str
+    kind: str  # question, task or sensing
+    # Of a question: asked, or left_out because too many wait. Of a part: same, different,
+    # not_deterministic (the own planner disagrees with itself) or failed (it raised).
     verdict: str
 
 
@@ -318,29 +199,16 @@ class LogEvent(NamedTuple):
 
 
 class Timing(NamedTuple):
-    """How long a decision took; for the tables only.
-
-    Attributes
-    ----------
-    kind : {"task", "sensing"}
-    service : str
-        Whose answer is used.
-    waited_ms : float
-        How long the robot stood still for it.
-    round_trip_ms : float
-        From the request to the answer.
-    computed_ms : float
-        The service's part of that.
-    """
+    """How long a decision took; for the tables only."""
 
     trial: int
     step: int
-    kind: str
-    service: str
+    kind: str  # task or sensing
+    service: str  # whose answer is used
     status: str
-    waited_ms: float
-    round_trip_ms: float
-    computed_ms: float
+    waited_ms: float  # how long the robot stood still for it
+    round_trip_ms: float  # from the request to the answer
+    computed_ms: float  # the service's part of that
 
 
 class EndTrial(NamedTuple):
@@ -366,7 +234,6 @@ RobotEffect: TypeAlias = (
     | Sense
     | Act
     | ComputeOwnAnswer
-    | Plan
     | Launch
     | LogEvent
     | Timing

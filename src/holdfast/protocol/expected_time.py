@@ -4,33 +4,19 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["ExpectedTime"]
-
 _TYPICAL_INERTIA = 16.0
 """A longer time raises the typical time by one such part of the difference."""
 
 
 class ExpectedTime:
-    """Two estimates of how long one kind of computation takes.
-
-    Parameters
-    ----------
-    inertia : float
-        A time moves the mean by one such part of its distance.
-
-    Attributes
-    ----------
-    mean_s : float
-        A moving average: what each computation of a queue costs.
-    typical_s : float
-        How long one takes on a free core; infinite before the first. Contention only lengthens a
-        computation, so a shorter time counts at once and a longer one little. Else a busy process
-        would send brief work to threads, which makes it busier.
-    """
+    """Two estimates of how long one kind of computation takes."""
 
     def __init__(self, mean_s: float = 0.0, inertia: float = 8.0) -> None:
-        self.mean_s = mean_s
-        self._inertia = inertia
+        self.mean_s = mean_s  # a moving average: what each computation of a queue costs
+        self._inertia = inertia  # a time moves the mean by one such part of its distance
+        # How long one takes on a free core; infinite before the first. Contention only lengthens a
+        # computation, so a shorter time counts at once and a longer one little. Else a busy process
+        # would send brief work to threads, which makes it busier.
         self.typical_s = math.inf
 
     def learn(self, computed_s: float) -> None:

@@ -1,9 +1,7 @@
 """Five lanes for the tasks of a service, so that none has to wait for what takes much longer.
 
 A robot chooses how long its decisions take, and a new identity costs nothing without a certificate.
-In one queue a few decisions that take seconds, or many robots that nobody has seen before, would
-keep all others waiting. So tasks of different kinds have different threads, and the system divides
-the cores between these:
+So tasks of different kinds have different threads, and the system divides the cores between these:
 
 - *New*: of sessions with a problem that their owner has not brought before, and states that come
   from outside (checkpoints).
@@ -13,16 +11,15 @@ the cores between these:
 - *Medium* and *long*: what is estimated to take too long for the first three, or for the fourth.
 
 A job first estimates what it costs (:mod:`~holdfast.protocol.decision_cost`); if that is too much
-for its lane, nothing is computed, and the task moves. An estimate can be wrong, or made wrong: a
-belief may hold states for which the problem's functions take a thousand times as long as for those
-that were measured. So a job ends by itself once it has computed for several times its lane's
-limit, and it is computed anew as a long one, as are the session's next ones until one takes less.
-Building a problem and measuring it count, but not in the long lane, which would do it again.
+for its lane, the task moves. An estimate can be made wrong: for some beliefs the problem's
+functions take a thousand times as long as for those that were measured. So a job ends by itself
+once it has computed for several times its lane's limit, and it is computed anew as a long one, as
+are the session's next ones until one takes less. Building a problem and measuring it count, but not
+in the long lane, which would do it again.
 
-The lanes go by cost and not by owner, because without certificates all robots are one owner, and
-nothing tells them apart. Each lane is a :class:`~holdfast.protocol.request_queue.RequestQueue`.
-Long decisions share a bound on memory, and new and first ones have half of the room for what waits
-each.
+The lanes go by cost and not by owner, because without certificates all robots are one owner. Each
+is a :class:`~holdfast.protocol.request_queue.RequestQueue`. Long decisions share a bound on memory,
+and new and first ones have half of the room for what waits each.
 """
 
 from __future__ import annotations
@@ -31,7 +28,6 @@ import math
 
 from holdfast.errors import MessageError
 from holdfast.protocol.decision_cost import Cost, describe_cost
-from holdfast.protocol.messages import Request
 from holdfast.protocol.request_queue import RequestQueue
 from holdfast.protocol.service_jobs import Job
 from holdfast.protocol.service_limits import ServiceLimits
@@ -41,12 +37,9 @@ from holdfast.protocol.service_sessions import (
     MEDIUM,
     NEW,
     REQUESTED,
-    Owner,
     PendingTask,
     Session,
 )
-
-__all__ = ["Lanes"]
 
 _OVERRUN = 5.0
 """So many times its lane's limit a job may compute; hardly any takes 3 times its estimate."""
@@ -56,32 +49,23 @@ _OVERDUE = 4.0
 
 
 class Lanes:
-    """The tasks that wait or run.
-
-    Parameters
-    ----------
-    workers : int
-        Brief tasks that may run at a time.
-
-    Attributes
-    ----------
-    max_running : int
-        Tasks that may run at a time.
-    limits_s : tuple of float
-        Bounds on the estimated time of a task in each lane.
-    """
+    """The tasks that wait or run; so many brief ones at a time as there are workers."""
 
     def __init__(self, workers: int, limits: ServiceLimits) -> None:
         self._limits = limits
         fewer = max(1, workers - 1)
-        self.max_running = workers + 4 * fewer
+        self.max_running = workers + 4 * fewer  # tasks that may run at a time
         self._fewer = fewer
         self._lanes = [
             *(RequestQueue(fewer, limits, room=0.5) for _ in (NEW, FIRST)),
             *(RequestQueue(number, limits) for number in (workers, fewer, fewer)),
         ]
         brief_s = limits.max_brief_s
+        # Bounds on the estimated time of a task in each lane.
         self.limits_s = (brief_s, brief_s, brief_s, limits.max_medium_s, limits.max_decision_s)
+
+    def __getitem__(self, number: int) -> RequestQueue:
+        return self._lanes[number]
 
     @property
     def num_waiting(self) -> int:
@@ -93,18 +77,6 @@ class Lanes:
         """Tasks that workers have."""
         return sum(lane.num_running for lane in self._lanes)
 
-    def is_overloaded(self, now: float, owner: Owner, lane: int) -> bool:
-        """Return whether a new request that begins in this lane is to be turned away."""
-        return self._lanes[lane].is_overloaded(now, owner)
-
-    def wait_s(self, now: float, owner: Owner, lane: int) -> float:
-        """Estimate the wait of a new request that begins in this lane."""
-        return self._lanes[lane].wait_s(now, owner)
-
-    def _of(self, task: PendingTask) -> RequestQueue:
-        """Return the lane of a task."""
-        return self._lanes[task.lane]
-
     def is_alone(self, task: PendingTask) -> bool:
         """Return whether a task that is to be started may have all cores."""
         if task.lane == LONG and self._fewer == 1:
@@ -114,24 +86,6 @@ class Lanes:
     def most_s(self, task: PendingTask) -> float:
         """Return how long a job of a task may compute."""
         return (_OVERDUE if task.lane == LONG else _OVERRUN) * self.limits_s[task.lane]
-
-    # -- waiting ---------------------------------------------------------------------------------
-
-    def enqueue(self, task: PendingTask) -> None:
-        """Queue a task in its lane."""
-        self._of(task).enqueue(task)
-
-    def replace(self, task: PendingTask, request: Request, *, sensing: bool, size: int) -> None:
-        """Give a waiting task's turn to a newer request."""
-        self._of(task).replace(task, request, sensing=sensing, size=size)
-
-    def remove(self, task: PendingTask) -> None:
-        """Remove a task that was not begun."""
-        self._of(task).remove(task)
-
-    def promote(self, task: PendingTask) -> None:
-        """Make a prefetch urgent: its robot waits for it now."""
-        self._of(task).promote(task)
 
     def release_held(self, session: Session) -> None:
         """Queue a session's tasks that were held back behind those that have run."""
@@ -150,46 +104,15 @@ class Lanes:
                 return task
         return None
 
-    def handed_out(self, task: PendingTask, job: Job, now: float) -> None:
-        """Note that a worker has a task."""
-        self._of(task).handed_out(task, job, now)
-
-    def started(self, job: Job, now: float) -> None:
-        """Note that a worker starts its task only now, if it was not forgotten."""
-        lane = self._running_in(job)
-        if lane is not None:
-            lane.started(job, now)
-
-    def end(self, job: Job) -> PendingTask:
-        """Note that a worker is free; return its task."""
-        lane = self._running_in(job)
-        assert lane is not None
-        return lane.end(job)
-
-    def runs(self, job: Job) -> bool:
-        """Return whether a worker has a job of these tasks."""
-        return self._running_in(job) is not None
-
-    def _running_in(self, job: Job) -> RequestQueue | None:
+    def with_job(self, job: Job) -> RequestQueue | None:
+        """Return the lane of which a worker has a job; None if it was forgotten."""
         return next((lane for lane in self._lanes if lane.runs(job)), None)
 
     def postpone(self, task: PendingTask, cost: Cost | None, now: float) -> bool:
-        """Queue a task again in another lane, if a call waits for it.
+        """Queue a task again in another lane, if a call waits for it; return whether there is room.
 
-        Parameters
-        ----------
-        cost : Cost or None
-            The estimate; None if the task took longer than that.
-
-        Returns
-        -------
-        bool
-            Whether there is room. (A prefetch has always room, at most one for each session.)
-
-        Raises
-        ------
-        MessageError
-            If it has used up the time of a long one.
+        It has taken longer than estimated if there is no ``cost``. (A prefetch has always room, at
+        most one for each session.) Raises MessageError if it has used up the time of a long one.
         """
         session, limits = task.session, self._limits
         if cost is None and task.lane == LONG:
@@ -207,10 +130,10 @@ class Lanes:
             return True  # nobody awaits it
         fits = cost.seconds <= limits.max_medium_s and cost.num_bytes <= limits.max_medium_bytes
         task.move_to(MEDIUM if fits else LONG, cost)
-        if task.slot == REQUESTED and self._of(task).is_overloaded(now, session.owner):
+        if task.slot == REQUESTED and self[task.lane].is_overloaded(now, session.owner):
             return False
         session.pending[task.digest] = task
-        self.enqueue(task)
+        self[task.lane].enqueue(task)
         return True
 
     # -- what nobody awaits, or takes too long ---------------------------------------------------
@@ -225,10 +148,10 @@ class Lanes:
             if task.lane == LONG:
                 # Further calls that ask for the same do not wait for this one.
                 task.session.remove_task(task)
-                self._of(task).job_of(task).cancel()
+                self[task.lane].job_of(task).cancel()
             return False
         task.session.remove_task(task)
-        self.remove(task)
+        self[task.lane].remove(task)
         return True
 
     def cancel_all(self) -> None:

@@ -13,8 +13,6 @@ from __future__ import annotations
 from holdfast.planning.settings import OffloadSettings, RecoverySettings
 from holdfast.protocol.question import Question
 
-__all__ = ["HedgingBudget", "RestartPolicy"]
-
 _HEDGING_BURST = 3.0
 """Hedges that may be made at once."""
 
@@ -26,13 +24,7 @@ _MOST_TIME = 8
 
 
 class RestartPolicy:
-    """Decides when the local service's process is (re)started.
-
-    Attributes
-    ----------
-    number : int
-        Of the last launch; 0 before the first.
-    """
+    """Decides when the local service's process is (re)started."""
 
     def __init__(self, settings: RecoverySettings) -> None:
         self._timeout_s = 1e-3 * settings.launch_timeout_ms
@@ -42,7 +34,7 @@ class RestartPolicy:
         self._launch_after: float | None = None
         self._failures = 0
         self._late = 0
-        self.number = 0
+        self.number = 0  # of the last launch; 0 before the first
 
     @property
     def pending(self) -> bool:
@@ -81,10 +73,7 @@ class RestartPolicy:
     def failed(self, now: float, *, late: bool = False) -> None:
         """Schedule another launch: at once the first time, then after growing delays.
 
-        Parameters
-        ----------
-        late : bool
-            Whether the last was not seen in time; the next one gets more time.
+        After one that was not seen in time (``late``) the next one gets more time.
         """
         self._late += late
         if self._launch_after is not None:

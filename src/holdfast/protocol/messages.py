@@ -32,41 +32,6 @@ from holdfast.planning.settings import PlanningSettings
 from holdfast.printable import one_line
 from holdfast.protocol.plain_data import check_plain_data
 
-__all__ = [
-    "CHECKSUM_SIZE",
-    "DIGEST_SIZE",
-    "MAX_ACTION_SIZE",
-    "MAX_CONFIGURATION_BYTES",
-    "MAX_INPUTS",
-    "MAX_TASK_ACTIONS",
-    "MAX_TEXT",
-    "MAX_WORD",
-    "PROTOCOL_VERSION",
-    "Busy",
-    "Input",
-    "Moved",
-    "NeedState",
-    "Observed",
-    "Progress",
-    "Refused",
-    "Reply",
-    "Request",
-    "SensingAnswer",
-    "SessionConfiguration",
-    "TaskAnswer",
-    "decode_floats",
-    "decode_reply",
-    "decode_request",
-    "encode",
-    "encode_floats",
-    "numbers_of",
-    "pack_configuration",
-    "settings_digest",
-    "unpack_configuration",
-    "with_checksum",
-]
-
-
 PROTOCOL_VERSION = 5
 """Raised when a message changes its form or meaning. All versions have the same checksum."""
 
@@ -139,21 +104,16 @@ class SessionConfiguration(msgspec.Struct, array_like=True, frozen=True):
     The settings are complete, and their digest is sent with them (:func:`settings_digest`), so a
     service to which they mean something else refuses. Code is named by its digest, so a service
     with other code refuses.
-
-    Attributes
-    ----------
-    model, state_space_planner : dict
-        The problem's two sections of the configuration.
-    core_version, problem_digest : str
-        Of the robot's holdfast, and of the problem's code beyond that
-        (:mod:`holdfast.config.source_digest`).
     """
 
     problem: Name
+    # model, state_space_planner: the problem's two sections of the configuration.
     model: dict[str, object]
     state_space_planner: dict[str, object]
     planning: PlanningSettings
     seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+    # core_version, problem_digest: of the robot's holdfast, and of the problem's code beyond that
+    # (:mod:`holdfast.config.source_digest`).
     core_version: Annotated[str, msgspec.Meta(max_length=200)] = ""
     problem_digest: Annotated[str, msgspec.Meta(max_length=200)] = ""
 
@@ -170,37 +130,27 @@ class Request(msgspec.Struct, array_like=True, frozen=True):
     """A robot's question: what to do from this state until it has sensed again.
 
     Encode it with :func:`encode` only: on the wire the session configuration has another form.
-
-    Attributes
-    ----------
-    session : bytes
-        Random, drawn once per run.
-    epoch : int
-        Raised by each restart of the robot; a service refuses a lower one than it has seen.
-    number : int
-        Increases within an epoch, and is unique among epochs. Every reply repeats it.
-    trial, step, sensed, digest
-        Of the state; ``sensed`` says whether the step's observation is part of it.
-    inputs : tuple of Input
-        Of this trial, in order, since the state that this service acknowledged last; all of them if
-        it acknowledged none.
-    session_configuration : SessionConfiguration or None
-        For a service that may not know the session.
-    checkpoint : bytes, memoryview or None
-        The state (:func:`holdfast.planning.planner.encode_checkpoint`); then ``inputs`` is empty. A
-        decoded one is a view of the message.
     """
 
     version: int
-    session: Session
+    session: Session  # random, drawn once per run
+    # Raised by each restart of the robot; a service refuses a lower one than it has seen.
     epoch: Word
+    # Increases within an epoch, and is unique among epochs. Every reply repeats it.
     number: Word
+    # trial, step, sensed, digest: of the state; ``sensed`` says whether the step's observation is
+    # part of it.
     trial: Word
     step: Word
     sensed: bool
     digest: Digest
+    # Of this trial, in order, since the state that this service acknowledged last; all of them if
+    # it acknowledged none.
     inputs: Annotated[tuple[Input, ...], msgspec.Meta(max_length=MAX_INPUTS)] = ()
+    # For a service that may not know the session.
     session_configuration: SessionConfiguration | None = None
+    # The state (:func:`holdfast.planning.planner.encode_checkpoint`); then ``inputs`` is empty. A
+    # decoded one is a view of the message.
     checkpoint: bytes | memoryview | None = None
 
 
@@ -231,20 +181,14 @@ class TaskAnswer(msgspec.Struct, array_like=True, frozen=True, tag=1):
 
 
 class SensingAnswer(msgspec.Struct, array_like=True, frozen=True, tag=2):
-    """The sensing action of the next sensing step.
-
-    Attributes
-    ----------
-    step : int
-        The sensing step: the request's own if its state must still sense, else that after the task
-        actions.
-    digest : bytes
-        Of the state in which it was chosen; the robot follows it only in exactly that state.
-    """
+    """The sensing action of the next sensing step."""
 
     number: Word
+    # The sensing step: the request's own if its state must still sense, else that after the task
+    # actions.
     step: Word
     sensing_action: Word
+    # Of the state in which it was chosen; the robot follows it only in exactly that state.
     digest: Digest
     computed_us: Word
 
@@ -257,20 +201,13 @@ class Progress(msgspec.Struct, array_like=True, frozen=True, tag=3):
 
 
 class NeedState(msgspec.Struct, array_like=True, frozen=True, tag=4):
-    """The service lacks the state: send the session configuration, and what leads to the state.
-
-    Attributes
-    ----------
-    differs : bool
-        Whether the service holds a state of the trial that does not lead to the robot's; then only
-        the checkpoint helps.
-    diverged : bool
-        Whether it reached that step with all observations, but another digest.
-    """
+    """The service lacks the state: send the session configuration, and what leads to the state."""
 
     number: Word
+    # Whether the service holds a state of the trial that does not lead to the robot's; then only
+    # the checkpoint helps.
     differs: bool
-    diverged: bool = False
+    diverged: bool = False  # whether it reached that step with all observations, but another digest
 
 
 class Busy(msgspec.Struct, array_like=True, frozen=True, tag=5):
@@ -284,21 +221,13 @@ class Busy(msgspec.Struct, array_like=True, frozen=True, tag=5):
 
 
 class Refused(msgspec.Struct, array_like=True, frozen=True, tag=6):
-    """The request is not answered; ``code`` says whether it may be sent again.
+    """The request is not answered; ``code`` says whether it may be sent again."""
 
-    Attributes
-    ----------
-    number : int
-        0 if the request could not be read.
-    code : str
-        ``damaged`` (in transit: it may be sent again), ``malformed``, ``too_large``, ``version``,
-        ``stale_epoch``, ``unknown_problem``, ``other_code`` (the service's holdfast or problem
-        is not the robot's), ``invalid`` (settings or state out of bounds),
-        ``out_of_memory`` (it may be asked again) or ``failed`` (the problem's own functions failed
-        in this state).
-    """
-
-    number: Word
+    number: Word  # 0 if the request could not be read
+    # ``damaged`` (in transit: it may be sent again), ``malformed``, ``too_large``, ``version``,
+    # ``stale_epoch``, ``unknown_problem``, ``other_code`` (the service's holdfast or problem is not
+    # the robot's), ``invalid`` (settings or state out of bounds), ``out_of_memory`` (it may be
+    # asked again) or ``failed`` (the problem's own functions failed in this state).
     code: Annotated[str, msgspec.Meta(max_length=40)]
     text: Annotated[str, msgspec.Meta(max_length=MAX_TEXT)]
 
@@ -373,14 +302,11 @@ def decode_request(payload: bytes) -> Request:
     A large message that is no request takes no more memory than a small one, and no more time than
     to look at each of its bytes once.
 
-    Raises
-    ------
-    MessageError
-        ``damaged``: the checksum is wrong. ``malformed``: not a request, or its session
-        configuration has free sections that :func:`check_plain_data` refuses. ``out_of_memory``:
-        it may be sent again. ``version``: another protocol version. ``too_large``: the session
-        configuration has more than :data:`MAX_CONFIGURATION_BYTES`, or too many values.
-        ``other_code``: its settings mean something else here than on the robot.
+    Raises MessageError: ``damaged``: the checksum is wrong. ``malformed``: not a request, or its
+    session configuration has free sections that :func:`check_plain_data` refuses.
+    ``out_of_memory``: it may be sent again. ``version``: another protocol version. ``too_large``:
+    the session configuration has more than :data:`MAX_CONFIGURATION_BYTES`, or too many values.
+    ``other_code``: its settings mean something else here than on the robot.
     """
     content = _checked_content(payload)
     # Other versions may have other fields. A decoder would look at all of a large message first.
@@ -412,13 +338,7 @@ def decode_request(payload: bytes) -> Request:
 
 
 def decode_reply(payload: bytes) -> Reply:
-    """Decode a reply.
-
-    Raises
-    ------
-    MessageError
-        If it was changed in transit, or is no reply.
-    """
+    """Decode a reply; raise MessageError if it was changed in transit, or is no reply."""
     content = _checked_content(payload)
     try:
         reply = _REPLY_DECODER.decode(content)
@@ -441,13 +361,7 @@ def encode_floats(array: npt.ArrayLike) -> bytes:
 
 
 def decode_floats(data: bytes, size: int) -> FloatArray:
-    """Decode ``size`` numbers.
-
-    Raises
-    ------
-    MessageError
-        If their number differs, or one is not finite.
-    """
+    """Decode ``size`` numbers; raise MessageError if their number differs, or one is not finite."""
     if len(data) != 8 * size:
         raise MessageError("malformed", f"{len(data)} bytes are not {size} numbers")
     numbers = np.frombuffer(data, dtype="<f8").astype(np.float64)

@@ -17,8 +17,6 @@ from holdfast.planning.tracking import Trial
 from holdfast.problems.attributes import sensing_labels
 from holdfast.protocol.events import Effects, RobotEffect
 
-__all__ = ["ObservationReports", "held_error"]
-
 _MAX_REPORTS = 10
 """Bound on reports of each kind per trial; all are counted."""
 
@@ -34,17 +32,12 @@ _OR_ITS_SENSOR = ", or this sensor is dead: nothing else was sensed meanwhile"
 
 
 class ObservationReports:
-    """Reports to ``effects`` what is observed in trials.
-
-    Attributes
-    ----------
-    counts : Counter of str
-        Events of each kind in this process, also those that were counted only.
-    """
+    """Reports to ``effects`` what is observed in trials."""
 
     def __init__(self, effects: Effects[RobotEffect], lost: LostSettings) -> None:
         self._effects = effects
         self._lost = lost
+        # Events of each kind in this process, also those that were counted only.
         self.counts: Counter[str] = Counter()
         self._trial: int | None = None
         self._reported: Counter[str] = Counter()  # in that trial

@@ -15,8 +15,6 @@ from typing import Final
 
 from holdfast.errors import MessageError
 
-__all__ = ["MAX_CONFIGURATION_DEPTH", "MAX_CONFIGURATION_VALUES", "check_plain_data"]
-
 MAX_CONFIGURATION_VALUES: Final = 10_000
 """Bound on a session configuration's values: the smallest take one byte each when encoded, and
 sixty in memory."""
@@ -56,12 +54,9 @@ def check_plain_data(sections: Iterable[bytes], where: str) -> None:
 
     ``where`` names the sections in errors.
 
-    Raises
-    ------
-    MessageError
-        ``malformed``: a value or key that a file does not have, or more than
-        :data:`MAX_CONFIGURATION_DEPTH` levels. ``too_large``: more than
-        :data:`MAX_CONFIGURATION_VALUES` in all sections.
+    Raises MessageError: ``malformed``: a value or key that a file does not have, or more than
+    :data:`MAX_CONFIGURATION_DEPTH` levels. ``too_large``: more than
+    :data:`MAX_CONFIGURATION_VALUES` in all sections.
     """
     count = 0
     for data in sections:

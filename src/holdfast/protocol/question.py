@@ -11,17 +11,16 @@ What answers is a :class:`DecisionSource`: services, or the robot's own planner.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from holdfast.errors import HoldfastError, MessageError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.planner import Planner, PlanningState, encode_checkpoint
 from holdfast.protocol.events import (
+    ComputeOwnAnswer,
     Effects,
     Halt,
     OwnAnswer,
-    Plan,
-    Planned,
     RecoveryExited,
     RobotEffect,
     TransportEvent,
@@ -35,16 +34,6 @@ from holdfast.protocol.messages import (
     decode_floats,
 )
 from holdfast.protocol.status import StatusTracker
-
-__all__ = [
-    "OWN_PLANNER",
-    "DecisionSource",
-    "InProcessSource",
-    "Provenance",
-    "Question",
-    "WrongAnswer",
-    "same_actions",
-]
 
 OWN_PLANNER = "in_process"
 """Name of the planner in the robot's own process, where services have names."""
@@ -66,20 +55,13 @@ def same_actions(first: Sequence[FloatArray], second: Sequence[FloatArray]) -> b
 
 
 class WrongAnswer(NamedTuple):
-    """A service's answer that differs from the own planner's.
-
-    Attributes
-    ----------
-    kind : {"task", "sensing"}
-    step : int
-        Of the first action that differs.
-    answered, own : str
-        The service's action, and the own planner's; of sensing actions with the state's digest.
-    """
+    """A service's answer that differs from the own planner's."""
 
     service: str
-    kind: str
-    step: int
+    kind: str  # task or sensing
+    step: int  # of the first action that differs
+    # answered, own: the service's action, and the own planner's; of sensing actions with the
+    # state's digest.
     answered: str
     own: str
 
@@ -90,27 +72,6 @@ class Question:
     The question itself never changes. Its answer is written by
     :class:`~holdfast.protocol.verification.Verification` where services answer, else by
     :class:`InProcessSource`; the robot writes ``needed_at`` and ``num_ordered``.
-
-    Attributes
-    ----------
-    inputs, num_inputs
-        The latest of this trial, and how many there were.
-    task_count : int
-        Task actions in the answer.
-    sensing_step : int or None
-        Step of the answer's sensing action; None if it is too far away.
-    needed_at : float or None
-        Since when the robot waits for the answer; None if it does not.
-    num_ordered : int
-        Task actions of the answer that are performed or ordered.
-    task_actions, sensing
-        What the robot follows; None until it arrives.
-    check_decided : bool
-        Whether a check by the own planner was ordered, or left out.
-    own : OwnAnswer or None
-        The own planner's answer.
-    differing : list of WrongAnswer
-        Answers that differ from it, until the own planner has decided a second time.
     """
 
     def __init__(
@@ -123,21 +84,26 @@ class Question:
     ) -> None:
         self.state = state
         self.digest = digest[:DIGEST_SIZE]
+        # inputs, num_inputs: the latest of this trial, and how many there were.
         self.inputs = inputs
         self.num_inputs = num_inputs
+        # Since when the robot waits for the answer; None if it does not.
         self.needed_at: float | None = None
-        self.num_ordered = 0
+        self.num_ordered = 0  # task actions of the answer that are performed or ordered
+        # task_actions, sensing: what the robot follows; None until it arrives.
         self.task_actions: Sequence[FloatArray] | None = None
         self.sensing: SensingAnswer | None = None
         self.task_provenance: Provenance | None = None
         self.sensing_provenance: Provenance | None = None
-        self.check_decided = False
-        self.own: OwnAnswer | None = None
+        self.check_decided = False  # whether a check by the own planner was ordered, or left out
+        self.own: OwnAnswer | None = None  # the own planner's answer
+        # Answers that differ from it, until the own planner has decided a second time.
         self.differing: list[WrongAnswer] = []
         self._checkpoint: bytes | None = None
+        # Step of the answer's sensing action; None if it is too far away.
         self.sensing_step: int | None
         if planner.needs_sensing(state):
-            self.task_count = 0
+            self.task_count = 0  # task actions in the answer
             self.sensing_step = state.step
         elif planner.moves_show:
             self.task_count = 1
@@ -175,10 +141,7 @@ class Question:
     def read_tasks(self, reply: TaskAnswer, action_size: int) -> list[FloatArray]:
         """Return the task actions of a reply.
 
-        Raises
-        ------
-        MessageError
-            If the reply cannot answer this question.
+        Raises MessageError if the reply cannot answer this question.
         """
         if reply.count != self.task_count:
             raise MessageError(
@@ -190,10 +153,7 @@ class Question:
     def check_sensing(self, reply: SensingAnswer, num_choices: int) -> None:
         """Check the sensing action of a reply.
 
-        Raises
-        ------
-        MessageError
-            If the reply cannot answer this question.
+        Raises MessageError if the reply cannot answer this question.
         """
         if reply.step != self.sensing_step:
             raise MessageError(
@@ -212,27 +172,16 @@ class DecisionSource:
     :class:`~holdfast.protocol.dispatcher.Dispatcher` asks services; :class:`InProcessSource` asks
     only the robot's own planner. What only services need does nothing here: there is no service to
     be lost, timed or verified.
-
-    Attributes
-    ----------
-    effects : Effects
-        To be carried out in order; the robot appends its own.
-    question : Question or None
-        The current question, answered or not.
-    tracker : StatusTracker
-        Which service decides.
-    holding_since : float or None
-        Since when the robot holds still because no service is usable.
-    stopped : bool
-        Whether this source has stopped the run.
     """
 
     def __init__(self) -> None:
+        # To be carried out in order; the robot appends its own.
         self.effects: Effects[RobotEffect] = Effects()
-        self.question: Question | None = None
-        self.tracker = StatusTracker()
+        self.question: Question | None = None  # the current question, answered or not
+        self.tracker = StatusTracker()  # which service decides
+        # Since when the robot holds still because no service is usable.
         self.holding_since: float | None = None
-        self.stopped = False
+        self.stopped = False  # whether this source has stopped the run
 
     @property
     def num_unverified(self) -> int:
@@ -253,9 +202,7 @@ class DecisionSource:
     def recompute(self) -> None:
         """Have the own planner answer the question too."""
 
-    def handle(
-        self, event: TransportEvent | OwnAnswer | Planned | RecoveryExited, now: float
-    ) -> None:
+    def handle(self, event: TransportEvent | OwnAnswer | RecoveryExited, now: float) -> None:
         """Handle an event of the transport, of a planner or of the local service's process."""
         raise NotImplementedError
 
@@ -279,8 +226,8 @@ class DecisionSource:
 class InProcessSource(DecisionSource):
     """Decisions without services.
 
-    Its only effects are :class:`Plan` and :class:`Halt`; the shell computes each :class:`Plan` and
-    passes the result back to :meth:`handle`.
+    The own planner computes the parts of an answer, and the shell passes them back to
+    :meth:`handle`.
     """
 
     def __init__(self) -> None:
@@ -293,24 +240,26 @@ class InProcessSource(DecisionSource):
         self.question = question
         self._number += 1
         self._asked_at = now
-        self.effects.append(Plan(self._number, question.state, question.task_count == 0))
+        self._compute("sensing" if question.task_count == 0 else "task", question.state)
 
-    def handle(
-        self, event: TransportEvent | OwnAnswer | Planned | RecoveryExited, now: float
-    ) -> None:
+    def _compute(self, part: Literal["task", "sensing"], state: PlanningState) -> None:
+        self.effects.append(ComputeOwnAnswer(self._number, state, part=part))
+
+    def handle(self, event: TransportEvent | OwnAnswer | RecoveryExited, now: float) -> None:
         """Take a part of the answer; results of earlier questions are ignored."""
         question = self.question
-        if not isinstance(event, Planned) or event.number != self._number or question is None:
+        if not isinstance(event, OwnAnswer) or event.number != self._number or question is None:
             return
-        if event.error is not None:
-            self.stop(event.error)
+        if event.failure is not None:
+            self.stop(event.failure)
             return
         source = Provenance(OWN_PLANNER, now - self._asked_at, event.computed_s)
         if event.sensing_action is None:
             question.task_actions = event.actions
             question.task_provenance = source
             if question.sensing_step is not None:
-                self.effects.append(Plan(self._number, event.ahead, sensing=True))
+                assert event.ahead is not None
+                self._compute("sensing", event.ahead)
         else:
             assert question.sensing_step is not None
             digest = event.ahead_digest[:DIGEST_SIZE]

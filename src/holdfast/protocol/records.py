@@ -28,42 +28,15 @@ from holdfast.protocol.messages import (
     numbers_of,
 )
 
-__all__ = [
-    "ActingRecord",
-    "LateRecord",
-    "LocalTookOverRecord",
-    "ObservedRecord",
-    "PausedRecord",
-    "PerformedRecord",
-    "Record",
-    "ReinitialisedRecord",
-    "TrialHistory",
-    "decisions_of",
-    "decode_record",
-    "encode_record",
-    "has_shown",
-    "replay",
-]
-
 
 class ObservedRecord(msgspec.Struct, array_like=True, frozen=True, tag=1):
-    """An observation (little-endian float64), written before it is used.
-
-    Attributes
-    ----------
-    observation : bytes
-        Empty if it comes later, or if the choice was not to sense.
-    digest : bytes
-        32 bytes, of the state that it led to; checked by :func:`replay`.
-    sensing_ms : float
-        How long the sensing action was computed; for the tables only.
-    """
+    """An observation (little-endian float64), written before it is used."""
 
     step: int
     sensing_action: int
-    observation: bytes
-    digest: bytes
-    sensing_ms: float
+    observation: bytes  # empty if it comes later, or if the choice was not to sense
+    digest: bytes  # 32 bytes, of the state that it led to; checked by :func:`replay`
+    sensing_ms: float  # how long the sensing action was computed; for the tables only
 
 
 class ActingRecord(msgspec.Struct, array_like=True, frozen=True, tag=2):
@@ -97,20 +70,12 @@ class LocalTookOverRecord(msgspec.Struct, array_like=True, frozen=True, tag=5):
 
 
 class LateRecord(msgspec.Struct, array_like=True, frozen=True, tag=6):
-    """An observation of an earlier step came.
-
-    Attributes
-    ----------
-    taken : int
-        The step at which it was taken.
-    digest : bytes
-        32 bytes, of the state that it led to.
-    """
+    """An observation of an earlier step came."""
 
     step: int
-    taken: int
+    taken: int  # the step at which it was taken
     observation: bytes
-    digest: bytes
+    digest: bytes  # 32 bytes, of the state that it led to
 
     def late(self) -> LateObservation:
         """Return the observation and its step."""
@@ -145,13 +110,7 @@ def encode_record(record: Record) -> bytes:
 
 
 def decode_record(data: bytes) -> Record:
-    """Decode a record.
-
-    Raises
-    ------
-    RecordError
-        If the bytes are not a record.
-    """
+    """Decode a record; raise RecordError if the bytes are not a record."""
     try:
         return _DECODER.decode(data)
     except Exception as error:  # decoding may raise anything
@@ -159,22 +118,7 @@ def decode_record(data: bytes) -> Record:
 
 
 class TrialHistory(Trial):
-    """An unfinished trial: what its records fold to.
-
-    Attributes
-    ----------
-    inputs : tuple of Input
-        The latest from which a service can fold the state, as many as fit into a request.
-    actions : list of array
-        Replayed task actions in order.
-    pending : array or None
-        A task action in the journal that is not known to be performed.
-    paused : bool
-        Whether the previous process ended in order.
-    is_lost : bool
-        Whether the robot was found lost by the last observation or move, or by what came late since
-        then.
-    """
+    """An unfinished trial: what its records fold to."""
 
     def __init__(
         self,
@@ -184,10 +128,14 @@ class TrialHistory(Trial):
         false_alarm_rate: float = LostSettings().false_alarm_rate,
     ) -> None:
         super().__init__(planner, seed, trial, false_alarm_rate)
+        # The latest from which a service can fold the state, as many as fit into a request.
         self.inputs: tuple[Input, ...] = ()
-        self.actions: list[FloatArray] = []
+        self.actions: list[FloatArray] = []  # replayed task actions in order
+        # A task action in the journal that is not known to be performed.
         self.pending: FloatArray | None = None
-        self.paused = False
+        self.paused = False  # whether the previous process ended in order
+        # Whether the robot was found lost by the last observation or move, or by what came late
+        # since then.
         self.is_lost = False
 
     @property
@@ -255,10 +203,8 @@ def replay(
 ) -> TrialHistory:
     """Fold the records of an unfinished trial, in the order in which they were written.
 
-    Raises
-    ------
-    RecordError
-        If a record does not follow from those before it, or leads to another state than before.
+    Raises RecordError if a record does not follow from those before it, or leads to another state
+    than before.
     """
     history = TrialHistory(planner, seed, trial, false_alarm_rate)
     for position, record in enumerate(records):

@@ -15,8 +15,6 @@ from collections.abc import Collection, Iterator, Sequence
 from holdfast.protocol.messages import Input
 from holdfast.protocol.question import Question
 
-__all__ = ["FailureDetector", "Replica", "ReplicaSet"]
-
 _LATE_IN_A_ROW = 3
 """After so many late replies in a row, the service is further away than the timeout."""
 
@@ -65,28 +63,18 @@ class FailureDetector:
       stopped or is cut off. A service of which nothing is awaited may be silent for any time;
     - *calls that end without an answer*: the process is gone;
     - *deadlines*: a decision that takes too long is of no use even with signs of life.
-
-    Parameters
-    ----------
-    detection_timeout_s : float
-        Longest accepted silence while something is awaited.
-
-    Attributes
-    ----------
-    incarnation : str or None
-        Of the present process; None if the service is absent. ``seen`` says if it ever was present.
-    suspicion : str or None
-        Why the service is not trusted; None if it is.
     """
 
     def __init__(self, detection_timeout_s: float) -> None:
         self._usual_timeout_s = detection_timeout_s
-        self._timeout_s = detection_timeout_s
+        self._timeout_s = detection_timeout_s  # accepted silence while something is awaited
         self._longest_silence_s = 0.0
         self._awaited = 0
         self._last_sign = 0.0
+        # Of the present process; None if the service is absent. ``seen`` says if it ever was
+        # present.
         self.incarnation: str | None = None
-        self.suspicion: str | None = None
+        self.suspicion: str | None = None  # why the service is not trusted; None if it is
         self.seen = False
 
     @property
@@ -178,58 +166,34 @@ class FailureDetector:
 
 
 class Replica:
-    """One service, as far as the robot knows it.
-
-    Parameters
-    ----------
-    late_after_s : float
-        The first reply to a request is late after this time; ``late_s`` are those late in a row.
-
-    Attributes
-    ----------
-    last_incarnation : str or None
-        Of the process seen last.
-    opened : bool
-        Whether it knows the session.
-    acknowledged : tuple of int or None
-        Trial and number of inputs of the latest state that it is known to hold.
-    num_diverged : int
-        Times in a row that it came to another state than the robot from the same observations.
-    num_refusals : list of int
-        Of the task and of the sensing part, since it last gave that part: a problem's code can fail
-        in one part only.
-    complaint : str or None
-        Text of the last of these.
-    refusal, refusal_code : str or None, str
-        Why it is no longer asked.
-    distrusted : str or None
-        Why it is no longer asked, not even after a restart.
-    retry_at, backoff_s : float
-        It is not asked before that time, and then delayed by so much.
-    """
+    """One service, as far as the robot knows it."""
 
     def __init__(
         self, name: str, detection_timeout_s: float, late_after_s: float = math.inf
     ) -> None:
         self.name = name
         self.detector = FailureDetector(detection_timeout_s)
-        self.last_incarnation: str | None = None
-        self.late_after_s = late_after_s
+        self.last_incarnation: str | None = None  # of the process seen last
+        self.late_after_s = late_after_s  # the first reply to a request is late after this time
         self.late_at = -math.inf
-        self.late_s: list[float] = []
-        self.distrusted: str | None = None
+        self.late_s: list[float] = []  # first replies late in a row
+        self.distrusted: str | None = None  # why it is not asked, not even after a restart
         self.forget()
 
     def forget(self) -> None:
         """Reset what was known of the previous process."""
-        self.opened = False
+        self.opened = False  # whether it knows the session
+        # Trial and number of inputs of the latest state that it is known to hold.
         self.acknowledged: tuple[int, int] | None = None
+        # Times in a row that it came to another state than the robot from the same observations.
         self.num_diverged = 0
+        # Of the task and of the sensing part, since it last gave that part: a problem's code can
+        # fail in one part only. And the text of the last.
         self.num_refusals = [0, 0]
         self.complaint: str | None = None
-        self.refusal = self.distrusted
+        self.refusal = self.distrusted  # why it is no longer asked
         self.refusal_code = "" if self.refusal is None else _WRONG_ANSWER
-        self.retry_at = 0.0
+        self.retry_at = 0.0  # it is not asked before, and then delayed by the following
         self.backoff_s = _FIRST_RETRY_S
         self.num_busy = 0
 
@@ -250,12 +214,9 @@ class Replica:
     # -- what it says ----------------------------------------------------------------------------
 
     def note_first_reply(self, sent_at: float, now: float) -> float | None:
-        """Record the time to the first reply of a request.
+        """Record the time to the first reply; return the shortest of several late in a row, once.
 
-        Returns
-        -------
-        float or None
-            The shortest of these times in seconds, once, when several in a row were late.
+        In seconds; None otherwise.
         """
         after_s = now - sent_at
         if len(self.late_s) == _LATE_IN_A_ROW:
@@ -274,12 +235,7 @@ class Replica:
     def note_answer(self, question: Question, now: float, *, sensing: bool, restored: bool) -> None:
         """Record a part of an answer: it lives and holds the question's state.
 
-        Parameters
-        ----------
-        sensing : bool
-            Whether it is the sensing part.
-        restored : bool
-            Whether the request carried the state.
+        ``restored`` if the request carried the state.
         """
         self.detector.heard(now)
         self.opened = True
@@ -308,13 +264,7 @@ class Replica:
         self.acknowledged = None
 
     def note_refusal(self, code: str, text: str, now: float, *, sensing: bool) -> bool:
-        """Record a refusal, which delays it; return whether it is no longer asked.
-
-        Parameters
-        ----------
-        sensing : bool
-            Whether it refuses the sensing part.
-        """
+        """Record a refusal, which delays it; return whether it is no longer asked."""
         most = _MAX_REFUSALS
         if code == _OUT_OF_MEMORY:
             most = _MAX_OUT_OF_MEMORY
@@ -340,17 +290,7 @@ class Replica:
     ) -> tuple[tuple[Input, ...], bytes | None]:
         """Return what a request must carry for the service to reach the question's state.
 
-        Parameters
-        ----------
-        whole_state : bool
-            Whether it needs the whole state in any case.
-
-        Returns
-        -------
-        inputs : tuple of Input
-            From the state that it holds to the question's.
-        checkpoint : bytes or None
-            The whole state, where that is better.
+        The inputs since the state that it holds; or, where that is better, the whole state.
         """
         state = question.state
         known = self.acknowledged
@@ -371,32 +311,16 @@ class Replica:
 
 
 class ReplicaSet:
-    """All services that a robot may ask.
-
-    Parameters
-    ----------
-    cloud : sequence of str
-        Names in order of preference.
-    local : str or None
-        Name of the local service.
-    startup_timeout_s : float
-        For so long after :meth:`start`, absent services may be coming up.
-    distrusted : collection of str
-        Services that answered wrongly earlier in this run.
-
-    Attributes
-    ----------
-    startup_until : float or None
-        When the services must have come up.
-    """
+    """All services that a robot may ask."""
 
     def __init__(
         self,
-        cloud: Sequence[str],
-        local: str | None,
+        cloud: Sequence[str],  # names in order of preference
+        local: str | None,  # name of the local service
         detection_timeout_s: float,
+        # For so long after :meth:`start`, absent services may be coming up.
         startup_timeout_s: float = 0.0,
-        distrusted: Collection[str] = (),
+        distrusted: Collection[str] = (),  # services that answered wrongly earlier in this run
     ) -> None:
         timeout_s = detection_timeout_s
         self.cloud = [Replica(name, timeout_s, late_after_s=timeout_s) for name in cloud]
@@ -411,7 +335,7 @@ class ReplicaSet:
                     "run; name another service, or begin anew in another directory"
                 )
         self._startup_timeout_s = startup_timeout_s
-        self.startup_until: float | None = None
+        self.startup_until: float | None = None  # when the services must have come up
 
     def __iter__(self) -> Iterator[Replica]:
         return iter(self._by_name.values())

@@ -29,8 +29,6 @@ from holdfast.protocol.service_sessions import (
     Session,
 )
 
-__all__ = ["RequestQueue"]
-
 
 class _RoundRobin:
     """Tasks that wait, their owners by turns."""
@@ -91,14 +89,9 @@ class _Load:
 
 
 class RequestQueue:
-    """The tasks of one lane that wait or run.
+    """The tasks of one lane that wait, or run on so many workers.
 
-    Parameters
-    ----------
-    workers : int
-        Tasks that may run at a time.
-    room : float, optional
-        Share of the limits on what may wait.
+    ``room`` is its share of the limits on what may wait.
     """
 
     def __init__(self, workers: int, limits: ServiceLimits, room: float = 1.0) -> None:

@@ -35,9 +35,6 @@ from holdfast.protocol.question import Provenance, Question
 from holdfast.protocol.replica_set import Replica
 from holdfast.protocol.verification import Verification
 
-__all__ = ["OpenRequest", "OpenRequests"]
-
-
 _MAX_CALLS = 4
 """Bound on the open requests to one service."""
 
@@ -48,20 +45,7 @@ bits even if a process makes two thousand times as many requests."""
 
 
 class OpenRequest:
-    """A request in flight.
-
-    Attributes
-    ----------
-    call_number : int
-        Of its call, in effects and events.
-    number : int
-        In the message, repeated by each reply. It is unique in the run over 2,048 processes of the
-        robot, so a reply that arrives late in another call is recognized.
-    opens, restores : bool
-        Whether it carries the session configuration, and the state.
-    heard, has_task_part, has_sensing_part : bool
-        Whether any reply has come, and that part of the answer.
-    """
+    """A request in flight."""
 
     def __init__(
         self,
@@ -74,12 +58,17 @@ class OpenRequest:
         opens: bool,
         restores: bool,
     ) -> None:
-        self.call_number = call_number
+        self.call_number = call_number  # of its call, in effects and events
+        # In the message, repeated by each reply. It is unique in the run over 2,048 processes of
+        # the robot, so a reply that arrives late in another call is recognized.
         self.number = number
         self.replica = replica
         self.question = question
         self.sent_at = sent_at
+        # heard, has_task_part, has_sensing_part: whether any reply has come, and that part of the
+        # answer.
         self.heard = False
+        # opens, restores: whether it carries the session configuration, and the state.
         self.opens = opens
         self.restores = restores
         self.has_task_part = False
@@ -111,11 +100,6 @@ class OpenRequests:
     """Sends requests, records what their replies say, and keeps those in flight.
 
     They are kept in the order in which they were sent.
-
-    Parameters
-    ----------
-    timeout_s : float
-        From one request to the next of a service that may not hear the robot.
     """
 
     def __init__(
@@ -123,7 +107,7 @@ class OpenRequests:
         session: bytes,
         epoch: int,
         session_configuration: SessionConfiguration,
-        timeout_s: float,
+        timeout_s: float,  # from one request to the next of a service that may not hear the robot
         planner: Planner,
         verification: Verification,
         effects: Effects[RobotEffect],
@@ -205,18 +189,11 @@ class OpenRequests:
         question: Question,
         now: float,
         *,
-        whole_state: bool = False,
+        whole_state: bool = False,  # whether the service needs the whole state
+        # Whether another attempt at a question is reported; not if other services have it too.
         is_retry: bool = True,
     ) -> None:
-        """Send a question to a service, with the state information that the service lacks.
-
-        Parameters
-        ----------
-        whole_state : bool
-            Whether the service needs the whole state.
-        is_retry : bool
-            Whether another attempt at a question is reported; not if other services have it too.
-        """
+        """Send a question to a service, with the state information that the service lacks."""
         open_calls = self.to(replica)
         for call in open_calls[: max(0, len(open_calls) - _MAX_CALLS + 1)]:
             self.abandon(call)
@@ -270,17 +247,10 @@ class OpenRequests:
     # -- replies -----------------------------------------------------------------------------------
 
     def take(self, call: OpenRequest, payload: bytes, now: float) -> Reply | None:
-        """Record what a reply to an open request says.
+        """Record what a reply to an open request says; return it, or None if it is invalid.
 
-        Returns
-        -------
-        Reply or None
-            The reply; None if it is invalid.
-
-        Raises
-        ------
-        HoldfastError
-            If another process of the robot has taken over, or the own planner fails.
+        Raises HoldfastError if another process of the robot has taken over, or the own planner
+        fails.
         """
         replica = call.replica
         try:
@@ -335,13 +305,7 @@ class OpenRequests:
     def _take_answer(
         self, call: OpenRequest, reply: TaskAnswer | SensingAnswer, now: float
     ) -> None:
-        """Take a part of the answer.
-
-        Raises
-        ------
-        MessageError
-            If it cannot answer the question.
-        """
+        """Take a part of the answer; raise MessageError if it cannot answer the question."""
         replica, question = call.replica, call.question
         first = not call.answered
         sensing = isinstance(reply, SensingAnswer)

@@ -32,7 +32,6 @@ from holdfast.protocol.events import (
     Halt,
     OwnAnswer,
     Paused,
-    Planned,
     RecoveryExited,
     RobotEffect,
     Sense,
@@ -55,8 +54,6 @@ from holdfast.protocol.records import (
 )
 from holdfast.protocol.status import Status
 
-__all__ = ["Robot"]
-
 _FROM_ENVIRONMENT = (Sensed, Acted, EnvironmentFailed)
 """Events that complete an order to the environment."""
 
@@ -68,13 +65,6 @@ class Robot:
     """The loop of one robot over the trials of a run.
 
     ``rate_hz`` is task actions per second; None is as soon as possible.
-
-    Attributes
-    ----------
-    num_performed, missed_ticks : int
-        Task actions performed, and ticks of ``rate_hz`` at which the robot was not ready.
-    has_decided : bool
-        Whether this process has used an answer.
     """
 
     def __init__(
@@ -102,10 +92,13 @@ class Robot:
         self._computed_ms = 0.0
         self._timed_provenance: Provenance | None = None
         self._unwritten: list[Record] = []
+        # has_decided: whether this process has used an answer.
         self._pausing = self._stopped = self.has_decided = False
         self._next_tick: float | None = None
         self._asleep_until: float | None = None
         self._report_ticks_at = 0.0
+        # num_performed, missed_ticks: task actions performed, and ticks of ``rate_hz`` at which the
+        # robot was not ready.
         self._recoveries_counted = self._reported_ticks = self.missed_ticks = self.num_performed = 0
 
     @property
@@ -156,21 +149,15 @@ class Robot:
     def begin_trial(
         self,
         trial: int,
+        # From :func:`~holdfast.protocol.records.replay`; of no records for a new trial.
         history: TrialHistory,
         begun: EnvironmentReady,
         now: float,
         *,
+        # Whether no record can be missing: no power was cut and no file removed since the last.
         tail_is_certain: bool,
     ) -> list[RobotEffect]:
-        """Begin or resume a trial.
-
-        Parameters
-        ----------
-        history : TrialHistory
-            From :func:`~holdfast.protocol.records.replay`; of no records for a new trial.
-        tail_is_certain : bool
-            Whether no record can be missing: no power was cut and no file removed since the last.
-        """
+        """Begin or resume a trial."""
         self._trial = trial
         self._history = history
         self._ending = begun.ending
@@ -239,7 +226,7 @@ class Robot:
 
     def handle(
         self,
-        event: TransportEvent | EnvironmentEvent | OwnAnswer | Planned | RecoveryExited,
+        event: TransportEvent | EnvironmentEvent | OwnAnswer | RecoveryExited,
         now: float,
     ) -> list[RobotEffect]:
         """Handle an event."""

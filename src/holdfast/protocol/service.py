@@ -67,8 +67,6 @@ from holdfast.protocol.service_sessions import (
     with_cores,
 )
 
-__all__ = ["Service"]
-
 _INERTIA_OF_ONE = 4.0
 """Of the mean times of one session, whose decisions are alike."""
 
@@ -77,28 +75,18 @@ _NO_ROOM_RETRY_MS = 100.0
 
 
 class Service:
-    """Answers the requests of many robots.
-
-    Parameters
-    ----------
-    make_problem : callable
-        Builds the problem of a session configuration; raises the robot's mistakes as errors of
-        :mod:`holdfast.errors`. Jobs call it, several at a time.
-    workers : int
-        Brief jobs that may run at a time.
-    describe_error : callable, optional
-        Turns an error of a problem's code into a message.
-    pricing : Pricing, optional
-        How fast this machine is.
-    """
+    """Answers the requests of many robots."""
 
     def __init__(
         self,
+        # Builds the problem of a session configuration; raises the robot's mistakes as errors of
+        # :mod:`holdfast.errors`. Jobs call it, several at a time.
         make_problem: Callable[[SessionConfiguration], Problem],
-        workers: int,
+        workers: int,  # brief jobs that may run at a time
         limits: ServiceLimits | None = None,
+        # Turns an error of a problem's code into a message.
         describe_error: Callable[[BaseException], str] | None = None,
-        pricing: Pricing = ANY_MACHINE,
+        pricing: Pricing = ANY_MACHINE,  # how fast this machine is
     ) -> None:
         if workers < 1:
             raise InvalidValueError(f"workers {workers}: a service needs at least 1")
@@ -146,23 +134,15 @@ class Service:
 
     def receive(
         self,
-        call: int,
+        call: int,  # unique; used in effects
+        # What :func:`~holdfast.protocol.messages.decode_request` returned or raised.
         request: Request | MessageError,
         size: int,
         now: float,
+        # Name in the robot's verified certificate. It reaches only sessions of this owner.
         owner: Owner = None,
     ) -> list[ServiceEffect]:
-        """Handle a request, which callers decode outside their lock.
-
-        Parameters
-        ----------
-        call : int
-            Unique; used in effects.
-        request : Request or MessageError
-            What :func:`~holdfast.protocol.messages.decode_request` returned or raised.
-        owner : str or None, optional
-            Name in the robot's verified certificate. It reaches only sessions of this owner.
-        """
+        """Handle a request, which callers decode outside their lock."""
         if isinstance(request, MessageError):
             self._calls.send_refused(call, 0, request.code, str(request))
             return self._effects.take()
@@ -172,13 +152,15 @@ class Service:
 
     def started(self, job: Job, now: float) -> None:
         """Note that a job that was handed out starts only now."""
-        self._queue.started(job, now)
+        if (lane := self._queue.with_job(job)) is not None:
+            lane.started(job, now)
 
     def finished(self, job: Job, outcome: JobResult, now: float) -> list[ServiceEffect]:
         """Handle the result of a job that was handed out."""
-        if not self._queue.runs(job):
+        lane = self._queue.with_job(job)
+        if lane is None:
             return []  # handed out before everything was forgotten
-        task = self._queue.end(job)
+        task = lane.end(job)
         session = task.session
         is_awaited = session.pending.get(task.digest) is task
         session.remove_task(task)
@@ -304,7 +286,7 @@ class Service:
         )
         session.known = self._problems.cost_of(session.owner, session.problem_key)
         lane = session.lane_of(request)
-        if self._queue.is_overloaded(now, key[0], lane):
+        if self._queue[lane].is_overloaded(now, key[0]):
             self._sessions.note_epoch(key, request.epoch)
             self._reject_busy(call, request.number, key, lane, now)
             return None
@@ -338,17 +320,12 @@ class Service:
     ) -> tuple[bool, PendingTask | None]:
         """Answer as far as the cache goes.
 
-        Returns
-        -------
-        known : bool
-            Whether it has the answer, or will have it.
-        task : PendingTask or None
-            For which the call waits.
+        Returns whether it has the answer, or will have it; and the task for which the call waits.
         """
         task = session.pending.get(request.digest)
         if task is not None:
             if task.request is None and not task.running:
-                self._queue.promote(task)
+                self._queue[task.lane].promote(task)
             self._statistics.attached += 1
             self._calls.attach(task, call, request.number, now)
             return True, task
@@ -402,7 +379,7 @@ class Service:
             ),
             None,
         )
-        if waiting is None and self._queue.is_overloaded(now, session.owner, lane):
+        if waiting is None and self._queue[lane].is_overloaded(now, session.owner):
             self._reject_busy(call, request.number, session.key, lane, now)
             return None
         if waiting is not None:
@@ -410,13 +387,13 @@ class Service:
             self._calls.end(waiting)
             self._statistics.superseded += 1
             session.remove_task(waiting)
-            self._queue.replace(waiting, request, sensing=sensing, size=size)
+            self._queue[lane].replace(waiting, request, sensing=sensing, size=size)
             task = waiting
         else:
             task = PendingTask(
                 session, request.digest, sensing=sensing, since=now, request=request, size=size
             )
-            self._queue.enqueue(task)
+            self._queue[lane].enqueue(task)
         session.pending[task.digest] = task
         self._calls.attach(task, call, request.number, now)
         return task
@@ -435,7 +412,7 @@ class Service:
         digest, state = session.ahead_digest, session.ahead
         task = PendingTask(session, digest, sensing=True, since=now, state=state)
         session.pending[digest] = task
-        self._queue.enqueue(task)
+        self._queue[task.lane].enqueue(task)
         return task
 
     def _dispatch(self, now: float) -> None:
@@ -479,7 +456,7 @@ class Service:
             # A long one would have to build it again.
             building_counts=task.lane != LONG,
         )
-        self._queue.handed_out(task, job, now)
+        self._queue[task.lane].handed_out(task, job, now)
         self._effects.append(StartJob(job, expected_s, task.lane <= BRIEF))
 
     # -- outcomes --------------------------------------------------------------------------------
@@ -576,7 +553,7 @@ class Service:
         least_ms: float = 1.0,
     ) -> None:
         owner, session = key
-        wait_ms = max(least_ms, 1e3 * self._queue.wait_s(now, owner, lane))
+        wait_ms = max(least_ms, 1e3 * self._queue[lane].wait_s(now, owner))
         self._calls.send_busy(call, number, session, wait_ms, self._queue.num_waiting)
 
     # -- sessions --------------------------------------------------------------------------------

@@ -28,8 +28,6 @@ from holdfast.protocol.service_jobs import EndCall, SendReply, ServiceEffect
 from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
 from holdfast.protocol.service_sessions import CachedAnswer, PendingTask, WaitingCall
 
-__all__ = ["WaitingCalls"]
-
 _PROGRESS_TOGETHER = 0.8
 """Calls this far into the interval get their progress together with those due: fewer wakeups."""
 
@@ -152,17 +150,7 @@ class WaitingCalls:
         self._end_with(call, NeedState(number, differs, diverged))
 
     def send_busy(self, call: int, number: int, key: bytes, wait_ms: float, waiting: int) -> None:
-        """Turn a request away, and end the call.
-
-        Parameters
-        ----------
-        key : bytes
-            Of the robot's session.
-        wait_ms : float
-            Shortest time until it retries.
-        waiting : int
-            Waiting tasks, for the log.
-        """
+        """Turn a request of a session away, for at least ``wait_ms``, and end the call."""
         self._statistics.busy += 1
         # Robots that were turned away together shall not come back together.
         share = int.from_bytes(hashlib.blake2b(key, digest_size=2).digest(), "big") / 2**16

@@ -55,64 +55,36 @@ from holdfast.protocol.messages import (
 )
 from holdfast.protocol.service_limits import ServiceLimits
 
-__all__ = [
-    "Computed",
-    "EndCall",
-    "Job",
-    "JobResult",
-    "ProblemPool",
-    "SendReply",
-    "ServiceEffect",
-    "StartJob",
-]
-
 _COSTS_PER_PROBLEM = 128
 """So many costs are kept for each problem of which instances are; they take little memory."""
 
 
 class JobResult(NamedTuple):
-    """The result of a job.
+    """The result of a job."""
 
-    Attributes
-    ----------
-    failure : tuple of str or None
-        Code and text of the refusal; None if it succeeded or lacks the state.
-    lacks_state : bool
-        The requested state does not follow from what the service holds. ``differs``: it held a
-        state of this trial that leads elsewhere. ``diverged``: the requested step was reached with
-        another digest.
-    problem : Problem or None
-        To be reused, as far as it could be built.
-    state : PlanningState or None
-        The requested state, verified; ``restored`` if it came from a checkpoint.
-    ahead, ahead_digest
-        The state to which the ``num_actions`` actions lead, and its digest as it is sent; None
-        where it depends on what a move will show.
-    sensing_action : int
-        The chosen one; -1 if none was to be chosen.
-    price : Price or None
-        What this session's decisions cost, as far as that is known.
-    postponed : Cost or None
-        The estimated cost; nothing was computed, because it is more than this job may take.
-    cancelled : bool
-        It was ended from outside, or has used up its time.
-    """
-
+    # Code and text of the refusal; None if it succeeded or lacks the state.
     failure: tuple[str, str] | None = None
+    # The requested state does not follow from what the service holds. ``differs``: it held a state
+    # of this trial that leads elsewhere. ``diverged``: the requested step was reached with another
+    # digest.
     lacks_state: bool = False
     differs: bool = False
     diverged: bool = False
-    problem: Problem | None = None
+    problem: Problem | None = None  # to be reused, as far as it could be built
+    # The requested state, verified; ``restored`` if it came from a checkpoint.
     state: PlanningState | None = None
     restored: bool = False
     num_actions: int = 0
     actions: bytes = b""
+    # ahead, ahead_digest: the state to which the ``num_actions`` actions lead, and its digest as it
+    # is sent; None where it depends on what a move will show.
     ahead: PlanningState | None = None
     ahead_digest: bytes = b""
-    sensing_action: int = -1
-    price: Price | None = None
+    sensing_action: int = -1  # the chosen one; -1 if none was to be chosen
+    price: Price | None = None  # what this session's decisions cost, as far as that is known
+    # The estimated cost; nothing was computed, because it is more than this job may take.
     postponed: Cost | None = None
-    cancelled: bool = False
+    cancelled: bool = False  # it was ended from outside, or has used up its time
 
 
 class _LacksStateError(Exception):
@@ -125,55 +97,30 @@ class _LacksStateError(Exception):
 
 
 class Job:
-    """A part of an answer to be computed.
-
-    Parameters
-    ----------
-    kind : {"task", "sensing"}
-    problem : Problem or None
-        None if it must be built.
-    configuration : bytes
-        Packed (:func:`~holdfast.protocol.messages.pack_configuration`).
-    request : Request or None
-        Names the state; None if ``state`` is that state.
-    state : PlanningState or None
-        Where to start; None for the trial's beginning.
-    price : Price or None
-        From an earlier job of this session.
-    known : ProblemCost or None
-        What the problem's functions take, from an earlier job of any session.
-    most : Cost or None
-        What it may take; if it is estimated to take more, nothing is computed. None: what a
-        decision may take at all.
-    most_s : float
-        Processor time after which it ends, whatever was estimated.
-    building_counts : bool
-        Whether building the problem and measuring it are part of that time.
-
-    Attributes
-    ----------
-    interruption : Interruption
-        Ends it.
-    """
+    """A part of an answer to be computed."""
 
     def __init__(
         self,
         kind: Literal["task", "sensing"],
-        problem: Problem | None,
+        problem: Problem | None,  # None if it must be built
         make_problem: Callable[[SessionConfiguration], Problem],
         describe_error: Callable[[BaseException], str],
-        configuration: bytes,
+        configuration: bytes,  # packed (:func:`~holdfast.protocol.messages.pack_configuration`)
         planning: PlanningSettings,
         seed: int,
         limits: ServiceLimits,
-        request: Request | None,
-        state: PlanningState | None,
+        request: Request | None,  # names the state; None if ``state`` is that state
+        state: PlanningState | None,  # where to start; None for the trial's beginning
         pricing: Pricing = ANY_MACHINE,
-        price: Price | None = None,
+        price: Price | None = None,  # from an earlier job of this session
+        # What the problem's functions take, from an earlier job of any session.
         known: ProblemCost | None = None,
+        # What it may take; if it is estimated to take more, nothing is computed. None: what a
+        # decision may take at all.
         most: Cost | None = None,
-        most_s: float = math.inf,
+        most_s: float = math.inf,  # processor time after which it ends, whatever was estimated
         *,
+        # Whether building the problem and measuring it are part of that time.
         building_counts: bool = False,
     ) -> None:
         self.kind = kind
@@ -182,7 +129,7 @@ class Job:
         self._known = known
         self._most = most
         self._building_counts = building_counts
-        self.interruption = Interruption(most_s)
+        self.interruption = Interruption(most_s)  # ends it
         self._problem = problem
         self._make_problem = make_problem
         self._describe_error = describe_error
@@ -436,13 +383,8 @@ def _code_of(error: HoldfastError) -> str:
 class ProblemPool:
     """Problem instances that no job is using, and what problems cost.
 
-    Each instance is used by one job at a time, since it may keep buffers.
-
-    Parameters
-    ----------
-    max_problems : int
-        Distinct problems of which instances are kept; the least recently released goes first. What
-        a problem costs is kept for many times as many.
+    Each instance is used by one job at a time, since it may keep buffers. Instances are kept of so
+    many distinct problems, the least recently released going first; costs of many times as many.
     """
 
     def __init__(self, max_problems: int) -> None:
@@ -494,36 +436,23 @@ class EndCall(NamedTuple):
 
 
 class StartJob(NamedTuple):
-    """Run a job anywhere, and hand its result to the machine's ``finished``.
-
-    Attributes
-    ----------
-    expected_s : float
-        Typical time of the robot's earlier jobs; infinite if that predicts nothing: the first job,
-        a problem that is not built in, or an unusual request.
-    is_brief : bool
-        Whether its lane ends it after a moment. All others may take any time, so their threads have
-        less weight (:class:`~holdfast.protocol.lanes.Lanes`).
-    """
+    """Run a job anywhere, and hand its result to the machine's ``finished``."""
 
     job: Job
+    # Typical time of the robot's earlier jobs; infinite if that predicts nothing: the first job, a
+    # problem that is not built in, or an unusual request.
     expected_s: float
+    # Whether its lane ends it after a moment. All others may take any time, so their threads have
+    # less weight (:class:`~holdfast.protocol.lanes.Lanes`).
     is_brief: bool
 
 
 class Computed(NamedTuple):
-    """Time that a part of an answer took; for metrics only.
-
-    Attributes
-    ----------
-    kind : {"task", "sensing"}
-    waited_s : float
-        Before it was begun.
-    """
+    """Time that a part of an answer took; for metrics only."""
 
     kind: Literal["task", "sensing"]
     computed_s: float
-    waited_s: float
+    waited_s: float  # before it was begun
 
 
 ServiceEffect: TypeAlias = SendReply | EndCall | StartJob | Computed | LogEvent

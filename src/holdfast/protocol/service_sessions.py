@@ -15,7 +15,7 @@ calls. A part is identified by the digest of its state, so equal questions share
 from __future__ import annotations
 
 import hashlib
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -28,25 +28,6 @@ from holdfast.protocol.decision_cost import Cost, Price, ProblemCost
 from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.messages import Request, SessionConfiguration, pack_configuration
 from holdfast.protocol.service_limits import ServiceLimits
-
-__all__ = [
-    "BRIEF",
-    "FIRST",
-    "LONG",
-    "MEDIUM",
-    "NEW",
-    "PREFETCHED",
-    "REQUESTED",
-    "CachedAnswer",
-    "ForgottenEpochs",
-    "Owner",
-    "PendingTask",
-    "Session",
-    "SessionKey",
-    "SessionTable",
-    "WaitingCall",
-    "with_cores",
-]
 
 _LEAST_EPOCHS = 4096
 """Epochs of forgotten sessions are remembered at least for so many."""
@@ -104,36 +85,20 @@ class PendingTask:
     The service creates and drops tasks; :class:`RequestQueue` writes ``urgent``, ``running`` and
     ``started_at``, and has a waiting task carry a newer request; :class:`WaitingCalls` writes
     ``calls``.
-
-    Parameters
-    ----------
-    digest : bytes
-        Of the part's state.
-    request, state
-        The request names the state; without one (the robot has not asked yet) it is ``state``.
-    size : int
-        Bytes of the request.
-    since : float
-        When it was queued; of one that carries a newer request, the first of them.
-
-    Attributes
-    ----------
-    lane : int
-        Where it waits and runs (:mod:`~holdfast.protocol.lanes`).
-    num_bytes : float
-        Estimated memory, unless it is brief.
     """
 
     def __init__(
         self,
         session: Session,
-        digest: bytes,
+        digest: bytes,  # of the part's state
         *,
         sensing: bool,
-        since: float,
+        since: float,  # when it was queued; of one that carries a newer request, the first of them
+        # request, state: the request names the state; without one (the robot has not asked yet) it
+        # is ``state``.
         request: Request | None = None,
         state: PlanningState | None = None,
-        size: int = 0,
+        size: int = 0,  # bytes of the request
     ) -> None:
         self.session = session
         self.digest = digest
@@ -145,8 +110,9 @@ class PendingTask:
         self.slot = PREFETCHED if request is None else REQUESTED
         self.urgent = request is not None
         self.calls: dict[int, WaitingCall] = {}
+        # Where it waits and runs (:mod:`~holdfast.protocol.lanes`).
         self.lane = session.lane_of(request)
-        self.num_bytes = 0.0
+        self.num_bytes = 0.0  # estimated memory, unless it is brief
         self.cost_s = self._expected_s()
         self.running = False
         self.started_at = since
@@ -209,40 +175,6 @@ class Session:
     :class:`SessionTable` writes ``served``, ``closed`` and ``num_bytes``, and drops states and
     answers; :class:`~holdfast.protocol.service.Service` and
     :class:`~holdfast.protocol.lanes.Lanes` write all else.
-
-    Attributes
-    ----------
-    number : int
-        Of the newest request in this epoch; -1 before the first.
-    configuration : bytes
-        Packed session configuration.
-    problem_key : bytes
-        Digest that identifies the problem among those kept for reuse.
-    built, built_in : bool
-        Whether the problem was built before, and whether it is part of holdfast.
-    known : ProblemCost or None
-        What its problem's functions take, if they were measured for another session of its owner.
-    is_brief : bool
-        Whether no decision was estimated to be too long for the lane of brief ones.
-    overran : bool
-        Whether its last decision took much longer than was estimated.
-    restored_trial : int or None
-        The last trial of which a state came from a checkpoint.
-    price : Price or None
-        What its decisions cost; None before the first.
-    planning : PlanningSettings
-        With the threads that a decision has when it is computed alone.
-    served : bool
-        Whether the robot got an answer.
-    acknowledged, ahead : PlanningState or None
-        The state last asked about, and that at the next sensing step.
-    answers, pending : dict
-        Cached parts of answers, oldest first, and tasks that wait or run, by the digest of their
-        state.
-    num_bytes : int
-        Counted size of states and answers.
-    used_at : float
-        Time of the last request or result.
     """
 
     def __init__(
@@ -255,11 +187,12 @@ class Session:
     ) -> None:
         self.key = key
         self.epoch = request.epoch
-        self.number = -1
+        self.number = -1  # of the newest request in this epoch; -1 before the first
         # Packed, it is one object instead of thousands, all of which the collector would look at
         # again and again while nobody else has the interpreter.
         self.configuration = pack_configuration(configuration)
-        # With its code's digests: a robot with other code must be refused.
+        # Identifies the problem among those kept for reuse. With its code's digests: a robot with
+        # other code must be refused.
         self.problem_key = _digest_of(
             (
                 configuration.problem,
@@ -269,27 +202,35 @@ class Session:
                 configuration.state_space_planner,
             )
         )
+        # built, built_in: whether the problem was built before, and whether it is part of holdfast.
         self.built = False
+        # What its problem's functions take, if they were measured for another session of its owner.
         self.known: ProblemCost | None = None
+        # Whether no decision was estimated to be too long for the lane of brief ones.
         self.is_brief = True
-        self.overran = False
+        self.overran = False  # whether its last decision took much longer than was estimated
+        # The last trial of which a state came from a checkpoint.
         self.restored_trial: int | None = None
-        self.price: Price | None = None
+        self.price: Price | None = None  # what its decisions cost; None before the first
         self.built_in = configuration.problem in BUILT_IN
         # The number of threads changes no result, so the service may choose it.
         most = min(configuration.planning.active_sensing.num_cores, _MAX_THREADS)
+        # With the threads that a decision has when it is computed alone.
         self.planning = with_cores(configuration.planning, most)
         self.seed = configuration.seed
-        self.served = False
+        self.served = False  # whether the robot got an answer
+        # acknowledged, ahead: the state last asked about, and that at the next sensing step.
         self.acknowledged: PlanningState | None = None
         self.ahead: PlanningState | None = None
         self.ahead_digest = b""
+        # answers, pending: cached parts of answers, oldest first, and tasks that wait or run, by
+        # the digest of their state.
         self.answers: OrderedDict[bytes, CachedAnswer] = OrderedDict()
         self.pending: dict[bytes, PendingTask] = {}
         self.task_time = task_time
         self.sensing_time = sensing_time
-        self.num_bytes = 0
-        self.used_at = 0.0
+        self.num_bytes = 0  # counted size of states and answers
+        self.used_at = 0.0  # time of the last request or result
         self.closed = False
 
     @property
@@ -342,10 +283,7 @@ class Session:
 class ForgottenEpochs:
     """Epochs of forgotten sessions, remembered so that a replaced process stays replaced.
 
-    Parameters
-    ----------
-    most : int
-        So many are kept; beyond that the oldest of the owner with the most is dropped.
+    Above the ``most`` that are kept, the oldest of the owner with the most is dropped.
     """
 
     def __init__(self, most: int) -> None:
@@ -384,40 +322,19 @@ class ForgottenEpochs:
                 del self._of[owner]
 
 
-class _Holding:
-    """What all sessions take, or all of one owner."""
-
-    def __init__(self) -> None:
-        self.sessions = 0
-        self.state_bytes = 0
-        self.configuration_bytes = 0
-
-    def count(self, session: Session, sign: int) -> None:
-        """Add a session without states, or subtract it."""
-        self.sessions += sign
-        self.configuration_bytes += sign * len(session.configuration)
-
-
 class SessionTable:
     """All sessions, least recently used first."""
 
     def __init__(self, limits: ServiceLimits) -> None:
         self._limits = limits
         self._sessions: OrderedDict[SessionKey, Session] = OrderedDict()
-        self._holdings: dict[Owner, _Holding] = {}
+        # What each owner holds, and all together.
+        self._num_of: Counter[Owner] = Counter()
+        self._configuration_bytes_of: Counter[Owner] = Counter()
+        self._state_bytes_of: Counter[Owner] = Counter()
+        self.configuration_bytes = self.state_bytes = 0
         self._epochs = ForgottenEpochs(max(4 * limits.max_sessions, _LEAST_EPOCHS))
-        self._total = _Holding()
         self._num_unserved = 0
-
-    @property
-    def state_bytes(self) -> int:
-        """Bytes of all states and answers, as counted by :meth:`update_size`."""
-        return self._total.state_bytes
-
-    @property
-    def configuration_bytes(self) -> int:
-        """Bytes of all packed session configurations."""
-        return self._total.configuration_bytes
 
     def __len__(self) -> int:
         return len(self._sessions)
@@ -439,10 +356,7 @@ class SessionTable:
     def add(self, session: Session) -> None:
         """Add a session."""
         self._sessions[session.key] = session
-        self._num_unserved += not session.served
-        self._holdings.setdefault(session.owner, _Holding())
-        for holding in self._holdings_with(session):
-            holding.count(session, 1)
+        self._count(session, 1)
         self._epochs.forget(session.key)
 
     def use(self, session: Session, now: float) -> None:
@@ -454,13 +368,20 @@ class SessionTable:
         """Drop all of a session but its epoch. Nothing may wait for it."""
         session.closed = True
         del self._sessions[session.key]
-        self._num_unserved -= not session.served
         self._count_state(session, 0)
-        for holding in self._holdings_with(session):
-            holding.count(session, -1)
-        if not self._holdings[session.owner].sessions:
-            del self._holdings[session.owner]
+        self._count(session, -1)
         self.note_epoch(session.key, session.epoch)
+
+    def _count(self, session: Session, sign: int) -> None:
+        """Count a session without states, or count it no more."""
+        owner, num_bytes = session.owner, sign * len(session.configuration)
+        self._num_unserved += sign * (not session.served)
+        self._num_of[owner] += sign
+        self._configuration_bytes_of[owner] += num_bytes
+        self.configuration_bytes += num_bytes
+        if not self._num_of[owner]:
+            for held in (self._num_of, self._configuration_bytes_of, self._state_bytes_of):
+                del held[owner]
 
     def note_epoch(self, key: SessionKey, epoch: int) -> None:
         """Remember the epoch of a robot without a session."""
@@ -487,19 +408,12 @@ class SessionTable:
             owner = session.owner
             return self._first_unused(lambda each: each.owner == owner)
         only_unserved = 2 * self._num_unserved >= self._limits.max_sessions
-        if self._is_full:
-            return self._unused_of_most(
-                lambda holding: holding.sessions, only_unserved=only_unserved
-            )
-        return self._unused_of_most(
-            lambda holding: holding.configuration_bytes, only_unserved=only_unserved
-        )
+        held = self._num_of if self._is_full else self._configuration_bytes_of
+        return self._unused_of_most(held, only_unserved=only_unserved)
 
     def _is_full_for(self, owner: Owner) -> bool:
-        most, holding = self._limits.max_sessions_per_robot, self._holdings.get(owner)
-        if owner is None or most is None or holding is None:
-            return False
-        return holding.sessions >= most
+        most = self._limits.max_sessions_per_robot
+        return owner is not None and most is not None and self._num_of[owner] >= most
 
     @property
     def _is_full(self) -> bool:
@@ -511,21 +425,16 @@ class SessionTable:
             > self._limits.max_configuration_bytes
         )
 
-    def _unused_of_most(
-        self, amount: Callable[[_Holding], int], *, only_unserved: bool
-    ) -> Session | None:
+    def _unused_of_most(self, held: Counter[Owner], *, only_unserved: bool) -> Session | None:
         """Return the least recently used session without tasks, of the owners that hold the most.
 
         These hold at least half of the largest holding: among near equals the same one is not
         dropped each time. If all of these have tasks, it is one of the others.
         """
-        holdings = self._holdings
-        if len(holdings) > 1:
-            least = max(map(amount, holdings.values())) / 2
+        if len(self._num_of) > 1:
+            least = max(held.values()) / 2
             found = self._first_unused(
-                lambda each: (
-                    amount(holdings[each.owner]) >= least and not (only_unserved and each.served)
-                )
+                lambda each: held[each.owner] >= least and not (only_unserved and each.served)
             )
             if found is not None:
                 return found
@@ -563,7 +472,7 @@ class SessionTable:
 
     def largest_evictable(self) -> Session | None:
         """Return the session without tasks to be dropped for its memory; None if there is none."""
-        return self._unused_of_most(lambda holding: holding.state_bytes, only_unserved=False)
+        return self._unused_of_most(self._state_bytes_of, only_unserved=False)
 
     def drop_states(self, session: Session) -> None:
         """Drop a session's states and answers; the robot will send its state each time."""
@@ -572,12 +481,9 @@ class SessionTable:
         self._count_state(session, 0)
 
     def _count_state(self, session: Session, num_bytes: int) -> None:
-        for holding in self._holdings_with(session):
-            holding.state_bytes += num_bytes - session.num_bytes
+        self._state_bytes_of[session.owner] += num_bytes - session.num_bytes
+        self.state_bytes += num_bytes - session.num_bytes
         session.num_bytes = num_bytes
-
-    def _holdings_with(self, session: Session) -> tuple[_Holding, _Holding]:
-        return self._total, self._holdings[session.owner]
 
 
 def _digest_of(data: object) -> bytes:

@@ -14,8 +14,6 @@ from types import MappingProxyType
 
 from holdfast.errors import IllegalTransitionError
 
-__all__ = ["MEANINGS", "TRANSITIONS", "Cause", "Status", "StatusTracker", "diagram", "next_status"]
-
 
 class Status(Enum):
     """Which service decides."""
@@ -94,15 +92,8 @@ class StatusTracker:
     ) -> dict[str, object]:
         """Change the status; return the fields of the log event.
 
-        Parameters
-        ----------
-        silence_s : float or None
-            How long the cloud has been silent, if it is lost and was ever there.
-
-        Raises
-        ------
-        IllegalTransitionError
-            If the table does not have that transition; nothing is changed.
+        ``silence_s`` says how long the cloud has been silent, if it is lost and was ever there.
+        Raises IllegalTransitionError, and changes nothing, if the table does not have that.
         """
         before, self.status = self.status, next_status(self.status, cause)
         fields: dict[str, object] = {"from": before.value, "to": self.status.value}

@@ -43,8 +43,6 @@ from holdfast.protocol.question import (
     same_actions,
 )
 
-__all__ = ["Verification"]
-
 MAX_OPEN_CHECKS = 64
 """Bound on the questions that wait for the own planner; further ones are left out and counted."""
 
@@ -56,25 +54,16 @@ class Verification:
     """Takes answers, has some recomputed and finds the service that was wrong.
 
     It alone writes into the answer of a question that services answer.
-
-    Parameters
-    ----------
-    share : float
-        Of the questions that services answer, from 0 to 1.
-    secret : bytes
-        Of the robot; selects the questions, together with their digests.
-    exempt : str or None
-        A service that is not sampled: the local one, which runs the same code on the same machine.
-    planner : Planner
-        Computes the task actions of a service that are outside the limits.
     """
 
     def __init__(
         self,
-        share: float,
-        secret: bytes,
+        share: float,  # of the questions that services answer, from 0 to 1
+        secret: bytes,  # of the robot; selects the questions, together with their digests
+        # A service that is not sampled: the local one, which runs the same code on the same
+        # machine.
         exempt: str | None,
-        planner: Planner,
+        planner: Planner,  # computes the task actions of a service that are outside the limits
         effects: Effects[RobotEffect],
     ) -> None:
         self._share = share
@@ -102,10 +91,7 @@ class Verification:
     ) -> None:
         """Take task actions of a service; the robot follows the first that come.
 
-        Raises
-        ------
-        HoldfastError
-            If they are outside the limits and the own planner fails.
+        Raises HoldfastError if they are outside the limits and the own planner fails.
         """
         actions, provenance = self._within_limits(question, actions, provenance)
         followed = question.task_actions
@@ -163,17 +149,7 @@ class Verification:
         return actions, provenance
 
     def outside_limits(self, actions: FloatArray) -> str | None:
-        """Describe task actions that the problem's ``execute`` would change.
-
-        Parameters
-        ----------
-        actions : array of shape (count, action_size)
-
-        Returns
-        -------
-        str or None
-            None if all are within the limits.
-        """
+        """Describe what of the task actions, one a row, the problem's ``execute`` would change."""
         limited = checked.executed_action(self._planner.problem, actions)
         # An action on a limit may be moved by a rounding error.
         slack = 1e-9 * np.maximum(1.0, np.abs(limited))
@@ -220,18 +196,10 @@ class Verification:
         self._effects.append(ComputeOwnAnswer(self._number, question.state, again))
 
     def decided(self, event: OwnAnswer, current: Question | None) -> bool:
-        """Take the own planner's answer.
+        """Take the own planner's answer; return whether the current question remains usable.
 
-        Parameters
-        ----------
-        current : Question or None
-            The robot's current question; this answer may belong to an earlier one.
-
-        Returns
-        -------
-        bool
-            Whether the current question remains usable: False if the performed actions differ from
-            the correct ones.
+        Not if the performed actions differ from the right ones. The answer may belong to an earlier
+        question.
         """
         question = self._asked.pop(event.number, None)
         if question is None:
@@ -241,7 +209,7 @@ class Verification:
             return True
         if event.failure is not None:
             self._effects.report(
-                "verification_failed", step=question.state.step, reason=event.failure
+                "verification_failed", step=question.state.step, reason=str(event.failure)
             )
             for kind, service in question.followed():
                 self._note(question, service, kind, "failed")

@@ -114,7 +114,6 @@ def perform_trials(
         if directory.before_upgrade is not None:
             events.event("version_changed", reason=directory.before_upgrade.in_words())
         links = make_links(configuration, directory.path / RECOVERY_LOG_NAME, events)
-        stack.callback(links.close)
         timings = EventTable(directory.path / TIMINGS_NAME, Timing)
         stack.callback(timings.close)
         earlier = verification = None

@@ -46,8 +46,6 @@ from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.exchanges import MAX_DATAGRAM_BYTES
 from holdfast.transport.tls import client_context
 
-__all__ = ["Examination", "LayerFinding", "State"]
-
 _NAME_S: Final = 3.0
 _CONNECT_S: Final = 2.0
 _REPLY_S: Final = 2.0

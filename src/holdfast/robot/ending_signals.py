@@ -13,8 +13,6 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 
-__all__ = ["ending_signals"]
-
 
 @contextlib.contextmanager
 def ending_signals(
@@ -24,12 +22,7 @@ def ending_signals(
 
     Before the callback runs, the previous handlers are restored, so a second signal has its usual
     effect. In other threads, which receive no signals, nothing changes. Ignored signals stay
-    ignored.
-
-    Parameters
-    ----------
-    on_signal : callable
-        Called in the signal handler with the signal's number; it must not wait.
+    ignored. ``on_signal`` is called in the signal handler, so it must not wait.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

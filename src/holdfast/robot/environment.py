@@ -15,27 +15,38 @@ from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from holdfast.errors import EnvironmentFailedError
-from holdfast.numerics.arrays import FloatArray, KeepsReadOnly, floats, real_numbers
+from holdfast.errors import EnvironmentFailedError, InvalidValueError
+from holdfast.numerics.arrays import (
+    NOTHING_ELSE,
+    FloatArray,
+    KeepsReadOnly,
+    floats,
+    real_numbers,
+)
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.numerics.randomness import Purpose, Stream, seed_and_trial, stream
-from holdfast.planning.outcome import Done, MoveResult
+from holdfast.planning.outcome import Done, Ending, MoveResult, ending_of
 from holdfast.planning.settings import EnvironmentSettings
+from holdfast.planning.tracking import LateObservation
 from holdfast.problems import checked
 from holdfast.problems.attributes import check_sizes, has_general_observations, sensing_action_of
 from holdfast.problems.problem import Problem, ProblemBase
+from holdfast.protocol.events import Acted, EnvironmentReady, Sensed
+from holdfast.protocol.messages import MAX_ACTION_SIZE
 
 __all__ = [
     "LATER",
+    "CheckedEnvironment",
     "Environment",
     "Later",
-    "MissingReadings",
     "ObservationSizes",
     "SimulatedEnvironment",
     "is_no_reading",
     "require_methods",
 ]
 
+
+_NUMBERS = f"numbers {NOTHING_ELSE}"
 
 _REQUIRED = ("perform_sensing", "perform", "is_done")
 
@@ -78,14 +89,12 @@ class Environment(Protocol):
         None, or NaN in every component, is no reading: the belief stays as it is. Or :data:`LATER`:
         the robot goes on, and ``late_observations`` returns it when it is there.
         """
-        ...
 
     def perform(self, task_action: FloatArray) -> float | MoveResult | None:
         """Perform a task action and return its reward, or None where there is none.
 
         A :class:`~holdfast.planning.outcome.MoveResult` also says what the move has shown.
         """
-        ...
 
     def is_done(self) -> Done:
         """Return True if the task has succeeded, False if it goes on, or ``"failed"``.
@@ -94,7 +103,6 @@ class Environment(Protocol):
         what it was to handle. An :class:`~holdfast.planning.outcome.Ending` also says why, and may
         say that the trial was cut off.
         """
-        ...
 
 
 class SimulatedEnvironment(KeepsReadOnly):
@@ -206,41 +214,6 @@ def is_no_reading(numbers: FloatArray) -> bool:
     return bool(numbers.size) and bool(np.isnan(numbers).all())
 
 
-class MissingReadings:
-    """Tells no reading from an observation, and bounds how many come without one in a row.
-
-    Parameters
-    ----------
-    max_in_a_row : int
-        ``environment.max_missing_in_a_row``.
-    """
-
-    def __init__(self, max_in_a_row: int = EnvironmentSettings().max_missing_in_a_row) -> None:
-        self._max_in_a_row = max_in_a_row
-        self._in_a_row = 0
-
-    def is_missing(self, called: str, shown: object) -> bool:
-        """Return whether sensing has given no reading: None, or NaN in every component.
-
-        Raises
-        ------
-        EnvironmentFailedError
-            If it has given none too often in a row; ``called`` is the method in the message.
-        """
-        if shown is not None:
-            numbers = real_numbers(shown)
-            if numbers is None or not is_no_reading(numbers):
-                self._in_a_row = 0
-                return False
-        self._in_a_row += 1
-        if self._in_a_row > self._max_in_a_row:
-            raise EnvironmentFailedError(
-                f"{called} gave no reading {self._in_a_row} times in a row; "
-                f"environment.max_missing_in_a_row allows {self._max_in_a_row}"
-            )
-        return True
-
-
 class ObservationSizes(dict[int, "int | None"]):
     """Numbers that a problem expects of each sensing action; None where it does not say."""
 
@@ -256,6 +229,181 @@ class ObservationSizes(dict[int, "int | None"]):
             size = int(checked.prediction(problem, state, sensing_action)[0].shape[-1])
         self[sensing_action] = size
         return size
+
+
+class CheckedEnvironment:
+    """Calls an environment, and checks what it returns.
+
+    Methods raise whatever the environment raises, and an EnvironmentFailedError, with the method's
+    name, for what does not keep to its contract.
+
+    Attributes
+    ----------
+    environment : Environment or None
+        None until it is made.
+    method : str
+        The one that was called last; at first the environment's name.
+    performed : Acted or None
+        What the last task action has shown; what is asked after it may fail.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        name: str,
+        max_missing_in_a_row: int = EnvironmentSettings().max_missing_in_a_row,
+        environment: Environment | None = None,
+    ) -> None:
+        self._sizes = ObservationSizes(problem)
+        self._name = self.method = name
+        self._max_missing_in_a_row = max_missing_in_a_row
+        self._missing_in_a_row = 0
+        self.environment = environment
+        self.performed: Acted | None = None
+
+    def ready(self, *, resumed: bool) -> EnvironmentReady:
+        """Ask how the task stands, and of a ``resumed`` trial what has been done in it."""
+        environment = self._environment
+        count = None
+        ask = getattr(environment, "steps_performed", None)
+        if resumed and callable(ask):
+            self.method = "steps_performed"
+            count = self._count(ask())
+        last: Acted | None = None
+        late: tuple[LateObservation, ...] = ()
+        if resumed:
+            ask = getattr(environment, "last_move", None)
+            if count and callable(ask):
+                self.method = "last_move"
+                last = self._moved(count - 1, ask())
+            late, _ = self._late()
+        return EnvironmentReady(self._is_done(), count, last, late)
+
+    def sense(self, step: int, sensing_action: int) -> Sensed:
+        """Perform a sensing action."""
+        self.method = "perform_sensing"
+        shown = self._environment.perform_sensing(sensing_action)
+        if shown is LATER:
+            if not callable(getattr(self.environment, "late_observations", None)):
+                raise EnvironmentFailedError(
+                    f"{self.called} returned LATER, but there is no late_observations() that "
+                    "could return the observation when it is there"
+                )
+            return Sensed(step, None)
+        if self._is_missing(shown):
+            return Sensed(step, None, no_reading=True)
+        size = self._sizes[sensing_action]
+        need = f"an array of shape ({size or 'n'},), of {_NUMBERS}, or None"
+        return Sensed(step, self._array(shown, shown, need, size))
+
+    def perform(self, step: int, task_action: FloatArray) -> Acted:
+        """Perform a task action, take what comes late, and ask whether the task is done."""
+        self.performed = None
+        self.method = "perform"
+        # A copy: the robot's own record of the action must stay what it is.
+        action = np.array(task_action, dtype=np.float64)
+        acted = self.performed = self._moved(step, self._environment.perform(action))
+        late, no_reading = self._late()
+        acted = self.performed = acted._replace(late=late, no_reading=no_reading)
+        return acted._replace(ending=self._is_done())
+
+    def _moved(self, step: int, shown: object) -> Acted:
+        """Return what a task action has shown."""
+        if not isinstance(shown, MoveResult):
+            return Acted(step, self._reward(shown), None)
+        need = f"a MoveResult whose {{}} is an array of 1 to {MAX_ACTION_SIZE} {_NUMBERS}"
+        motion, observation = (
+            None if value is None else self._array(value, value, need.format(what))
+            for value, what in ((shown.motion, "motion"), (shown.observation, "observation"))
+        )
+        return Acted(step, self._reward(shown.reward), None, motion, observation)
+
+    @property
+    def called(self) -> str:
+        """The method that was called last, for messages."""
+        return self._name if self.method == self._name else f"{self._name}: {self.method}"
+
+    @property
+    def _environment(self) -> Environment:
+        assert self.environment is not None
+        return self.environment
+
+    def _reward(self, value: object) -> float | None:
+        if value is None:
+            return None
+        number = real_numbers(value)
+        if number is None or number.ndim != 0 or not np.isfinite(number):
+            raise self._unusable(value, "a finite number, the reward, a MoveResult, or None")
+        return float(number)
+
+    def _is_done(self) -> Ending | None:
+        self.method = "is_done"
+        try:
+            return ending_of(self._environment.is_done())
+        except InvalidValueError as error:
+            raise EnvironmentFailedError(f"{self.called} {error}") from error
+
+    def _array(
+        self, value: object, whole: object, need: str, size: int | None = None
+    ) -> FloatArray:
+        """Return a read-only copy of an array; ``whole`` is what the environment has returned."""
+        array = real_numbers(value)
+        fits = array is not None and array.ndim == 1 and 1 <= array.size <= MAX_ACTION_SIZE
+        if not fits or array is None or size not in (None, array.size):
+            raise self._unusable(whole, need)
+        finite = np.array(array, dtype=np.float64)
+        if not np.isfinite(finite).all():
+            raise self._unusable(whole, "finite numbers")
+        finite.setflags(write=False)
+        return finite
+
+    def _late(self) -> tuple[tuple[LateObservation, ...], tuple[int, ...]]:
+        """Ask for observations of earlier steps, and of which steps there is no reading."""
+        ask = getattr(self._environment, "late_observations", None)
+        if not callable(ask):
+            return (), ()
+        self.method = "late_observations"
+        value = ask()
+        need = "a list of (step, observation)"
+        if not isinstance(value, Sequence) or isinstance(value, str):
+            raise self._unusable(value, need)
+        late, no_reading = [], []
+        for entry in value:
+            if not isinstance(entry, tuple | list) or len(entry) != 2:
+                raise self._unusable(value, need)
+            step = self._count(entry[0])
+            if self._is_missing(entry[1]):
+                no_reading.append(step)
+                continue
+            of_shape = f"{need} with observations of shape (n,), of {_NUMBERS}"
+            late.append(LateObservation(step, self._array(entry[1], value, of_shape)))
+        return tuple(late), tuple(no_reading)
+
+    def _is_missing(self, shown: object) -> bool:
+        """Return whether sensing has given no reading; raise if it has too often in a row."""
+        numbers = None if shown is None else real_numbers(shown)
+        if shown is not None and (numbers is None or not is_no_reading(numbers)):
+            self._missing_in_a_row = 0
+            return False
+        self._missing_in_a_row += 1
+        if self._missing_in_a_row > self._max_missing_in_a_row:
+            raise EnvironmentFailedError(
+                f"{self.called} gave no reading {self._missing_in_a_row} times in a row; "
+                f"environment.max_missing_in_a_row allows {self._max_missing_in_a_row}"
+            )
+        return True
+
+    def _count(self, value: object) -> int:
+        number = real_numbers(value)
+        if number is None or number.ndim != 0 or number.dtype.kind not in "iu" or number < 0:
+            raise self._unusable(value, "a whole number >= 0")
+        return int(number)
+
+    def _unusable(self, value: object, need: str) -> EnvironmentFailedError:
+        came = f"an array of shape {value.shape}: " if isinstance(value, np.ndarray) else ""
+        return EnvironmentFailedError(
+            f"{self.called} returned {came}{value!r:.80}; it must return {need}"
+        )
 
 
 def _initial_state(problem: Problem, random: Stream) -> FloatArray:

@@ -20,8 +20,6 @@ from holdfast.robot.late_sensing import SenseInBackground
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
 
-__all__ = ["EnvironmentMaker", "load_environment"]
-
 GROUP = "holdfast.environments"
 """Entry points by which packages register their environments."""
 
@@ -45,37 +43,21 @@ class EnvironmentMaker:
     - ``performed``: the task actions that were performed in this trial before that. A world that
       has died with the process performs them again.
 
-    Parameters
-    ----------
-    name : str
-        For messages.
-    timeout_ms : float
-        Longest time that one call of the environment may take.
-    environment_class : type, optional
-        The user's class; None for a world that is simulated from the problem.
-    arguments : mapping, optional
-        Keyword arguments for the class.
-    sense_in_background : bool
-        Whether the robot goes on while it senses.
-    max_missing_in_a_row : int
-        How often in a row sensing may give no reading.
-
-    Raises
-    ------
-    ConfigurationError
-        If the class does not take the arguments.
+    Raises ConfigurationError if the class does not take the arguments.
     """
 
     def __init__(
         self,
-        name: str,
+        name: str,  # for messages
         problem: Problem,
         seed: int,
-        timeout_ms: float,
+        timeout_ms: float,  # longest time that one call of the environment may take
+        # The user's class; None for a world that is simulated from the problem.
         environment_class: type[Any] | None = None,
-        arguments: Mapping[str, Any] | None = None,
+        arguments: Mapping[str, Any] | None = None,  # keyword arguments for the class
         *,
-        sense_in_background: bool = False,
+        sense_in_background: bool = False,  # whether the robot goes on while it senses
+        # How often in a row sensing may give no reading.
         max_missing_in_a_row: int = EnvironmentSettings().max_missing_in_a_row,
     ) -> None:
         self.name = name
@@ -98,19 +80,10 @@ class EnvironmentMaker:
     ) -> Environment:
         """Make the environment of a trial.
 
-        Parameters
-        ----------
-        resumed : bool, optional
-            Whether the robot's process has died in the middle of this trial.
-        performed : sequence of array, optional
-            Task actions that were performed in this trial before that. A simulated world has died
-            with the process and performs them again; a real one stands where they led to.
-
-        Raises
-        ------
-        EnvironmentFailedError
-            If the object lacks one of the three methods. Whatever the user's constructor raises is
-            passed on.
+        Of the task actions that were performed before the robot's process died: a simulated world
+        has died with it and performs them again; a real one stands where they led to. Raises
+        EnvironmentFailedError if the object lacks one of the three methods, and whatever the user's
+        constructor raises.
         """
         if self._class is None:
             return SimulatedEnvironment.after(self.problem, self._seed, trial, performed)
@@ -136,12 +109,8 @@ class EnvironmentMaker:
 def load_environment(configuration: Configuration, option: str | None = None) -> EnvironmentMaker:
     """Find the environment that a configuration names.
 
-    ``option`` is what has named it instead of the file; messages then begin with that.
-
-    Raises
-    ------
-    ConfigurationError
-        If the class cannot be imported or does not take the arguments.
+    ``option`` is what has named it instead of the file; messages then begin with that. Raises
+    ConfigurationError if the class cannot be imported or does not take the arguments.
     """
     settings = configuration.environment
     seed, timeout_ms = configuration.simulator.seed, settings.timeout_ms

@@ -6,8 +6,6 @@ environment, one call at a time, and each call ends as an event, with the result
 call that takes too long has failed; its later result is dropped.
 
 A simulated world answers within microseconds. It is called at once, in the loop's own thread.
-
-Results are checked against the environment's contract here, where the method's name is known.
 """
 
 from __future__ import annotations
@@ -19,34 +17,19 @@ from collections.abc import Callable, Sequence
 from time import monotonic
 from typing import Any, NamedTuple, TypeAlias
 
-import numpy as np
-import numpy.typing as npt
-
 from holdfast.config.user_code import account_of_user_error
-from holdfast.errors import EnvironmentFailedError, HoldfastError, InvalidValueError
-from holdfast.numerics.arrays import NOTHING_ELSE, FloatArray, real_numbers
-from holdfast.planning.outcome import Ending, MoveResult, ending_of
-from holdfast.planning.tracking import LateObservation
-from holdfast.problems.problem import Problem
+from holdfast.errors import HoldfastError, InvalidValueError
+from holdfast.numerics.arrays import FloatArray
 from holdfast.protocol.events import (
-    Acted,
     EnvironmentEvent,
     EnvironmentFailed,
-    EnvironmentReady,
-    Sensed,
 )
-from holdfast.protocol.messages import MAX_ACTION_SIZE
-from holdfast.robot.environment import LATER, Environment, MissingReadings, ObservationSizes
+from holdfast.robot.environment import CheckedEnvironment
 from holdfast.robot.environment_maker import EnvironmentMaker
 from holdfast.runtime.pool import ThreadPool
 
-__all__ = ["EnvironmentRunner", "InlineRunner", "ThreadedRunner", "make_runner"]
-
-
 Deliver: TypeAlias = Callable[[EnvironmentEvent, float], None]
 """Takes an event and its time, in seconds; it must not block."""
-
-_NUMBERS = f"numbers {NOTHING_ELSE}"
 
 _SUSPENDED_S = 0.1
 """If a timer fires this much too late, the process was stopped, and with it the environment."""
@@ -61,21 +44,8 @@ def make_runner(
     performed: Sequence[FloatArray] = (),
 ) -> EnvironmentRunner:
     """Return the runner of a trial in the configuration's environment."""
-
-    def make() -> Environment:
-        return maker(trial, resumed=resumed, performed=performed)
-
-    if maker.simulated:
-        return InlineRunner(make, maker.problem, deliver, maker.name, resumed=resumed)
-    return ThreadedRunner(
-        make,
-        maker.problem,
-        deliver,
-        maker.name,
-        maker.timeout_ms,
-        resumed=resumed,
-        missing=MissingReadings(maker.max_missing_in_a_row),
-    )
+    kind = InlineRunner if maker.simulated else ThreadedRunner
+    return kind(maker, trial, deliver, resumed=resumed, performed=performed)
 
 
 class _Call(NamedTuple):
@@ -100,25 +70,19 @@ class EnvironmentRunner(abc.ABC):
 
     def __init__(
         self,
-        make: Callable[[], Environment],
-        problem: Problem,
+        maker: EnvironmentMaker,
+        trial: int,
         deliver: Deliver,
-        name: str,
         *,
         resumed: bool = False,
-        missing: MissingReadings | None = None,
+        performed: Sequence[FloatArray] = (),
     ) -> None:
-        self._missing = MissingReadings() if missing is None else missing
-        self._make = make
+        self._make = functools.partial(maker, trial, resumed=resumed, performed=performed)
         self._deliver = deliver
-        self._name = name
+        self._name = maker.name
         self._resumed = resumed
-        self._sizes = ObservationSizes(problem)
-        # They are read when a call takes too long, too: the environment, its current method, and
-        # what the task action that the current call has performed has shown.
-        self.environment: Environment | None = None
-        self._method = name
-        self._performed: Acted | None = None
+        # Read when a call takes too long, too.
+        self.world = CheckedEnvironment(maker.problem, maker.name, maker.max_missing_in_a_row)
         self._failed: EnvironmentFailed | None = None
         self._closed = False
 
@@ -128,11 +92,11 @@ class EnvironmentRunner(abc.ABC):
 
     def sense(self, step: int, sensing_action: int) -> None:
         """Perform a sensing action: :class:`Sensed`."""
-        self._call(_Call(step, "sense", lambda: self._sensed(step, sensing_action)))
+        self._call(_Call(step, "sense", lambda: self.world.sense(step, sensing_action)))
 
     def perform(self, step: int, task_action: FloatArray) -> None:
         """Perform a task action, and ask whether the task is done: :class:`Acted`."""
-        self._call(_Call(step, "perform", lambda: self._acted(step, task_action)))
+        self._call(_Call(step, "perform", lambda: self.world.perform(step, task_action)))
 
     @abc.abstractmethod
     def close(self, timeout_s: float = 1.0) -> None:
@@ -146,60 +110,8 @@ class EnvironmentRunner(abc.ABC):
         """Call the environment, and deliver the event."""
 
     def _made(self) -> EnvironmentEvent:
-        environment = self.environment = self._make()
-        count = None
-        ask = getattr(environment, "steps_performed", None)
-        if self._resumed and callable(ask):
-            self._method = "steps_performed"
-            count = self._count(ask())
-        last: Acted | None = None
-        late: tuple[LateObservation, ...] = ()
-        if self._resumed:
-            ask = getattr(environment, "last_move", None)
-            if count and callable(ask):
-                self._method = "last_move"
-                last = self._moved(count - 1, ask())
-            late, _ = self._late()
-        self._method = "is_done"
-        return EnvironmentReady(self._ending(environment.is_done()), count, last, late)
-
-    def _sensed(self, step: int, sensing_action: int) -> EnvironmentEvent:
-        assert self.environment is not None
-        self._method = "perform_sensing"
-        shown = self.environment.perform_sensing(sensing_action)
-        if shown is LATER:
-            self._require_late_observations()
-            return Sensed(step, None)
-        if self._missing.is_missing(self._called("perform_sensing"), shown):
-            return Sensed(step, None, no_reading=True)
-        return Sensed(step, self._observation(sensing_action, shown))
-
-    def _require_late_observations(self) -> None:
-        if not callable(getattr(self.environment, "late_observations", None)):
-            raise EnvironmentFailedError(
-                f"{self._called('perform_sensing')} returned LATER, but there is no "
-                "late_observations() that could return the observation when it is there"
-            )
-
-    def _acted(self, step: int, task_action: FloatArray) -> EnvironmentEvent:
-        assert self.environment is not None
-        self._performed = None
-        self._method = "perform"
-        # A copy: the robot's own record of the action must stay what it is.
-        action = np.array(task_action, dtype=np.float64)
-        acted = self._performed = self._moved(step, self.environment.perform(action))
-        late, no_reading = self._late()
-        acted = self._performed = acted._replace(late=late, no_reading=no_reading)
-        self._method = "is_done"
-        return acted._replace(ending=self._ending(self.environment.is_done()))
-
-    def _moved(self, step: int, shown: object) -> Acted:
-        """Return what a task action has shown."""
-        if not isinstance(shown, MoveResult):
-            return Acted(step, self._reward(shown), None)
-        motion = self._shown(shown.motion, "motion")
-        observation = self._shown(shown.observation, "observation")
-        return Acted(step, self._reward(shown.reward), None, motion, observation)
+        self.world.environment = self._make()
+        return self.world.ready(resumed=self._resumed)
 
     def _event_of(self, call: _Call) -> EnvironmentEvent:
         """Call the environment; an exception is an event, too."""
@@ -208,7 +120,7 @@ class EnvironmentRunner(abc.ABC):
         except self._passed_on:
             raise
         except BaseException as error:  # noqa: BLE001 - a SystemExit would end a thread unheard
-            called = self._called(self._method)
+            called = self.world.called
             text = account_of_user_error(error, called)
             if text is None and isinstance(error, HoldfastError):
                 text = str(error)
@@ -218,11 +130,11 @@ class EnvironmentRunner(abc.ABC):
             return self._failure(call, text)
 
     def _failure(self, call: _Call, text: str) -> EnvironmentFailed:
-        method, performed = self._method, self._performed
+        method, performed = self.world.method, self.world.performed
         if call.kind != "perform":
             return EnvironmentFailed(call.step, method, text, False)
         if performed is None:
-            counts = callable(getattr(self.environment, "steps_performed", None))
+            counts = callable(getattr(self.world.environment, "steps_performed", None))
             return EnvironmentFailed(call.step, method, text, True, counts_steps=counts)
         # Only what came after it has failed: the result of ``perform`` is known.
         return EnvironmentFailed(call.step, method, text, False, performed)
@@ -242,7 +154,7 @@ class EnvironmentRunner(abc.ABC):
         self._deliver(event, at)
 
     def _close_environment(self) -> None:
-        close = getattr(self.environment, "close", None)
+        close = getattr(self.world.environment, "close", None)
         if callable(close):
             # The trial is over: an error here changes nothing of it.
             try:
@@ -251,87 +163,6 @@ class EnvironmentRunner(abc.ABC):
                 raise
             except BaseException:  # noqa: BLE001
                 return
-
-    def _called(self, method: str) -> str:
-        return self._name if method == self._name else f"{self._name}: {method}"
-
-    def _observation(self, sensing_action: int, value: object) -> FloatArray:
-        size = self._sizes[sensing_action]
-        array = real_numbers(value)
-        if array is None or array.ndim != 1 or array.size < 1 or size not in (None, array.size):
-            raise self._unusable(
-                value, f"an array of shape ({size or 'n'},), of {_NUMBERS}, or None"
-            )
-        return self._finite(array, value)
-
-    def _reward(self, value: object) -> float | None:
-        if value is None:
-            return None
-        number = real_numbers(value)
-        if number is None or number.ndim != 0 or not np.isfinite(number):
-            raise self._unusable(value, "a finite number, the reward, a MoveResult, or None")
-        return float(number)
-
-    def _ending(self, value: object) -> Ending | None:
-        try:
-            return ending_of(value)
-        except InvalidValueError as error:
-            raise EnvironmentFailedError(f"{self._called(self._method)} {error}") from error
-
-    def _shown(self, value: object, what: str) -> FloatArray | None:
-        """Return what a move has shown."""
-        if value is None:
-            return None
-        array = real_numbers(value)
-        if array is None or array.ndim != 1 or not 1 <= array.size <= MAX_ACTION_SIZE:
-            need = f"a MoveResult whose {what} is an array of 1 to {MAX_ACTION_SIZE} {_NUMBERS}"
-            raise self._unusable(value, need)
-        return self._finite(array, value)
-
-    def _late(self) -> tuple[tuple[LateObservation, ...], tuple[int, ...]]:
-        """Ask for observations of earlier steps, and of which steps there is no reading."""
-        ask = getattr(self.environment, "late_observations", None)
-        if not callable(ask):
-            return (), ()
-        self._method = "late_observations"
-        value = ask()
-        need = "a list of (step, observation)"
-        if not isinstance(value, Sequence) or isinstance(value, str):
-            raise self._unusable(value, need)
-        late, no_reading = [], []
-        for entry in value:
-            if not isinstance(entry, tuple | list) or len(entry) != 2:
-                raise self._unusable(value, need)
-            step = self._count(entry[0])
-            if self._missing.is_missing(self._called("late_observations"), entry[1]):
-                no_reading.append(step)
-                continue
-            array = real_numbers(entry[1])
-            if array is None or array.ndim != 1 or not 1 <= array.size <= MAX_ACTION_SIZE:
-                raise self._unusable(
-                    value, f"{need} with observations of shape (n,), of {_NUMBERS}"
-                )
-            late.append(LateObservation(step, self._finite(array, value)))
-        return tuple(late), tuple(no_reading)
-
-    def _finite(self, array: npt.NDArray[Any], value: object) -> FloatArray:
-        finite = np.array(array, dtype=np.float64)
-        if not np.isfinite(finite).all():
-            raise self._unusable(value, "finite numbers")
-        finite.setflags(write=False)
-        return finite
-
-    def _count(self, value: object) -> int:
-        number = real_numbers(value)
-        if number is None or number.ndim != 0 or number.dtype.kind not in "iu" or number < 0:
-            raise self._unusable(value, "a whole number >= 0")
-        return int(number)
-
-    def _unusable(self, value: object, need: str) -> EnvironmentFailedError:
-        came = f"an array of shape {value.shape}: " if isinstance(value, np.ndarray) else ""
-        return EnvironmentFailedError(
-            f"{self._called(self._method)} returned {came}{value!r:.80}; it must return {need}"
-        )
 
 
 class InlineRunner(EnvironmentRunner):
@@ -360,18 +191,10 @@ class ThreadedRunner(EnvironmentRunner):
     """
 
     def __init__(
-        self,
-        make: Callable[[], Environment],
-        problem: Problem,
-        deliver: Deliver,
-        name: str,
-        timeout_ms: float,
-        *,
-        resumed: bool = False,
-        missing: MissingReadings | None = None,
+        self, maker: EnvironmentMaker, trial: int, deliver: Deliver, **resumption: Any
     ) -> None:
-        super().__init__(make, problem, deliver, name, resumed=resumed, missing=missing)
-        self._timeout_ms = timeout_ms
+        super().__init__(maker, trial, deliver, **resumption)
+        self._timeout_ms = maker.timeout_ms
         self._thread = ThreadPool(1, "environment")
         self._current: _Call | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -415,8 +238,8 @@ class ThreadedRunner(EnvironmentRunner):
             self._watch(call, min(now - due_at, 1e-3 * self._timeout_ms))
             return
         self._current = None
-        method = self._method
-        made = method == self._name
-        called = f"the constructor of {method}" if made else self._called(method)
+        called = self.world.called
+        if self.world.method == self._name:
+            called = f"the constructor of {called}"
         limit = f"{self._timeout_ms:g} ms, which is environment.timeout_ms"
         self._finish(self._failure(call, f"{called} has not returned within {limit}"), now)

@@ -45,8 +45,6 @@ from holdfast.problems.problem import Problem
 if TYPE_CHECKING:
     import gymnasium
 
-__all__ = ["GymnasiumEnvironment"]
-
 Function: TypeAlias = Callable[..., Any] | str
 """A function, or the name of one: ``module:function``."""
 

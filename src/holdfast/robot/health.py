@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from holdfast.robot.metrics import RobotMetrics
     from holdfast.runtime.monitoring import HttpAddress, MonitoringServers, Pages
 
-__all__ = ["Condition", "RobotWatch"]
-
 
 class Condition(NamedTuple):
     """A robot's condition: in a word, and the trial, None between two trials.
@@ -59,12 +57,8 @@ class RobotWatch:
     async def start(self, condition: Callable[[], Condition], robot: Robot) -> None:
         """Answer from now on, in the running loop.
 
-        Raises
-        ------
-        HealthError
-            If it cannot listen there; the message names the address.
-        MetricsError
-            If metrics are to be offered and ``prometheus_client`` is not installed.
+        Raises HealthError, which names the address, if it cannot listen there; MetricsError if
+        metrics are to be offered and ``prometheus_client`` is not installed.
         """
         if self._health is not None or self._metrics_address is not None:
             await self._offer(condition, robot)

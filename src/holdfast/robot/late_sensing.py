@@ -19,8 +19,6 @@ from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.outcome import Done, MoveResult
 from holdfast.robot.environment import LATER, Environment, Later
 
-__all__ = ["SenseInBackground"]
-
 
 class SenseInBackground:
     """An environment that senses on a thread while the robot moves.

@@ -1,7 +1,7 @@
 """From the configuration to a robot's links.
 
-With services there is one link to each, and one at which the local service, once launched, connects
-to the robot. Without services the planner is in the robot's process.
+With services there is one link to each, and one to the local service, once that is launched.
+Without services the planner is in the robot's process.
 """
 
 from __future__ import annotations
@@ -28,8 +28,6 @@ from holdfast.transport.contract import RobotTransport
 if TYPE_CHECKING:
     from holdfast.transport.endpoints import TlsFiles
 
-__all__ = ["RECOVERY_SERVICE", "Links", "check_services", "make_links"]
-
 RECOVERY_SERVICE = "cloud_active_sensing_recovery"
 """The name of the local service (the thesis's)."""
 
@@ -41,8 +39,6 @@ class Links(NamedTuple):
     """Not started yet; None for a robot without services, which decides itself."""
     launcher: RecoveryLauncher | None = None
     """Of the local service; None if there is none."""
-    close: Callable[[], None] = lambda: None
-    """Releases resources, after the transport is closed."""
     make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner
     """Joins the robot's problem and settings to the functions that lead from state to state."""
 
@@ -50,11 +46,8 @@ class Links(NamedTuple):
 def check_services(configuration: Configuration, source: str | None = "") -> None:
     """Check what can be checked of the services before a run: endpoints and credentials.
 
-    Raises
-    ------
-    HoldfastError
-        If one of them cannot be used; the message names its key, after ``source``. None leaves the
-        key out, too, of services that were not given by it.
+    Raises HoldfastError if one of them cannot be used; the message names its key, after ``source``.
+    None leaves the key out, too, of services that were not given by it.
     """
     offload = configuration.offload
     if not offload.services:
@@ -80,18 +73,14 @@ def check_services(configuration: Configuration, source: str | None = "") -> Non
 def make_links(configuration: Configuration, log_path: Path | None, events: EventSink) -> Links:
     """Make the links that a configuration asks for.
 
-    Raises
-    ------
-    HoldfastError
-        If an endpoint or the credentials cannot be used.
+    Raises HoldfastError if an endpoint or the credentials cannot be used.
     """
     offload = configuration.offload
     if not offload.services:
         # The robot and its own planner come to the same states.
         return Links(None, make_planner=functools.partial(MemoizingPlanner, cache=MemoCache()))
     # Only a robot that has services needs these.
-    from holdfast.transport.endpoints import ServiceAddress, parse_endpoint
-    from holdfast.transport.private_socket import PrivateSocket
+    from holdfast.transport.endpoints import parse_endpoint
     from holdfast.transport.robot_end import StreamRobotTransport
 
     def tell_credentials(reason: str) -> None:
@@ -107,33 +96,29 @@ def make_links(configuration: Configuration, log_path: Path | None, events: Even
                 reason="whoever is on the way can read along and decide in its place; use tls/... "
                 "or udp/... with --tls",
             )
-    addresses = {service: ServiceAddress(service) for service in offload.services}
-    with contextlib.ExitStack() as stack:
-        launcher = None
-        if configuration.recovery.launch != "never":
-            local = PrivateSocket()
-            stack.callback(local.remove)
-            addresses[RECOVERY_SERVICE] = ServiceAddress(
-                local.endpoint, listens=True, name=RECOVERY_SERVICE
-            )
-            arguments = ["--name", RECOVERY_SERVICE, "--connect", local.endpoint]
-            arguments += ["--lease-ms", f"{offload.lease_ms:g}", "--until-stdin-closes"]
-            # The most there is: it decides for this robot alone, as a run without services would.
-            arguments += ["--max-decision-s", "3600", "--max-decision-mb", "1000000"]
-            if ":" in configuration.problem_name:
-                arguments += ["--problem", configuration.problem_name]
-                if configuration.problem_directory is not None:
-                    arguments += ["--problem-directory", str(configuration.problem_directory)]
-            launcher = RecoveryLauncher(arguments, log_path)
-        transport = StreamRobotTransport(
-            addresses,
-            name=name,
-            incarnation=os.urandom(8).hex(),
-            lease_ms=offload.lease_ms,
-            tls=tls,
-            on_event=events.event,
-        )
-        return Links(transport, launcher, stack.pop_all().close)
+    endpoints: dict[str, str | None] = {service: service for service in offload.services}
+    launches = configuration.recovery.launch != "never"
+    if launches:
+        endpoints[RECOVERY_SERVICE] = None
+    transport = StreamRobotTransport(
+        endpoints,
+        name=name,
+        incarnation=os.urandom(8).hex(),
+        lease_ms=offload.lease_ms,
+        tls=tls,
+        on_event=events.event,
+    )
+    if not launches:
+        return Links(transport)
+    arguments = ["--name", RECOVERY_SERVICE, "--lease-ms", f"{offload.lease_ms:g}"]
+    # The most there is: it decides for this robot alone, as a run without services would.
+    arguments += ["--max-decision-s", "3600", "--max-decision-mb", "1000000"]
+    if ":" in configuration.problem_name:
+        arguments += ["--problem", configuration.problem_name]
+        if configuration.problem_directory is not None:
+            arguments += ["--problem-directory", str(configuration.problem_directory)]
+    attach = functools.partial(transport.attach, RECOVERY_SERVICE)
+    return Links(transport, RecoveryLauncher(arguments, attach, log_path))
 
 
 def _identity(offload: OffloadSettings, warn: Callable[[str], None]) -> tuple[str, TlsFiles | None]:

@@ -18,8 +18,6 @@ from holdfast.runtime.exposition import Durations, exposition, require_prometheu
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
 
-__all__ = ["RobotMetrics"]
-
 _COUNTERS = (
     ("no_reading", "missing_observations", "Sensing actions that gave no reading."),
     ("unexplained", "unexplained_observations", "Observations that no particle explains."),

@@ -30,8 +30,6 @@ from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.schemes import load_scheme
 from holdfast.transport.tls import TlsStream
 
-__all__ = ["AddressPath", "account_of", "in_thread", "interface_of"]
-
 _GREETING_S: Final = 3.0
 """For the handshake and the other end's hello."""
 
@@ -110,7 +108,7 @@ class AddressPath(LinkOwner):
             {}, name=self._robot, incarnation=os.urandom(8).hex(), lease_ms=_LEASE_MS
         )
         self._link = load_scheme(endpoint.protocol).make_link(
-            self, robot.settings, self.tls, role="robot", dialled=True
+            self, robot.settings, self.tls, role="robot"
         )
         await self._link.connect(self._stream)
         with contextlib.suppress(TimeoutError):
@@ -131,10 +129,7 @@ class AddressPath(LinkOwner):
     async def ask(self, request: Request) -> list[Reply]:
         """Send a request under a number of its own; return all replies but progress reports.
 
-        Raises
-        ------
-        HoldfastError
-            If the link ends, or what comes is no reply.
+        Raises HoldfastError if the link ends, or what comes is no reply.
         """
         replies: list[Reply] = []
         number = next(self._numbers)

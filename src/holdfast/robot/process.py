@@ -24,7 +24,7 @@ from holdfast.config.loader import Configuration
 from holdfast.config.user_code import account_of_user_error, describe_problem_error
 from holdfast.errors import DEFECT, HeldError, HoldfastError, TrialError, defect_fields
 from holdfast.planning.outcome import TrialResult
-from holdfast.planning.planner import Planner, PlanningState
+from holdfast.planning.planner import PlanningState
 from holdfast.problems.problem import Problem
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.events import (
@@ -40,8 +40,6 @@ from holdfast.protocol.events import (
     LogEvent,
     OwnAnswer,
     Paused,
-    Plan,
-    Planned,
     RecoveryExited,
     RobotEffect,
     Send,
@@ -55,17 +53,14 @@ from holdfast.protocol.question import DecisionSource, InProcessSource
 from holdfast.protocol.records import Record, TrialHistory, replay
 from holdfast.protocol.robot import Robot
 from holdfast.protocol.status import Status
-from holdfast.robot.answer_check import AnswerChecker
 from holdfast.robot.ending_signals import ending_signals
 from holdfast.robot.environment_maker import EnvironmentMaker
 from holdfast.robot.environment_runner import EnvironmentRunner, make_runner
 from holdfast.robot.health import Condition, RobotWatch
-from holdfast.robot.in_process_planner import InProcessPlanner
 from holdfast.robot.links import RECOVERY_SERVICE, Links
+from holdfast.robot.own_planner import OwnPlanner
 from holdfast.robot.session_configuration import session_configuration_of
 from holdfast.runtime.events import EventSink
-
-__all__ = ["RobotProcess", "StepJournal"]
 
 _LAST_VERIFICATION_S = 10.0
 """Longest wait for unfinished verifications once all trials are finished."""
@@ -99,19 +94,15 @@ class StepJournal(Protocol):
 
     def session(self) -> bytes:
         """Return the run's identifier, 16 bytes."""
-        ...
 
     def raise_epoch(self) -> int:
         """Return a number above all earlier ones, once it is on the disk."""
-        ...
 
     def append(self, trial: int, records: Sequence[Record]) -> None:
         """Write records of the unfinished trial; they are safe when this returns."""
-        ...
 
     def unfinished(self) -> _TrialInProgress | None:
         """Return the trial that has not ended, if there is one."""
-        ...
 
 
 class _Interrupted(NamedTuple):
@@ -122,42 +113,31 @@ class _Interrupted(NamedTuple):
 
 
 _Happening: TypeAlias = (
-    TransportEvent | EnvironmentEvent | OwnAnswer | Planned | RecoveryExited | _Interrupted
+    TransportEvent | EnvironmentEvent | OwnAnswer | RecoveryExited | _Interrupted
 )
 
 
 class RobotProcess:
-    """Runs the trials of a configuration, one after another.
-
-    Parameters
-    ----------
-    links : Links
-        Their transport is closed at the end. Without one the robot's own planner decides.
-    on_result, on_timing, on_verified : callable
-        Store the result of each trial, the times of each decision, and the result of each verified
-        answer.
-    rate_hz : float or None
-        Task actions a second; None acts as soon as possible.
-    distrusted : collection of str
-        Services that answered wrongly earlier in the run.
-    on_order : callable
-        Gets each order to the environment and the state in which it was decided, on the event loop;
-        it must return at once.
-    """
+    """Runs the trials of a configuration, one after another."""
 
     def __init__(
         self,
         configuration: Configuration,
+        # Their transport is closed at the end. Without one the robot's own planner decides.
         links: Links,
         journal: StepJournal,
         maker: EnvironmentMaker,
         events: EventSink,
+        # on_result, on_timing, on_verified: store the result of each trial, the times of each
+        # decision, and the result of each verified answer.
         on_result: Callable[[TrialResult], None],
         on_timing: Callable[[Timing], None],
         on_verified: Callable[[VerificationNoted], None],
-        rate_hz: float | None = None,
-        distrusted: Collection[str] = (),
+        rate_hz: float | None = None,  # task actions a second; None acts as soon as possible
+        distrusted: Collection[str] = (),  # services that answered wrongly earlier in the run
         watch: RobotWatch | None = None,
+        # Gets each order to the environment and the state in which it was decided, on the event
+        # loop; it must return at once.
         on_order: Callable[[PlanningState, Act | Sense], None] | None = None,
     ) -> None:
         self._watch = watch
@@ -213,14 +193,9 @@ class RobotProcess:
         def another_problem() -> Problem:
             return Configuration.from_plain(configuration.plain()).problem
 
-        self._verifier = AnswerChecker(
-            lambda: Planner(another_problem(), configuration.planning),
-            functools.partial(describe_problem_error, configuration.problem_name),
-            self._happens,
-            self._fail,
-        )
-        self._in_process = InProcessPlanner(
+        self._own = OwnPlanner(
             lambda: links.make_planner(another_problem(), configuration.planning),
+            functools.partial(describe_problem_error, configuration.problem_name),
             self._happens,
             self._fail,
             may_be_brief=":" not in configuration.problem_name,
@@ -266,13 +241,10 @@ class RobotProcess:
     def run(self, finished: Collection[int]) -> None:
         """Run all trials that are not finished, on a new event loop.
 
-        Raises
-        ------
-        HoldfastError
-            If the robot holds still and cannot go on; the journal has everything to resume.
-        KeyboardInterrupt
-            After Ctrl-C or another ending signal, once the journal is written; or what the caller's
-            handler of that signal raises. Other threads than the main one use :meth:`pause`.
+        Raises HoldfastError if the robot holds still and cannot go on; the journal has everything
+        to resume. After Ctrl-C or another ending signal, once the journal is written, raises
+        KeyboardInterrupt or what the caller's handler of that signal raises. Other threads than the
+        main one use :meth:`pause`.
         """
         self._finished = set(finished)
         self._loop = loop = asyncio.new_event_loop()
@@ -308,8 +280,7 @@ class RobotProcess:
                 self._runner.close()
             if self._transport is not None:
                 loop.run_until_complete(self._transport.close())
-            self._in_process.close()
-            self._verifier.close()
+            self._own.close()
             if self._launcher is not None:
                 self._launcher.close()
             loop.close()
@@ -380,7 +351,7 @@ class RobotProcess:
             if wake and not self._ended:
                 self._now = max(self._now, now)
                 self._carry_out(self._robot.wake(self._now))
-            while not self._ended and (self._happened or self._in_process.compute_brief()):
+            while not self._ended and (self._happened or self._own.compute_brief()):
                 if now - began > self._turn_s:
                     self._go_on_soon()
                     break
@@ -495,13 +466,11 @@ class RobotProcess:
                 self._on_timing(effect)
                 if self._watch is not None:
                     self._watch.timed(effect)
-            elif isinstance(effect, Plan):
-                self._in_process.ask(effect)
             elif isinstance(effect, Send):
                 assert self._transport is not None
                 self._transport.call(effect.service, effect.call, effect.payload)
             elif isinstance(effect, ComputeOwnAnswer):
-                self._verifier.ask(effect)
+                self._own.ask(effect)
             elif isinstance(effect, VerificationNoted):
                 self._on_verified(effect)
             elif isinstance(effect, Abandon):

@@ -26,33 +26,22 @@ from holdfast.protocol.records import (
 from holdfast.robot.environment import Environment, SimulatedEnvironment
 from holdfast.robot.trial import LateStep, SensingStep, TaskStep, TrialObserver
 
-__all__ = ["run_recorded_trial"]
-
 
 def run_recorded_trial(
     planner: Planner,
     seed: int,
     trial: int,
+    # In the order in which they were written; the one of the last performance may be missing.
     records: Sequence[Record],
     observer: TrialObserver,
+    # None if the trial is not finished: then it does not end, and None is returned.
     result: TrialResult | None = None,
+    # Performs the same task actions, so that the true state is known.
     simulated: SimulatedEnvironment | None = None,
 ) -> TrialResult | None:
     """Run a trial again, as far as its records go.
 
-    Parameters
-    ----------
-    records : sequence of Record
-        In the order in which they were written; the one of the last performance may be missing.
-    result : TrialResult or None
-        None if the trial is not finished: then it does not end, and None is returned.
-    simulated : SimulatedEnvironment or None
-        Performs the same task actions, so that the true state is known.
-
-    Raises
-    ------
-    DecidedOtherwiseError
-        If a decision is another one than the recorded.
+    Raises DecidedOtherwiseError if a decision is another one than the recorded.
     """
     again = _Again(Trial(planner, seed, trial), observer, simulated)
     for record in records:

@@ -1,13 +1,15 @@
 """Starts the local service: a process of the same program that ends with the robot.
 
-It connects to the robot, which already listens, so that no discovery is needed. It ends when its
-standard input closes, so it does not survive the robot, however that dies.
+It inherits one end of a pair of sockets, and the robot has the other: there is no address, so
+nobody else can reach it. It ends when its standard input closes, so it does not survive the robot,
+however that dies.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import socket
 import subprocess
 import sys
 import weakref
@@ -20,16 +22,21 @@ from holdfast.runtime.files import started_in
 from holdfast.runtime.pool import ThreadPool
 from holdfast.runtime.process_ends import how_it_ended
 
-__all__ = ["RecoveryLauncher"]
-
 
 class RecoveryLauncher:
     """Starts the local service, watches it, and ends it; all on the thread of an event loop.
 
-    The file at ``log_path`` gets what the service writes.
+    ``attach`` gets the robot's end of the connection to each process. The file at ``log_path`` gets
+    what the service writes.
     """
 
-    def __init__(self, arguments: Sequence[str], log_path: Path | None = None) -> None:
+    def __init__(
+        self,
+        arguments: Sequence[str],
+        attach: Callable[[socket.socket], None],
+        log_path: Path | None = None,
+    ) -> None:
+        self._attach = attach
         # -P: files in the current directory must not shadow modules.
         self._command = [sys.executable, "-P", "-m", "holdfast", "serve", *arguments]
         self._log_path = log_path
@@ -43,10 +50,13 @@ class RecoveryLauncher:
         :meth:`close`; at once if it cannot be started.
         """
         self._end()
+        ours, theirs = socket.socketpair()
+        ours.setblocking(False)
         try:
-            with self._output() as output:
+            with theirs, self._output() as output:
                 process = subprocess.Popen(
-                    self._command,
+                    [*self._command, "--until-stdin-closes", f"--robot={theirs.fileno()}"],
+                    pass_fds=[theirs.fileno()],
                     stdin=subprocess.PIPE,
                     stdout=output,
                     stderr=output,
@@ -56,9 +66,11 @@ class RecoveryLauncher:
                     start_new_session=True,
                 )
         except OSError as error:
+            ours.close()
             deliver(RecoveryExited(number, f"cannot be started: {error.strerror}"))
             return
         self._process = process
+        self._attach(ours)
         if process.stdin is not None:
             _close_in_forked_children(process.stdin)
 

@@ -24,8 +24,6 @@ from holdfast.protocol.messages import (
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.session_configuration import session_configuration_of
 
-__all__ = ["ReferenceDecision", "answer_in", "reference_decisions"]
-
 
 class ReferenceDecision(NamedTuple):
     """A decision and the time that it took."""
@@ -49,10 +47,7 @@ def answer_in(replies: Iterable[Reply]) -> set[object]:
 def reference_decisions(configuration: Configuration) -> list[ReferenceDecision]:
     """Decide in a simulated world: twice, if the first decision leads to a sensing action.
 
-    Raises
-    ------
-    HoldfastError
-        If the problem's code fails.
+    Raises HoldfastError if the problem's code fails.
     """
     decisions: list[ReferenceDecision] = []
 

@@ -10,8 +10,6 @@ from holdfast.config.registry import problem_class, problem_module
 from holdfast.config.source_digest import core_version, problem_digest
 from holdfast.protocol.messages import SessionConfiguration
 
-__all__ = ["session_configuration_of"]
-
 
 def session_configuration_of(configuration: Configuration) -> SessionConfiguration:
     """Describe a configuration's run, and the code of this process, for a service."""

@@ -14,12 +14,9 @@ from collections.abc import Collection
 from time import perf_counter
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
-from holdfast.errors import EnvironmentFailedError, HeldError, InvalidValueError, ProblemError
-from holdfast.numerics.arrays import NOTHING_ELSE, FloatArray, real_number, real_numbers, whole
-from holdfast.planning.outcome import Ending, MoveResult, TrialResult, ending_of
+from holdfast.errors import HeldError, InvalidValueError
+from holdfast.numerics.arrays import FloatArray, whole
+from holdfast.planning.outcome import MoveResult, TrialResult
 from holdfast.planning.planner import ObservationInfo, Planner, PlanningState, SensingInfo, TaskInfo
 from holdfast.planning.settings import (
     EnvironmentSettings,
@@ -29,24 +26,12 @@ from holdfast.planning.settings import (
     check_settings,
 )
 from holdfast.planning.tracking import LateObservation, Trial
-from holdfast.printable import one_line
-from holdfast.protocol.messages import MAX_ACTION_SIZE
 from holdfast.robot.environment import (
-    LATER,
+    CheckedEnvironment,
     Environment,
-    MissingReadings,
     SimulatedEnvironment,
     require_methods,
 )
-
-__all__ = [
-    "NULL_OBSERVER",
-    "LateStep",
-    "SensingStep",
-    "TaskStep",
-    "TrialObserver",
-    "run_trial",
-]
 
 
 class SensingStep(NamedTuple):
@@ -154,9 +139,7 @@ def run_trial(
     HeldError
         If the robot is lost and ``lost.on_lost`` is ``hold``.
     HoldfastError
-        If holdfast refuses what the problem or the environment returned; :class:`ProblemError` for
-        a reward that is not finite, :class:`EnvironmentFailedError` for anything else than what
-        ``is_done`` may return.
+        If holdfast refuses what the problem or the environment returned.
     """
     if not isinstance(planner, Planner):
         raise InvalidValueError(
@@ -173,51 +156,30 @@ def run_trial(
     missed = EnvironmentSettings(max_missing_in_a_row=max_missing_in_a_row)
     missed = check_settings(missed, EnvironmentSettings, "environment")
     track = Trial(planner, seed, trial, lost.false_alarm_rate)
-    missing = MissingReadings(missed.max_missing_in_a_row)
-    name = type(environment).__name__
+    name, most = type(environment).__name__, missed.max_missing_in_a_row
+    world = CheckedEnvironment(planner.problem, name, most, environment)
     observer.trial_began(environment, track.state)
-
-    late_observations = getattr(environment, "late_observations", None)
-
-    def take_late() -> None:
-        for step, came in late_observations() if callable(late_observations) else ():
-            if missing.is_missing(f"{name}: late_observations", came):
-                continue
-            late = LateObservation(step, _reading(environment, "late_observations", came))
+    ending = world.ready(resumed=False).ending
+    while ending is None and track.state.step < max_steps:
+        if planner.needs_sensing(track.state):
+            _sense(track, world, observer)
+            _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
+        before = track.state
+        executed, task_info = planner.choose_task_action(before)
+        acted = world.perform(before.step, executed)
+        shown = MoveResult(acted.reward, acted.motion, acted.observation)
+        info = track.move(executed, acted.reward, acted.motion, acted.observation)
+        observer.acted(
+            TaskStep(environment, before, task_info, executed, acted.reward, shown, info)
+        )
+        if info is not None:
+            _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
+        for late in acted.late:
             found = track.observe_late(late)
             if found is not None:
                 observer.observed_late(LateStep(late, track.state, found[0]))
                 _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
-
-    ending = _ask_done(environment)
-    while ending is None and track.state.step < max_steps:
-        if planner.needs_sensing(track.state):
-            _sense(track, environment, observer, missing)
-            _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
-        before = track.state
-        executed, task_info = planner.choose_task_action(before)
-        # A copy, as of all that it shows: what late observations are folded in with must stay.
-        shown = environment.perform(executed.copy())
-        result = shown if isinstance(shown, MoveResult) else MoveResult(shown)
-        reward, motion, observation = result
-        if reward is not None:
-            reward = real_number(reward)
-            if reward is None or not np.isfinite(reward):
-                raise ProblemError(
-                    f"the reward of step {before.step} is {result.reward!r:.80}; it must be a "
-                    "finite number"
-                )
-        info = track.move(
-            executed,
-            reward,
-            _numbers(environment, "motion", motion),
-            _numbers(environment, "observation", observation),
-        )
-        observer.acted(TaskStep(environment, before, task_info, executed, reward, result, info))
-        if info is not None:
-            _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
-        take_late()
-        ending = _ask_done(environment)
+        ending = acted.ending
     ended = track.result(ending)
     observer.trial_ended(track.state, ended)
     return ended
@@ -236,19 +198,14 @@ def _require_new(environment: Environment) -> None:
             )
 
 
-def _sense(
-    track: Trial, environment: Environment, observer: TrialObserver, missing: MissingReadings
-) -> None:
+def _sense(track: Trial, world: CheckedEnvironment, observer: TrialObserver) -> None:
     planner, before = track.planner, track.state
     started = perf_counter()
     sensing_action, sensing_info = planner.choose_sensing_action(before)
     sensing_ms = (perf_counter() - started) * 1e3
     observation = None
     if sensing_action != planner.no_sensing:
-        shown = environment.perform_sensing(sensing_action)
-        called = f"{type(environment).__name__}: perform_sensing"
-        if shown is not LATER and not missing.is_missing(called, shown):
-            observation = _reading(environment, "perform_sensing", shown)
+        observation = world.sense(before.step, sensing_action).observation
     info, _ = track.observe(sensing_action, observation, sensing_ms)
     observer.sensed(
         SensingStep(before, sensing_action, sensing_info, observation, track.state, info)
@@ -276,35 +233,3 @@ def _act_if_lost(
     if again:
         track.reinitialise()
         observer.reinitialised(track.state)
-
-
-def _reading(environment: Environment, method: str, shown: object) -> FloatArray:
-    """Return a copy of what sensing has shown, checked as for a robot."""
-    numbers = real_numbers(shown)
-    if numbers is None:
-        raise EnvironmentFailedError(
-            f"{type(environment).__name__}: {method} returned {one_line(repr(shown)):.80}; "
-            f"an observation must be an array of numbers {NOTHING_ELSE}"
-        )
-    return np.array(numbers, dtype=np.float64)
-
-
-def _numbers(environment: Environment, what: str, shown: npt.ArrayLike | None) -> FloatArray | None:
-    """Return what a move has shown, checked as for a robot."""
-    if shown is None:
-        return None
-    array = real_numbers(shown)
-    if array is None or array.ndim != 1 or not 1 <= array.size <= MAX_ACTION_SIZE:
-        raise EnvironmentFailedError(
-            f"{type(environment).__name__}: perform returned a MoveResult whose {what} is "
-            f"{one_line(repr(shown)):.80}; it must be an array of 1 to {MAX_ACTION_SIZE} "
-            f"numbers {NOTHING_ELSE}"
-        )
-    return np.array(array, dtype=np.float64)
-
-
-def _ask_done(environment: Environment) -> Ending | None:
-    try:
-        return ending_of(environment.is_done())
-    except InvalidValueError as error:
-        raise EnvironmentFailedError(f"{type(environment).__name__}: is_done {error}") from error

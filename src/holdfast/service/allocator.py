@@ -13,8 +13,6 @@ from __future__ import annotations
 import ctypes
 import os
 
-__all__ = ["limit_arenas"]
-
 _ARENAS = 2
 """One for the thread that holds the interpreter, one for those that compute without it."""
 

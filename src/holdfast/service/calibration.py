@@ -26,8 +26,6 @@ from holdfast.problems.attributes import has_general_observations, has_own
 from holdfast.problems.problem import Problem
 from holdfast.protocol.decision_cost import TYPICAL_PROBLEM, CallCost, ProblemCost
 
-__all__ = ["measure_problem", "measure_slowness"]
-
 _REFERENCE_S = 0.46e-3
 """Time of :func:`_work` on the machine on which the cost model's constants were measured."""
 
@@ -68,11 +66,8 @@ def measure_problem(problem: Problem) -> ProblemCost:
 
     A function that is slow is asked once, of few states: a robot chooses the problem's model.
 
-    Raises
-    ------
-    HoldfastError
-        If no initial state can be drawn. The decision that is asked for would fail as well, but
-        only after as many attempts for each of its particles.
+    Raises HoldfastError if no initial state can be drawn. The decision that is asked for would fail
+    as well, but only after as many attempts for each of its particles.
     """
     own: dict[str, Any] = {}
     refused: HoldfastError | None = None

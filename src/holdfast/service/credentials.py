@@ -24,23 +24,13 @@ if TYPE_CHECKING:
 
     from holdfast.transport.service_end import StreamServiceTransport
 
-__all__ = ["ServiceCredentials"]
-
 _CHECK_INTERVAL_S = 1.0
 
 
 class ServiceCredentials:
     """The credentials of this process; ``warn`` takes warnings as text.
 
-    Attributes
-    ----------
-    expires_s : float
-        When the certificate in use expires, in seconds since 1970.
-
-    Raises
-    ------
-    CredentialsError
-        If they cannot be used.
+    Raises CredentialsError if they cannot be used.
     """
 
     def __init__(self, directory: Path, warn: Callable[[str], None]) -> None:
@@ -50,6 +40,7 @@ class ServiceCredentials:
         self._used = self._seen = self.files.versions()
         self._failure: str | None = None
         self._gone: str | None = None
+        # When the certificate in use expires, in seconds since 1970.
         self.expires_s = load_credentials(directory, "service", warn=warn).expires_s
 
     @property

@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     import asyncio
 
-__all__ = ["collect_in_loop"]
-
 _INTERVAL_S: Final = 0.25
 
 _YOUNG_OBJECTS: Final = 500

@@ -17,28 +17,18 @@ from holdfast.runtime.addresses import why_not_bound
 from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.listener import listen, remove_socket_file
 
-__all__ = ["SharedEndpoints"]
-
 
 class SharedEndpoints:
     """Endpoints at which several processes listen.
 
-    Attributes
-    ----------
-    endpoints : tuple of Endpoint
-        With the ports that were free instead of 0.
-    descriptors : list of int
-        The sockets that a process is to inherit, one for each endpoint.
-
-    Raises
-    ------
-    TransportError
-        If one of them is taken, or cannot be shared; the message names it.
+    Raises TransportError if one of them is taken, or cannot be shared; the message names it.
     """
 
     def __init__(self, endpoints: Sequence[Endpoint]) -> None:
+        # The sockets that a process is to inherit, one for each endpoint.
         self.descriptors: list[int] = []
         with contextlib.ExitStack() as stack:
+            # With the ports that were free instead of 0.
             self.endpoints = tuple([self._bind(endpoint, stack) for endpoint in endpoints])
             self._bound = stack.pop_all()
 

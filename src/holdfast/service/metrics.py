@@ -22,14 +22,6 @@ from holdfast.runtime.exposition import Durations, exposition, require_prometheu
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
 
-__all__ = [
-    "DecisionKind",
-    "DecisionTimes",
-    "Exposition",
-    "ServiceReport",
-    "summed",
-]
-
 DecisionKind: TypeAlias = Literal["task", "sensing"]
 
 _COUNTERS = (

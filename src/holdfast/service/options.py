@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from holdfast.runtime.monitoring import HttpAddress
     from holdfast.transport.endpoints import Endpoint
 
-__all__ = ["DEFAULT_NAME", "ServeOptions", "checked_endpoints", "http_address", "parse_options"]
-
 DEFAULT_NAME = "cloud_active_sensing"
 """The name of the service in the cloud (the thesis's)."""
 
@@ -65,13 +63,6 @@ class ServeOptions(Options):
         read=absolute_endpoint,
         metavar="ENDPOINT",
         help=f"Where robots can connect (default: tcp/{_DEFAULT_PLACE}, with --tls over TLS).",
-    )
-    connect: tuple[str, ...] = option(
-        many=True,
-        read=absolute_endpoint,
-        metavar="ENDPOINT",
-        help="The local socket at which a robot listens for this service (unix/PATH). Then nothing "
-        "listens here without --listen.",
     )
     name: str = option(metavar="NAME", default=DEFAULT_NAME, help="Name of the service.")
     tls: Path | None = option(
@@ -163,6 +154,8 @@ class ServeOptions(Options):
         help="Stop when standard input ends, as it does when the process that started this one "
         "dies.",
     )
+    # For a process that a robot launches: the descriptor of the connection to it.
+    robot: int | None = option(metavar="N", read=int, help="", hidden=True)
     # For the processes that a supervisor starts: its number, and the descriptors they inherit.
     supervised: tuple[int, int] | None = option(
         metavar="N,N", read=_descriptors, help="", hidden=True
@@ -184,20 +177,14 @@ class ServeOptions(Options):
 def parse_options(arguments: Sequence[str]) -> ServeOptions:
     """Read what follows ``serve`` on the command line.
 
-    Raises
-    ------
-    HoldfastError
-        If an option cannot be used, or two do not go together.
+    Raises HoldfastError if an option cannot be used, or two do not go together.
     """
     options = ServeOptions.parse("serve", arguments)
-    if options.processes > 1:
-        for name, given in (
-            ("--connect", options.connect),
-            ("--until-stdin-closes", options.until_stdin_closes),
-        ):
-            if given:
-                raise InvalidValueError(f"{name}: goes with one process only, not with --processes")
-    if not options.listen and not options.connect:
+    if options.processes > 1 and options.until_stdin_closes:
+        raise InvalidValueError(
+            "--until-stdin-closes: goes with one process only, not with --processes"
+        )
+    if not options.listen and options.robot is None:
         options.listen = (f"{'tls' if options.tls else 'tcp'}/{_DEFAULT_PLACE}",)
     return options
 
@@ -205,34 +192,27 @@ def parse_options(arguments: Sequence[str]) -> ServeOptions:
 def checked_endpoints(options: ServeOptions) -> list[Endpoint]:
     """Return where to listen.
 
-    Raises
-    ------
-    TransportError
-        If an endpoint is malformed or cannot be used so, or is one that other machines can reach
-        although they do not have to prove who they are; the message names the option.
-    InvalidValueError
-        If health or metrics are to be offered at the same port.
+    Raises TransportError if an endpoint is malformed or cannot be used so, or is one that other
+    machines can reach although they do not have to prove who they are; the message names the
+    option; InvalidValueError if health or metrics are to be offered at the same port.
     """
     from holdfast.transport.endpoints import check_endpoint
 
     listen = []
-    for name, texts in (("--listen", options.listen), ("--connect", options.connect)):
-        listens = name == "--listen"
-        for text in texts:
-            try:
-                endpoint = check_endpoint(text, "service", listens=listens)
-            except TransportError as error:
-                raise TransportError(f"{name}: {error}") from None
-            # Of an encrypted one without credentials the transport says that they are missing.
-            if not (endpoint.is_loopback or options.insecure or endpoint.is_encrypted):
-                raise TransportError(
-                    f"{name}: endpoint {endpoint}: other machines can reach it, and no peer "
-                    f"proves its identity; use tls/... or udp/... with --tls DIR ('holdfast "
-                    f"keys DIR' makes the credentials), an address of this machine alone, as in "
-                    f"tcp/{_DEFAULT_PLACE}, or say --insecure"
-                )
-            if listens:
-                listen.append(endpoint)
+    for text in options.listen:
+        try:
+            endpoint = check_endpoint(text, "service")
+        except TransportError as error:
+            raise TransportError(f"--listen: {error}") from None
+        # Of an encrypted one without credentials the transport says that they are missing.
+        if not (endpoint.is_loopback or options.insecure or endpoint.is_encrypted):
+            raise TransportError(
+                f"--listen: endpoint {endpoint}: other machines can reach it, and no peer "
+                f"proves its identity; use tls/... or udp/... with --tls DIR ('holdfast "
+                f"keys DIR' makes the credentials), an address of this machine alone, as in "
+                f"tcp/{_DEFAULT_PLACE}, or say --insecure"
+            )
+        listen.append(endpoint)
     for name, address in (("--health", options.health), ("--metrics", options.metrics)):
         for endpoint in listen:
             if address is not None and _is_same_port(endpoint, address):

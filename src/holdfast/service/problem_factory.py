@@ -17,26 +17,14 @@ from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.problems.problem import Problem
 from holdfast.protocol.messages import SessionConfiguration
 
-__all__ = ["ProblemFactory"]
-
 
 class ProblemFactory:
     """Builds the problems that a service decides for.
 
     Registered problems are known by name. A robot must not be able to load a class from an
-    arbitrary file, so such a class is known only if the service's operator has named it.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Problems to load at once; ``module:Class`` is allowed.
-    directory : Path or None
-        Searched first for their modules.
-
-    Raises
-    ------
-    UnknownProblemError
-        If one of the names does not lead to a problem.
+    arbitrary file, so such a class is known only if the service's operator has named it: ``names``
+    are loaded at once, their modules looked for in ``directory`` first. Raises UnknownProblemError
+    if one does not lead to a problem.
     """
 
     def __init__(self, names: Sequence[str] = (), directory: Path | None = None) -> None:
@@ -57,14 +45,9 @@ class ProblemFactory:
     def __call__(self, session_configuration: SessionConfiguration) -> Problem:
         """Build the problem that an opening names.
 
-        Raises
-        ------
-        UnknownProblemError
-            If this service does not know it.
-        OtherCodeError
-            If the robot's holdfast or problem is other code than this service's.
-        ConfigurationError
-            If its settings do not fit.
+        Raises UnknownProblemError if this service does not know it; OtherCodeError if the robot's
+        holdfast or problem is other code than this service's; ConfigurationError if its settings do
+        not fit.
         """
         with self._lock:
             return self._build(session_configuration)

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from holdfast.service.shell import ServiceShell
     from holdfast.service.supervisor import Supervised
 
-__all__ = ["IS_SERVICE", "Extension", "main", "serve"]
-
 IS_SERVICE = True
 
 _SWITCH_INTERVAL_S = 0.0005
@@ -56,7 +54,6 @@ class Extension(Protocol):
     @property
     def is_busy(self) -> bool:
         """Whether it owes answers."""
-        ...
 
     def start(
         self, on_event: Callable[..., None], on_shutdown: Callable[[str], None]
@@ -67,15 +64,12 @@ class Extension(Protocol):
         this to end; both from any thread. A start that raises a HoldfastError has released
         everything.
         """
-        ...
 
     def take_no_more(self) -> None:
         """Finish open requests and refuse new ones."""
-        ...
 
     def close(self, timeout_s: float) -> None:
         """Stop; wait at most this long for a running computation. May be repeated."""
-        ...
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -89,16 +83,9 @@ def serve(options: ServeOptions, make_extension: Callable[[], Extension] | None 
     ``make_extension`` is called once the options are checked; it raises a HoldfastError if there
     can be none.
 
-    Returns
-    -------
-    int
-        0 after SIGTERM or the end of standard input, 130 after SIGINT, 129 after SIGHUP. With
-        credentials, SIGHUP reloads them instead.
-
-    Raises
-    ------
-    HoldfastError
-        If an option cannot be used; the message says which and why.
+    Returns 0 after SIGTERM or the end of standard input, 130 after SIGINT, 129 after SIGHUP. With
+    credentials, SIGHUP reloads them instead. Raises HoldfastError if an option cannot be used; the
+    message says which and why.
     """
     # Importing modules leaves no garbage to collect.
     gc.disable()
@@ -231,7 +218,7 @@ class _ServiceProcess:
             options.name,
             incarnation=self._incarnation,
             listen=options.listen,
-            connect=options.connect,
+            robot=None if options.robot is None else socket.socket(fileno=options.robot),
             shared=[socket.socket(fileno=each) for each in options.sockets],
             lease_ms=options.lease_ms,
             # Otherwise robots with many links would leave no descriptor for a new one.
@@ -305,8 +292,6 @@ class _ServiceProcess:
                 if supervised is None:
                     where: dict[str, object] = {"boot": self._incarnation, **watched, **offered}
                     where["listen"] = list(self._transport.endpoints)
-                    if options.connect:
-                        where["connect"] = list(options.connect)
                     _say_ready(options, where)
                     self._manager.watch(loop, self._status)
                     self._manager.ready()
@@ -373,7 +358,7 @@ class _ServiceProcess:
         it, to robots that have to prove who they are. If nothing is, the process ends as after
         SIGTERM: ``rosnode kill`` and a second node of the same name are to end a node.
         """
-        goes_on = bool(self._options.connect or self._transport.endpoints)
+        goes_on = bool(self._transport.endpoints)
         self._shell.note("ros_shutdown", reason=reason, goes_on=goes_on)
         if not goes_on:
             os.kill(os.getpid(), signal.SIGTERM)
@@ -529,11 +514,11 @@ def _say_ready(options: ServeOptions, where: Mapping[str, object]) -> None:
             "ready", service=options.name, pid=os.getpid(), **where
         )
         return
-    parts = [
-        f"{verb} {' and '.join(map(str, places))}"
-        for verb, key in (("is listening on", "listen"), ("is connecting to", "connect"))
-        if isinstance(places := where.get(key), list) and places
-    ]
+    places = where["listen"]
+    assert isinstance(places, list)
+    parts = [f"is listening on {' and '.join(map(str, places))}"] if places else []
+    if options.robot is not None:
+        parts.append("decides for the robot that has launched it")
     if "processes" in where:
         parts[-1] += f" with {where['processes']} processes"
     parts += [f"offers {what} at {where[what]}" for what in _OFFERED if what in where]

@@ -47,8 +47,6 @@ from holdfast.runtime.events import EventRates, EventSink
 from holdfast.runtime.pool import ThreadPool
 from holdfast.transport.contract import IncomingCall, ServiceTransport
 
-__all__ = ["DecisionHook", "ServiceShell"]
-
 DecisionHook: TypeAlias = Callable[[Literal["task", "sensing"], float, float], None]
 
 _BRIEF_S = 0.001
@@ -75,21 +73,14 @@ _UNREAD_BUSY = [encode(Busy(0, retry_after_ms)) for retry_after_ms in range(100,
 
 
 class ServiceShell:
-    """Joins a service's machine to a transport; all methods are called on the loop's thread.
-
-    Parameters
-    ----------
-    transport : ServiceTransport
-        Not started yet.
-    on_decision : callable or None
-        Called with the kind, computing time and waiting time of each decision.
-    """
+    """Joins a service's machine to a transport; all methods are called on the loop's thread."""
 
     def __init__(
         self,
         service: Service,
-        transport: ServiceTransport,
+        transport: ServiceTransport,  # not started yet
         events: EventSink,
+        # Called with the kind, computing time and waiting time of each decision.
         on_decision: DecisionHook | None = None,
     ) -> None:
         self._service = service
@@ -114,13 +105,7 @@ class ServiceShell:
         self.is_draining = False
 
     async def start(self) -> None:
-        """Start the transport.
-
-        Raises
-        ------
-        TransportError
-            If the transport cannot be started.
-        """
+        """Start the transport; raise TransportError if the transport cannot be started."""
         self._loop = asyncio.get_running_loop()
         self._stopped: asyncio.Future[str] = self._loop.create_future()
         await self._transport.start(self.deliver)

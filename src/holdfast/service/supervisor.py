@@ -35,8 +35,6 @@ from holdfast.service.metrics import ServiceReport, summed
 if TYPE_CHECKING:
     from holdfast.service.listening import SharedEndpoints
 
-__all__ = ["Supervised", "Supervisor"]
-
 _REPORT_EVERY_S = 1.0
 
 _SILENT_S = 10.0
@@ -134,10 +132,7 @@ class Supervisor:
         read their credentials again unless it is one of the ``ending`` signals. ``ready`` is called
         once, when all of them serve.
 
-        Raises
-        ------
-        ServiceProcessError
-            If one of them cannot serve; the message says why.
+        Raises ServiceProcessError if one of them cannot serve; the message says why.
         """
 
         def stop(number: signal.Signals) -> None:

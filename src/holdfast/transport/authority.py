@@ -33,25 +33,6 @@ except ImportError as error:
         "making keys needs the package cryptography: pip install cryptography"
     ) from error
 
-__all__ = [
-    "AUTHORITY_DAYS",
-    "AUTHORITY_KEY_FILE",
-    "Authority",
-    "certificate_pem",
-    "common_name_of",
-    "hosts_of",
-    "is_host",
-    "is_signed_by",
-    "key_pem",
-    "new_key",
-    "normal_host",
-    "public_key_of",
-    "read_certificate",
-    "read_file",
-    "read_revocations",
-    "role_of",
-]
-
 AUTHORITY_DAYS = 3650
 """Days for which a new authority is valid; no certificate outlives its authority."""
 

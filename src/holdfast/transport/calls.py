@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import msgspec
-
 from holdfast.errors import InvalidValueError
 from holdfast.protocol.events import (
     CallEnded,
@@ -18,8 +16,6 @@ from holdfast.protocol.events import (
     ServiceVanished,
     TransportEvent,
 )
-
-__all__ = ["CallTable", "PendingCall", "too_large"]
 
 
 def too_large(size_bytes: int, max_message_bytes: int) -> bytes:
@@ -36,60 +32,47 @@ def too_large(size_bytes: int, max_message_bytes: int) -> bytes:
     )
 
 
-class PendingCall(msgspec.Struct, eq=False):
-    """A call in flight to ``peer``.
-
-    Its number may be used again as soon as it is abandoned; this object identifies it.
-    """
-
-    number: int
-    peer: object
-
-
 class CallTable:
     """Calls in flight of one robot's end; delivers each one's events in order and one end."""
 
     def __init__(self) -> None:
-        self._pending: dict[int, PendingCall] = {}
+        self._peers: dict[int, object] = {}
         self._deliver: Callable[[TransportEvent], None] | None = None
 
     def open(self, deliver: Callable[[TransportEvent], None]) -> None:
         """Begin to deliver."""
         self._deliver = deliver
 
-    def begin(self, number: int, peer: object) -> PendingCall | None:
-        """Add a call to a peer; return None if the table is closed.
+    def begin(self, number: int, peer: object) -> bool:
+        """Add a call to a peer; return False if the table is closed.
 
-        Raises
-        ------
-        InvalidValueError
-            If a call of this number is in flight.
+        Raises InvalidValueError if a call of this number is in flight.
         """
         if self._deliver is None:
-            return None
-        if number in self._pending:
+            return False
+        if number in self._peers:
             raise InvalidValueError(f"call {number} is in flight already")
-        call = self._pending[number] = PendingCall(number, peer)
-        return call
+        self._peers[number] = peer
+        return True
 
-    def is_pending(self, call: PendingCall) -> bool:
-        """Whether a call has neither ended nor been abandoned."""
-        return self._pending.get(call.number) is call
+    def to(self, peer: object) -> list[int]:
+        """Return the calls to a peer."""
+        return [number for number, its_peer in self._peers.items() if its_peer is peer]
 
-    def replied(self, call: PendingCall, payload: bytes) -> None:
+    def replied(self, number: int, payload: bytes) -> None:
         """Deliver a reply, if the call is still in flight."""
-        if self._deliver is not None and self.is_pending(call):
-            self._deliver(ReplyReceived(call.number, payload))
+        if self._deliver is not None and number in self._peers:
+            self._deliver(ReplyReceived(number, payload))
 
-    def ended(self, call: PendingCall) -> None:
+    def ended(self, number: int) -> None:
         """Deliver the end of a call, if it is still in flight."""
-        if self._deliver is not None and self.is_pending(call):
-            del self._pending[call.number]
-            self._deliver(CallEnded(call.number))
+        if self._deliver is not None and number in self._peers:
+            del self._peers[number]
+            self._deliver(CallEnded(number))
 
-    def abandon(self, number: int) -> PendingCall | None:
-        """Remove a call without delivering anything."""
-        return self._pending.pop(number, None)
+    def abandon(self, number: int) -> object | None:
+        """Remove a call without delivering anything; return its peer."""
+        return self._peers.pop(number, None)
 
     def appeared(self, service: str, incarnation: str) -> None:
         """Deliver that a service has appeared."""
@@ -98,20 +81,16 @@ class CallTable:
 
     def vanished(self, service: str, incarnation: str, peer: object) -> None:
         """Deliver that a service has vanished, then the ends of its calls."""
-        if self._deliver is None:
-            return
-        # Listed first: the receiver of ServiceVanished may reuse their numbers at once.
-        calls = [call for call in self._pending.values() if call.peer is peer]
-        self._deliver(ServiceVanished(service, incarnation))
-        for call in calls:
-            self.ended(call)
+        if self._deliver is not None:
+            self._deliver(ServiceVanished(service, incarnation))
+            self.peer_lost(peer)
 
     def peer_lost(self, peer: object) -> None:
         """Deliver the ends of the calls to a peer."""
-        for call in [call for call in self._pending.values() if call.peer is peer]:
-            self.ended(call)
+        for number in self.to(peer):
+            self.ended(number)
 
     def close(self) -> None:
         """Forget all calls and deliver nothing more."""
         self._deliver = None
-        self._pending.clear()
+        self._peers.clear()

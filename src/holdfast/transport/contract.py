@@ -15,8 +15,6 @@ from typing import Protocol
 
 from holdfast.protocol.events import TransportEvent
 
-__all__ = ["DEFAULT_MAX_MESSAGE_BYTES", "IncomingCall", "RobotTransport", "ServiceTransport"]
-
 DEFAULT_MAX_MESSAGE_BYTES = 64 * 1024 * 1024
 """Default bound on a message: a state of a million particles fills 56 MB."""
 
@@ -32,13 +30,7 @@ class RobotTransport(Protocol):
         already there is delivered as :class:`~holdfast.protocol.events.ServiceAppeared` as well.
         One that is gone is delivered as :class:`~holdfast.protocol.events.ServiceVanished`, then
         the ends of its calls.
-
-        Raises
-        ------
-        TransportError
-            If the robot is to listen somewhere and cannot; the message names the endpoint.
         """
-        ...
 
     def call(self, service: str, call: int, payload: bytes) -> None:
         """Send a request to a known service; never raises for a lost one.
@@ -47,15 +39,12 @@ class RobotTransport(Protocol):
         open. The last event is always :class:`~holdfast.protocol.events.CallEnded`, soon if the
         service is absent or lost.
         """
-        ...
 
     def abandon(self, call: int) -> None:
         """Abandon a call: nothing more of it is delivered, not even its end."""
-        ...
 
     async def close(self, timeout_s: float = 1.0) -> None:
         """Deliver nothing more, flush, and close all links, within this time. May be repeated."""
-        ...
 
 
 class IncomingCall(Protocol):
@@ -67,23 +56,19 @@ class IncomingCall(Protocol):
     @property
     def payload(self) -> bytes:
         """The request."""
-        ...
 
     @property
     def robot(self) -> str | None:
         """Name in the robot's certificate; None without one."""
-        ...
 
     def reply(self, payload: bytes) -> None:
         """Send a reply; may be repeated. A robot that is gone is no error.
 
         A robot that does not read loses its link, and nothing waits for it.
         """
-        ...
 
     def end(self) -> None:
         """End the call; the robot waits for the end of every call."""
-        ...
 
 
 class ServiceTransport(Protocol):
@@ -92,17 +77,12 @@ class ServiceTransport(Protocol):
     @property
     def endpoints(self) -> tuple[str, ...]:
         """Where robots can connect; once started, with the ports that were free instead of 0."""
-        ...
 
     async def start(self, deliver: Callable[[IncomingCall], None]) -> None:
         """Listen and deliver calls; returns when robots can connect.
 
-        Raises
-        ------
-        TransportError
-            If it cannot listen there; the message names the endpoint.
+        Raises TransportError if it cannot listen there; the message names the endpoint.
         """
-        ...
 
     def dismiss(self) -> asyncio.Future[None]:
         """Take no new links, and ask the robots to go elsewhere.
@@ -110,8 +90,6 @@ class ServiceTransport(Protocol):
         Until they do, calls are delivered and answered as before. The future is done when all
         robots that can be asked have left.
         """
-        ...
 
     async def close(self, timeout_s: float = 1.0) -> None:
         """End all calls, flush, and close all links, within this time. May be repeated."""
-        ...

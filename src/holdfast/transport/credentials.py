@@ -20,14 +20,6 @@ from holdfast.errors import CredentialsError, CredentialsGoneError, TransportErr
 from holdfast.transport.endpoints import AUTHORITY_FILE, REVOKED_FILE, Role, TlsFiles
 from holdfast.transport.revocation import refuse_revoked
 
-__all__ = [
-    "EXPIRES_SOON_DAYS",
-    "LoadedCredentials",
-    "date_text",
-    "load_credentials",
-    "warn_if_open",
-]
-
 EXPIRES_SOON_DAYS = 14
 """With fewer days left, loading a certificate warns."""
 
@@ -50,13 +42,10 @@ def load_credentials(
 
     It warns if others can read the key, or the certificate expires soon.
 
-    Raises
-    ------
-    CredentialsError
-        If the peer would refuse them: a file is missing, unreadable or malformed, the key belongs
-        to another certificate, the certificate is not valid now, was signed by another authority,
-        is for the other role, or has not exactly one common name. The kind is
-        CredentialsGoneError for what is missing, unreadable, expired or revoked.
+    Raises CredentialsError if the peer would refuse them: a file is missing, unreadable or
+    malformed, the key belongs to another certificate, the certificate is not valid now, was signed
+    by another authority, is for the other role, or has not exactly one common name. The kind is
+    CredentialsGoneError for what is missing, unreadable, expired or revoked.
     """
     directory = Path(directory)
     files = TlsFiles.of(directory)

@@ -1,20 +1,12 @@
-"""The encryption of datagrams: a record protocol beside a TLS link.
+"""The encryption of datagrams: a record protocol beside a TLS link (``docs/datagrams.md``).
 
 TLS has authenticated both ends. Over it the service sends the robot an *association*: a number, and
-two keys drawn for it, one for each direction. A datagram is ::
-
-    association   4 bytes, big-endian
-    counter       4 bytes, big-endian: 0, 1, 2, ... in this direction
-    ciphertext    AES-256-GCM of the message, with a tag of 16 bytes
-
-The first eight bytes are the nonce, so they are authenticated too. No nonce is used twice: a
-counter is never set back, and the keys exist only in the memory of the two processes. Each
-direction has its own key, so a datagram cannot be reflected.
+two keys drawn for it, one for each direction, so a datagram cannot be reflected. The header, with
+the association and a counter, is the nonce of AES-256-GCM, so it is authenticated too. No nonce is
+used twice: a counter is never set back, and the keys exist only in the memory of the two processes.
 
 Datagrams may arrive late, in any order, or twice. A window over the last counters, as in IPsec
 (RFC 4303 and RFC 6479), accepts each once and drops what is older. It also counts the losses.
-
-Nothing here knows sockets or time.
 """
 
 from __future__ import annotations
@@ -27,18 +19,6 @@ from holdfast.errors import KeysExhaustedError, TransportError
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.ciphers.aead import AESGCM
-
-__all__ = [
-    "KNOWN_AFTER",
-    "LOSS_SAMPLE",
-    "MAX_DATAGRAMS",
-    "OVERHEAD",
-    "WINDOW",
-    "AssociationKeys",
-    "DatagramCipher",
-    "ReplayWindow",
-    "require_cryptography",
-]
 
 _HEADER = struct.Struct(">II")
 _NONCE_PREFIX = bytes(4)
@@ -150,10 +130,7 @@ class DatagramCipher:
     def encrypt(self, message: bytes) -> bytes:
         """Return a datagram, with the next counter.
 
-        Raises
-        ------
-        KeysExhaustedError
-            After :data:`MAX_DATAGRAMS`.
+        Raises KeysExhaustedError after :data:`MAX_DATAGRAMS`.
         """
         counter = self._counter
         if counter >= MAX_DATAGRAMS:

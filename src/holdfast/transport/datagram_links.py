@@ -64,8 +64,6 @@ from holdfast.transport.return_path import SECRET_BYTES, ReturnPath
 from holdfast.transport.schemes import Scheme
 from holdfast.transport.tls import TlsStream
 
-__all__ = ["DatagramScheme", "RobotDatagramLink", "ServiceDatagramLink"]
-
 _KEYS: Final = struct.Struct(">I32s32sH")
 """Association, both keys, and the service's port; 0 is the stream's."""
 
@@ -573,10 +571,8 @@ class DatagramScheme(Scheme):
         tls: TlsStream | None,
         *,
         role: Role,
-        dialled: bool,
     ) -> Link:
         """Make the link of a new connection."""
-        del dialled
         assert tls is not None
         if role == "robot":
             return RobotDatagramLink(owner, settings, tls=tls)

@@ -13,15 +13,6 @@ from typing import Any, Final
 
 from holdfast.transport.datagram_cipher import AssociationKeys
 
-__all__ = [
-    "DATAGRAMS_AT_ONCE",
-    "LARGEST_DATAGRAM",
-    "QUOTED_BYTES",
-    "DatagramSocket",
-    "connected_socket",
-    "reported_errors",
-]
-
 LARGEST_DATAGRAM: Final = 2048
 DATAGRAMS_AT_ONCE: Final = 64
 """Read before the event loop serves other sockets."""
@@ -69,10 +60,7 @@ def reported_errors(opened: socket.socket) -> Iterator[tuple[bytes, bool]]:
 class DatagramSocket:
     """A socket at one address, on the port of the stream if that is free.
 
-    Raises
-    ------
-    OSError
-        If the system has none left.
+    Raises OSError if the system has none left.
     """
 
     def __init__(self, address: Any) -> None:

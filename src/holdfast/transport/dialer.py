@@ -27,8 +27,6 @@ from holdfast.runtime.addresses import system_words
 from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.links import Link
 
-__all__ = ["Dialer"]
-
 _FIRST_PAUSE_S: Final = 0.02
 _LAST_PAUSE_S: Final = 1.0
 _SHARE_OF_OUTAGE: Final = 0.02

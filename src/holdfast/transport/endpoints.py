@@ -19,25 +19,6 @@ from holdfast.errors import TransportError
 from holdfast.printable import did_you_mean
 from holdfast.runtime.addresses import host_and_port
 
-__all__ = [
-    "AUTHORITY_FILE",
-    "CERTIFICATE_FILE",
-    "KEY_FILE",
-    "MAX_SOCKET_PATH_BYTES",
-    "NEXT_KEY_FILE",
-    "REVOKED_FILE",
-    "SCHEMES",
-    "Endpoint",
-    "Role",
-    "ServiceAddress",
-    "TlsFiles",
-    "check_credentials",
-    "check_endpoint",
-    "check_name",
-    "parse_endpoint",
-    "parse_host",
-]
-
 Role: TypeAlias = Literal["robot", "service"]
 """Of an end of a link."""
 
@@ -168,23 +149,10 @@ class Endpoint(NamedTuple):
         return all(each is not None and _is_loopback_address(each) for each in addresses)
 
 
-class ServiceAddress(NamedTuple):
-    """How a robot and a service find each other."""
-
-    endpoint: str
-    # Whether the robot listens there, at a local socket, and the service connects. A service that
-    # the robot launches does, so the robot need not poll for it.
-    listens: bool = False
-    name: str | None = None  # that the service must have; None accepts any
-
-
 def parse_endpoint(text: str) -> Endpoint:
     """Read ``PROTOCOL/HOST:PORT``, with an IPv6 address in brackets, or another endpoint.
 
-    Raises
-    ------
-    TransportError
-        If it is none, or its protocol is not in :data:`SCHEMES`.
+    Raises TransportError if it is none, or its protocol is not in :data:`SCHEMES`.
     """
     protocol, slash, place = text.partition("/")
     if protocol[:-1] in SCHEMES and protocol.endswith(":") and place.startswith("/"):
@@ -234,10 +202,7 @@ def parse_host(host: str, before: str = "") -> str:
 
     ``before`` precedes the host in the examples of error messages.
 
-    Raises
-    ------
-    TransportError
-        If it is malformed.
+    Raises TransportError if it is malformed.
     """
     if host.startswith("[") and host.endswith("]"):
         inner = host[1:-1]
@@ -265,24 +230,16 @@ def parse_host(host: str, before: str = "") -> str:
     return host
 
 
-def check_endpoint(text: str, role: Role, *, listens: bool) -> Endpoint:
-    """Read the endpoint at which the end of this role listens, or to which it connects.
+def check_endpoint(text: str, role: Role) -> Endpoint:
+    """Read the endpoint at which a service listens, or to which a robot connects.
 
-    Raises
-    ------
-    TransportError
-        If it is malformed, has port 0 to connect to, or is one at which the other end listens.
+    Raises TransportError if it is malformed, or has port 0 to connect to.
     """
     endpoint = parse_endpoint(text)
-    if not listens and endpoint.port == 0 and not endpoint.is_local_socket:
+    if role == "robot" and endpoint.port == 0 and not endpoint.is_local_socket:
         raise TransportError(
             f"endpoint {endpoint}: port 0 is for listening; to connect, give the port, "
             f"as in {endpoint._replace(port=7447)}"
-        )
-    if listens != (role == "service") and not endpoint.is_local_socket:
-        raise TransportError(
-            f"endpoint {endpoint}: there the service listens and the robot connects; a robot "
-            "listens at a local socket alone (unix/PATH), for the service that it launches"
         )
     return endpoint
 
@@ -299,10 +256,7 @@ def check_name(what: str, name: str) -> None:
 def check_credentials(endpoint: Endpoint, tls: TlsFiles | None) -> None:
     """Check that there are credentials exactly where the protocol needs them.
 
-    Raises
-    ------
-    TransportError
-        If they are missing, or would not be used.
+    Raises TransportError if they are missing, or would not be used.
     """
     if endpoint.is_encrypted and tls is None:
         raise TransportError(

@@ -6,35 +6,18 @@ are known to get through. Long ones, and all while datagrams are blocked, go on 
 
 A request is retransmitted until it is answered, and replies are kept until the robot acknowledges
 them. So the service needs no retransmission timer: whatever was lost, the robot misses a reply,
-sends the request again with the number of replies that it has, and gets the rest.
+sends the request again with the number of replies that it has, and gets the rest. The
+retransmission timeout follows the measured round trips, as in TCP (RFC 6298).
 
-The retransmission timeout follows the measured round trips, as in TCP (RFC 6298): a smoothed mean
-plus a margin for the variation, doubled each time.
-
-A retransmission costs a round trip, which is expensive on a long path, and these messages are
-short. So while a path is losing datagrams each message is sent twice, a few milliseconds apart,
-because losses come in bursts (:mod:`~holdfast.transport.redundancy`). The receiver measures the
-loss over the last 128 datagrams (:class:`~holdfast.transport.datagram_cipher.ReplayWindow`), and
-each message carries that count back. A path without loss gets no copies. A new link starts with a
-few dozen probes, and assumes loss until they have come back.
+A retransmission costs a round trip, so while a path is losing datagrams each message is sent twice
+(:mod:`~holdfast.transport.redundancy`). The receiver counts the losses, and each message carries
+that count back. A new link starts with a few dozen probes, and assumes loss until they have come
+back.
 
 Under heavy loss, as while the service's port is flooded, the copy goes on the stream instead, and
 so do those of its replies (a *hedge*): when a request has been sent twice and nothing was heard; at
 once if a quarter of the last datagrams were lost, and after such a request until a probe returns.
-The first reply to arrive counts.
-
-A message is::
-
-    kind       1 byte
-    lost       1 byte: of the last 128 datagrams of the other end, how many did not come
-    request:   number (4), settled (4): all below it are answered, have (2): replies that the robot
-               has, then the payload
-    hedge:     a request that was sent as a datagram, too
-    reply:     number (4), index (2) with two bits for "last" and "end without payload", then the
-               payload
-    working:   number (4): the request has come, and there is no reply yet that the robot lacks
-    probe, echo: 8 bytes that are sent back. The robot probes the path, the service an address
-               (:mod:`~holdfast.transport.return_path`)
+The first reply to arrive counts. ``docs/datagrams.md`` has the bytes of each message.
 """
 
 from __future__ import annotations
@@ -47,21 +30,6 @@ import msgspec
 
 from holdfast.transport.datagram_cipher import KNOWN_AFTER, LOSS_SAMPLE, OVERHEAD
 from holdfast.transport.redundancy import MAX_TIMEOUT_S, Paths, RedundantSender, RoundTripEstimator
-
-__all__ = [
-    "ECHO",
-    "KEEP_ALIVE_S",
-    "MAX_CACHED_REQUESTS",
-    "MAX_DATAGRAM_BYTES",
-    "MAX_PAYLOAD_BYTES",
-    "MAX_REORDERED_BYTES",
-    "MESSAGE_OVERHEAD",
-    "PROBE",
-    "ReceivedReply",
-    "ReceivedRequest",
-    "RobotExchange",
-    "ServiceExchange",
-]
 
 _REQUEST, _REPLY, _WORKING, PROBE, ECHO, _HEDGE = range(1, 7)
 

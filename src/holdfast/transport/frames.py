@@ -21,30 +21,6 @@ from holdfast.errors import FrameError, TransportError
 from holdfast.printable import one_line
 from holdfast.transport.endpoints import Role, check_name
 
-__all__ = [
-    "CALL",
-    "END",
-    "GOODBYE",
-    "HEADER_BYTES",
-    "HELLO",
-    "KEYS",
-    "LAST",
-    "MAGIC",
-    "MAX_HELLO_BYTES",
-    "MESSAGE",
-    "PING",
-    "REPLY",
-    "WIRE_VERSION",
-    "Frame",
-    "FrameDecoder",
-    "Hello",
-    "decode_hello",
-    "encode_frame",
-    "encode_goodbye",
-    "encode_hello",
-    "read_goodbye",
-]
-
 WIRE_VERSION: Final = 1
 """Of the frames and the hello; the protocol's messages have another version."""
 
@@ -127,13 +103,7 @@ def read_goodbye(payload: bytes) -> str:
 
 
 def decode_hello(payload: bytes) -> Hello:
-    """Decode the peer's hello.
-
-    Raises
-    ------
-    FrameError
-        If it is of another version, or malformed.
-    """
+    """Decode the peer's hello; raise FrameError if it is of another version, or malformed."""
     version = _decoded(payload, _Version)
     if version.version != WIRE_VERSION:
         raise FrameError(

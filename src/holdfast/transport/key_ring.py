@@ -65,18 +65,6 @@ if TYPE_CHECKING:
     from cryptography import x509
     from cryptography.hazmat.primitives.asymmetric import ec
 
-__all__ = [
-    "AUTHORITY_DAYS",
-    "DEFAULT_DAYS",
-    "Issued",
-    "KeyRing",
-    "MadeCredentials",
-    "alone_in",
-    "list_credentials",
-    "make_credentials",
-    "revoke_credentials",
-]
-
 DEFAULT_DAYS = 365
 """Days for which a certificate is valid unless said otherwise."""
 
@@ -159,10 +147,15 @@ def alone_in(directory: Path, *, warn: Callable[[str], object] = warnings.warn) 
 def make_credentials(
     directory: Path,
     *,
+    # robots, services: their names; none at all means one robot ``robot`` and one service
+    # ``service``, or with ``renew`` or ``rotate`` all that are there.
     robots: Sequence[str] = (),
     services: Sequence[str] = (),
+    # Names and addresses under which robots call the services, besides those of this machine.
     hosts: Sequence[str] = (),
+    # For which the certificates are valid; never longer than the authority.
     days: int = DEFAULT_DAYS,
+    # renew, rotate: whether to replace existing certificates, except revoked ones; or keys as well.
     renew: bool = False,
     rotate: bool = False,
     now: datetime | None = None,
@@ -178,24 +171,8 @@ def make_credentials(
     container may have mounted it, and can be used at every moment. The caller holds the lock
     (:func:`alone_in`).
 
-    Parameters
-    ----------
-    robots, services : sequence of str
-        Their names; none at all means one robot ``robot`` and one service ``service``, or with
-        ``renew`` or ``rotate`` all that are there.
-    hosts : sequence of str
-        Names and addresses under which robots call the services, besides those of this machine.
-    days : int
-        For which the certificates are valid; never longer than the authority.
-    renew, rotate : bool
-        Whether to replace existing certificates, except revoked ones; or keys as well.
-
-    Raises
-    ------
-    CredentialsError
-        If a name, host or number is out of bounds, or a file is in the way or missing.
-    OutputError
-        If a file cannot be written.
+    Raises CredentialsError if a name, host or number is out of bounds, or a file is in the way or
+    missing; OutputError if a file cannot be written.
     """
     # Certificates have whole seconds.
     now = (now or datetime.now(UTC)).replace(microsecond=0)
@@ -290,13 +267,8 @@ def revoke_credentials(
     single ones by their numbers. The list is written to the authority and beside each party's
     credentials. Entries are never removed.
 
-    Raises
-    ------
-    CredentialsError
-        If a name never had a certificate, a number cannot be one, or a file is missing or
-        malformed.
-    OutputError
-        If a file cannot be written.
+    Raises CredentialsError if a name never had a certificate, a number cannot be one, or a file is
+    missing or malformed; OutputError if a file cannot be written.
     """
     now = (now or datetime.now(UTC)).replace(microsecond=0)
     home = directory / _AUTHORITY
@@ -330,10 +302,7 @@ def revoke_credentials(
 def list_credentials(directory: Path) -> tuple[Issued, ...]:
     """Return all certificates that an authority has signed or revoked.
 
-    Raises
-    ------
-    CredentialsError
-        If there is no authority, or a file is malformed.
+    Raises CredentialsError if there is no authority, or a file is malformed.
     """
     home = directory / _AUTHORITY
     certificate = read_certificate(home / AUTHORITY_FILE)

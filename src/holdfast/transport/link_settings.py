@@ -11,8 +11,6 @@ from typing import Final, Protocol
 
 from holdfast.transport.frames import HEADER_BYTES
 
-__all__ = ["SLICE_S", "FairScheduler", "LinkSettings", "MemoryBudget"]
-
 _RECEIVED_AT_ONCE_BYTES: Final = 256 * 1024
 
 SLICE_S: Final = 0.001
@@ -116,13 +114,8 @@ class MemoryBudget:
     the link that has held something for longest. So an owner that takes much cannot end the links
     of owners that take little.
 
-    Parameters
-    ----------
-    max_bytes : float
-    reason : str
-        Why a link is ended, as the rest of a sentence about the other end.
-    measure : callable, optional
-        What a link holds now, where that shrinks without a :meth:`note`.
+    ``reason`` says why a link is ended, as the rest of a sentence about the other end; ``measure``
+    what a link holds now, where that shrinks without a :meth:`note`.
     """
 
     def __init__(
@@ -159,31 +152,18 @@ class MemoryBudget:
 
 
 class LinkSettings:
-    """What all links of one end have in common.
-
-    Parameters
-    ----------
-    hello : callable
-        Returns this end's first bytes.
-    lease_ms : float
-        This end sends something several times in this time.
-    pauses_for_readers : bool
-        Whether reading pauses while the other end does not read.
-    max_unsent_bytes : float
-        Bound on the bytes of all links together that wait for the other ends to read.
-    pause_s : float
-        Of the :class:`FairScheduler`.
-    """
+    """What all links of one end have in common."""
 
     def __init__(
         self,
-        hello: Callable[[], bytes],
-        lease_ms: float,
+        hello: Callable[[], bytes],  # returns this end's first bytes
+        lease_ms: float,  # this end sends something several times in this time
         max_message_bytes: int,
         *,
-        pauses_for_readers: bool,
+        pauses_for_readers: bool,  # whether reading pauses while the other end does not read
+        # Bound on the bytes of all links together that wait for the other ends to read.
         max_unsent_bytes: float = math.inf,
-        pause_s: float = 0.0,
+        pause_s: float = 0.0,  # of the :class:`FairScheduler`
     ) -> None:
         self.hello = hello
         self.lease_ms = lease_ms

@@ -44,8 +44,6 @@ from holdfast.transport.link_settings import SLICE_S, LinkSettings
 if TYPE_CHECKING:
     from holdfast.transport.tls import PeerCertificate, TlsStream
 
-__all__ = ["OPENING_TIMEOUT_S", "Link", "LinkOwner", "ends_link"]
-
 _Arguments = ParamSpec("_Arguments")
 _AnyLink = TypeVar("_AnyLink", bound="Link")
 

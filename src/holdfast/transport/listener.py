@@ -25,14 +25,6 @@ from holdfast.runtime.addresses import why_not_bound
 from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.links import OPENING_TIMEOUT_S
 
-__all__ = [
-    "MAX_SILENT",
-    "Listener",
-    "connection_to_drop",
-    "listen",
-    "remove_socket_file",
-]
-
 _BACKLOG: Final = 1024
 """Connections that wait to be accepted."""
 
@@ -58,26 +50,16 @@ _T = TypeVar("_T")
 class Listener:
     """Accepts connections, and delivers each when its first byte has come.
 
-    Parameters
-    ----------
-    endpoint : Endpoint
-        Port 0 takes a free one; the attribute has its number.
-    accepted : callable
-        Gets the socket of such a connection, and the network from which it came.
-    shared : socket or None
-        A socket that is bound there for several processes, of which this one listens, too.
-
-    Raises
-    ------
-    TransportError
-        If it cannot listen there; the message names the endpoint.
+    Raises TransportError if it cannot listen there; the message names the endpoint.
     """
 
     def __init__(
         self,
-        endpoint: Endpoint,
+        endpoint: Endpoint,  # port 0 takes a free one; the attribute has its number
+        # Gets the socket of such a connection, and the network from which it came.
         accepted: Callable[[socket.socket, bytes], None],
         *,
+        # A socket that is bound there for several processes, of which this one listens, too.
         shared: socket.socket | None = None,
     ) -> None:
         self._accepted = accepted

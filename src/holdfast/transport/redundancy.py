@@ -14,8 +14,6 @@ from typing import Final, NamedTuple
 
 from holdfast.transport.datagram_cipher import OVERHEAD
 
-__all__ = ["COPY_DELAY_S", "MAX_TIMEOUT_S", "Paths", "RedundantSender", "RoundTripEstimator"]
-
 COPY_DELAY_S: Final = 0.003
 """Between a message and its copy."""
 

@@ -1,24 +1,17 @@
 """Where a service's datagrams go: to an address that has proved that it receives them.
 
 Anybody can write any source address on a datagram, a robot with a certificate as well. So a new
-address gets nothing but *probes* with a secret of eight bytes, and the answers go on to the old
-address until the secret has come back from the new one (as in QUIC: RFC 9000, section 8.2). Each
-authentic datagram leads to at most one probe for each address, which is hardly longer, so a service
-cannot be used to amplify traffic.
-
-An attacker beside the path can copy a robot's datagram, send it from an address of its own, and
-carry the probe to the robot. So the old address is probed as well: a robot that is still reached
-there stays there (RFC 9000, section 9.3.3).
-
-Nothing here knows sockets, keys or clocks.
+address gets nothing but *probes* with a secret, and the answers go on to the old address until the
+secret has come back from the new one (as in QUIC: RFC 9000, section 8.2). An attacker beside the
+path can copy a robot's datagram, send it from an address of its own, and carry the probe to the
+robot. So the old address is probed as well: a robot that is still reached there stays there
+(section 9.3.3). ``docs/datagrams.md`` has the rules. Nothing here knows sockets, keys or clocks.
 """
 
 from __future__ import annotations
 
 import os
 from typing import Any, Final, NamedTuple
-
-__all__ = ["SECRET_BYTES", "Probe", "ReturnPath"]
 
 SECRET_BYTES: Final = 8
 

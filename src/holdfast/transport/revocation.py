@@ -22,8 +22,6 @@ from holdfast.transport.endpoints import REVOKED_FILE
 if TYPE_CHECKING:
     import ssl
 
-__all__ = ["refuse_revoked", "revoked_serials"]
-
 _MAX_LIST_BYTES = 16 << 20
 """Of a list: about 400,000 certificates."""
 
@@ -36,10 +34,7 @@ _INTEGER, _SEQUENCE, _TIMES = 0x02, 0x30, (0x17, 0x18)
 def refuse_revoked(context: ssl.SSLContext, directory: Path) -> None:
     """Make handshakes refuse the certificates in a directory's list, if there is one.
 
-    Raises
-    ------
-    TransportError
-        If the list cannot be read. Its signature is checked in a handshake.
+    Raises TransportError if the list cannot be read. Its signature is checked in a handshake.
     """
     import ssl
 
@@ -57,10 +52,7 @@ def refuse_revoked(context: ssl.SSLContext, directory: Path) -> None:
 def revoked_serials(path: Path) -> frozenset[int]:
     """Return the serial numbers in a list in PEM form; none if there is no such file.
 
-    Raises
-    ------
-    TransportError
-        If it cannot be read, or is no revocation list.
+    Raises TransportError if it cannot be read, or is no revocation list.
     """
     try:
         with path.open("rb") as file:

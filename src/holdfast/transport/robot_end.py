@@ -22,12 +22,11 @@ from holdfast.errors import (
     defect_fields,
 )
 from holdfast.protocol.events import TransportEvent
-from holdfast.transport.calls import CallTable, PendingCall, too_large
+from holdfast.transport.calls import CallTable, too_large
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
 from holdfast.transport.dialer import Dialer
 from holdfast.transport.endpoints import (
     Endpoint,
-    ServiceAddress,
     TlsFiles,
     check_credentials,
     check_endpoint,
@@ -36,13 +35,8 @@ from holdfast.transport.endpoints import (
 from holdfast.transport.frames import CALL, END, LAST, REPLY, Frame, Hello, encode_hello
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
-from holdfast.transport.listener import Listener
 from holdfast.transport.schemes import load_scheme
 from holdfast.transport.tls import ClientCredentials, TlsStream
-
-__all__ = ["StreamRobotTransport"]
-
-_CALL_NUMBERS = 1 << 32
 
 _PAUSE_S = 0.004
 """Between time slices of services that send too much: the robot's own loop comes first."""
@@ -56,9 +50,6 @@ _TAKES_NO_TLS = (
 
 _NO_DATAGRAMS = "none gets through, so everything goes on the TLS stream; is UDP filtered?"
 
-_MAX_WITHOUT_HELLO = 64
-"""Connections to a listening robot without a hello yet."""
-
 _MAX_REPORTED_REASONS = 8
 """Reasons that are not reported again; bounded, as a service may send a new one each time."""
 
@@ -70,42 +61,29 @@ def _unheard(_name: str, **_fields: object) -> None:
 class StreamRobotTransport:
     """The robot's end: see :class:`~holdfast.transport.contract.RobotTransport`.
 
-    Parameters
-    ----------
-    services : mapping of str to ServiceAddress
-        Where each service is, by the robot's name for it.
-    name : str
-        The robot's; may be empty.
-    lease_ms : float
-        After this much silence services consider this robot lost. A service's own lease is in its
-        hello.
-    max_message_bytes : int
-        A larger request is refused here, a larger reply is dropped.
-    tls : TlsFiles or None
-        The robot's credentials, for ``tls`` and ``udp``.
-    on_event : callable
-        Called for the log: ``defect`` with ``service``, ``reason`` and ``traceback``, when an
-        exception that no code here expects has ended a link; ``unreachable`` with ``service`` and
-        ``reason``, the rest of a sentence about a service that cannot be reached, refuses this
-        robot or is another one (recent reasons are not repeated until it has appeared);
-        ``no_datagrams`` with ``service`` and ``reason``, once for each; ``credentials`` with
-        ``reason``, when replaced ones cannot be used.
-
-    Raises
-    ------
-    TransportError
-        If an endpoint, a name or the credentials cannot be used.
+    Raises TransportError if an endpoint, a name or the credentials cannot be used.
     """
 
     def __init__(
         self,
-        services: Mapping[str, ServiceAddress],
+        # The endpoint of each service, by the robot's name for it. None for one that the robot
+        # launches, whose connections come by :meth:`attach`.
+        services: Mapping[str, str | None],
         *,
-        name: str = "",
+        name: str = "",  # the robot's; may be empty
         incarnation: str = "0",
+        # After this much silence services consider this robot lost. A service's own lease is in its
+        # hello.
         lease_ms: float = 400.0,
+        # A larger request is refused here, a larger reply is dropped.
         max_message_bytes: int = DEFAULT_MAX_MESSAGE_BYTES,
-        tls: TlsFiles | None = None,
+        tls: TlsFiles | None = None,  # the robot's credentials, for ``tls`` and ``udp``
+        # Called for the log: ``defect`` with ``service``, ``reason`` and ``traceback``, when an
+        # exception that no code here expects has ended a link; ``unreachable`` with ``service`` and
+        # ``reason``, the rest of a sentence about a service that cannot be reached, refuses this
+        # robot or is another one (recent reasons are not repeated until it has appeared);
+        # ``no_datagrams`` with ``service`` and ``reason``, once for each; ``credentials`` with
+        # ``reason``, when replaced ones cannot be used.
         on_event: Callable[..., None] = _unheard,
     ) -> None:
         if name:
@@ -123,17 +101,18 @@ class StreamRobotTransport:
         self.on_event = on_event
         self._services: dict[str, _ServiceLinks] = {}
         credentials: ClientCredentials | None = None
-        for service, address in services.items():
-            endpoint = check_endpoint(address.endpoint, "robot", listens=address.listens)
+        for service, text in services.items():
+            if text is None:
+                self._services[service] = _ServiceLinks(self, service, None, None)
+                continue
+            endpoint = check_endpoint(text, "robot")
             check_credentials(endpoint, tls)
-            if address.name is not None:
-                check_name("name of a service", address.name)
             if credentials is None and tls is not None and endpoint.is_encrypted:
                 credentials = ClientCredentials(
                     tls, lambda reason: on_event("credentials", reason=reason)
                 )
             own = credentials if endpoint.is_encrypted else None
-            self._services[service] = _ServiceLinks(self, service, address, endpoint, own)
+            self._services[service] = _ServiceLinks(self, service, endpoint, own)
         self._started = False
         self._closed = False
 
@@ -143,46 +122,40 @@ class StreamRobotTransport:
         return link is not None and link.sends_datagrams
 
     def start(self, deliver: Callable[[TransportEvent], None]) -> None:
-        """Begin to connect and to deliver events; returns at once.
-
-        Raises
-        ------
-        TransportError
-            If the robot cannot listen where it should.
-        """
+        """Begin to connect and to deliver events; returns at once."""
         if self._started or self._closed:
             raise TransportError("this transport was started before; make another one")
         self._started = True
         self.calls.open(deliver)
-        try:
-            for service in self._services.values():
-                service.start()
-        except TransportError:
-            self._stop()
-            raise
+        for service in self._services.values():
+            service.start()
+
+    def attach(self, service: str, connection: socket.socket) -> None:
+        """Take the connection to a service that was launched now; it replaces the one before."""
+        self._service(service).attach(connection)
 
     def call(self, service: str, call: int, payload: bytes) -> None:
         """Send a request; never waits."""
         to = self._service(service)
         link = to.link_for_call()
-        pending = self.calls.begin(call, link)
-        if pending is None:
+        if not self.calls.begin(call, link):
             return
         if link is not None and len(payload) <= self.settings.max_message_bytes:
-            to.send(link, pending, payload)
+            link.send_message(CALL, call, payload)
             return
         loop = asyncio.get_running_loop()
         if len(payload) > self.settings.max_message_bytes:
             refusal = too_large(len(payload), self.settings.max_message_bytes)
-            loop.call_soon(self.calls.replied, pending, refusal)
-        loop.call_soon(self.calls.ended, pending)
+            loop.call_soon(self.calls.replied, call, refusal)
+        loop.call_soon(self.calls.ended, call)
 
     def abandon(self, call: int) -> None:
         """Abandon a call: nothing more of it is delivered, not even its end."""
-        pending = self.calls.abandon(call)
-        if pending is not None:
+        link = self.calls.abandon(call)
+        if isinstance(link, Link):
+            link.forget(call)
             for service in self._services.values():
-                service.forget(pending)
+                service.freed(link)
 
     async def close(self, timeout_s: float = 1.0) -> None:
         """Close all links, within this time whatever the other ends do. May be repeated."""
@@ -211,19 +184,18 @@ class _ServiceLinks(LinkOwner):
         self,
         robot: StreamRobotTransport,
         name: str,
-        address: ServiceAddress,
-        endpoint: Endpoint,
+        endpoint: Endpoint | None,
         credentials: ClientCredentials | None,
     ) -> None:
         self._robot = robot
         self._name = name
-        self._address = address
+        self._endpoint = endpoint
         self._credentials = credentials
-        self._scheme = load_scheme(endpoint.protocol)
-        self._listener: Listener | None = None
+        self._scheme = None if endpoint is None else load_scheme(endpoint.protocol)
         self._dialer: Dialer | None = None
+        # To a launched process that has said nothing yet.
+        self._silent: socket.socket | None = None
         # The links with a known process, with the incarnation that was reported, the newest last.
-        # There are several only where the robot listens.
         self._links: dict[Link, str] = {}
         # A link to the next process, while the current one still owes replies; and its incarnation.
         self._successor: tuple[Link, str] | None = None
@@ -231,8 +203,6 @@ class _ServiceLinks(LinkOwner):
         self._has_no_successor = False
         # All links, the oldest first.
         self._made: dict[Link, None] = {}
-        self._calls: dict[Link, dict[int, PendingCall]] = {}
-        self._numbers = count()
         # From the last hello, and the name under which that process was reported.
         self._incarnation: str | None = None
         self._reported = ""
@@ -242,7 +212,6 @@ class _ServiceLinks(LinkOwner):
         self._reported_reasons: deque[str] = deque(maxlen=_MAX_REPORTED_REASONS)
         self._reported_blocked = False
         self._stopped = False
-        self._endpoint = endpoint  # where it listens or, for one that connects, the robot
 
     @property
     def current(self) -> Link | None:
@@ -251,9 +220,7 @@ class _ServiceLinks(LinkOwner):
         return None if link is None or link.ended else link
 
     def start(self) -> None:
-        if self._address.listens:
-            self._listener = Listener(self._endpoint, self._accepted)
-        else:
+        if self._endpoint is not None:
             self._dialer = Dialer(
                 self._endpoint,
                 self._make_link,
@@ -264,14 +231,32 @@ class _ServiceLinks(LinkOwner):
 
     def stop(self) -> list[asyncio.Future[None]]:
         self._stopped = True
-        if self._listener is not None:
-            self._listener.close()
+        self._drop_silent()
         if self._dialer is not None:
             self._dialer.stop()
         links = list(self._made)
         for link in links:
             link.end("", goodbye="")
         return [link.closed for link in links]
+
+    def attach(self, connection: socket.socket) -> None:
+        self._drop_silent()
+        self._silent = connection
+        # A process may take long to start, and no link waits so long for a hello.
+        asyncio.get_running_loop().add_reader(connection, self._heard_from, connection)
+
+    def _heard_from(self, connection: socket.socket) -> None:
+        asyncio.get_running_loop().remove_reader(connection)
+        self._silent = None
+        link = Link(self, self._robot.settings, speaks_first=False)
+        self._made[link] = None
+        link.begin(connection)
+
+    def _drop_silent(self) -> None:
+        if self._silent is not None:
+            asyncio.get_running_loop().remove_reader(self._silent)
+            self._silent.close()
+            self._silent = None
 
     def link_for_call(self) -> Link | None:
         """Return the link for a new call: the successor's, if there is one.
@@ -285,44 +270,22 @@ class _ServiceLinks(LinkOwner):
         asyncio.get_running_loop().call_soon(self._switch)
         return self._successor[0]
 
-    def send(self, link: Link, pending: PendingCall, payload: bytes) -> None:
-        number = next(self._numbers) % _CALL_NUMBERS
-        self._calls[link][number] = pending
-        link.send_message(CALL, number, payload)
-
-    def forget(self, pending: PendingCall) -> None:
-        link = pending.peer
-        if isinstance(link, Link):
-            for number, call in list(self._calls.get(link, {}).items()):
-                if call is pending:
-                    del self._calls[link][number]
-                    link.forget(number)
-            if link.said_goodbye and self._successor is not None:
-                asyncio.get_running_loop().call_soon(self._switch_if_free)
+    def freed(self, link: Link) -> None:
+        """Note that a call on a link was abandoned."""
+        if link.said_goodbye and link in self._links and self._successor is not None:
+            asyncio.get_running_loop().call_soon(self._switch_if_free)
 
     # -- links -----------------------------------------------------------------------------------
 
     def _make_link(self) -> Link:
+        assert self._endpoint is not None and self._scheme is not None
         tls = None
         if self._credentials is not None:
             context = self._credentials.context()
             tls = TlsStream(context, self._endpoint.host, self._incarnation)
-        link = self._scheme.make_link(
-            self,
-            self._robot.settings,
-            tls,
-            role="robot",
-            dialled=not self._address.listens,
-        )
+        link = self._scheme.make_link(self, self._robot.settings, tls, role="robot")
         self._made[link] = None
         return link
-
-    def _accepted(self, connection: socket.socket, network: bytes) -> None:
-        del network
-        unknown = [link for link in self._made if link.hello is None and not link.ended]
-        if len(unknown) >= _MAX_WITHOUT_HELLO:
-            unknown[0].end("has said no hello, and others wait", abort=True)
-        self._make_link().begin(connection)
 
     def on_handshake(self, link: Link) -> None:
         if not self._handshake_is_enough or self._links:
@@ -334,12 +297,7 @@ class _ServiceLinks(LinkOwner):
 
     def refusal(self, link: Link, hello: Hello) -> str | None:
         del link
-        if hello.role != "service":
-            return "is a robot, and a service was expected"
-        wanted = self._address.name
-        if wanted is not None and hello.name != wanted:
-            return f"is the service {hello.name}, and {wanted} was expected"
-        return None
+        return None if hello.role == "service" else "is a robot, and a service was expected"
 
     def on_hello(self, link: Link, hello: Hello) -> None:
         incarnation = self._links.get(link)
@@ -353,7 +311,6 @@ class _ServiceLinks(LinkOwner):
             self._dialer.succeeded()
         before = self.current
         if link not in self._links and before is not None and before.said_goodbye:
-            self._calls[link] = {}
             self._successor = link, incarnation
             if self._dialer is not None:
                 self._dialer.selected(link)
@@ -366,7 +323,6 @@ class _ServiceLinks(LinkOwner):
     def _appeared(self, link: Link, incarnation: str) -> None:
         is_news = incarnation not in self._links.values()
         self._links[link] = incarnation
-        self._calls.setdefault(link, {})
         self._has_no_successor = False
         if self._dialer is not None:
             self._dialer.selected(link)
@@ -380,7 +336,7 @@ class _ServiceLinks(LinkOwner):
         """
         for link, its_incarnation in list(self._links.items()):
             ending = link is not by and (link.without_stream or link.said_goodbye)
-            if ending and (its_incarnation != incarnation or not self._calls[link]):
+            if ending and (its_incarnation != incarnation or not self._robot.calls.to(link)):
                 link.end("", goodbye="")
 
     # -- a draining process ----------------------------------------------------------------------
@@ -393,7 +349,7 @@ class _ServiceLinks(LinkOwner):
             self._leave(link)
 
     def _leave(self, link: Link) -> None:
-        if not self._calls.get(link):
+        if not self._robot.calls.to(link):
             link.end("", goodbye="")
 
     def _all_failed(self, reason: str) -> None:
@@ -409,7 +365,7 @@ class _ServiceLinks(LinkOwner):
     def _switch_if_free(self) -> None:
         """Switch to the successor if the current process owes no replies."""
         current = self.current
-        if current is None or not self._calls.get(current):
+        if current is None or not self._robot.calls.to(current):
             self._switch()
 
     def _switch(self) -> None:
@@ -419,21 +375,19 @@ class _ServiceLinks(LinkOwner):
             self._replace_others(*successor)
 
     def on_frame(self, link: Link, frame: Frame) -> None:
-        calls = self._calls.get(link)
-        if calls is None:
+        calls = self._robot.calls
+        if link not in self._links and (self._successor is None or link is not self._successor[0]):
             raise FrameError("replies before it has a request")
         if frame.kind not in (REPLY, LAST, END):
             raise FrameError(f"is a service and sends a frame of kind {frame.kind}")
-        call = calls.get(frame.call)
-        if call is None:
+        if frame.call not in calls.to(link):
             return  # it has ended
         if frame.kind != END and not frame.skipped_bytes:
             link.has_answered = True
-            self._robot.calls.replied(call, frame.payload)
+            calls.replied(frame.call, frame.payload)
         if frame.kind != REPLY:
-            calls.pop(frame.call, None)
-            self._robot.calls.ended(call)
-            if calls:
+            calls.ended(frame.call)
+            if calls.to(link):
                 return
             if link.said_goodbye and self._successor is not None:
                 self._switch_if_free()
@@ -458,7 +412,6 @@ class _ServiceLinks(LinkOwner):
 
     def on_ended(self, link: Link) -> None:
         self._made.pop(link, None)
-        self._calls.pop(link, None)
         if self._successor is not None:
             if link is self._successor[0]:
                 self._successor = None

@@ -18,16 +18,11 @@ if TYPE_CHECKING:
     from holdfast.transport.link_settings import LinkSettings
     from holdfast.transport.tls import TlsStream
 
-__all__ = ["Scheme", "load_scheme"]
-
 
 def load_scheme(name: str) -> Scheme:
     """Import and make the implementation of a scheme, for one end of a transport.
 
-    Raises
-    ------
-    TransportError
-        If it needs a package that is not installed.
+    Raises TransportError if it needs a package that is not installed.
     """
     module, _, class_name = SCHEMES[name].implementation.partition(":")
     made: Scheme = getattr(importlib.import_module(module), class_name)()
@@ -44,11 +39,9 @@ class Scheme:
         tls: TlsStream | None,
         *,
         role: Role,
-        dialled: bool,
     ) -> Link:
-        """Make the link of a new connection; ``dialled`` if this end has opened it."""
-        del role
-        return Link(owner, settings, speaks_first=dialled, tls=tls)
+        """Make the link of a new connection, which the robot has opened."""
+        return Link(owner, settings, speaks_first=role == "robot", tls=tls)
 
     def close(self) -> None:
         """Close what the links of this end share. May be repeated."""

@@ -19,7 +19,6 @@ import msgspec
 from holdfast.errors import DEFECT, FrameError, TransportError, defect_fields
 from holdfast.transport.calls import too_large
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, IncomingCall
-from holdfast.transport.dialer import Dialer
 from holdfast.transport.endpoints import (
     REVOKED_FILE,
     Endpoint,
@@ -47,8 +46,6 @@ if TYPE_CHECKING:
     import ssl
 
     from holdfast.transport.tls import PeerCertificate
-
-__all__ = ["MAX_LINKS", "MAX_UNKNOWN", "StreamServiceTransport"]
 
 MAX_LINKS: Final = 4096
 """Of robots, at the same time. Above it the owner of the most links loses one."""
@@ -118,31 +115,8 @@ class _StreamCall(msgspec.Struct, eq=False):
 class StreamServiceTransport(LinkOwner):
     """The service's end: see :class:`~holdfast.transport.contract.ServiceTransport`.
 
-    Parameters
-    ----------
-    listen, connect : sequence of str
-        Endpoints at which robots connect, and of robots that listen.
-    shared : sequence of socket
-        If given, a socket for each of ``listen`` that is bound there, for several processes.
-    lease_ms : float
-        After this much silence robots consider this service lost. A robot's own lease is in its
-        hello.
-    max_message_bytes : int
-        A larger request is refused and not kept.
-    max_links : int or None
-        Of robots, at the same time; None: :data:`MAX_LINKS`.
-    tls : TlsFiles or None
-        The service's credentials, for ``tls`` and ``udp``.
-    on_event : callable or None
-        Called for the log: ``defect`` with ``robot``, ``reason`` and ``traceback``, when an
-        exception that no code here expects has ended a link; ``link_refused`` with ``reason`` and,
-        if known, ``robot``; ``robot_connected`` with ``robot``; ``robot_disconnected`` with
-        ``robot`` and ``reason``. Each has the robot's ``address``, None over a local socket.
-
-    Raises
-    ------
-    TransportError
-        If an endpoint, the name, the incarnation or the credentials cannot be used.
+    Raises TransportError if an endpoint, the name, the incarnation or the credentials cannot be
+    used.
     """
 
     def __init__(
@@ -150,25 +124,33 @@ class StreamServiceTransport(LinkOwner):
         name: str,
         *,
         incarnation: str,
-        listen: Sequence[str] = (),
-        connect: Sequence[str] = (),
+        listen: Sequence[str] = (),  # endpoints at which robots connect
+        # The connection to the robot that has launched this service.
+        robot: socket.socket | None = None,
+        # If given, a socket for each of ``listen`` that is bound there, for several processes.
         shared: Sequence[socket.socket] = (),
+        # After this much silence robots consider this service lost. A robot's own lease is in its
+        # hello.
         lease_ms: float = 400.0,
+        # A larger request is refused and not kept.
         max_message_bytes: int = DEFAULT_MAX_MESSAGE_BYTES,
-        max_links: int | None = None,
-        tls: TlsFiles | None = None,
+        max_links: int | None = None,  # of robots, at the same time; None: :data:`MAX_LINKS`
+        tls: TlsFiles | None = None,  # the service's credentials, for ``tls`` and ``udp``
+        # Called for the log: ``defect`` with ``robot``, ``reason`` and ``traceback``, when an
+        # exception that no code here expects has ended a link; ``link_refused`` with ``reason``
+        # and, if known, ``robot``; ``robot_connected`` with ``robot``; ``robot_disconnected`` with
+        # ``robot`` and ``reason``. Each has the robot's ``address``, None over a local socket.
         on_event: Callable[..., None] | None = None,
     ) -> None:
         check_name("name of a service", name)
         check_name("incarnation of a service", incarnation)
-        self._listen = [check_endpoint(text, "service", listens=True) for text in listen]
-        self._connect = [check_endpoint(text, "service", listens=False) for text in connect]
-        for endpoint in (*self._listen, *self._connect):
+        self._listen = [check_endpoint(text, "service") for text in listen]
+        for endpoint in self._listen:
             check_credentials(endpoint, tls)
+        self._robot = robot
         self._shared: Sequence[socket.socket | None] = shared or [None] * len(listen)
         self._schemes = {
-            endpoint.protocol: load_scheme(endpoint.protocol)
-            for endpoint in (*self._listen, *self._connect)
+            endpoint.protocol: load_scheme(endpoint.protocol) for endpoint in self._listen
         }
         self._incarnation = incarnation
         self._max_links = MAX_LINKS if max_links is None else max_links
@@ -189,10 +171,7 @@ class StreamServiceTransport(LinkOwner):
         self._on_event = on_event
         self._deliver: Callable[[IncomingCall], None] | None = None
         self._started = False
-        self._takes_links = True
         self._listeners: list[Listener] = []
-        self._dialers: dict[Endpoint, Dialer] = {}
-        self._dialled: dict[Link, Dialer] = {}
         self._without_hello: dict[Link, bytes] = {}
         self._links: dict[Link, set[_StreamCall]] = {}
         self._closing: set[asyncio.Future[None]] = set()
@@ -206,10 +185,7 @@ class StreamServiceTransport(LinkOwner):
     async def start(self, deliver: Callable[[IncomingCall], None]) -> None:
         """Listen and deliver calls; returns when robots can connect.
 
-        Raises
-        ------
-        TransportError
-            If it cannot listen there; the message names the endpoint.
+        Raises TransportError if it cannot listen there; the message names the endpoint.
         """
         if self._started:
             raise TransportError("this transport was started before; make another one")
@@ -223,10 +199,11 @@ class StreamServiceTransport(LinkOwner):
             self._stop_listening()
             raise
         self._listen = [listener.endpoint for listener in self._listeners]
-        for endpoint in self._connect:
-            dialer = Dialer(endpoint, partial(self._make_dialled, endpoint))
-            self._dialers[endpoint] = dialer
-            dialer.start()
+        if self._robot is not None:
+            link = Link(self, self._settings, speaks_first=True)
+            self._add(link, b"")
+            link.begin(self._robot)
+            self._robot = None
 
     def dismiss(self) -> asyncio.Future[None]:
         """Take no new links, and ask the robots to leave; the result is done when all have left.
@@ -250,9 +227,6 @@ class StreamServiceTransport(LinkOwner):
     def _stop_listening(self) -> None:
         for listener in self._listeners:
             listener.close()
-        for dialer in self._dialers.values():
-            dialer.stop()
-        self._takes_links = False
 
     async def close(self, timeout_s: float = 1.0) -> None:
         """End all calls, send what was to be sent, and close all links, within this time."""
@@ -265,6 +239,8 @@ class StreamServiceTransport(LinkOwner):
             await asyncio.wait(self._closing, timeout=timeout_s)
         for scheme in self._schemes.values():
             scheme.close()
+        if self._robot is not None:
+            self._robot.close()
 
     def _end(self, link: Link) -> None:
         """End a link in order, because this service ends."""
@@ -299,10 +275,8 @@ class StreamServiceTransport(LinkOwner):
 
         Links end if their certificate is now revoked, or its authority was replaced.
 
-        Raises
-        ------
-        TransportError
-            If the files cannot be used; then the previous credentials stay in use.
+        Raises TransportError if the files cannot be used; then the previous credentials stay in
+        use.
         """
         if self._tls is None:
             return 0
@@ -333,16 +307,19 @@ class StreamServiceTransport(LinkOwner):
             )
         self._revoked, self._trusted, self._context = revoked, trusted, context
 
-    def _make_link(self, endpoint: Endpoint, network: bytes = b"", *, dialled: bool) -> Link:
+    def _accepted(self, endpoint: Endpoint, connection: socket.socket, network: bytes) -> None:
         tls = None
         if endpoint.is_encrypted:
             from holdfast.transport.tls import TlsStream
 
             assert self._context is not None
             tls = TlsStream(self._context)
-        link = self._schemes[endpoint.protocol].make_link(
-            self, self._settings, tls, role="service", dialled=dialled
-        )
+        link = self._schemes[endpoint.protocol].make_link(self, self._settings, tls, role="service")
+        self._add(link, network)
+        link.begin(connection)
+
+    def _add(self, link: Link, network: bytes) -> None:
+        """Keep a new link, until it has ended."""
         if len(self._without_hello) >= _MAX_WITHOUT_HELLO:
             other = connection_to_drop(self._without_hello)
             del self._without_hello[other]
@@ -350,15 +327,6 @@ class StreamServiceTransport(LinkOwner):
         self._without_hello[link] = network
         self._closing.add(link.closed)
         link.closed.add_done_callback(self._closing.discard)
-        return link
-
-    def _make_dialled(self, endpoint: Endpoint) -> Link:
-        link = self._make_link(endpoint, dialled=True)
-        self._dialled[link] = self._dialers[endpoint]
-        return link
-
-    def _accepted(self, endpoint: Endpoint, connection: socket.socket, network: bytes) -> None:
-        self._make_link(endpoint, network, dialled=False).begin(connection)
 
     def on_handshake(self, link: Link) -> None:
         """Refuse a robot that is no longer trusted, before anything of it is read."""
@@ -397,10 +365,6 @@ class StreamServiceTransport(LinkOwner):
         """Take a robot's hello."""
         self._without_hello.pop(link, None)
         self._links[link] = set()
-        dialer = self._dialled.get(link)
-        if dialer is not None:
-            dialer.succeeded()
-            dialer.selected(link)
         self._report("robot_connected", robot=_name(link, hello), address=link.address)
 
     def on_frame(self, link: Link, frame: Frame) -> None:
@@ -436,12 +400,11 @@ class StreamServiceTransport(LinkOwner):
         """Note that a link has ended."""
         self._without_hello.pop(link, None)
         calls = self._links.pop(link, None)
-        was_there = calls is not None
         for call in calls or ():
             call.is_open = False
             if call.on_gone is not None:
                 call.on_gone()
-        if was_there and link.hello is not None:
+        if calls is not None and link.hello is not None:
             reason = link.reason or (_SAID_GOODBYE if link.said_goodbye else _NO_GOODBYE)
             robot = _name(link, link.hello)
             self._report("robot_disconnected", robot=robot, reason=reason, address=link.address)
@@ -449,11 +412,6 @@ class StreamServiceTransport(LinkOwner):
             fields = {"robot": link.peer.name} if link.peer is not None else {}
             self._report("link_refused", reason=link.reason, address=link.address, **fields)
         self._resolve_if_all_gone()
-        dialer = self._dialled.pop(link, None)
-        if dialer is not None:
-            dialer.ended(link)
-            if self._takes_links and (was_there or link.refused):
-                dialer.start(refused=link.refused)
 
     def _report(self, name: str, **fields: object) -> None:
         if self._on_event is not None:

@@ -26,18 +26,6 @@ from holdfast.errors import FrameError, TransportError
 from holdfast.transport.endpoints import AUTHORITY_FILE, NEXT_KEY_FILE, TlsFiles
 from holdfast.transport.revocation import refuse_revoked
 
-__all__ = [
-    "REMEDIES",
-    "ClientCredentials",
-    "PeerCertificate",
-    "TlsStream",
-    "client_context",
-    "common_name",
-    "describe_certificate_error",
-    "make_context",
-    "server_context",
-]
-
 _ANY_INCARNATION = "holdfast"
 
 _KEY_EXCHANGE = "prime256v1"
@@ -215,12 +203,8 @@ class TlsStream:
     def receive(self, data: bytes) -> bytes:
         """Take bytes of the stream; return those of messages.
 
-        Raises
-        ------
-        ssl.SSLError
-            If the handshake fails at either end.
-        FrameError
-            If the peer does not speak TLS at all.
+        Raises ssl.SSLError if the handshake fails at either end; FrameError if the peer does not
+        speak TLS at all.
         """
         if not self._has_first_byte:
             self._has_first_byte = True

@@ -8,14 +8,13 @@ is taken over, a share is computed again, and must come to the same.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from functools import partial
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
-from holdfast.planning.planner import Decision, PlanningState, digest
+from holdfast.planning.planner import PlanningState, digest
 from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
 from holdfast.protocol.service_jobs import Job, JobResult
-from holdfast.robot.memo_cache import MemoCache, MemoizingPlanner
+from holdfast.robot.memo_cache import MemoCache, MemoizingPlanner, key_of
 from holdfast_lab.errors import Violation
 
 __all__ = ["CheckedPlanner", "JobCache", "Memo"]
@@ -26,7 +25,6 @@ _COMPUTED_AGAIN = 61
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
-Result = TypeVar("Result")
 
 
 class Memo(Generic[Key, Value]):
@@ -93,13 +91,10 @@ def _comparable(outcome: JobResult) -> tuple[object, ...]:
 class CheckedPlanner(MemoizingPlanner):
     """The robot's planner, which knows the states and decisions that it has come to before."""
 
+    shared: ClassVar[tuple[str, ...]] = (*MemoizingPlanner.shared, "decide")
+
     def __init__(self, problem: Problem, settings: PlanningSettings) -> None:
         super().__init__(problem, settings, _CheckedCache())
-
-    def decide(self, state: PlanningState, max_actions: int) -> Decision:
-        """Decide all that can be decided before something is sensed again."""
-        key = ("decision", id(state))
-        return self._once(key, state, partial(super().decide, state, max_actions))
 
 
 class _CheckedCache(MemoCache):
@@ -108,20 +103,16 @@ class _CheckedCache(MemoCache):
     def __init__(self) -> None:
         super().__init__()
         # By the identity of a state, which is kept with the result and so stays the state's own.
-        self._kept: Memo[Hashable, tuple[PlanningState | None, Any]]
+        self._kept: Memo[Hashable, tuple[tuple[Any, ...], Any]]
         self._kept = Memo(5 * _MOST, _check_states)
 
-    def once(
-        self, key: Hashable, state: PlanningState | None, compute: Callable[[], Result]
-    ) -> Result:
-        """Return the result for a key, computed if it is not known."""
-        result: Result = self._kept.get(key, lambda: (state, compute()))[1]
-        return result
+    def once(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return what a function returns, computed if it is not known."""
+        key = key_of(function, arguments)
+        return self._kept.get(key, lambda: (arguments, function(*arguments)))[1]
 
 
-def _check_states(
-    known: tuple[PlanningState | None, Any], now: tuple[PlanningState | None, Any]
-) -> None:
+def _check_states(known: tuple[tuple[Any, ...], Any], now: tuple[tuple[Any, ...], Any]) -> None:
     before, after = _state_of(known[1]), _state_of(now[1])
     if before is not None and after is not None and digest(before) != digest(after):
         raise Violation(f"the same events lead to another state of step {after.step} than before")

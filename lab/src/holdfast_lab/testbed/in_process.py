@@ -13,7 +13,7 @@ import msgspec
 
 from holdfast.errors import InvalidValueError, TransportError
 from holdfast.protocol.events import TransportEvent
-from holdfast.transport.calls import CallTable, PendingCall, too_large
+from holdfast.transport.calls import CallTable, too_large
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, IncomingCall
 
 __all__ = ["InProcessNetwork", "InProcessRobotTransport", "InProcessServiceTransport"]
@@ -54,7 +54,7 @@ class InProcessNetwork:
 class _InProcessCall(msgspec.Struct, eq=False):
     """A call; both ends hold it."""
 
-    call: PendingCall
+    number: int
     robot_end: InProcessRobotTransport
     service_end: InProcessServiceTransport
     payload: bytes
@@ -67,10 +67,10 @@ class _InProcessCall(msgspec.Struct, eq=False):
     def reply(self, payload: bytes) -> None:
         if len(payload) <= self.service_end.max_message_bytes:
             calls = self.robot_end.calls
-            asyncio.get_running_loop().call_soon(calls.replied, self.call, payload)
+            asyncio.get_running_loop().call_soon(calls.replied, self.number, payload)
 
     def end(self) -> None:
-        asyncio.get_running_loop().call_soon(self.robot_end.calls.ended, self.call)
+        asyncio.get_running_loop().call_soon(self.robot_end.calls.ended, self.number)
         self.service_end.open_calls.discard(self)
 
 
@@ -98,17 +98,16 @@ class InProcessRobotTransport:
         if service not in self._services:
             raise InvalidValueError(f"service {service!r}: known are {sorted(self._services)}")
         peer = self._network._find(service)
-        pending = self.calls.begin(call, peer)
-        if pending is None:
+        if not self.calls.begin(call, peer):
             return
         loop = asyncio.get_running_loop()
         if len(payload) > self._max_message_bytes:
             refusal = too_large(len(payload), self._max_message_bytes)
-            loop.call_soon(self.calls.replied, pending, refusal)
+            loop.call_soon(self.calls.replied, call, refusal)
         elif peer is not None:
-            loop.call_soon(peer.received, _InProcessCall(pending, self, peer, payload))
+            loop.call_soon(peer.received, _InProcessCall(call, self, peer, payload))
             return
-        loop.call_soon(self.calls.ended, pending)
+        loop.call_soon(self.calls.ended, call)
 
     def abandon(self, call: int) -> None:
         """Abandon a call."""
