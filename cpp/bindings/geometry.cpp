@@ -21,6 +21,7 @@
 #include "geometry_3d.hpp"
 #include "motion.hpp"
 #include "policies.hpp"
+#include "rollouts.hpp"
 
 namespace nb = nanobind;
 using namespace holdfast;
@@ -181,11 +182,75 @@ bool follow_batch(const World& world, const Policy& policy, const Input<2>& stat
 }
 
 template <class World, class Policy>
+bool roll_out_batch(
+    const World& world, const Policy& policy, const Input<2>& true_states,
+    const Input<3>& estimates,
+    const nb::ndarray<const double, nb::ndim<4>, nb::c_contig, nb::device::cpu>& clouds,
+    std::size_t stage, const Input<1>& standard_deviation, double tolerance,
+    const StreamWords& stream, const std::array<std::size_t, 3>& lengths, double discount,
+    double price, bool counts_steps, int threads, InPlace<double, 2> returns) {
+    constexpr std::size_t d = World::dimension;
+    const std::size_t actions = returns.shape(0), samples = returns.shape(1);
+    const std::size_t members = clouds.shape(2);
+    require(true_states.shape(0) == samples && true_states.shape(1) == d &&
+                estimates.shape(0) == actions && estimates.shape(1) == samples &&
+                estimates.shape(2) == d && clouds.shape(0) == actions &&
+                clouds.shape(1) == samples && clouds.shape(3) == d && members > 0 &&
+                standard_deviation.shape(0) == d,
+            "shapes differ");
+    require(stage < policy.num_stages(), "there is no such stage");
+    if (!all_finite(true_states.data(), true_states.size()) ||
+        !all_finite(estimates.data(), estimates.size()) ||
+        !all_finite(clouds.data(), clouds.size())) {
+        return false;
+    }
+    const auto [interval, looks, steps] = lengths;
+    WithoutInterpreter released;
+    roll_out(world, policy,
+             {actions, samples, members, true_states.data(), estimates.data(), clouds.data(), stage,
+              standard_deviation.data(), tolerance, interval, looks, steps, discount, price,
+              counts_steps},
+             to_stream(stream), threads, returns.data());
+    return true;
+}
+
+nb::tuple beliefs_without_truth_batch(
+    InPlace<double, 3> weights, const Input<2>& states,
+    const nb::ndarray<const std::int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>& truths,
+    const Input<2>& at, double negligible) {
+    const std::size_t actions = weights.shape(0), samples = weights.shape(1),
+                      count = weights.shape(2), dimension = states.shape(1), members = at.shape(1);
+    require(states.shape(0) == count && truths.shape(0) == samples && at.shape(0) == samples,
+            "shapes differ");
+    for (std::size_t i = 0; i < samples; ++i) {
+        const std::int64_t truth = truths.data()[i];
+        require(truth >= 0 && static_cast<std::size_t>(truth) < count, "there is no such particle");
+    }
+    double* means;
+    std::int64_t* drawn;
+    auto estimates = make_array<double>({actions, samples, dimension}, means);
+    auto clouds = make_array<std::int64_t>({actions, samples, members}, drawn);
+    {
+        WithoutInterpreter released;
+        beliefs_without_truth(actions, samples, count, dimension, members, states.data(),
+                              truths.data(), at.data(), negligible, weights.data(), means, drawn);
+    }
+    return nb::make_tuple(estimates, clouds);
+}
+
+template <class World, class Policy>
 void bind_way(nb::class_<World>& world) {
     world.def("follow", &follow_batch<World, Policy>, nb::arg("policy"),
               nb::arg("states").noconvert(), nb::arg("stage"), nb::arg("offsets"),
               nb::arg("tolerance"), nb::arg("threads"), nb::arg("states_at").noconvert(),
               nb::arg("stages_at").noconvert(), nb::call_guard<StandardRounding>());
+    world.def("roll_out", &roll_out_batch<World, Policy>, nb::arg("policy"),
+              nb::arg("true_states").noconvert(), nb::arg("estimates").noconvert(),
+              nb::arg("clouds").noconvert(), nb::arg("stage"),
+              nb::arg("standard_deviation").noconvert(), nb::arg("tolerance"), nb::arg("stream"),
+              nb::arg("lengths"), nb::arg("discount"), nb::arg("price"), nb::arg("counts_steps"),
+              nb::arg("threads"), nb::arg("returns").noconvert(),
+              nb::call_guard<StandardRounding>());
 }
 
 template <class World>
@@ -233,27 +298,30 @@ void holdfast::bind_geometry(nb::module_& module) {
 
     nb::class_<PegPolicy2D>(module, "PegPolicy2D")
         .def("__init__", [](PegPolicy2D* self, const std::vector<std::array<double, 3>>& stages,
-                            double half_width, double height, const std::array<double, 3>& limits) {
+                            double half_width, double height, const std::array<double, 3>& limits,
+                            const std::array<double, 4>& goal) {
             require(!stages.empty(), "a policy has a stage");
-            new (self) PegPolicy2D{{}, half_width, height, limits};
-            for (const auto& [axis, upright_limit, passed_below] : stages) {
-                self->stages.push_back({axis, upright_limit, passed_below});
+            const auto [axis, tolerance, above, below] = goal;
+            new (self) PegPolicy2D{{}, half_width, height, limits, {axis, tolerance, above, below}};
+            for (const auto& [hole, upright_limit, passed_below] : stages) {
+                self->stages.push_back({hole, upright_limit, passed_below});
             }
         });
     nb::class_<PegPolicy3D>(module, "PegPolicy3D")
         .def("__init__", [](PegPolicy3D* self, double half_width, double upright_limit,
-                            const std::array<double, 6>& limits) {
-            new (self) PegPolicy3D{half_width, upright_limit, limits};
+                            const std::array<double, 6>& limits, double goal_tolerance) {
+            new (self) PegPolicy3D{half_width, upright_limit, limits, goal_tolerance};
         });
     nb::class_<ViaPointPolicy>(module, "ViaPointPolicy")
         .def("__init__", [](ViaPointPolicy* self, const std::vector<std::array<double, 5>>& stages,
                             double step_size) {
             require(!stages.empty(), "a policy has a stage");
-            new (self) ViaPointPolicy{{}, step_size};
+            new (self) ViaPointPolicy(step_size);
             for (const auto& [x, y, gain_x, gain_y, squared_radius] : stages) {
                 self->stages.push_back({{x, y}, {gain_x, gain_y}, squared_radius});
             }
         });
+    define(module, "beliefs_without_truth", &beliefs_without_truth_batch);
     bind_way<DiscWorld, ViaPointPolicy>(disc);
     bind_way<RectangleWorld, PegPolicy2D>(rectangle);
     bind_way<BoxWorld, PegPolicy3D>(box);

@@ -24,23 +24,6 @@ constexpr std::size_t attempts_of_long_work = 16;
 // About what one particle takes; from it follows how many threads are worth their waking.
 constexpr double nanoseconds_of_a_move = 80.0;
 
-template <class World>
-void stop_at_contact(const World& world, const double* state, const double* action,
-                     double tolerance, double* next) {
-    constexpr std::size_t d = World::dimension;
-    for (std::size_t c = 0; c < d; ++c) next[c] = state[c] + action[c];
-    if (!world.collides(next)) return;
-
-    double reached = 0.0, blocked = 1.0;
-    while (blocked - reached > tolerance) {
-        const double fraction = 0.5 * (reached + blocked);
-        if (fraction <= reached || fraction >= blocked) break;  // no number lies between them
-        for (std::size_t c = 0; c < d; ++c) next[c] = state[c] + fraction * action[c];
-        (world.collides(next) ? blocked : reached) = fraction;
-    }
-    for (std::size_t c = 0; c < d; ++c) next[c] = state[c] + reached * action[c];
-}
-
 // Adds noise to the `count` states of one block, of which the first is particle `first`. Returns
 // how many found no free state; those are left as they are.
 template <class World>

@@ -33,6 +33,24 @@ inline thread_local LongWork* long_work = nullptr;
 // Below this number of particles one thread is faster than waking the others.
 inline constexpr std::size_t parallel_threshold = 4096;
 
+// Where an action leads without noise, stopped at contact.
+template <class World>
+void stop_at_contact(const World& world, const double* state, const double* action,
+                     double tolerance, double* next) {
+    constexpr std::size_t d = World::dimension;
+    for (std::size_t c = 0; c < d; ++c) next[c] = state[c] + action[c];
+    if (!world.collides(next)) return;
+
+    double reached = 0.0, blocked = 1.0;
+    while (blocked - reached > tolerance) {
+        const double fraction = 0.5 * (reached + blocked);
+        if (fraction <= reached || fraction >= blocked) break;  // no number lies between them
+        for (std::size_t c = 0; c < d; ++c) next[c] = state[c] + fraction * action[c];
+        (world.collides(next) ? blocked : reached) = fraction;
+    }
+    for (std::size_t c = 0; c < d; ++c) next[c] = state[c] + reached * action[c];
+}
+
 // Moves `count` states by executed actions. `action_stride` is the dimension, or 0 if there is one
 // action for all. `tolerance` is a fraction of the action. `next` does not overlap the inputs.
 //

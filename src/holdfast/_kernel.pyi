@@ -84,6 +84,13 @@ def hypothetical_weights(
     circular: Sequence[int],
     drop_negligible: bool,
 ) -> _Floats: ...
+def beliefs_without_truth(
+    weights: _Floats,
+    states: _Floats,
+    truths: npt.NDArray[np.int64],
+    at: _Floats,
+    negligible: float,
+) -> tuple[_Floats, npt.NDArray[np.int64]]: ...
 def measure_exp(count: int, repetitions: int) -> float: ...
 def measure_visit(count: int, dimension: int, repetitions: int) -> float: ...
 
@@ -94,11 +101,16 @@ class PegPolicy2D:
         half_width: float,
         height: float,
         limits: Sequence[float],
+        goal: tuple[float, float, float, float],
     ) -> None: ...
 
 class PegPolicy3D:
     def __init__(
-        self, half_width: float, upright_limit: float, limits: Sequence[float]
+        self,
+        half_width: float,
+        upright_limit: float,
+        limits: Sequence[float],
+        goal_tolerance: float,
     ) -> None: ...
 
 class ViaPointPolicy:
@@ -127,6 +139,23 @@ class _World:
         threads: int,
         states_at: _Floats,
         stages_at: npt.NDArray[np.int64],
+    ) -> bool: ...
+    def roll_out(
+        self,
+        policy: PegPolicy2D | PegPolicy3D | ViaPointPolicy,
+        true_states: _Floats,
+        estimates: _Floats,
+        clouds: _Floats,
+        stage: int,
+        standard_deviation: _Floats,
+        tolerance: float,
+        stream: _Words,
+        lengths: tuple[int, int, int],
+        discount: float,
+        price: float,
+        counts_steps: bool,
+        threads: int,
+        returns: _Floats,
     ) -> bool: ...
     def move_each(
         self,

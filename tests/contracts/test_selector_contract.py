@@ -134,7 +134,7 @@ class TestEverySelector:
         assert info.samples.shape == (count, 4)
         assert np.isfinite(info.samples).all()
         np.testing.assert_allclose(info.entropies, info.samples.mean(axis=1), rtol=1e-12)
-        assert index == int(np.argmin(info.entropies))
+        assert info.entropies[index] == info.entropies.min()
 
     def test_a_function_of_its_arguments(
         self, problem: Problem, selector: SelectorSettings
@@ -167,7 +167,7 @@ class TestEverySelector:
         assert len(results) == 1
 
     def test_collapsed_beliefs(self, problem: Problem, selector: SelectorSettings) -> None:
-        """All particles alike, or all weight on one: everything stays finite, and ties go low."""
+        """All particles alike, or all weight on one: all is finite, ties go low or are drawn."""
         states = belief_of(problem).states
         one_weight = np.zeros(COUNT)
         one_weight[5] = 1.0
@@ -178,7 +178,7 @@ class TestEverySelector:
             if entropies is not None:
                 assert np.isfinite(entropies).all()
                 np.testing.assert_allclose(entropies, entropies[0], rtol=1e-12)
-                assert index == 0
+                assert index == 0 or selector.method == "expected_return"
 
 
 @pytest.mark.parametrize("selector", SELECTORS, ids=describe)

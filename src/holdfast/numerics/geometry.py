@@ -186,6 +186,49 @@ class _World(KeepsReadOnly):
             _raise_not_finite("states", states)
         return states_at, stages_at
 
+    def roll_out(
+        self,
+        policy: Any,
+        true_states: FloatArray,
+        estimates: FloatArray,
+        clouds: FloatArray,
+        stage: int,
+        standard_deviation: FloatArray,
+        tolerance: float,
+        stream: Stream,
+        lengths: tuple[int, int, int],
+        discount: float,
+        price: float,
+        counts_steps: bool,
+        threads: int,
+    ) -> FloatArray:
+        """Return the rollouts of a policy of the kernel, shape (J, M).
+
+        They are those of :func:`holdfast.planning.expected_return.rollout_returns`; ``lengths`` are
+        the steps from one sensing step to the next, the number of later sensing steps at which the
+        state may become known, and the steps of a rollout. cpp/src/rollouts.hpp has the noise.
+        """
+        returns = np.empty(estimates.shape[:2])
+        rolled_out = self._kernel.own.roll_out(
+            policy,
+            self._rows("true states", true_states),
+            self._rows("estimates", estimates),
+            self._rows("clouds", clouds),
+            stage,
+            standard_deviation,
+            tolerance,
+            stream.for_motion(),
+            lengths,
+            discount,
+            price,
+            counts_steps,
+            threads,
+            returns,
+        )
+        if not rolled_out:
+            _raise_not_finite("clouds", clouds)
+        return returns
+
     def move_each(
         self,
         states: FloatArray,

@@ -26,6 +26,8 @@ them lead to the same actions, and a return is the sum of a hundred noisy steps.
 - A rollout ends at the goal, or as soon as the state is known and the same after every sensing
   action: the rest cancels in every difference. Far from the goal, where all of them lead to the
   same actions, that is soon.
+- The kernel has rollouts of its own for the built-in problems (cpp/src/rollouts.hpp): ten times
+  faster, with contacts to a quarter of an action, and without obstacles once the state is known.
 - The number of samples is doubled, up to a bound, for those sensing actions alone whose paired
   difference from the best is less than two standard errors.
 """
@@ -37,6 +39,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from holdfast import _kernel
 from holdfast.errors import ProblemError
 from holdfast.numerics import reproducible as numerics
 from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -46,10 +49,10 @@ from holdfast.planning import interruption
 from holdfast.planning.belief import Belief, estimate
 from holdfast.planning.settings import PlanningSettings
 from holdfast.problems import checked
-from holdfast.problems.attributes import circular_states, sensing_costs
+from holdfast.problems.attributes import circular_states, has_own, sensing_costs
 from holdfast.problems.problem import Problem, ProblemBase
 
-__all__ = ["Posteriors", "Returns", "expected_returns", "rollout_returns"]
+__all__ = ["Posteriors", "Returns", "expected_returns", "has_own_rollouts", "rollout_returns"]
 
 
 Posteriors = Callable[[Sequence[int], int, Stream], tuple[Sequence[int], FloatArray]]
@@ -62,8 +65,8 @@ _ROUNDS = 4
 _CLOUDS = 5
 _MOTION = 6
 
-_CLOUD = 8
-"""Particles that stand for a posterior where it only has to move."""
+_CLOUD, _KERNEL_CLOUD = 8, 2
+"""Particles that stand for a posterior where it only has to move. In NumPy more cost little."""
 
 _CLOSE = 2.0
 """Standard errors below which a difference counts as undecided."""
@@ -145,37 +148,35 @@ def _sampled_returns(
     """Return the return after each hypothetical observation, shape ``(actions, samples)``."""
     actions, samples, _ = weights.shape
     kind, circular = settings.particle_filter.estimate, circular_states(problem)
-    states = belief.states
-    estimates = np.empty((actions, samples, states.shape[1]))
-    clouds = np.empty((actions, samples, _CLOUD, states.shape[1]))
-    at = (np.arange(_CLOUD) + stream.substream(_CLOUDS).uniform((samples, 1))) / _CLOUD
-    for j in range(actions):
-        for i in range(samples):
+    states, particles = belief.states, np.asarray(truths)
+    # A comparison with NaN is false.
+    if not (weights[:, np.arange(samples), particles] >= 0.0).all():
+        raise ProblemError(
+            f"a hypothetical observation of {problem.name} had no likelihood under any particle"
+        )
+    members = _KERNEL_CLOUD if has_own_rollouts(problem) else _CLOUD
+    at = (np.arange(members) + stream.substream(_CLOUDS).uniform((samples, 1))) / members
+    own = weights.copy()
+    estimates, drawn = _kernel.beliefs_without_truth(own, states, particles, at, _NEGLIGIBLE)
+    if kind != "mean" or circular:
+        for j, i in np.ndindex(actions, samples):
             interruption.check()
-            own = _without(weights[j, i], truths[i])
-            if own is None:
-                raise ProblemError(
-                    f"a hypothetical observation of {problem.name} had no likelihood under any "
-                    "particle"
-                )
-            estimates[j, i] = estimate(Belief(states, own), kind, circular)
-            # np.cumsum adds one by one, in order, unlike np.sum.
-            drawn = np.searchsorted(np.cumsum(own), at[i], side="right")
-            clouds[j, i] = states[np.minimum(drawn, int(np.flatnonzero(own)[-1]))]
-    true_states = states[np.asarray(truths)]
+            estimates[j, i] = estimate(Belief(states, own[j, i]), kind, circular)
     return rollout_returns(
-        problem, settings, true_states, estimates, clouds, stage, stream.substream(_MOTION)
+        problem,
+        settings,
+        states[particles],
+        estimates,
+        states[drawn],
+        stage,
+        stream.substream(_MOTION),
     )
 
 
-def _without(weights: FloatArray, particle: int) -> FloatArray | None:
-    """Return normalised weights without one particle's, unless that is all there is."""
-    if not weights[particle] >= 0.0:
-        return None  # NaN
-    rest = weights.copy()
-    rest[particle] = 0.0
-    total = numerics.sum(rest)
-    return rest / total if total > _NEGLIGIBLE else np.ascontiguousarray(weights)
+def has_own_rollouts(problem: Problem) -> bool:
+    """Tell whether the rollouts are those of the kernel, as for the built-in problems."""
+    alike = ("policy", "execute", "move", "next_stage", "reward", "is_goal", "known_state_return")
+    return has_own(problem, "rollout_returns", alike) and not circular_states(problem)
 
 
 def rollout_returns(
@@ -202,12 +203,29 @@ def rollout_returns(
     motion : Stream
         The noise of the motion, the same for all J.
     """
-    rollouts = _Rollouts(problem, settings, true_states, estimates, clouds, stage)
     interval = settings.sensing_interval + 1
     looks = settings.selector.rollout_looks
     costs = sensing_costs(problem, optional=settings.selector.sensing_is_optional)
     price = numerics.sum(costs) / costs.shape[0]
-    for step in range(settings.selector.rollout_steps):
+    own_rewards = getattr(type(problem), "reward", None) is not ProblemBase.reward
+    counts_steps = settings.selector.rollout_reward == "steps" or not own_rewards
+    discount, steps = settings.active_sensing.discount, settings.selector.rollout_steps
+    if has_own_rollouts(problem):
+        return checked.rollout_returns(
+            problem,
+            true_states,
+            estimates,
+            clouds,
+            stage,
+            motion,
+            (interval, looks, steps),
+            discount,
+            price,
+            counts_steps,
+            settings.active_sensing.num_cores,
+        )
+    rollouts = _Rollouts(problem, discount, counts_steps, true_states, estimates, clouds, stage)
+    for step in range(steps):
         interruption.check()
         later, between = divmod(step, interval)
         if between == 0 and later > 0:
@@ -232,17 +250,17 @@ class _Rollouts:
     def __init__(
         self,
         problem: Problem,
-        settings: PlanningSettings,
+        discount: float,
+        counts_steps: bool,
         true_states: FloatArray,
         estimates: FloatArray,
         clouds: FloatArray,
         stage: int,
     ) -> None:
         actions, samples, size = estimates.shape
-        own_rewards = getattr(type(problem), "reward", None) is not ProblemBase.reward
         self._problem = problem
-        self._counts_steps = settings.selector.rollout_reward == "steps" or not own_rewards
-        self._discount = settings.active_sensing.discount
+        self._counts_steps = counts_steps
+        self._discount = discount
         self._factor = 1.0
         self.returns = np.zeros((actions, samples))
         self._unknown = samples

@@ -113,12 +113,15 @@ def choose_sensing_action(
 ) -> tuple[int, SensingInfo]:
     """Choose a sensing action for a belief: an index, the lowest of equally good ones.
 
+    Of equal expected returns the method ``expected_return`` draws one: where nothing is gained
+    within its rollouts, no sensor is preferred for its number.
+
     If ``selector.sensing_is_optional``, the index ``len(problem.sensing_actions)`` is the choice
     not to sense. It wins where nothing gains more than its price: of equally good choices it is the
     one without effort.
 
     The stream ``hypotheses`` has the random numbers of the hypothetical observations, ``selection``
-    the one of the method ``random``.
+    the one of the method ``random`` and of equal expected returns.
 
     Raises
     ------
@@ -146,7 +149,7 @@ def choose_sensing_action(
         return int(float(selection.anew().uniform()) * choices), SensingInfo(None, None, 0, 0)
 
     if selector.method == "expected_return":
-        return _greatest_return(problem, settings, belief, stage, hypotheses)
+        return _greatest_return(problem, settings, belief, stage, hypotheses, selection)
 
     points_of = _points_of(problem, settings)
     if selector.method == "path_entropy":
@@ -225,7 +228,12 @@ def _total_factor(settings: PlanningSettings) -> float:
 
 
 def _greatest_return(
-    problem: Problem, settings: PlanningSettings, belief: Belief, stage: int, hypotheses: Stream
+    problem: Problem,
+    settings: PlanningSettings,
+    belief: Belief,
+    stage: int,
+    hypotheses: Stream,
+    selection: Stream,
 ) -> tuple[int, SensingInfo]:
     likelihoods = 0
     not_sensing = len(problem.sensing_actions)
@@ -245,6 +253,9 @@ def _greatest_return(
     # What is least: as for the other methods.
     losses = -returns.means
     index = _least(losses, optional=settings.selector.sensing_is_optional)
+    if index != not_sensing:
+        best = np.flatnonzero(losses == losses[index])
+        index = int(best[int(float(selection.anew().uniform()) * len(best))])
     return index, SensingInfo(losses, -returns.samples, likelihoods, 0)
 
 

@@ -185,6 +185,7 @@ class CapsuleRobot(RigidBodyProblem):
         return np.where(self.world.collides(states + actions), -1.0, 0.0)
 
     expected_path = RigidBodyProblem.follow_policy
+    rollout_returns = RigidBodyProblem.roll_out_policy
 
     def is_goal(self, states: FloatArray) -> BoolArray:
         """Tell where the centre is within the goal's radius."""

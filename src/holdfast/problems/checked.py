@@ -56,6 +56,7 @@ __all__ = [
     "require_usable",
     "reward",
     "rewards",
+    "rollout_returns",
     "sample_observation",
     "scene",
 ]
@@ -330,6 +331,14 @@ def known_state_return(problem: Any, states: FloatArray, stages: IntArray) -> Fl
     own_stages.setflags(write=False)
     values = _finite(problem, function, _ask(problem, function, rows, own_stages), rows.shape[:1])
     return values.reshape(stages.shape)
+
+
+def rollout_returns(
+    problem: Any, true_states: FloatArray, estimates: FloatArray, *further: Any
+) -> FloatArray:
+    """Return the problem's own rollouts, shape (J, M): a built-in problem's, in the kernel."""
+    found = _ask(problem, "rollout_returns", true_states, estimates, *further)
+    return _array(problem, "rollout_returns", found, estimates.shape[:2])
 
 
 def initial_states(problem: Any, stream: Stream, count: int) -> FloatArray:

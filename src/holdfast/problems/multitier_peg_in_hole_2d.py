@@ -6,6 +6,7 @@ task's stage, and the robot must notice from its estimate alone that it has pass
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Annotated, ClassVar
 
@@ -113,6 +114,7 @@ class MultitierPegInHole2D(PegProblem):
         self._upright_limits = constant(
             [upright_limit(hole.tol, 0.5 * height) for hole in model.holes]
         )
+        last = model.holes[-1]
         stages = np.column_stack([self._hole_x, self._upright_limits, self._passed_below])
         self._path_policy = KernelObject(
             _kernel.PegPolicy2D,
@@ -120,6 +122,7 @@ class MultitierPegInHole2D(PegProblem):
             self._half_width,
             self._peg_height,
             self._upper_limits.tolist(),
+            (last.center[0], last.tol, -math.inf, last.center[1]),
         )
 
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
@@ -141,6 +144,7 @@ class MultitierPegInHole2D(PegProblem):
         return int(following) if np.ndim(following) == 0 else following
 
     expected_path = PegProblem.follow_policy
+    rollout_returns = PegProblem.roll_out_policy
 
     def is_goal(self, states: FloatArray) -> BoolArray:
         """Tell where the peg's centre is below that of the last hole, near its axis."""

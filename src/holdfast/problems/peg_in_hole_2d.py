@@ -96,6 +96,7 @@ class PegInHole2D(PegProblem):
             self._half_width,
             0.0,
             self._upper_limits.tolist(),
+            (0.0, model.hole_tolerance, -model.hole_tolerance, model.hole_tolerance),
         )
 
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
@@ -111,6 +112,7 @@ class PegInHole2D(PegProblem):
         return actions
 
     expected_path = PegProblem.follow_policy
+    rollout_returns = PegProblem.roll_out_policy
 
     def is_goal(self, states: FloatArray) -> BoolArray:
         """Tell where the peg is half-way in the hole."""

@@ -106,7 +106,11 @@ class PegInHole3D(PegProblem):
         self._half_width = 0.5 * min(model.peg_dim[0], model.peg_dim[1])
         self._upright_limit = upright_limit(model.hole_tolerance, 0.5 * model.peg_dim[2])
         self._path_policy = KernelObject(
-            _kernel.PegPolicy3D, self._half_width, self._upright_limit, self._upper_limits.tolist()
+            _kernel.PegPolicy3D,
+            self._half_width,
+            self._upright_limit,
+            self._upper_limits.tolist(),
+            model.hole_tolerance,
         )
 
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
@@ -123,6 +127,7 @@ class PegInHole3D(PegProblem):
         return actions
 
     expected_path = PegProblem.follow_policy
+    rollout_returns = PegProblem.roll_out_policy
 
     def is_goal(self, states: FloatArray) -> BoolArray:
         """Tell where the peg is half-way in the hole."""

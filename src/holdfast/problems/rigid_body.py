@@ -57,6 +57,9 @@ Tolerance = Annotated[float, msgspec.Meta(ge=1e-12, lt=1.0)]
 """Finer ones change nothing that matters, and each halving costs time."""
 Seed = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
+_ROLLOUT_TOLERANCE = 0.25
+"""Fraction of an action to which a rollout finds a contact: noise follows that is larger."""
+
 StructT = TypeVar("StructT", bound=msgspec.Struct)
 
 SMALLEST_RESOLUTION = 1e-3
@@ -111,7 +114,7 @@ class RigidBodyProblem(KeepsReadOnly, ProblemBase):
     Model: ClassVar[type[Any]]
     StateSpacePlanner: ClassVar[type[Any]]
     _path_policy: KernelObject
-    """The policy as the kernel has it, for ``expected_path``."""
+    """The policy, rewards and goal as the kernel has them."""
 
     @classmethod
     def from_settings(
@@ -187,6 +190,40 @@ class RigidBodyProblem(KeepsReadOnly, ProblemBase):
         """
         return self.world.follow(
             self._path_policy.own, states, stage, offsets, self._collision_tolerance, threads
+        )
+
+    def roll_out_policy(
+        self,
+        true_states: FloatArray,
+        estimates: FloatArray,
+        clouds: FloatArray,
+        stage: int,
+        motion: Stream,
+        lengths: tuple[int, int, int],
+        discount: float,
+        price: float,
+        counts_steps: bool,
+        threads: int,
+    ) -> FloatArray:
+        """Return the rollouts of ``expected_return``, in the kernel.
+
+        A problem makes this its ``rollout_returns``, as :meth:`follow_policy` its
+        ``expected_path``.
+        """
+        return self.world.roll_out(
+            self._path_policy.own,
+            true_states,
+            estimates,
+            clouds,
+            stage,
+            self._motion_deviation,
+            max(self._collision_tolerance, _ROLLOUT_TOLERANCE),
+            motion,
+            lengths,
+            discount,
+            price,
+            counts_steps,
+            threads,
         )
 
     def _check_sensing_action(self, sensing_action: int) -> None:

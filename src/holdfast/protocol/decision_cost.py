@@ -18,6 +18,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
+from holdfast.planning.expected_return import has_own_rollouts
 from holdfast.planning.settings import (
     ENTROPY_METHODS,
     UNINFORMED_METHODS,
@@ -329,6 +330,16 @@ def _expected_return(sizes: _Sizes) -> Cost:
     seconds += posteriors * (sizes.estimate_s() + (25e3 + 14.0 * particles) * unit_s)
     steps = float(selector.rollout_steps)
     interval = planning.sensing_interval + 1.0
+    num_bytes = 16.0 * choices * samples * particles + 24.0 * choices * samples * rounds
+    if not sizes.general:
+        num_bytes += 24.0 * sizes.senses * own.observation_size * particles
+    if has_own_rollouts(sizes.problem):
+        # The true state and two particles; and once at each look the way from there.
+        unknown_steps = min(steps, interval * selector.rollout_looks)
+        known_steps = min(steps / interval, float(selector.rollout_looks)) * steps
+        seconds += posteriors * 6.0 * unknown_steps * sizes.move_s(1.0, 0.0)
+        seconds += posteriors * 20.0 * known_steps * unit_s
+        return Cost(seconds, num_bytes)
     # Columns of a rollout: it forks at each of the next looks, and carries a cloud up to the last.
     looks = min(float(selector.rollout_looks), math.floor((steps - 1.0) / interval))
     forks = 0.0 if own.known_return is not None else looks
@@ -351,14 +362,9 @@ def _expected_return(sizes: _Sizes) -> Cost:
     seconds += rounds * steps * call_s
     last = samples if rounds == 1.0 else max(sizes.samples, samples / 2.0)
     columns = 1.0 + forks
-    num_bytes = (
-        6.0 * sizes.state_bytes
-        + 16.0 * choices * last * particles
-        + 8.0 * choices * last * (columns * (4.0 * numbers + 8.0) + 4.0 * _CLOUD * numbers)
-        + 24.0 * choices * samples * rounds
+    num_bytes += 6.0 * sizes.state_bytes + 8.0 * choices * last * (
+        columns * (4.0 * numbers + 8.0) + 4.0 * _CLOUD * numbers
     )
-    if not sizes.general:
-        num_bytes += 24.0 * sizes.senses * own.observation_size * particles
     return Cost(seconds, num_bytes)
 
 
