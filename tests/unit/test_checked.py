@@ -84,6 +84,11 @@ MISFITS: dict[str, tuple[str, Any, str]] = {
         lambda *_: np.float64(5.3),
         r"is_goal of line is .*5\.3.*: must be True or False",
     ),
+    "a text as failure": (
+        "is_failure",
+        lambda *_: "wall",
+        "is_failure of line returned str .*: need one number",
+    ),
     "integer states": (
         "initial_states",
         lambda _self, _stream, count: np.zeros((count, 2), np.int64),

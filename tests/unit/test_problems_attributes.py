@@ -15,6 +15,7 @@ from holdfast.problems.attributes import PARAMETERS, check_problem, resolution_o
 from holdfast.problems.problem import (
     BatchedMotionProblem,
     ExpectedMotionProblem,
+    FailingProblem,
     GeneralObservationProblem,
     KnownStateReturnProblem,
     Problem,
@@ -178,6 +179,7 @@ def test_the_parameters_are_those_of_the_contract() -> None:
         Problem,
         GeneralObservationProblem,
         ExpectedMotionProblem,
+        FailingProblem,
         KnownStateReturnProblem,
         BatchedMotionProblem,
         ShownMovesProblem,

@@ -59,6 +59,7 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "execute": ("actions",),
     "reward": ("states", "actions"),
     "is_goal": ("states",),
+    "is_failure": ("states",),
     "scene": (),
     "log_likelihood": ("states", "sensing_action", "observation"),
     "sample_observation": ("state", "sensing_action", "stream"),

@@ -33,11 +33,12 @@ from holdfast.printable import one_line
 from holdfast.problems.attributes import has_own, name_of
 
 __all__ = [
+    "ends",
     "executed_action",
     "expected_move",
     "expected_path",
-    "goals",
     "initial_states",
+    "is_failure",
     "is_goal",
     "known_state_return",
     "log_likelihood",
@@ -307,16 +308,27 @@ def rewards(problem: Any, states: FloatArray, actions: FloatArray) -> FloatArray
     return _finite(problem, "reward", found, states.shape[:-1])
 
 
-def goals(problem: Any, states: FloatArray) -> BoolArray:
-    """Return which of many states are goals."""
-    reached = _ask(problem, "is_goal", states)
+def ends(problem: Any, states: FloatArray) -> tuple[BoolArray, BoolArray | None]:
+    """Return which of many states end the task, and which of them in failure.
+
+    The second is None for a problem that has no failures. A state that is a goal, too, is one.
+    """
+    reached = _truths(problem, "is_goal", states)
+    if getattr(problem, "is_failure", None) is None:
+        return reached, None
+    failed = _truths(problem, "is_failure", states)
+    return reached | failed, failed
+
+
+def _truths(problem: Any, function: str, states: FloatArray) -> BoolArray:
+    found = _ask(problem, function, states)
     shape = states.shape[:-1]
-    if not isinstance(reached, np.ndarray) or reached.dtype != np.bool_ or reached.shape != shape:
+    if not isinstance(found, np.ndarray) or found.dtype != np.bool_ or found.shape != shape:
         raise ProblemError(
-            f"is_goal of {name_of(problem)}, asked of {states.shape[0]} states at once, returned "
-            f"{reached!r:.80}: need as many truth values"
+            f"{function} of {name_of(problem)}, asked of {states.shape[0]} states at once, "
+            f"returned {found!r:.80}: need as many truth values"
         )
-    return reached.copy()
+    return found.copy()
 
 
 def known_state_return(problem: Any, states: FloatArray, stages: IntArray) -> FloatArray | None:
@@ -408,9 +420,20 @@ def scene(problem: Any) -> Any:
 
 def is_goal(problem: Any, state: FloatArray) -> bool:
     """Tell whether one state is a goal: true or false, or 1 or 0."""
-    single = _single(problem, "is_goal", _ask(problem, "is_goal", state))
+    return _truth(problem, "is_goal", state)
+
+
+def is_failure(problem: Any, state: FloatArray) -> bool:
+    """Tell whether one state ends the task in failure; none does if the problem does not say."""
+    if getattr(problem, "is_failure", None) is None:
+        return False
+    return _truth(problem, "is_failure", state)
+
+
+def _truth(problem: Any, function: str, state: FloatArray) -> bool:
+    single = _single(problem, function, _ask(problem, function, state))
     if single not in (0, 1):
-        raise ProblemError(f"is_goal of {name_of(problem)} is {single!r}: must be True or False")
+        raise ProblemError(f"{function} of {name_of(problem)} is {single!r}: must be True or False")
     return bool(single)
 
 

@@ -44,6 +44,7 @@ from holdfast.numerics.randomness import Stream
 __all__ = [
     "BatchedMotionProblem",
     "ExpectedMotionProblem",
+    "FailingProblem",
     "GeneralObservationProblem",
     "KnownStateReturnProblem",
     "Problem",
@@ -357,6 +358,21 @@ class ReinitialisedProblem(Protocol):
 
     def reinitial_states(self, states: FloatArray, stream: Stream) -> FloatArray:
         """Draw a new belief after the particles ``states``, of the same shape."""
+        ...
+
+
+class FailingProblem(Protocol):
+    """One more method, for a task that can fail; without it a trial succeeds or runs out of steps.
+
+    A simulated trial ends there as ``"failed"``, and so does a rollout of ``expected_return``. By
+    rewards, a rollout has no further ones then: give the failure one of its own (in ``reward``,
+    which is asked of the state that was reached), or to fail soon is cheap. Counted in steps, it
+    costs all that are left of ``selector.rollout_steps``. A real robot's environment says itself
+    how a trial ends.
+    """
+
+    def is_failure(self, states: FloatArray) -> BoolArray:
+        """Tell which states end the task in failure, of the leading shape, also if at a goal."""
         ...
 
 

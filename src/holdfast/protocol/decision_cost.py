@@ -92,7 +92,7 @@ class ProblemCost(NamedTuple):
         Time of the mean and variance of one sensing action's observation; with a general
         likelihood, of drawing an observation and evaluating it.
     judge : CallCost
-        Time of ``reward`` and ``is_goal`` together.
+        Time of ``reward``, ``is_goal`` and ``is_failure`` together.
     path_step : CallCost
         Time of one step of a noise-free path.
     known_return : CallCost or None

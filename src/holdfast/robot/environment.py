@@ -182,8 +182,10 @@ class SimulatedEnvironment(KeepsReadOnly):
         return MoveResult(reward, motion, observation) if self._moves_show else reward
 
     @in_own_mode
-    def is_done(self) -> bool:
-        """Return whether the true state is a goal."""
+    def is_done(self) -> Done:
+        """Return whether the true state is a goal, or ``"failed"`` if it is a failure."""
+        if checked.is_failure(self._problem, self.state):
+            return "failed"
         return checked.is_goal(self._problem, self.state)
 
     def steps_performed(self) -> int:

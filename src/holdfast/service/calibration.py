@@ -131,7 +131,7 @@ def _measure(problem: Any, one_s: float, own: dict[str, Any]) -> None:
 
     def judge(states: FloatArray) -> None:
         problem.reward(states, np.broadcast_to(action, (len(states), action.size)))
-        problem.is_goal(states)
+        checked.ends(problem, states)
 
     own["judge"] = _measured(judge, few, many)
 
