@@ -60,6 +60,9 @@ class TwoEnds(hf.ProblemBase):
     def is_goal(self, states):
         return self.at_an_end(states) & (states[..., 1] * self.sign(states) > 0.0)
 
+    def is_failure(self, states):
+        return self.at_an_end(states) & ~self.is_goal(states)
+
 
 class Corridor(TwoEnds):
     """Along x to the length, and there up or down by one."""
@@ -128,18 +131,3 @@ class Sorting(TwoEnds):
     def at_an_end(self, states):
         there = np.abs(np.abs(states[..., 1]) - 2.0) < 0.15
         return there & (np.abs(states[..., 0]) < 0.5)
-
-
-class World(hf.SimulatedEnvironment):
-    """Ends the trial at either end."""
-
-    def __init__(self, problem, seed, trial, performed=()):
-        super().__init__(problem, seed, trial)
-        self.problem = problem
-        for task_action in performed:  # after a crash
-            self.perform(task_action)
-
-    def is_done(self):
-        if not self.problem.at_an_end(self.state):
-            return False
-        return super().is_done() or hf.Ending("failed", "the wrong end")

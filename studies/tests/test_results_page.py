@@ -118,7 +118,7 @@ def test_the_page_says_that_the_default_is_not_beaten_in_the_study() -> None:
     rows = [
         row for row in table_of("selectors", "default_candidates") if row["candidate"] == default
     ]
-    assert len(rows) == 80
+    assert len(rows) == 160
     assert not any(row["beaten_in"] for row in rows)
     assert f"in 0 of {len(rows)} comparisons" in PAGE
 
