@@ -42,13 +42,16 @@ class TwoEnds(hf.ProblemBase):
         return self.shows[sensing_action][1] + 0.0 * states[..., 0]
 
     def log_likelihood(self, states, sensing_action, observation):
+        return self.log_likelihoods(states, sensing_action, observation[np.newaxis])[0]
+
+    def log_likelihoods(self, states, sensing_action, observations):
         coordinate, spread = self.shows[sensing_action]
         if coordinate < 2:
-            deviations = (observation[0] - states[..., coordinate]) / spread
+            deviations = (observations - states[:, coordinate]) / spread
             return -0.5 * deviations * deviations
         right = self.rightly(states, sensing_action)
-        agrees = observation[0] * states[..., coordinate] > 0.0
-        return numerics.log(np.where(agrees, right, 1.0 - right))
+        agrees = observations * states[:, coordinate] > 0.0
+        return np.where(agrees, numerics.log(right), numerics.log(1.0 - right))
 
     def sample_observation(self, state, sensing_action, stream):
         coordinate, spread = self.shows[sensing_action]

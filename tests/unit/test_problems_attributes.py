@@ -14,6 +14,7 @@ from holdfast.planning.planner import Planner
 from holdfast.problems.attributes import PARAMETERS, check_problem, resolution_of
 from holdfast.problems.problem import (
     BatchedMotionProblem,
+    BatchedObservationProblem,
     ExpectedMotionProblem,
     FailingProblem,
     GeneralObservationProblem,
@@ -182,6 +183,7 @@ def test_the_parameters_are_those_of_the_contract() -> None:
         FailingProblem,
         KnownStateReturnProblem,
         BatchedMotionProblem,
+        BatchedObservationProblem,
         ShownMovesProblem,
         ReinitialisedProblem,
     )
@@ -205,7 +207,6 @@ class TestMisspelt:
         ("name", "meant"),
         [
             ("log_likelyhood", "log_likelihood"),
-            ("log_likelihoods", "log_likelihood"),
             ("reinitial_state", "reinitial_states"),
             ("sensing_cost", "sensing_costs"),
             ("circular_observation", "circular_observations"),
@@ -233,6 +234,8 @@ class TestMisspelt:
         )
         with pytest.raises(ProblemError, match="go together; it has log_likelyhood: did you mean"):
             check_problem(broken)
+        with pytest.raises(ProblemError, match="line has log_likelihoods alone: log_likelihood "):
+            check_problem(self.of(log_likelihoods=lambda *_: 0.0))
 
     def test_one_that_is_needed(self) -> None:
         class Bare(ProblemBase):

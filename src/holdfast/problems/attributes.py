@@ -30,6 +30,7 @@ __all__ = [
     "circular_actions",
     "circular_observation",
     "circular_states",
+    "has_batched_likelihoods",
     "has_circular_observations",
     "has_general_observations",
     "has_own",
@@ -63,6 +64,7 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "scene": (),
     "log_likelihood": ("states", "sensing_action", "observation"),
     "sample_observation": ("state", "sensing_action", "stream"),
+    "log_likelihoods": ("states", "sensing_action", "observations"),
     "known_state_return": ("states", "stages"),
     "move_each": ("states", "actions", "streams", "threads"),
     "move_by_measurement": ("states", "motion", "stream"),
@@ -96,7 +98,8 @@ def check_problem(problem: Any) -> None:
     ------
     ProblemError
         If an attribute is missing or out of bounds, a function cannot be called as it will be, or
-        only one of ``log_likelihood`` and ``sample_observation`` is there.
+        only one of ``log_likelihood`` and ``sample_observation`` is there, or ``log_likelihoods``
+        without them.
     """
     check_sizes(problem)
     name = problem.name
@@ -133,6 +136,8 @@ def check_problem(problem: Any) -> None:
         for function in ("log_likelihood", "sample_observation")
         if hasattr(problem, function)
     ]
+    if not given and hasattr(problem, "log_likelihoods"):
+        given = ["log_likelihoods"]
     if len(given) == 1:
         raise ProblemError(
             f"{name} has {given[0]} alone: log_likelihood and sample_observation go together"
@@ -437,6 +442,11 @@ def _costs_of_actions(problem: Any, otherwise: float) -> FloatArray:
 def has_general_observations(problem: object) -> bool:
     """Tell whether a problem gives a likelihood of its own instead of a Gaussian one."""
     return hasattr(problem, "log_likelihood")
+
+
+def has_batched_likelihoods(problem: object) -> bool:
+    """Tell whether a problem evaluates the likelihoods of several observations at once."""
+    return has_own(problem, "log_likelihoods", ("log_likelihood",))
 
 
 def choice_labels(problem: Any) -> list[str]:

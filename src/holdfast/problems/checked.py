@@ -42,6 +42,7 @@ __all__ = [
     "is_goal",
     "known_state_return",
     "log_likelihood",
+    "log_likelihoods",
     "measured_motion",
     "move",
     "move_each",
@@ -167,6 +168,30 @@ def log_likelihood(
     return _likelihoods(problem, "log_likelihood", found, states, observation, under)
 
 
+def log_likelihoods(
+    problem: Any, states: FloatArray, sensing_action: int, observations: Sequence[FloatArray]
+) -> FloatArray:
+    """Return those of several observations, shape ``(num_observations, num_particles)``.
+
+    Only for a problem that :func:`~holdfast.problems.attributes.has_batched_likelihoods`.
+    """
+    function = "log_likelihoods"
+    sizes = {each.size for each in observations}
+    if len(sizes) > 1:
+        raise ProblemError(
+            f"sample_observation of {name_of(problem)} drew observations of {min(sizes)} and of "
+            f"{max(sizes)} coordinates under sensing action {sensing_action}: {function} needs "
+            "them to be of one size"
+        )
+    together = np.array(observations)
+    together.setflags(write=False)
+    found = _ask(problem, function, states, sensing_action, together)
+    shape = (len(observations), *states.shape[:-1])
+    values = _array(problem, function, found, shape)
+    under = f"under sensing action {sensing_action}"
+    return _require_likelihoods(problem, function, values, together, under)
+
+
 def move_log_likelihood(
     problem: Any, states: FloatArray, task_action: FloatArray, observation: FloatArray
 ) -> FloatArray:
@@ -190,7 +215,16 @@ def _likelihoods(
     where: str,
 ) -> FloatArray:
     values = _array(problem, function, found, states.shape[:-1])
-    if np.isnan(values).any() or (values == np.inf).any():
+    return _require_likelihoods(problem, function, values, observation, where)
+
+
+def _require_likelihoods(
+    problem: Any, function: str, values: FloatArray, observation: FloatArray, where: str
+) -> FloatArray:
+    # A comparison with NaN is false.
+    if not (values < np.inf).all():
+        if observation.ndim > 1:
+            observation = observation[np.argmin((values < np.inf).all(axis=1))]
         raise ProblemError(
             f"{function} of {name_of(problem)}, observation {in_brief(observation)} {where}, "
             "is NaN or plus infinity for a particle"

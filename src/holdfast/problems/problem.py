@@ -43,6 +43,7 @@ from holdfast.numerics.randomness import Stream
 
 __all__ = [
     "BatchedMotionProblem",
+    "BatchedObservationProblem",
     "ExpectedMotionProblem",
     "FailingProblem",
     "GeneralObservationProblem",
@@ -239,7 +240,7 @@ class GeneralObservationProblem(Protocol):
 
     With them ``observation_mean`` and ``observation_variance`` are not used and need not be there.
     Sensing costs more: the likelihood is evaluated in Python, once for each hypothetical
-    observation.
+    observation, or once for all of a sensing action (:class:`BatchedObservationProblem`).
 
     A robot is found lost (:mod:`holdfast.planning.lost`) by observations that no particle can have
     made. A likelihood that is zero nowhere has none of these. An attribute ``rank_test = True``
@@ -263,6 +264,22 @@ class GeneralObservationProblem(Protocol):
         self, state: FloatArray, sensing_action: int, stream: Stream
     ) -> FloatArray:
         """Draw an observation in one state, shape ``(observation_size,)``."""
+        ...
+
+
+class BatchedObservationProblem(Protocol):
+    """One more method, for speed, beside those of :class:`GeneralObservationProblem`."""
+
+    def log_likelihoods(
+        self, states: FloatArray, sensing_action: int, observations: FloatArray
+    ) -> FloatArray:
+        """Return :meth:`GeneralObservationProblem.log_likelihood` of several observations.
+
+        ``observations`` has the shape ``(num_observations, observation_size)``, the result
+        ``(num_observations, num_particles)``: what is the same for all of them is computed once.
+        The result has the bits of one after the other. A method that a class inherits is not used
+        if the class itself replaces ``log_likelihood``.
+        """
         ...
 
 
