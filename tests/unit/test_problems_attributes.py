@@ -67,6 +67,11 @@ from holdfast.problems.problem import (
         ("circular", "0", "circular of line"),
         ("circular", 0, "circular of line is 0: must be different indices"),
         ("circular", (0.5,), "circular of line"),
+        (
+            "static_parameters",
+            (2,),
+            r"static_parameters of line is \(2,\): .* coordinates that do not move, from 0 to 1,",
+        ),
         ("circular_actions", (1,), "circular_actions of line is .* from 0 to 0, such as"),
         ("circular_observations", (0,), "circular_observations of line is .*: must be 2 sequences"),
         ("circular_observations", ((0,), 1), r"circular_observations\[1\] of line is 1: must be"),

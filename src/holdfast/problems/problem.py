@@ -167,6 +167,11 @@ class Problem(Protocol):
     ``numerics.wrapped(goal - heading)`` for a difference of angles. Noise on an observed angle is
     that of its shorter way round, so its standard deviation should be below one radian.
 
+    It may say which coordinates of a state are continuous parameters that do not move (a landmark,
+    a drift), as indices: ``static_parameters = (2, 3)``. Resampling then draws them anew from a
+    kernel about each particle (:func:`holdfast.planning.belief.regularised`); otherwise copies of a
+    few values are left. What must keep its values, a bit, is none.
+
     It may have ``sensing_costs``, the price of each sensing action in units of reward, numbers
     from 0 to 1e150. A trial's reward is less by it at each sensing, and ``expected_return`` weighs
     it against what sensing gains; methods that minimise an entropy do with a rate,
@@ -436,6 +441,7 @@ class ProblemBase:
     resolution: float | FloatArray = 0.1
     state_resolution: float | FloatArray | None = None
     circular: Sequence[int] = ()
+    static_parameters: Sequence[int] = ()
     circular_actions: Sequence[int] = ()
     circular_observations: Sequence[Sequence[int]] = ()
     motion_variance: FloatArray = np.array([0.01])
