@@ -42,13 +42,16 @@ class TwoEnds(hf.ProblemBase):
         return self.shows[sensing_action][1] + 0.0 * states[..., 0]
 
     def log_likelihood(self, states, sensing_action, observation):
+        return self.log_likelihoods(states, sensing_action, observation[np.newaxis])[0]
+
+    def log_likelihoods(self, states, sensing_action, observations):
         coordinate, spread = self.shows[sensing_action]
         if coordinate < 2:
-            deviations = (observation[0] - states[..., coordinate]) / spread
+            deviations = (observations - states[:, coordinate]) / spread
             return -0.5 * deviations * deviations
         right = self.rightly(states, sensing_action)
-        agrees = observation[0] * states[..., coordinate] > 0.0
-        return numerics.log(np.where(agrees, right, 1.0 - right))
+        agrees = observations * states[:, coordinate] > 0.0
+        return np.where(agrees, numerics.log(right), numerics.log(1.0 - right))
 
     def sample_observation(self, state, sensing_action, stream):
         coordinate, spread = self.shows[sensing_action]
@@ -59,6 +62,9 @@ class TwoEnds(hf.ProblemBase):
 
     def is_goal(self, states):
         return self.at_an_end(states) & (states[..., 1] * self.sign(states) > 0.0)
+
+    def is_failure(self, states):
+        return self.at_an_end(states) & ~self.is_goal(states)
 
 
 class Corridor(TwoEnds):
@@ -128,18 +134,3 @@ class Sorting(TwoEnds):
     def at_an_end(self, states):
         there = np.abs(np.abs(states[..., 1]) - 2.0) < 0.15
         return there & (np.abs(states[..., 0]) < 0.5)
-
-
-class World(hf.SimulatedEnvironment):
-    """Ends the trial at either end."""
-
-    def __init__(self, problem, seed, trial, performed=()):
-        super().__init__(problem, seed, trial)
-        self.problem = problem
-        for task_action in performed:  # after a crash
-            self.perform(task_action)
-
-    def is_done(self):
-        if not self.problem.at_an_end(self.state):
-            return False
-        return super().is_done() or hf.Ending("failed", "the wrong end")

@@ -45,6 +45,7 @@ _STUDIES: Mapping[str, str] = {
     "selectors": "studies.selectors:Selectors",
     "parameters": "studies.parameters:Parameters",
     "estimates": "studies.estimates:Estimates",
+    "myopic": "studies.myopic:Myopic",
     "sensing_price": "studies.sensing_price:SensingPrice",
 }
 """Where each is; imported when it is needed."""

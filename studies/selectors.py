@@ -88,7 +88,10 @@ _CANDIDATES = (
 """Candidates for the default, of which the trials for choosing choose one."""
 
 BEFORE = "action entropy, neighbours"
-"""The default before, with which the candidates are compared."""
+"""The default before."""
+
+RIVALS = (BASELINE, BEFORE, "state entropy, neighbours", "action covariance")
+"""With which the candidates are compared."""
 
 _DISTRACTING = ("busy room", "passer-by")
 """Problems made so that state entropy and action entropy differ."""
@@ -353,8 +356,8 @@ def _chosen_ways(chosen_by: _Places, places: _Places) -> pd.DataFrame:
 def _default_candidates(chosen_by: _Places, cells: _Cells) -> pd.DataFrame:
     """Return the comparisons that decide whether a candidate becomes the default.
 
-    It does not if the baseline or the default before beats it beyond noise, in steps or success, in
-    any row. The p-values of a candidate are adjusted for all its comparisons of both measures.
+    It does not if a rival beats it beyond noise, in steps or success, in any row. The p-values of a
+    candidate are adjusted for all its comparisons of both measures.
     """
     chosen = _fewest_steps(chosen_by, next(iter(GROUPS)), _CANDIDATES)
     return pd.concat(
@@ -380,7 +383,7 @@ def _candidate(candidate: str, cells: _Cells) -> pd.DataFrame:
         }
         for case in _CASES
         for name, intervals in _EACH_AND_ALL
-        for rival in (BASELINE, BEFORE)
+        for rival in RIVALS
     )
     levels = statistics.holm(np.concatenate([table["steps_p_value"], table["success_p_value"]]))
     table["steps_adjusted_p_value"], table["success_adjusted_p_value"] = np.split(levels, 2)

@@ -37,8 +37,9 @@ COLUMNS = (
 )
 """Of the table of a batch: a row for each trial.
 
-``step_limit`` is the limit of a trial with which it is continued, if it is, and ``steps_to_goal``
-the steps that it took within that limit; None if it did not reach the goal.
+The ``steps`` of a trial that fails are its limit, whenever that was. ``step_limit`` is the limit of
+a trial with which it is continued, if it is, and ``steps_to_goal`` the steps that it took within
+that limit; None if it did not reach the goal.
 """
 
 _DIGEST_CHARACTERS = 16
@@ -125,7 +126,7 @@ def run_trials_of(
             (
                 trial,
                 result.success,
-                result.steps,
+                wanted.max_steps if result.failed else result.steps,
                 result.reward,
                 result.sensing_decisions,
                 result.mean_sensing_ms,

@@ -95,7 +95,7 @@ class SimulatedRobot(Node):
                 return response
             response.success = True
             response.steps = self._world.step
-            response.done = bool(self._world.is_done())  # your robot: has the task succeeded?
+            response.done = self._world.is_done() is True  # your robot: has the task succeeded?
         return response
 
     def act_service(self, request, response):

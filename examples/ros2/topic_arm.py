@@ -51,7 +51,7 @@ class TopicArm(Node):
         self._tell()
 
     def _tell(self):
-        state = [self._trial, self._world.step, int(self._world.is_done())]
+        state = [self._trial, self._world.step, int(self._world.is_done() is True)]
         self._state.publish(Int32MultiArray(data=state))
         self.get_logger().debug(f"trial {self._trial}, move {self._world.step}")
 

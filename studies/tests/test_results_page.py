@@ -118,16 +118,16 @@ def test_the_page_says_that_the_default_is_not_beaten_in_the_study() -> None:
     rows = [
         row for row in table_of("selectors", "default_candidates") if row["candidate"] == default
     ]
-    assert len(rows) == 80
+    assert len(rows) == 160
     assert not any(row["beaten_in"] for row in rows)
     assert f"in 0 of {len(rows)} comparisons" in PAGE
 
 
 def test_the_pages_say_by_how_much_it_is_beaten_elsewhere() -> None:
     points = [
-        -100.0 * float(row["effect"])
-        for row in table_of("two_ends", "outcomes")
-        if (row["method"], row["measure"]) == ("path_entropy", "success_rate")
+        -100.0 * float(row["success_gain"])
+        for row in table_of("myopic", "outcomes")
+        if (row["way"], row["rival"]) == ("default", "random")
     ]
     said = f"{min(points):.0f} to {max(points):.0f} points"
     for text in (PAGE, README, (DOCS / "problems.md").read_text(encoding="utf-8")):

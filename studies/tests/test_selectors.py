@@ -324,14 +324,15 @@ def decided() -> Iterator[Report]:
 
 def test_what_decides_about_the_default(decided: Report) -> None:
     rows = list(decided.summary["default_candidates"].to_dict("records"))
-    assert len(rows) == 3 * len(CASES) * (len(selectors.INTERVALS) + 1) * 2
+    assert len(rows) == 3 * len(CASES) * (len(selectors.INTERVALS) + 1) * 4
     assert {row["candidate"] for row in rows if row["chosen"]} == {PATH}
     for row in rows:
         path = str(row["candidate"]).startswith("path")
         slow = path and row["problem"] == "busy room" and row["sensing_interval"] == 14
-        assert row["beaten_in"] == ("steps" if slow else ""), row
-        better = row["problem"] == "tight hole" and path
-        assert row["success_gain"] == (0.5 if better else 0.0)
+        fails = not path and row["problem"] == "tight hole" and row["rival"] in selectors.RIVALS[2:]
+        assert row["beaten_in"] == ("steps" if slow else "success" if fails else ""), row
+        better = path and row["problem"] == "tight hole" and row["rival"] in selectors.RIVALS[:2]
+        assert row["success_gain"] == (0.5 if better else -0.5 if fails else 0.0)
         assert row["candidate"] != PATH or better == (float(row["success_adjusted_p_value"]) < 0.05)
 
 

@@ -48,6 +48,7 @@ PLAIN: dict[str, Any] = {
     "state_labels": ("heading (rad)", "place (m)"),
     "circular": (0,),
     "circular_actions": (0,),
+    "static_parameters": (1,),
     "circular_observations": ((0,), ()),
     "motion_variance": (0.01, 0.04),
     "resolution": (0.1, 0.2),

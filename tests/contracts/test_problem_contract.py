@@ -6,6 +6,7 @@ A problem of your own can be put through the same checks: register it, and it is
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ OF_EXPERIMENTS = [
     "studies.busy_room:BusyRoom",
     "studies.vdp_tag:VdpTag",
 ]
+BATCHED = ["studies.two_ends:TwoCues", "studies.two_ends:TMaze", "studies.two_ends:Sorting"]
 motion = partial(stream, SEED, 0, 0, Purpose.PREDICTION)  # anew at each call
 
 
@@ -114,6 +116,23 @@ def test_observations(problem: Problem, leading: tuple[int, ...]) -> None:
         assert np.isfinite(mean).all()
         assert (variance > 0.0).all()
         assert np.isfinite(variance).all()
+
+
+@pytest.mark.parametrize("place", BATCHED)
+def test_likelihoods_of_several_observations_are_those_of_each(place: str) -> None:
+    several: Any = registry.problem_class(place).from_settings({}, {})
+    states = some_states(several, (50,))
+    for sensing_action in range(len(several.sensing_actions)):
+        observations = np.array(
+            [
+                several.sample_observation(state, sensing_action, motion().substream(number))
+                for number, state in enumerate(states[:7])
+            ]
+        )
+        together = several.log_likelihoods(states, sensing_action, observations)
+        for own, observation in zip(together, observations, strict=True):
+            alone = several.log_likelihood(states, sensing_action, observation)
+            assert own.tobytes() == alone.tobytes()
 
 
 def test_a_batch_is_its_elements(problem: Problem) -> None:

@@ -39,6 +39,9 @@ class Varying(Line):
     def known_state_return(self, states: Any, stages: Any) -> Any:
         return -np.abs(states[:, 0])
 
+    def is_failure(self, states: Any) -> Any:
+        return states[..., 1] > 2.5
+
     def reinitial_states(self, states: Any, stream: Any) -> Any:
         return states + stream.normal(states.shape)
 

@@ -135,6 +135,16 @@ def test_a_general_likelihood_is_measured(clock: Clock) -> None:
     assert found.observation_size == 7
     assert found.sense.state_s == pytest.approx(1e-6)
 
+    class Together(General):
+        def log_likelihoods(self, states: Any, sensing_action: int, observations: Any) -> Any:
+            clock.now += 4e-6 * len(states)
+            return np.zeros((len(observations), len(states)))
+
+    found = measure_problem(Together())
+    assert found.observation_size == 7
+    assert found.sense.state_s == pytest.approx(4e-6 / calibration._BATCH)
+    assert found.sense.call_s == pytest.approx(1e-5)
+
 
 def test_the_machine_is_compared_with_the_one_of_the_model(
     monkeypatch: pytest.MonkeyPatch, clock: Clock

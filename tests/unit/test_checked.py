@@ -84,6 +84,11 @@ MISFITS: dict[str, tuple[str, Any, str]] = {
         lambda *_: np.float64(5.3),
         r"is_goal of line is .*5\.3.*: must be True or False",
     ),
+    "a text as failure": (
+        "is_failure",
+        lambda *_: "wall",
+        "is_failure of line returned str .*: need one number",
+    ),
     "integer states": (
         "initial_states",
         lambda _self, _stream, count: np.zeros((count, 2), np.int64),
@@ -111,6 +116,24 @@ def test_what_a_path_must_be(found: object, need: str) -> None:
     problem: Any = type("Wrong", (Line,), {"expected_path": lambda *_: found})()
     with pytest.raises(ProblemError, match=f"^expected_path of line returned .*: {need}"):
         checked.expected_path(problem, np.zeros((4, 2)), 0, (3,), 1)
+
+
+@pytest.mark.parametrize(
+    ("found", "observations", "message"),
+    [
+        (np.zeros(4), [[1.0], [2.0]], r"returned float64 of shape \(4,\): need .* \(2, 4\)$"),
+        (
+            np.array([[0.0] * 4, [0.0, -np.inf, np.nan, 0.0]]),
+            [[1.0], [2.0]],
+            r"log_likelihoods of line, observation \[2\.\] under sensing action 1, is NaN",
+        ),
+        (np.zeros((2, 4)), [[1.0], [2.0, 3.0]], "of 1 and of 2 coordinates under sensing action 1"),
+    ],
+)
+def test_what_likelihoods_at_once_must_be(found: Any, observations: Any, message: str) -> None:
+    problem: Any = type("Wrong", (Line,), {"log_likelihoods": lambda *_: found})()
+    with pytest.raises(ProblemError, match=message):
+        checked.log_likelihoods(problem, np.zeros((4, 2)), 1, [np.array(o) for o in observations])
 
 
 @pytest.mark.parametrize("function", ["policy", "move", "observation_mean"])

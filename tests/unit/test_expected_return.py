@@ -91,6 +91,18 @@ class TwoDocks(Dock):
         return following if following.ndim else int(following)
 
 
+class Cliff(Dock):
+    """One of the two rollouts below falls after the second observation, the other never."""
+
+    def is_failure(self, states: FloatArray) -> npt.NDArray[np.bool_]:
+        x, y = states[..., 0], states[..., 1]
+        return np.asarray((x > 0.05) & (x < 0.2) & (y > 0.25))
+
+
+class FreeCliff(Cliff, Free):
+    """The same, judged by steps."""
+
+
 class Sonar(Dock):
     """The same with a likelihood of its own."""
 
@@ -222,7 +234,7 @@ class TestRollouts:
     ESTIMATES = np.array([[[0.7, 0.2], [-0.4, 0.9]], [[0.5, 0.6], [-0.6, 1.2]]])
     STATES = np.array([[0.5, 0.5], [-0.5, 1.0]])
 
-    @pytest.mark.parametrize("problem", [Dock(), Free(), TwoDocks()])
+    @pytest.mark.parametrize("problem", [Dock(), Free(), TwoDocks(), Cliff(), FreeCliff()])
     @pytest.mark.parametrize("discount", [1.0, 0.9])
     def test_against_single_robots(self, problem: Dock, discount: float) -> None:
         """Without noise: then it does not matter which column has which."""
@@ -282,6 +294,10 @@ class TestRollouts:
     ) -> float:
         stage, total = 0, 0.0
         for step in range(settings.selector.rollout_steps):
+            if isinstance(problem, Cliff) and problem.is_failure(state):
+                left = range(step, settings.selector.rollout_steps)
+                rest = sum(settings.active_sensing.discount**later for later in left)
+                return total - isinstance(problem, Free) * rest
             if problem.is_goal(state):
                 break
             if step >= known_from:
@@ -368,6 +384,7 @@ class TestRollouts:
         ("function", "own", "message"),
         [
             ("is_goal", lambda _, s: s[..., 0], "is_goal of dock, asked of 4 states at once"),
+            ("is_failure", lambda _, s: s[..., 0], "is_failure of dock, asked"),
             ("reward", lambda *_: 0.0, "reward of dock returned float"),
             ("reward", lambda _, s, __: np.full(s.shape[:-1], np.nan), "all must be finite"),
             ("move", lambda _, s, *__: s * np.inf, "move of dock put particle 0 at"),

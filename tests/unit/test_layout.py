@@ -97,6 +97,7 @@ ELSEWHERE = {
         "thesis_picture": FIGURES,
         "trial_batches": TASKS,
         "trial_files": "studies/tests/test_selectors.py",
+        "two_ends": "studies/tests/test_myopic.py",
         "vdp_trials": "studies/tests/test_vdp_tag.py",
         "westward": "studies/tests/test_estimates.py",
     },

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 import pytest
+from tests.line_problem import Line
 from tests.planning_settings import SEED, STEPS, TRIAL, planning_settings
 
 from holdfast.config import registry
@@ -141,6 +142,34 @@ class TestReplay:
             planner.advance(either, action).belief.states.tobytes() for either in (state, sensed)
         ]
         assert moved[0] == moved[1]
+
+    def test_static_parameters_are_drawn_anew(self) -> None:
+        """And the same again, from a checkpoint: so says every service."""
+
+        class Landmark(Line):
+            def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
+                moved = states + actions + 0.1 * stream.normal(states.shape)
+                moved[..., 1] = states[..., 1]
+                return moved
+
+        class Named(Landmark):
+            static_parameters = (1,)
+
+        distinct, ends = [], []
+        for problem, at in ((Landmark(), 30), (Named(), 30), (Named(), 4)):
+            planner = Planner(problem, planning_settings())
+            state = planner.init(SEED, TRIAL)
+            for step in range(10):
+                if step == at:
+                    state = decode_checkpoint(encode_checkpoint(state))
+                state, _ = planner.observe(state, 1, np.array([0.5]))
+                state = planner.advance(state, np.array([0.1]))
+            values = state.belief.states[:, 1]
+            distinct.append((len(np.unique(values)), len(values)))
+            ends.append(planner.digest(state))
+        assert distinct[0][0] < 0.2 * distinct[0][1]
+        assert distinct[1][0] == distinct[1][1]
+        assert ends[0] != ends[1] == ends[2]
 
 
 class TestPurity:

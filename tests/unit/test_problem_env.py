@@ -231,6 +231,22 @@ class TestRewards:
         assert environment.step(0)[1] == -4.0 - moves
         assert environment.step(2)[1] == -moves
 
+    @pytest.mark.parametrize("reward", ["problem", "steps"])
+    def test_a_failure_ends_the_episode_and_costs_the_steps_that_are_left(
+        self, reward: Any
+    ) -> None:
+        class Wall(PegInHole2D):
+            def is_failure(self, states: Any) -> Any:
+                return states[..., 0] < 3.0  # the peg starts at 4 and goes to 0
+
+        environment, _ = made(problem=Wall.from_settings({}, {}), reward=reward)
+        shown = episode(environment, lambda: 0, seed=1)
+        _, _, terminated, truncated, info = shown[-1]
+        assert (terminated, truncated, info["success"]) == (True, False, False)
+        assert 0 < info["steps"] < 60
+        total = sum(step[1] for step in shown[1:])
+        assert (total == -60.0) if reward == "steps" else -0.2 * info["steps"] < total < 0.0
+
 
 class TestWhatIsRefused:
     @pytest.mark.parametrize(

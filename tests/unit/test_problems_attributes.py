@@ -14,7 +14,9 @@ from holdfast.planning.planner import Planner
 from holdfast.problems.attributes import PARAMETERS, check_problem, resolution_of
 from holdfast.problems.problem import (
     BatchedMotionProblem,
+    BatchedObservationProblem,
     ExpectedMotionProblem,
+    FailingProblem,
     GeneralObservationProblem,
     KnownStateReturnProblem,
     Problem,
@@ -65,6 +67,11 @@ from holdfast.problems.problem import (
         ("circular", "0", "circular of line"),
         ("circular", 0, "circular of line is 0: must be different indices"),
         ("circular", (0.5,), "circular of line"),
+        (
+            "static_parameters",
+            (2,),
+            r"static_parameters of line is \(2,\): .* coordinates that do not move, from 0 to 1,",
+        ),
         ("circular_actions", (1,), "circular_actions of line is .* from 0 to 0, such as"),
         ("circular_observations", (0,), "circular_observations of line is .*: must be 2 sequences"),
         ("circular_observations", ((0,), 1), r"circular_observations\[1\] of line is 1: must be"),
@@ -178,8 +185,10 @@ def test_the_parameters_are_those_of_the_contract() -> None:
         Problem,
         GeneralObservationProblem,
         ExpectedMotionProblem,
+        FailingProblem,
         KnownStateReturnProblem,
         BatchedMotionProblem,
+        BatchedObservationProblem,
         ShownMovesProblem,
         ReinitialisedProblem,
     )
@@ -203,7 +212,6 @@ class TestMisspelt:
         ("name", "meant"),
         [
             ("log_likelyhood", "log_likelihood"),
-            ("log_likelihoods", "log_likelihood"),
             ("reinitial_state", "reinitial_states"),
             ("sensing_cost", "sensing_costs"),
             ("circular_observation", "circular_observations"),
@@ -231,6 +239,8 @@ class TestMisspelt:
         )
         with pytest.raises(ProblemError, match="go together; it has log_likelyhood: did you mean"):
             check_problem(broken)
+        with pytest.raises(ProblemError, match="line has log_likelihoods alone: log_likelihood "):
+            check_problem(self.of(log_likelihoods=lambda *_: 0.0))
 
     def test_one_that_is_needed(self) -> None:
         class Bare(ProblemBase):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -525,6 +526,45 @@ class TestBadInput:
         selector = SelectorSettings(method="action_entropy", estimator="gaussian_mixture_lower")
         with pytest.raises(InvalidValueError, match=r"variance \[.*\]: every entry must be > 0"):
             choose(Wrong(), settings_of(selector), belief_of(1.0, 1.0))
+
+    @pytest.mark.parametrize("method", ["path_entropy", "expected_return"])
+    def test_likelihoods_at_once_have_the_same_bits(self, method: Any) -> None:
+        asked = []
+
+        class General(Coordinates):
+            def log_likelihood(self, states: Any, sensing_action: int, observation: Any) -> Any:
+                asked.append(1)
+                away = observation[0] - states[:, sensing_action]
+                return -50.0 * away * away
+
+            def sample_observation(self, state: Any, sensing_action: int, stream: Stream) -> Any:
+                return state[sensing_action : sensing_action + 1] + 0.1 * stream.normal(1)
+
+        class Together(General):
+            def log_likelihoods(self, states: Any, sensing_action: int, observations: Any) -> Any:
+                assert not observations.flags.writeable
+                asked.append(len(observations))
+                away = observations - states[:, sensing_action]
+                return -50.0 * away * away
+
+        class Another(Together):
+            """Has a likelihood of which the inherited method knows nothing."""
+
+            log_likelihood = General.log_likelihood
+
+        found, calls = [], []
+        settings = settings_of(SelectorSettings(method=method))
+        for problem in (General(), Together(), Another()):
+            asked.clear()
+            chosen, info = choose(problem, settings, belief_of(1.0, 0.5))
+            assert info.entropies is not None
+            found.append((chosen, info.entropies.tobytes(), info.likelihoods))
+            calls.append((len(asked), sum(asked)))
+        assert found[0] == found[1] == found[2]
+        samples = settings.active_sensing.num_observation_samples
+        assert calls[0] == calls[2] == (sum(asked), sum(asked))
+        assert calls[1][0] <= calls[1][1] // samples
+        assert calls[1][1] == sum(asked)
 
     @pytest.mark.parametrize(
         ("bad", "message"),

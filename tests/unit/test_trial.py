@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.line_problem import SETTINGS, Line
 
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import EnvironmentFailedError, InvalidValueError
@@ -114,6 +115,16 @@ class TestOneTrial:
                     max_steps=simulator.max_steps,
                     environment=world,
                 )
+
+    def test_a_simulated_world_may_fail(self) -> None:
+        class Cliff(Line):
+            def is_failure(self, states: Any) -> Any:
+                return states[..., 0] > -1.0  # and so at the goal
+
+        results = [run_trial(Planner(Cliff(), SETTINGS), 2, trial) for trial in range(20)]
+        assert {result.outcome for result in results} == {"failed"}
+        # Of 20 trials, 0.84 each begin there: all of them do with a probability of 0.03.
+        assert 0 < sum(result.steps == 0 for result in results) < 20
 
     @pytest.mark.parametrize("nothing", [None, np.array([np.nan])])
     def test_without_a_reading_the_belief_stays(self, nothing: Any, tmp_path: Path) -> None:

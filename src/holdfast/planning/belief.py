@@ -37,6 +37,7 @@ __all__ = [
     "distinct_particles",
     "effective_sample_size",
     "estimate",
+    "regularised",
     "resample",
     "standard_deviation",
     "update",
@@ -48,6 +49,13 @@ VALIDATION_GATE_SQUARED = 64.0
 """Square of eight standard deviations. An observation further than this from every particle lies
 outside the validation gate; under a correct model in one dimension its probability is below
 2e-15."""
+
+
+_DISCOUNT = 0.98
+"""Of Liu and West's kernel; they propose 0.95 to 0.99."""
+
+_SHRINKAGE = (3.0 * _DISCOUNT - 1.0) / (2.0 * _DISCOUNT)
+_BANDWIDTH = float(np.sqrt(1.0 - _SHRINKAGE * _SHRINKAGE))
 
 
 class Belief(NamedTuple):
@@ -367,3 +375,52 @@ def resample(belief: Belief, stream: Stream) -> Belief:
     states = belief.states[indices]
     states.setflags(write=False)
     return Belief(states, uniform_weights(belief.weights.shape[0]))
+
+
+def regularised(
+    drawn: Belief, weighted: Belief, static: Sequence[int], circular: Sequence[int], stream: Stream
+) -> Belief:
+    """Return resampled particles with new values of the coordinates that do not move.
+
+    Each is drawn from a normal kernel about its particle's value, which is first shrunk towards the
+    mean: so mean and covariance stay those of the belief, however often it is resampled. Source:
+    Liu and West, "Combined parameter and state estimation in simulation-based filtering", 2001.
+
+    Parameters
+    ----------
+    drawn, weighted : Belief
+        After resampling, and before.
+    static, circular : sequence of int
+        The coordinates, and those that are angles.
+    """
+    own = list(static)
+    angles = [own.index(each) for each in circular if each in own]
+    middle = estimate(weighted, circular=circular)[own]
+    away = differences(weighted.states[:, own], middle, angles)
+    factor = _cholesky(weighted.weights, away)
+    noise = stream.substream(0).normal((drawn.states.shape[0], len(own)))
+    moved = middle + _SHRINKAGE * differences(drawn.states[:, own], middle, angles)
+    for row in range(len(own)):
+        for column in range(row + 1):
+            moved[:, row] += _BANDWIDTH * factor[row, column] * noise[:, column]
+    states = drawn.states.copy()
+    states[:, own] = moved
+    if not numerics.all_finite(states):
+        return drawn  # squares of what is spread so far overflow
+    states.setflags(write=False)
+    return Belief(states, drawn.weights)
+
+
+def _cholesky(weights: FloatArray, away: FloatArray) -> FloatArray:
+    """Return the lower factor of a covariance; where nothing is spread, zeros."""
+    size = away.shape[1]
+    factor = np.zeros((size, size))
+    for column in range(size):
+        products = np.ascontiguousarray(away * away[:, [column]])
+        rest = _kernel.weighted_sums(weights, products)
+        for earlier in range(column):
+            rest = rest - factor[:, earlier] * factor[column, earlier]
+        # Below rounding it is a combination of the columns before.
+        if rest[column] > 1e-12 * products[:, column].max():
+            factor[column:, column] = rest[column:] / np.sqrt(rest[column])
+    return factor

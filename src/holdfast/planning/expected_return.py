@@ -23,9 +23,10 @@ them lead to the same actions, and a return is the sum of a hundred noisy steps.
   counts in that mean, too.
 - True state i is left out of the posterior of its own observation. A robot's true state is not
   among its particles, and a posterior of few particles with it would be too good.
-- A rollout ends at the goal, or as soon as the state is known and the same after every sensing
-  action: the rest cancels in every difference. Far from the goal, where all of them lead to the
-  same actions, that is soon.
+- A rollout ends at the goal or in a failure, or as soon as the state is known and the same after
+  every sensing action: the rest cancels in every difference. Far from the goal, where all of them
+  lead to the same actions, that is soon. After a failure no reward follows. Where steps are
+  counted, a failure costs all that are left, as if the goal were never reached.
 - The kernel has rollouts of its own for the built-in problems (cpp/src/rollouts.hpp): ten times
   faster, with contacts to a quarter of an action, and without obstacles once the state is known.
 - The number of samples is doubled, up to a bound, for those sensing actions alone whose paired
@@ -175,7 +176,8 @@ def _sampled_returns(
 
 def has_own_rollouts(problem: Problem) -> bool:
     """Tell whether the rollouts are those of the kernel, as for the built-in problems."""
-    alike = ("policy", "execute", "move", "next_stage", "reward", "is_goal", "known_state_return")
+    ends = ("reward", "is_goal", "is_failure", "known_state_return")
+    alike = ("policy", "execute", "move", "next_stage", *ends)
     return has_own(problem, "rollout_returns", alike) and not circular_states(problem)
 
 
@@ -224,7 +226,9 @@ def rollout_returns(
             counts_steps,
             settings.active_sensing.num_cores,
         )
-    rollouts = _Rollouts(problem, discount, counts_steps, true_states, estimates, clouds, stage)
+    rollouts = _Rollouts(
+        problem, discount, counts_steps, steps, true_states, estimates, clouds, stage
+    )
     for step in range(steps):
         interruption.check()
         later, between = divmod(step, interval)
@@ -252,6 +256,7 @@ class _Rollouts:
         problem: Problem,
         discount: float,
         counts_steps: bool,
+        steps: int,
         true_states: FloatArray,
         estimates: FloatArray,
         clouds: FloatArray,
@@ -270,9 +275,10 @@ class _Rollouts:
         self._offsets = differences(estimates, self._means(), self._circular)
         self._stages: IntArray = np.full((actions, samples), stage, dtype=np.int64)
         self._origins = np.arange(samples)
-        # The probability of the branch; 0 where the goal is reached.
+        # The probability of the branch; 0 where it has ended.
         self._shares = np.ones((actions, samples))
-        self._end_at_goals()
+        self._steps_left = steps
+        self._end()
 
     def pay(self, price: float) -> None:
         """Pay for a later sensing action wherever the goal is not reached."""
@@ -337,7 +343,8 @@ class _Rollouts:
             rewards = checked.rewards(problem, self._states.reshape(-1, size), executed)
             self._add(self._origins, self._shares * rewards.reshape(shape))
         self._factor *= self._discount
-        self._end_at_goals()
+        self._steps_left -= 1
+        self._end()
         return True
 
     def _means(self) -> FloatArray:
@@ -351,10 +358,16 @@ class _Rollouts:
             means[..., angles] = numerics.arctan2(sines, cosines)
         return means
 
-    def _end_at_goals(self) -> None:
+    def _end(self) -> None:
+        """End the branches at the goal, and those that failed: in steps, these cost the rest."""
         rows = self._states.reshape(-1, self._states.shape[2])
-        reached = checked.goals(self._problem, rows).reshape(self._shares.shape)
-        self._shares = np.where(reached, 0.0, self._shares)
+        ended, failed = checked.ends(self._problem, rows)
+        if self._counts_steps and failed is not None and failed.any():
+            rest = 0.0
+            for _ in range(self._steps_left):
+                rest = 1.0 + self._discount * rest
+            self._add(self._origins, -rest * self._shares * failed.reshape(self._shares.shape))
+        self._shares = np.where(ended.reshape(self._shares.shape), 0.0, self._shares)
 
     def drop_decided(self) -> None:
         """Drop the columns in which nothing can differ any more.

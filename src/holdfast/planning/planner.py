@@ -42,6 +42,7 @@ from holdfast.planning.belief import (
     distinct_particles,
     effective_sample_size,
     estimate,
+    regularised,
     resample,
     uniform_weights,
     update,
@@ -61,6 +62,7 @@ from holdfast.problems.attributes import (
     circular_states,
     moves_show,
     sensing_action_of,
+    static_parameters,
 )
 from holdfast.problems.problem import Problem
 
@@ -310,7 +312,11 @@ class Planner:
         # Rounding may leave the size of equal weights a little above their number.
         resampled = threshold == count or found.effective_sample_size <= threshold
         if resampled:
-            belief = resample(belief, stream(state.seed, state.trial, state.step, purpose))
+            own = stream(state.seed, state.trial, state.step, purpose)
+            drawn = resample(belief, own)
+            if static := static_parameters(self.problem):
+                drawn = regularised(drawn, belief, static, circular_states(self.problem), own)
+            belief = drawn
         return belief, found._replace(resampled=resampled)
 
     @in_own_mode

@@ -53,6 +53,7 @@ from holdfast.problems.attributes import (
     circular_actions,
     circular_observation,
     circular_states,
+    has_batched_likelihoods,
     has_circular_observations,
     has_general_observations,
     resolution_of,
@@ -436,17 +437,22 @@ def _general_hypotheses(
     log_prior = numerics.log(belief.weights)
     particles = _stratified(belief.weights, samples, stream)
     streams = stream.substream(_GENERAL_OBSERVATIONS)
-    rows = []
-    for action in actions:
+    together = has_batched_likelihoods(problem)
+    rows = np.empty((len(actions), samples, len(log_prior)))
+    for own_rows, action in zip(rows, actions, strict=True):
+        observations = []
         for i, particle in enumerate(particles):
             interruption.check()
-            observation = checked.sample_observation(
+            shown = checked.sample_observation(
                 problem, belief.states[particle], action, streams.substream(i)
             )
-            rows.append(
-                log_prior + checked.log_likelihood(problem, belief.states, action, observation)
-            )
-    return _GeneralHypotheses(np.ascontiguousarray(rows, dtype=np.float64), log_prior, samples)
+            observations.append(shown)
+            if not together:
+                own_rows[i] = checked.log_likelihood(problem, belief.states, action, shown)
+        if together:
+            own_rows[:] = checked.log_likelihoods(problem, belief.states, action, observations)
+        own_rows += log_prior
+    return _GeneralHypotheses(rows.reshape(-1, len(log_prior)), log_prior, samples)
 
 
 def _stratified(weights: FloatArray, samples: int, stream: Stream) -> list[int]:

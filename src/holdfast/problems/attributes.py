@@ -30,6 +30,7 @@ __all__ = [
     "circular_actions",
     "circular_observation",
     "circular_states",
+    "has_batched_likelihoods",
     "has_circular_observations",
     "has_general_observations",
     "has_own",
@@ -41,6 +42,7 @@ __all__ = [
     "sensing_labels",
     "sequence_of",
     "state_labels",
+    "static_parameters",
 ]
 
 
@@ -59,9 +61,11 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "execute": ("actions",),
     "reward": ("states", "actions"),
     "is_goal": ("states",),
+    "is_failure": ("states",),
     "scene": (),
     "log_likelihood": ("states", "sensing_action", "observation"),
     "sample_observation": ("state", "sensing_action", "stream"),
+    "log_likelihoods": ("states", "sensing_action", "observations"),
     "known_state_return": ("states", "stages"),
     "move_each": ("states", "actions", "streams", "threads"),
     "move_by_measurement": ("states", "motion", "stream"),
@@ -82,6 +86,7 @@ NEEDED = ("initial_states", "move", "policy", "is_goal")
 KNOWN_ATTRIBUTES = (
     *("name", "state_size", "action_size", "num_stages", "sensing_actions", "state_labels"),
     *("resolution", "state_resolution", "motion_variance", "sensing_costs", "rank_test"),
+    "static_parameters",
     *("circular", "circular_actions", "circular_observations", "pose", "up"),
 )
 
@@ -95,7 +100,8 @@ def check_problem(problem: Any) -> None:
     ------
     ProblemError
         If an attribute is missing or out of bounds, a function cannot be called as it will be, or
-        only one of ``log_likelihood`` and ``sample_observation`` is there.
+        only one of ``log_likelihood`` and ``sample_observation`` is there, or ``log_likelihoods``
+        without them.
     """
     check_sizes(problem)
     name = problem.name
@@ -109,7 +115,7 @@ def check_problem(problem: Any) -> None:
             "be a sequence of labels, not empty"
         )
     sensing_costs(problem)
-    _check_circular(problem)
+    _check_coordinates(problem)
     labels = state_labels(problem)
     if labels and len(labels) != problem.state_size:
         raise ProblemError(
@@ -132,6 +138,8 @@ def check_problem(problem: Any) -> None:
         for function in ("log_likelihood", "sample_observation")
         if hasattr(problem, function)
     ]
+    if not given and hasattr(problem, "log_likelihoods"):
+        given = ["log_likelihoods"]
     if len(given) == 1:
         raise ProblemError(
             f"{name} has {given[0]} alone: log_likelihood and sample_observation go together"
@@ -214,10 +222,15 @@ def _check_resolution(problem: Any, attribute: str, of_what: str, size: int) -> 
         )
 
 
-def _check_circular(problem: Any) -> None:
+def _check_coordinates(problem: Any) -> None:
     name = problem.name
-    for attribute, size in (("circular", "state_size"), ("circular_actions", "action_size")):
-        _require_indices(name, attribute, getattr(problem, attribute, ()), getattr(problem, size))
+    for attribute, size, what in (
+        ("circular", "state_size", _ANGLES),
+        ("circular_actions", "action_size", _ANGLES),
+        ("static_parameters", "state_size", "do not move"),
+    ):
+        given = getattr(problem, attribute, ())
+        _require_indices(name, attribute, given, getattr(problem, size), what)
     given = getattr(problem, "circular_observations", ())
     own = sequence_of(given)
     if own == ():
@@ -237,7 +250,12 @@ def _check_circular(problem: Any) -> None:
         _require_indices(name, f"circular_observations[{action}]", each, None)
 
 
-def _require_indices(name: str, attribute: str, given: Any, size: int | None) -> None:
+_ANGLES = "are angles in radians"
+
+
+def _require_indices(
+    name: str, attribute: str, given: Any, size: int | None, what: str = _ANGLES
+) -> None:
     numbers = real_numbers(given)
     usable = numbers is not None and numbers.ndim == 1
     if numbers is not None and usable and numbers.size:
@@ -251,7 +269,7 @@ def _require_indices(name: str, attribute: str, given: Any, size: int | None) ->
         limit = "" if size is None else f" to {size - 1}"
         raise ProblemError(
             f"{attribute} of {name} is {given!r:.80}: must be different indices of coordinates "
-            f"that are angles in radians, from 0{limit}, such as (0,)"
+            f"that {what}, from 0{limit}, such as (0,)"
         )
 
 
@@ -310,6 +328,11 @@ def state_labels(problem: Any) -> tuple[str, ...]:
 def circular_states(problem: Any) -> Sequence[int]:
     """Return which coordinates of a state are angles."""
     return _indices(getattr(problem, "circular", ()))
+
+
+def static_parameters(problem: Any) -> Sequence[int]:
+    """Return which coordinates of a state are parameters that do not move."""
+    return _indices(getattr(problem, "static_parameters", ()))
 
 
 def circular_actions(problem: Any) -> Sequence[int]:
@@ -436,6 +459,11 @@ def _costs_of_actions(problem: Any, otherwise: float) -> FloatArray:
 def has_general_observations(problem: object) -> bool:
     """Tell whether a problem gives a likelihood of its own instead of a Gaussian one."""
     return hasattr(problem, "log_likelihood")
+
+
+def has_batched_likelihoods(problem: object) -> bool:
+    """Tell whether a problem evaluates the likelihoods of several observations at once."""
+    return has_own(problem, "log_likelihoods", ("log_likelihood",))
 
 
 def choice_labels(problem: Any) -> list[str]:

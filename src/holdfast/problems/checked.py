@@ -33,14 +33,16 @@ from holdfast.printable import one_line
 from holdfast.problems.attributes import has_own, name_of
 
 __all__ = [
+    "ends",
     "executed_action",
     "expected_move",
     "expected_path",
-    "goals",
     "initial_states",
+    "is_failure",
     "is_goal",
     "known_state_return",
     "log_likelihood",
+    "log_likelihoods",
     "measured_motion",
     "move",
     "move_each",
@@ -167,6 +169,30 @@ def log_likelihood(
     return _likelihoods(problem, "log_likelihood", found, states, observation, under)
 
 
+def log_likelihoods(
+    problem: Any, states: FloatArray, sensing_action: int, observations: Sequence[FloatArray]
+) -> FloatArray:
+    """Return those of several observations, shape ``(num_observations, num_particles)``.
+
+    Only for a problem that :func:`~holdfast.problems.attributes.has_batched_likelihoods`.
+    """
+    function = "log_likelihoods"
+    sizes = {each.size for each in observations}
+    if len(sizes) > 1:
+        raise ProblemError(
+            f"sample_observation of {name_of(problem)} drew observations of {min(sizes)} and of "
+            f"{max(sizes)} coordinates under sensing action {sensing_action}: {function} needs "
+            "them to be of one size"
+        )
+    together = np.array(observations)
+    together.setflags(write=False)
+    found = _ask(problem, function, states, sensing_action, together)
+    shape = (len(observations), *states.shape[:-1])
+    values = _array(problem, function, found, shape)
+    under = f"under sensing action {sensing_action}"
+    return _require_likelihoods(problem, function, values, together, under)
+
+
 def move_log_likelihood(
     problem: Any, states: FloatArray, task_action: FloatArray, observation: FloatArray
 ) -> FloatArray:
@@ -190,7 +216,16 @@ def _likelihoods(
     where: str,
 ) -> FloatArray:
     values = _array(problem, function, found, states.shape[:-1])
-    if np.isnan(values).any() or (values == np.inf).any():
+    return _require_likelihoods(problem, function, values, observation, where)
+
+
+def _require_likelihoods(
+    problem: Any, function: str, values: FloatArray, observation: FloatArray, where: str
+) -> FloatArray:
+    # A comparison with NaN is false.
+    if not (values < np.inf).all():
+        if observation.ndim > 1:
+            observation = observation[np.argmin((values < np.inf).all(axis=1))]
         raise ProblemError(
             f"{function} of {name_of(problem)}, observation {in_brief(observation)} {where}, "
             "is NaN or plus infinity for a particle"
@@ -308,16 +343,27 @@ def rewards(problem: Any, states: FloatArray, actions: FloatArray) -> FloatArray
     return _finite(problem, "reward", found, states.shape[:-1])
 
 
-def goals(problem: Any, states: FloatArray) -> BoolArray:
-    """Return which of many states are goals."""
-    reached = _ask(problem, "is_goal", states)
+def ends(problem: Any, states: FloatArray) -> tuple[BoolArray, BoolArray | None]:
+    """Return which of many states end the task, and which of them in failure.
+
+    The second is None for a problem that has no failures. A state that is a goal, too, is one.
+    """
+    reached = _truths(problem, "is_goal", states)
+    if getattr(problem, "is_failure", None) is None:
+        return reached, None
+    failed = _truths(problem, "is_failure", states)
+    return reached | failed, failed
+
+
+def _truths(problem: Any, function: str, states: FloatArray) -> BoolArray:
+    found = _ask(problem, function, states)
     shape = states.shape[:-1]
-    if not isinstance(reached, np.ndarray) or reached.dtype != np.bool_ or reached.shape != shape:
+    if not isinstance(found, np.ndarray) or found.dtype != np.bool_ or found.shape != shape:
         raise ProblemError(
-            f"is_goal of {name_of(problem)}, asked of {states.shape[0]} states at once, returned "
-            f"{reached!r:.80}: need as many truth values"
+            f"{function} of {name_of(problem)}, asked of {states.shape[0]} states at once, "
+            f"returned {found!r:.80}: need as many truth values"
         )
-    return reached.copy()
+    return found.copy()
 
 
 def known_state_return(problem: Any, states: FloatArray, stages: IntArray) -> FloatArray | None:
@@ -417,9 +463,20 @@ def scene(problem: Any) -> Any:
 
 def is_goal(problem: Any, state: FloatArray) -> bool:
     """Tell whether one state is a goal: true or false, or 1 or 0."""
-    single = _single(problem, "is_goal", _ask(problem, "is_goal", state))
+    return _truth(problem, "is_goal", state)
+
+
+def is_failure(problem: Any, state: FloatArray) -> bool:
+    """Tell whether one state ends the task in failure; none does if the problem does not say."""
+    if getattr(problem, "is_failure", None) is None:
+        return False
+    return _truth(problem, "is_failure", state)
+
+
+def _truth(problem: Any, function: str, state: FloatArray) -> bool:
+    single = _single(problem, function, _ask(problem, function, state))
     if single not in (0, 1):
-        raise ProblemError(f"is_goal of {name_of(problem)} is {single!r}: must be True or False")
+        raise ProblemError(f"{function} of {name_of(problem)} is {single!r}: must be True or False")
     return bool(single)
 
 

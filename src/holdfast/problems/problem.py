@@ -43,7 +43,9 @@ from holdfast.numerics.randomness import Stream
 
 __all__ = [
     "BatchedMotionProblem",
+    "BatchedObservationProblem",
     "ExpectedMotionProblem",
+    "FailingProblem",
     "GeneralObservationProblem",
     "KnownStateReturnProblem",
     "Problem",
@@ -165,6 +167,11 @@ class Problem(Protocol):
     ``numerics.wrapped(goal - heading)`` for a difference of angles. Noise on an observed angle is
     that of its shorter way round, so its standard deviation should be below one radian.
 
+    It may say which coordinates of a state are continuous parameters that do not move (a landmark,
+    a drift), as indices: ``static_parameters = (2, 3)``. Resampling then draws them anew from a
+    kernel about each particle (:func:`holdfast.planning.belief.regularised`); otherwise copies of a
+    few values are left. What must keep its values, a bit, is none.
+
     It may have ``sensing_costs``, the price of each sensing action in units of reward, numbers
     from 0 to 1e150. A trial's reward is less by it at each sensing, and ``expected_return`` weighs
     it against what sensing gains; methods that minimise an entropy do with a rate,
@@ -238,7 +245,7 @@ class GeneralObservationProblem(Protocol):
 
     With them ``observation_mean`` and ``observation_variance`` are not used and need not be there.
     Sensing costs more: the likelihood is evaluated in Python, once for each hypothetical
-    observation.
+    observation, or once for all of a sensing action (:class:`BatchedObservationProblem`).
 
     A robot is found lost (:mod:`holdfast.planning.lost`) by observations that no particle can have
     made. A likelihood that is zero nowhere has none of these. An attribute ``rank_test = True``
@@ -262,6 +269,22 @@ class GeneralObservationProblem(Protocol):
         self, state: FloatArray, sensing_action: int, stream: Stream
     ) -> FloatArray:
         """Draw an observation in one state, shape ``(observation_size,)``."""
+        ...
+
+
+class BatchedObservationProblem(Protocol):
+    """One more method, for speed, beside those of :class:`GeneralObservationProblem`."""
+
+    def log_likelihoods(
+        self, states: FloatArray, sensing_action: int, observations: FloatArray
+    ) -> FloatArray:
+        """Return :meth:`GeneralObservationProblem.log_likelihood` of several observations.
+
+        ``observations`` has the shape ``(num_observations, observation_size)``, the result
+        ``(num_observations, num_particles)``: what is the same for all of them is computed once.
+        The result has the bits of one after the other. A method that a class inherits is not used
+        if the class itself replaces ``log_likelihood``.
+        """
         ...
 
 
@@ -360,6 +383,21 @@ class ReinitialisedProblem(Protocol):
         ...
 
 
+class FailingProblem(Protocol):
+    """One more method, for a task that can fail; without it a trial succeeds or runs out of steps.
+
+    A simulated trial ends there as ``"failed"``, and so does a rollout of ``expected_return``. By
+    rewards, a rollout has no further ones then: give the failure one of its own (in ``reward``,
+    which is asked of the state that was reached), or to fail soon is cheap. Counted in steps, it
+    costs all that are left of ``selector.rollout_steps``. A real robot's environment says itself
+    how a trial ends.
+    """
+
+    def is_failure(self, states: FloatArray) -> BoolArray:
+        """Tell which states end the task in failure, of the leading shape, also if at a goal."""
+        ...
+
+
 class KnownStateReturnProblem(Protocol):
     """One more method, for ``selector.method: expected_return``; no problem needs it."""
 
@@ -403,6 +441,7 @@ class ProblemBase:
     resolution: float | FloatArray = 0.1
     state_resolution: float | FloatArray | None = None
     circular: Sequence[int] = ()
+    static_parameters: Sequence[int] = ()
     circular_actions: Sequence[int] = ()
     circular_observations: Sequence[Sequence[int]] = ()
     motion_variance: FloatArray = np.array([0.01])

@@ -76,7 +76,7 @@ class ProblemCost(NamedTuple):
     # Time of the mean and variance of one sensing action's observation; with a general likelihood,
     # of drawing an observation and evaluating it.
     sense: CallCost
-    judge: CallCost  # time of ``reward`` and ``is_goal`` together
+    judge: CallCost  # time of ``reward``, ``is_goal`` and ``is_failure`` together
     path_step: CallCost  # time of one step of a noise-free path
     known_return: CallCost | None  # time of ``known_state_return``; None without one
     observation_size: int  # numbers in the largest observation

@@ -57,8 +57,9 @@ def belief_remarks(problem: Any, settings: PlanningSettings, record: TrialRecord
         label = problem.state_labels[at] if problem.state_labels else f"coordinate {at} of a state"
         remarks.append(
             f"{label} does not move, and by step {step} its particles had {least} different values "
-            "left, of which the belief may be certain and wrong: give it some noise in move, or "
-            "take more particles (docs/problems.md, What does not move)"
+            "left, of which the belief may be certain and wrong: if it is continuous, give "
+            f"{name_of(problem)} static_parameters = ({at},), else take more particles "
+            "(docs/problems.md, What does not move)"
         )
     failed = record.result is not None and not record.result.success
     if failed and not remarks and settings.particle_filter.estimate == "mean":

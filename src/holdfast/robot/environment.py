@@ -190,8 +190,10 @@ class SimulatedEnvironment(KeepsReadOnly):
         return MoveResult(reward, motion, observation) if self._moves_show else reward
 
     @in_own_mode
-    def is_done(self) -> bool:
-        """Return whether the true state is a goal."""
+    def is_done(self) -> Done:
+        """Return whether the true state is a goal, or ``"failed"`` if it is a failure."""
+        if checked.is_failure(self._problem, self.state):
+            return "failed"
         return checked.is_goal(self._problem, self.state)
 
     def steps_performed(self) -> int:
@@ -281,6 +283,8 @@ class CheckedEnvironment:
 
     def sense(self, step: int, sensing_action: int) -> Sensed:
         """Perform a sensing action."""
+        # Before sensing: the problem may write into the array that the environment returns.
+        size = self._sizes[sensing_action]
         self.method = "perform_sensing"
         shown = self._environment.perform_sensing(sensing_action)
         if shown is LATER:
@@ -292,7 +296,6 @@ class CheckedEnvironment:
             return Sensed(step, None)
         if self._is_missing(shown):
             return Sensed(step, None, no_reading=True)
-        size = self._sizes[sensing_action]
         need = f"an array of shape ({size or 'n'},), of {_NUMBERS}, or None"
         return Sensed(step, self._array(shown, shown, need, size))
 

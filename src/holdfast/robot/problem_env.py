@@ -86,7 +86,8 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
     the problem's cost of the sensing action. Maximised without costs, -1 each means the fewest
     steps to the goal.
 
-    **End**: ``terminated`` at the goal, ``truncated`` after ``max_steps`` task actions.
+    **End**: ``terminated`` at the goal or in a failure (``is_failure``), ``truncated`` after
+    ``max_steps`` task actions. With -1 for each task action a failure costs all that are left.
 
     **Seeds**: ``reset(seed=s)`` is trial 0 of the seed s, and each further ``reset()`` the next
     trial; ``options={"trial": n}`` takes trial n. ``info`` has ``seed``, ``trial``, ``steps`` (task
@@ -267,7 +268,10 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
         reward, motion, observation = result
         track.move(executed, reward, *map(floats_or_none, (motion, observation)))
         self._ending = ending_of(world.is_done())
-        return -1.0 if reward is None or self._minus_steps else float(reward)
+        if reward is not None and not self._minus_steps:
+            return float(reward)
+        failed = self._ending is not None and self._ending.outcome == "failed"
+        return -1.0 - failed * (self.max_steps - track.state.step)
 
     def _info(self) -> dict[str, Any]:
         track, world = self._running()
@@ -391,7 +395,7 @@ def _ranges(problem: Problem, max_steps: int) -> tuple[FloatArray, FloatArray, F
         noise = _scouts_stream(step, Purpose.PREDICTION)
         states = checked.move(problem, states, executed, noise)
         low, high = np.minimum(low, states.min(axis=0)), np.maximum(high, states.max(axis=0))
-        if checked.goals(problem, states).all():
+        if checked.ends(problem, states)[0].all():
             break
     room = np.where(high > low, _MARGIN * (high - low), 1.0)
     low, high = low - room, high + room

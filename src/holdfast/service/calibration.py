@@ -22,7 +22,7 @@ from holdfast.numerics.arrays import FloatArray, IntArray
 from holdfast.numerics.randomness import Purpose, stream
 from holdfast.planning.estimators import KernelEstimator, NearestNeighbor, kernel_estimator, scaled
 from holdfast.problems import checked
-from holdfast.problems.attributes import has_general_observations, has_own
+from holdfast.problems.attributes import has_batched_likelihoods, has_general_observations, has_own
 from holdfast.problems.problem import Problem
 from holdfast.protocol.decision_cost import TYPICAL_PROBLEM, CallCost, ProblemCost
 
@@ -36,6 +36,9 @@ _FEW, _MANY = 16, 272
 
 _MOST_ACTIONS = 16
 """Bound on the sensing actions that are measured."""
+
+_BATCH = 8
+"""Observations whose likelihoods are evaluated together, where a problem can."""
 
 _SLOW_S = 0.3e-3
 """A function that takes longer is called once."""
@@ -126,7 +129,7 @@ def _measure(problem: Any, one_s: float, own: dict[str, Any]) -> None:
 
     def judge(states: FloatArray) -> None:
         problem.reward(states, np.broadcast_to(action, (len(states), action.size)))
-        problem.is_goal(states)
+        checked.ends(problem, states)
 
     own["judge"] = _measured(judge, few, many)
 
@@ -136,6 +139,16 @@ def _sensed(problem: Any, number: int, few: FloatArray, many: FloatArray) -> tup
     random = stream(0, 0, 0, Purpose.HYPOTHESES)
     if has_general_observations(problem):
         shown = checked.sample_observation(problem, few[0], number, random)
+        if has_batched_likelihoods(problem):
+            several = np.repeat(shown[np.newaxis], _BATCH, axis=0)
+
+            def sense_several(states: FloatArray) -> None:
+                for _ in range(_BATCH):
+                    problem.sample_observation(states[0], number, random.anew())
+                problem.log_likelihoods(states, number, several)
+
+            cost = _measured(sense_several, few, many)
+            return CallCost(cost.call_s / _BATCH, cost.state_s / _BATCH), shown.size
 
         def sense(states: FloatArray) -> None:
             problem.sample_observation(states[0], number, random.anew())

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from holdfast.numerics.arrays import FloatArray
-from holdfast.planning.outcome import TrialResult
+from holdfast.planning.outcome import Done, TrialResult
 from holdfast.planning.tracking import LateObservation
 from holdfast.protocol.records import (
     ActingRecord,
@@ -119,8 +119,8 @@ class EnvironmentModel:
         self._refer()
 
     @property
-    def done(self) -> bool:
-        """Whether the task is done."""
+    def done(self) -> Done:
+        """How the task stands."""
         if self.performed == 0:
             return self._reference.done_at_start
         return self._reference.steps[self.performed - 1].done
@@ -327,7 +327,7 @@ class EnvironmentModel:
         late = sum(self._is_late(step) for step in self._lateness if step < len(reference.steps))
         missing = late - len({delivery.taken for delivery in self._deliveries})
         for name, said, true in (
-            ("success", result.success, self.done),
+            ("success", result.success, self.done is True),
             ("sensing decisions", result.sensing_decisions, sensed),
             ("unexplained observations", result.unexplained_observations, reference.unexplained),
             ("missing observations", result.missing_observations, missing),

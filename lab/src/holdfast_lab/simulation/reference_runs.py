@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from holdfast.numerics.arrays import FloatArray
-from holdfast.planning.outcome import DecisionLog, MoveResult
+from holdfast.planning.outcome import DecisionLog, Done, MoveResult
 from holdfast.planning.planner import ObservationInfo, Planner, PlanningState
 from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
@@ -96,8 +96,8 @@ class ReferenceStep(NamedTuple):
         What it showed, at once or later.
     action : bytes
         The task action, little-endian float64.
-    done : bool
-        Whether the task is done after it.
+    done : bool or "failed"
+        How the task stands after it.
     motion, shown : array or None
         What the move has shown.
     """
@@ -106,7 +106,7 @@ class ReferenceStep(NamedTuple):
     observation: FloatArray | None
     action: bytes
     reward: float | None
-    done: bool
+    done: Done
     motion: FloatArray | None = None
     shown: FloatArray | None = None
 
@@ -115,7 +115,7 @@ class ReferenceRun(NamedTuple):
     """A trial as it goes when nothing disturbs it."""
 
     steps: tuple[ReferenceStep, ...]
-    done_at_start: bool
+    done_at_start: Done
     digest: str
     unexplained: int = 0
     lost: int = 0

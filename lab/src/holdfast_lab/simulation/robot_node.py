@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.errors import HoldfastError, UnknownPerformanceError
 from holdfast.numerics.arrays import FloatArray
-from holdfast.planning.outcome import Ending
+from holdfast.planning.outcome import ending_of
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import (
     LostSettings,
@@ -466,7 +466,7 @@ class RobotNode:
         )
         self._may_doubt = False
         performed = environment.performed if counts else None
-        ending = Ending("succeeded") if environment.done else None
+        ending = ending_of(environment.done)
         last = None
         if performed and resumed.last is not None:
             last = _acted(performed - 1, resumed.last)
@@ -511,5 +511,4 @@ class RobotNode:
 
 
 def _acted(step: int, done: ReferenceStep) -> Acted:
-    ending = Ending("succeeded") if done.done else None
-    return Acted(step, done.reward, ending, done.motion, done.shown)
+    return Acted(step, done.reward, ending_of(done.done), done.motion, done.shown)

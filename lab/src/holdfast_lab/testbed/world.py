@@ -21,7 +21,7 @@ import numpy as np
 
 from holdfast.errors import EnvironmentFailedError
 from holdfast.numerics.arrays import FloatArray
-from holdfast.planning.outcome import MoveResult
+from holdfast.planning.outcome import Done, MoveResult
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import SimulatedEnvironment
 
@@ -94,8 +94,8 @@ class WitnessedWorld:
         os.write(self._descriptor, line.encode())
         return self._world.perform(action)
 
-    def is_done(self) -> bool:
-        """Tell whether the true state is a goal."""
+    def is_done(self) -> Done:
+        """Tell how the task stands."""
         return self._world.is_done()
 
     def steps_performed(self) -> int:
