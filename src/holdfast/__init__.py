@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
     from holdfast.robot.late_sensing import SenseInBackground
     from holdfast.robot.trial import run_trial
+    from holdfast.tuning.simulated_trials import compare, run_trials
 
 __all__ = [
     "LATER",
@@ -59,11 +60,13 @@ __all__ = [
     "SelectorSettings",
     "SenseInBackground",
     "SimulatedEnvironment",
+    "compare",
     "entropy",
     "load_configuration",
     "make",
     "open_run",
     "run_trial",
+    "run_trials",
 ]
 
 __version__ = "0.1.0"
@@ -91,11 +94,13 @@ _PLACES = {
     "Scene": "problems.problem.Scene",
     "SimulatedEnvironment": "robot.environment.SimulatedEnvironment",
     "SelectorSettings": "planning.settings.SelectorSettings",
+    "compare": "tuning.simulated_trials.compare",
     "entropy": "planning.estimators.entropy",
     "load_configuration": "config.loader.load",
     "make": "config.registry.make",
     "open_run": "recording.reading.open_run",
     "run_trial": "robot.trial.run_trial",
+    "run_trials": "tuning.simulated_trials.run_trials",
 }
 """The module of each name, and its name there; type checkers read the imports above."""
 

@@ -59,7 +59,15 @@ class TransportError(HoldfastError):
 
 
 class TrialError(HoldfastError):
-    """An error of holdfast or of the problem's code, with the trial in which it occurred."""
+    """An error of holdfast or of the problem's code, with the trial in which it occurred.
+
+    Attributes
+    ----------
+    arm : Arm or None
+        Whose trial it was, in a pool (:mod:`holdfast.robot.trial_pool`).
+    """
+
+    arm: object | None = None
 
 
 class RunError(HoldfastError):

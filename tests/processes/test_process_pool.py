@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -35,3 +36,22 @@ def test_a_problem_of_the_users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         there = pool.submit(hf.run_trial, planner, 3, max_steps=40).result()
     assert there.digest == hf.run_trial(planner, 3, max_steps=40).digest
+
+
+def test_a_script_runs_trials_on_several_cores(tmp_path: Path) -> None:
+    """Its class goes to the workers, and they do not run the script: it has no guard."""
+    pytest.importorskip("cloudpickle")
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import holdfast as hf\nfrom holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
+        "from holdfast.robot import trial_pool\n"
+        "trial_pool._WORKER_START_S = 0.0  # they take all trials but the first\n"
+        "class Peg(PegInHole2D):\n    resolution = 0.2\n"
+        "planner = hf.Planner(Peg(), particles=30)\n"
+        "runs = [hf.run_trials(planner, 5, max_steps=40, jobs=jobs) for jobs in (1, 2)]\n"
+        "assert [each.digest for each in runs[0]] == [each.digest for each in runs[1]]\n"
+        "print(len(runs[1]), sum(each.steps for each in runs[1]))\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("5 ")
+    assert len(done.stdout.splitlines()) == 1

@@ -64,10 +64,10 @@ import numpy as np
 
 from holdfast import _kernel
 from holdfast.config.loader import load
-from holdfast.robot import trials
+from holdfast.robot import trial_pool, trials
 
 # As if workers cost nothing to start: they take all trials but the first.
-trials._WORKER_START_S = 0.0
+trial_pool._WORKER_START_S = 0.0
 # As if threads cost nothing to wake: they share all work that has more than one part.
 _kernel.use_threads_from(0.0)
 

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from holdfast.cli.application import run_application
-from holdfast.cli.overrides import combined, parse_assignment
+from holdfast.cli.overrides import combined, parse_assignment, parse_values
 from holdfast.config import loader
 from holdfast.config.loader import load
 from holdfast.config.problem_builder import schemas_of
@@ -176,3 +176,23 @@ def test_what_needs_an_environment_is_refused_without_one(path: Path) -> None:
     for words in ("environment.directory=x", "environment.arguments={port: 3}"):
         with pytest.raises(HoldfastError, match=f"^--set {words} needs --environment"):
             run_application(["run", str(path), "--set", words])
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("random, path_entropy", ["random", "path_entropy"]),
+        ("[0, 1],[0, 2]", [[0, 1], [0, 2]]),
+        ("null,0.5", [None, 0.5]),
+        ("{a: 1, b: 2}", [{"a": 1, "b": 2}]),
+    ],
+)
+def test_several_values(text: str, values: list[Any]) -> None:
+    found = parse_values(f"selector.method={text}")
+    assert found == (f"--set selector.method={text}", "selector.method", values)
+
+
+@pytest.mark.parametrize("text", ["selector=1,2", "selector.method=", "selector.a.b=1,2"])
+def test_several_values_need_a_key(text: str) -> None:
+    with pytest.raises(HoldfastError, match=f"--set {text.partition('=')[0]}="):
+        parse_values(text)

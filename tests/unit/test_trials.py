@@ -13,9 +13,10 @@ from holdfast.errors import InvalidValueError, ProblemError, TrialCrashError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
-from holdfast.robot import trials
+from holdfast.robot import trial_pool
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import run_trial
+from holdfast.robot.trial_pool import Arm, TrialPool
 from holdfast.robot.trials import TrialError, run_trials
 
 
@@ -45,6 +46,13 @@ def run_all(
     return results
 
 
+def in_workers(configuration: Configuration) -> list[TrialResult]:
+    """Run four trials in two workers, from the first one on."""
+    arm = Arm.of(configuration)
+    with TrialPool(2) as pool:
+        return [done.result for done in pool.run((arm, trial) for trial in range(4))]
+
+
 class TestManyTrials:
     def test_each_trial_is_run_once(self, tmp_path: Path) -> None:
         results = run_all(configuration_of(tmp_path), jobs=1)
@@ -65,7 +73,7 @@ class TestManyTrials:
         configuration = configuration_of(tmp_path, num_trials=9)
         alone = run_all(configuration, jobs=1)
         # As if workers cost nothing to start: so even these short trials go to them.
-        monkeypatch.setattr(trials, "_WORKER_START_S", 0.0)
+        monkeypatch.setattr(trial_pool, "_WORKER_START_S", 0.0)
         assert decided(run_all(configuration, jobs=2)) == decided(alone)
 
     def test_an_error_in_a_trial_names_it(self, tmp_path: Path) -> None:
@@ -95,7 +103,7 @@ class TestManyTrials:
     def test_a_defect_in_a_worker_comes_back_with_its_traceback(self, tmp_path: Path) -> None:
         configuration = defective_configuration(tmp_path)
         with pytest.raises(TrialCrashError, match=r"(?s)Traceback.*not callable.*in trial [01]"):
-            trials._run_in_workers(configuration, 2, iter(range(4)), 4, 1.0, lambda _: None)
+            in_workers(configuration)
 
     def test_a_reward_that_nobody_defines_is_none(self, tmp_path: Path) -> None:
         configuration = configuration_of(tmp_path)
@@ -174,7 +182,7 @@ class TestManyTrials:
     ) -> None:
         configuration = failing_configuration(tmp_path, error)
         with pytest.raises(expected, match=text):
-            trials._run_in_workers(configuration, 2, iter(range(4)), 4, 1.0, lambda _: None)
+            in_workers(configuration)
 
     @pytest.mark.parametrize("jobs", [0, -1, 1025])
     def test_the_number_of_jobs_is_bounded(self, tmp_path: Path, jobs: int) -> None:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from holdfast.errors import InvalidValueError
 
-__all__ = ["Override", "combined", "parse_assignment"]
+__all__ = ["Override", "combined", "parse_assignment", "parse_values"]
 
 
 class Override(NamedTuple):
@@ -50,6 +50,16 @@ def parse_assignment(assignment: str) -> Override:
     if value is None and text.strip() not in ("null", "~"):
         raise InvalidValueError(f"--set {assignment}: has no value")
     return Override(f"--set {assignment}", f"{section}.{key}", value)
+
+
+def parse_values(assignment: str) -> Override:
+    """Read ``SECTION.KEY=A,B,...``, as ``holdfast sweep --set`` takes it; the value is a list.
+
+    Raises what :func:`parse_assignment` raises.
+    """
+    name, equals, text = assignment.partition("=")
+    found = parse_assignment(f"{name}{equals}[{text}]" if text.strip() else assignment)
+    return found._replace(words=f"--set {assignment}")
 
 
 def combined(overrides: Iterable[Override]) -> dict[str, Any]:

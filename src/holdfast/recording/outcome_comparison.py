@@ -24,9 +24,23 @@ from holdfast.recording.run_directory import (
     recorded_configuration,
     world_of,
 )
+from holdfast.recording.table_formats import Table
+from holdfast.recording.tables import wilson_interval
 from holdfast.robot.environment_maker import BUILT_IN
 
-__all__ = ["OutcomeComparison", "OutcomeEffect", "RunOutcomes", "compare_outcomes", "effects_of"]
+__all__ = [
+    "ComparedRun",
+    "OutcomeComparison",
+    "OutcomeEffect",
+    "OutcomeEstimate",
+    "RunOutcomes",
+    "compare_outcomes",
+    "compare_results",
+    "effects_of",
+    "estimates_of",
+    "read_outcomes",
+    "shown_estimate",
+]
 
 LEVEL = 0.95
 RESAMPLES = 9_999
@@ -90,8 +104,17 @@ class RunOutcomes(msgspec.Struct, frozen=True, kw_only=True):
     notes: tuple[str, ...]
 
 
-class OutcomeComparison(msgspec.Struct, frozen=True, kw_only=True):
-    """The outcomes of runs, compared with those of the first.
+class OutcomeEstimate(NamedTuple):
+    """What a measure is in one run, with its interval; None if trials do not scatter."""
+
+    measure: str
+    trials: int
+    value: float
+    interval: tuple[float, float] | None
+
+
+class OutcomeComparison(Table, msgspec.Struct, frozen=True, kw_only=True):
+    """The outcomes of runs, compared with those of the first; a row for each run and measure.
 
     Attributes
     ----------
@@ -116,6 +139,64 @@ class OutcomeComparison(msgspec.Struct, frozen=True, kw_only=True):
     method: str
     runs: tuple[RunOutcomes, ...]
 
+    def columns(self) -> Sequence[str]:
+        """Return the names of the columns, for programs."""
+        of_effect = ("measure", "kind", "trials", "baseline", "value", "effect")
+        return ("run", *of_effect, "low", "high", "verdict")
+
+    def rows(self) -> list[tuple[object, ...]]:
+        """Return a row for each run and measure; without bounds where all trials are alike."""
+        rows: list[tuple[object, ...]] = []
+        for run in self.runs:
+            for each in run.effects:
+                numbers = (each.trials, each.baseline, each.run, each.effect)
+                bounds = each.interval or (None, None)
+                rows.append((run.run, each.measure, each.kind, *numbers, *bounds, each.verdict))
+        return rows
+
+    def shown(self) -> list[tuple[str, ...]]:
+        """Return a row for each run: its value of each measure, and the effect in brackets."""
+        found = [{effect.measure: effect for effect in run.effects} for run in self.runs]
+        names = [name for name in _TEXTS if any(name in effects for effects in found)]
+        head = ("", "trials", *(_TEXTS[name][0] for name in names))
+        of_baseline = []
+        for name in names:
+            effect = next(effects[name] for effects in found if name in effects)
+            of_baseline.append(_TEXTS[name][2].format(effect.baseline))
+        rows = [(f"{self.baseline} (baseline)", str(self.runs[0].trials), *of_baseline)]
+        for run, effects in zip(self.runs, found, strict=True):
+            cells = (_cell(effects[name]) if name in effects else "-" for name in names)
+            rows.append((run.run, str(run.trials), *cells))
+        return [head, *rows]
+
+    def legend(self) -> str:
+        """Return how the numbers are defined, and the notes."""
+        return "\n".join(
+            [
+                "In brackets: the effect against the baseline and its interval (points of a rate, "
+                "ratios of steps and times, differences of rewards).",
+                *self._definitions(),
+                *self.notes(),
+            ]
+        )
+
+    def notes(self) -> list[str]:
+        """Return what else a person should know, a line for each."""
+        return [f"{run.run}: {note}" for run in self.runs for note in run.notes]
+
+    def _definitions(self) -> list[str]:
+        return [
+            "steps: the geometric mean fits ratios (the summary has the arithmetic one); a trial "
+            f"that did not reach the goal counts as its limit, {self.step_limit:,} steps.",
+            f"intervals: {self.method}, each by itself.",
+        ]
+
+    def fitting(self, width: int) -> str:
+        """Return the table; if it has longer lines than ``width``, one for each run instead."""
+        text = str(self)
+        longest = max(map(len, text.splitlines()[: len(self.runs) + 2]))
+        return text if longest <= width else "\n".join([self.describe(), *self.notes()])
+
     def describe(self) -> str:
         """Return a table for each run, and how its numbers are defined."""
         lines = []
@@ -131,12 +212,7 @@ class OutcomeComparison(msgspec.Struct, frozen=True, kw_only=True):
                 cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
                 lines.append(f"  {'  '.join(cells)}".rstrip())
             lines.append("")
-        lines.append(
-            "steps: the geometric mean fits ratios (the summary has the arithmetic one); a trial "
-            f"that did not reach the goal counts as its limit, {self.step_limit:,} steps."
-        )
-        lines.append(f"intervals: {self.method}, each by itself.")
-        return "\n".join(lines)
+        return "\n".join([*lines, *self._definitions()])
 
     def to_json(self) -> str:
         """Return the comparison as indented JSON."""
@@ -160,12 +236,26 @@ def compare_outcomes(runs: Sequence[Path], *, paired: bool = True) -> OutcomeCom
         If one is no run, is damaged or in use, or if the runs cannot be compared: their problems,
         limits or (if paired) seeds differ, or they have too few trials.
     """
-    baseline, *others = map(_read, runs)
+    found = [read_outcomes(path, str(path)) for path in runs]
+    for other in found[1:]:
+        _require_comparable(found[0], other, paired=paired)
+    return compare_results(found, paired=paired)
+
+
+def compare_results(runs: Sequence[ComparedRun], *, paired: bool = True) -> OutcomeComparison:
+    """Compare results with those of the first run; where settings differ, notes say so.
+
+    Raises
+    ------
+    OutputError
+        If their limits or (if paired) their seeds differ, or they have too few trials.
+    """
+    baseline, *others = runs
     for other in others:
-        _require_comparable(baseline, other, paired=paired)
+        _require_same_worlds(baseline, other, paired=paired)
     over = "pairs of trials" if paired else "trials"
     return OutcomeComparison(
-        baseline=str(baseline.path),
+        baseline=baseline.name,
         paired=paired,
         step_limit=baseline.step_limit,
         level=LEVEL,
@@ -174,31 +264,32 @@ def compare_outcomes(runs: Sequence[Path], *, paired: bool = True) -> OutcomeCom
     )
 
 
-class _Run(NamedTuple):
+class ComparedRun(NamedTuple):
     """What is compared of a run.
 
     Attributes
     ----------
     world : mapping
-        The settings that must be the same for outcomes to be comparable.
+        The settings that say which task it is, as far as known.
     arguments : mapping
         Those of a world that is not simulated: they may say no more than how it is reached.
     simulated : bool
         Whether it is a simulated one.
     """
 
-    path: Path
-    problem_sources: str | None
+    name: str
     results: Mapping[int, TrialResult]
-    is_finished: bool
     seed: Any
     step_limit: int
     world: Mapping[str, Any]
-    arguments: Mapping[str, Any]
-    simulated: bool
+    is_finished: bool = True
+    arguments: Mapping[str, Any] = {}
+    simulated: bool = True
+    problem_sources: str | None = None
 
 
-def _read(path: Path) -> _Run:
+def read_outcomes(path: Path, name: str) -> ComparedRun:
+    """Read what is compared of a recorded run; OutputError if it is none, is damaged or in use."""
     with JournalReader.read_run(path, "compare") as journal:
         meta = journal.meta()
         results = {result.trial: result for result in journal.results()}
@@ -209,8 +300,8 @@ def _read(path: Path) -> _Run:
     # An episode of gymnasium follows from seed and trial, too.
     simulated = environment["object"] is None or environment["object"] in BUILT_IN
     arguments = environment["arguments"] if simulated else environment.pop("arguments")
-    return _Run(
-        path=path,
+    return ComparedRun(
+        name=name,
         problem_sources=meta.get("problem_sources"),
         results=results,
         is_finished=len(results) >= int(simulator["num_trials"]),
@@ -227,23 +318,32 @@ def _read(path: Path) -> _Run:
     )
 
 
-def _require_comparable(baseline: _Run, other: _Run, *, paired: bool) -> None:
+def _require_comparable(baseline: ComparedRun, other: ComparedRun, *, paired: bool) -> None:
     found = first_difference(baseline.world, other.world)
     if found is not None:
         key, old, new = found
         raise OutputError(
-            f"{other.path}: cannot be compared with {baseline.path}: {key} is {new} here and {old} "
+            f"{other.name}: cannot be compared with {baseline.name}: {key} is {new} here and {old} "
             "there, so the trials are of different tasks"
+        )
+    _require_same_worlds(baseline, other, paired=paired)
+
+
+def _require_same_worlds(baseline: ComparedRun, other: ComparedRun, *, paired: bool) -> None:
+    if baseline.step_limit != other.step_limit:
+        raise OutputError(
+            f"{other.name}: cannot be compared with {baseline.name}: the limit is "
+            f"{other.step_limit:,} steps here and {baseline.step_limit:,} there"
         )
     if paired and baseline.seed != other.seed:
         raise OutputError(
-            f"{other.path}: cannot be paired with {baseline.path}: the seed is {other.seed} here "
+            f"{other.name}: cannot be paired with {baseline.name}: the seed is {other.seed} here "
             f"and {baseline.seed} there, so the worlds differ; compare them as independent samples "
             "(--unpaired), which takes more trials to find a difference"
         )
 
 
-def _compare(baseline: _Run, other: _Run, *, paired: bool) -> RunOutcomes:
+def _compare(baseline: ComparedRun, other: ComparedRun, *, paired: bool) -> RunOutcomes:
     notes = []
     if paired:
         trials = sorted(baseline.results.keys() & other.results.keys())
@@ -257,20 +357,25 @@ def _compare(baseline: _Run, other: _Run, *, paired: bool) -> RunOutcomes:
             )
     else:
         pairs = [list(run.results.values()) for run in (baseline, other)]
-    notes += [f"{run.path}: is not finished" for run in (baseline, other) if not run.is_finished]
+    notes += [f"{run.name}: is not finished" for run in (baseline, other) if not run.is_finished]
     if min(map(len, pairs)) < _LEAST_TRIALS:
         raise OutputError(
-            f"{other.path}: too few trials to compare with {baseline.path}: "
+            f"{other.name}: too few trials to compare with {baseline.name}: "
             f"{min(map(len, pairs))}; intervals need at least {_LEAST_TRIALS}"
         )
     if other.problem_sources != baseline.problem_sources:
         notes.append("the source of the problem differs")
+    worlds = baseline.world, other.world
+    here, there = ({key: world[key] for key in worlds[0].keys() & worlds[1]} for world in worlds)
+    if (found := first_difference(here, there)) is not None:
+        key, old, new = found
+        notes.append(f"{key} is {new} here and {old} in {baseline.name}: these are two tasks")
     found = first_difference(baseline.arguments, other.arguments, "environment.arguments")
     if found is not None:
         key, old, new = found
         notes.append(f"{key} is {new} here and {old} there: these may be two worlds")
     return RunOutcomes(
-        run=str(other.path),
+        run=other.name,
         trials=len(pairs[1]),
         effects=effects_of(*pairs, step_limit=baseline.step_limit, paired=paired),
         notes=tuple(notes),
@@ -288,6 +393,27 @@ def effects_of(
     pairs = (first, second)
     effects = (_effect_of(measure, pairs, step_limit, paired=paired) for measure in _MEASURES)
     return tuple(filter(None, effects))
+
+
+def estimates_of(results: Sequence[TrialResult], *, step_limit: int) -> tuple[OutcomeEstimate, ...]:
+    """Return each measure of a run with its interval; rates have Wilson's, others the bootstrap's.
+
+    A measure that no trial has is left out.
+    """
+    found = []
+    for measure in _MEASURES:
+        numbers = _numbers_of(measure, [results], step_limit)
+        if numbers is None or not (known := [each for each in numbers[0] if each is not None]):
+            continue
+        values = np.array(known, dtype=np.float64)
+        interval: tuple[float, float] | None = None
+        if measure.name.endswith("_rate"):
+            interval = wilson_interval(int(values.sum()), values.size)
+        elif values.size >= _LEAST_TRIALS and np.ptp(values) > 0.0:
+            interval = _bootstrap([values], measure.summarise, paired=False)
+        value = float(measure.summarise(values, 0))
+        found.append(OutcomeEstimate(measure.name, values.size, value, interval))
+    return tuple(found)
 
 
 class _Measure(NamedTuple):
@@ -331,15 +457,25 @@ _MEASURES = (
 )
 
 
-def _effect_of(
-    measure: _Measure, pairs: Sequence[Sequence[TrialResult]], limit: int, *, paired: bool
-) -> OutcomeEffect | None:
-    """Return how the second run compares with the first, None if that is not known."""
-    numbers = [[measure.of_trial(result, limit) for result in results] for results in pairs]
+def _numbers_of(
+    measure: _Measure, runs: Sequence[Sequence[TrialResult]], limit: int
+) -> list[list[float | None]] | None:
+    """Return a measure of each trial of each run; None if it says nothing about them."""
+    numbers = [[measure.of_trial(result, limit) for result in results] for results in runs]
     if measure.name == "reward" and any(None in values for values in numbers):
         return None  # a mean over the trials that have one would not be of the same trials
     if measure.name == "failure_rate" and not any(map(any, numbers)):
         return None  # in most worlds nothing can fail
+    return numbers
+
+
+def _effect_of(
+    measure: _Measure, pairs: Sequence[Sequence[TrialResult]], limit: int, *, paired: bool
+) -> OutcomeEffect | None:
+    """Return how the second run compares with the first, None if that is not known."""
+    numbers = _numbers_of(measure, pairs, limit)
+    if numbers is None:
+        return None
     if paired:
         known = [pair for pair in zip(*numbers, strict=True) if None not in pair]
         numbers = [[pair[which] for pair in known] for which in (0, 1)]
@@ -402,25 +538,52 @@ def _bootstrap(
     return float(low), float(high)
 
 
+_TEXTS = {
+    "success_rate": ("success", " points", "{:.1%}", "{:+.1f}"),
+    "failure_rate": ("failed", " points", "{:.1%}", "{:+.1f}"),
+    "steps": ("steps, geometric mean", " times", "{:.4g}", "{:.3g}"),
+    "reward": ("reward, mean", "", "{:.4g}", "{:+.4g}"),
+    "decision_ms": ("decision time, median", " times", "{:.3g} ms", "{:.3g}"),
+}
+"""For people: a measure's title, the unit of its effect, and the formats of value and effect."""
+
+
 def _row(effect: OutcomeEffect) -> tuple[str, ...]:
     """Return what the table says of a measure."""
-    title, unit, of_run, of_effect = {
-        "success_rate": ("success", " points", "{:.1%}", "{:+.1f}"),
-        "failure_rate": ("failed", " points", "{:.1%}", "{:+.1f}"),
-        "steps": ("steps, geometric mean", " times", "{:.4g}", "{:.3g}"),
-        "reward": ("reward, mean", "", "{:.4g}", "{:+.4g}"),
-        "decision_ms": ("decision time, median", " times", "{:.3g} ms", "{:.3g}"),
-    }[effect.measure]
-    scale = 100.0 if effect.measure.endswith("_rate") else 1.0
-    low_high = "all alike"
-    if effect.interval is not None:
-        low, high = (of_effect.format(scale * end) for end in effect.interval)
-        low_high = f"[{low}, {high}]"
+    title, unit, of_run, _ = _TEXTS[effect.measure]
+    changed, low_high = _texts_of(effect)
     return (
         title,
         of_run.format(effect.baseline),
         of_run.format(effect.run),
-        of_effect.format(scale * effect.effect) + unit,
+        changed + unit,
         low_high,
         effect.verdict,
     )
+
+
+def _texts_of(effect: OutcomeEffect) -> tuple[str, str]:
+    """Return the effect, and its interval."""
+    of_effect = _TEXTS[effect.measure][3]
+    scale = 100.0 if effect.measure.endswith("_rate") else 1.0
+    changed = of_effect.format(scale * effect.effect)
+    if effect.interval is None:
+        return changed, "all alike"
+    low, high = (of_effect.format(scale * end) for end in effect.interval)
+    return changed, f"[{low}, {high}]"
+
+
+def _cell(effect: OutcomeEffect) -> str:
+    """Return a run's value, with the effect; a verdict only if there is a difference."""
+    changed, low_high = _texts_of(effect)
+    verdict = f", {effect.verdict}" if effect.verdict in ("better", "worse") else ""
+    return f"{_TEXTS[effect.measure][2].format(effect.run)} ({changed} {low_high}{verdict})"
+
+
+def shown_estimate(estimate: OutcomeEstimate) -> tuple[str, str, str]:
+    """Return a measure's title, its value and its interval, for people."""
+    title, _, of_run, _ = _TEXTS[estimate.measure]
+    low_high = "all alike"
+    if estimate.interval is not None:
+        low_high = f"[{', '.join(of_run.format(end) for end in estimate.interval)}]"
+    return title, of_run.format(estimate.value), low_high

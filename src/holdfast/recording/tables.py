@@ -15,7 +15,7 @@ import numpy as np
 
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
-from holdfast.printable import cell
+from holdfast.recording.table_formats import csv_rows
 from holdfast.recording.timings import AnswerCounts, VerificationCounts
 
 __all__ = ["RunSummary", "SummaryBuilder", "csv_lines", "wilson_interval"]
@@ -111,19 +111,8 @@ def csv_lines(results: Iterable[TrialResult]) -> Iterator[str]:
     Reading a number back gives the same number. None, such as the reward of a trial without one, is
     an empty cell.
     """
-    yield ",".join(TRIAL_COLUMNS) + "\n"
-    for result in results:
-        values = (getattr(result, column) for column in TRIAL_COLUMNS)
-        texts = (
-            "" if value is None else str(int(value)) if isinstance(value, bool) else str(value)
-            for value in values
-        )
-        yield ",".join(map(_quoted, map(str, map(cell, texts)))) + "\n"
-
-
-def _quoted(text: str) -> str:
-    """Return a cell as RFC 4180 writes it."""
-    return '"' + text.replace('"', '""') + '"' if set(text) & set(',"\r\n') else text
+    rows = (tuple(getattr(result, column) for column in TRIAL_COLUMNS) for result in results)
+    yield from csv_rows(TRIAL_COLUMNS, rows)
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:

@@ -12,10 +12,12 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 import weakref
 from collections.abc import Callable, Iterable, Iterator
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
+from types import ModuleType
 from typing import Any
 
 from holdfast.runtime.parent_death import end_with_parent
@@ -121,14 +123,19 @@ def _inherited_by_children(threads: int) -> Iterator[None]:
 
     Ctrl-C, a closed terminal and a batch system's SIGTERM reach every process of the group, and
     only the parent handles them. Blocking them here also covers the child's first moments.
+
+    They do not import the parent's main module: a user's script would begin anew in each.
     """
     variables = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     saved = {name: os.environ.get(name) for name in variables}
     os.environ.update(dict.fromkeys(variables, str(threads)))
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
     try:
         with _no_signals():
             yield
     finally:
+        sys.modules["__main__"] = main
         for name, value in saved.items():
             if value is None:
                 del os.environ[name]

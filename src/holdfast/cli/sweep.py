@@ -1,0 +1,194 @@
+"""``holdfast sweep``: runs of a grid of settings, compared on the same worlds."""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from holdfast.cli.exit_codes import EXIT_CAN_GO_ON, ended_by_signals, interrupted_by
+from holdfast.cli.overrides import combined, parse_assignment, parse_values
+from holdfast.cli.terminal import counted, progress_line
+from holdfast.errors import HoldfastError, InvalidValueError, RunError
+from holdfast.printable import printable
+from holdfast.runtime.command_line import (
+    MAX_JOBS,
+    MAX_SEED,
+    MAX_TRIALS,
+    Options,
+    argument,
+    flag,
+    location,
+    option,
+    whole_number,
+)
+from holdfast.runtime.files import claim_directory, shown_path
+
+if TYPE_CHECKING:
+    from holdfast.config.loader import Configuration
+    from holdfast.planning.outcome import TrialResult
+    from holdfast.tuning.sweep import SweptArm
+
+__all__ = ["main"]
+
+_RUNS = Path("runs")
+
+
+class SweepOptions(Options):
+    """Run all combinations of values on the same worlds, and compare them.
+
+    Each --set names the values of a key; a key with one value is set in all combinations. Each
+    combination gets a directory in DIR as holdfast run makes it. DIR itself gets trials.csv (a row
+    for each trial of each) and the comparison: table.md, table.tex and table.csv. Effects are
+    paired, with 95 % intervals, against the first combination or --baseline.
+
+    Ctrl-C or a crash loses no finished trial: the same command with --resume goes on.
+    """
+
+    exit_codes: ClassVar = {4: None}
+    needs_arguments = True
+
+    configuration: Path = argument("CONFIG", "Configuration file (YAML) of the runs.", location)
+    assignments: tuple[str, ...] = option(
+        "--set",
+        metavar="SECTION.KEY=A,B,...",
+        many=True,
+        help="Values of a key, as YAML: selector.method=path_entropy,random. May be given for "
+        "several keys; the last varies fastest.",
+    )
+    baseline: tuple[str, ...] = option(
+        metavar="SECTION.KEY=A",
+        many=True,
+        help="Compare with the first combination that has this value (default: the first of all).",
+    )
+    trials: int | None = option(
+        metavar="N",
+        read=whole_number(2, MAX_TRIALS),
+        key="simulator.num_trials",
+        help="Number of trials of each combination, instead of the file's.",
+    )
+    seed: int | None = option(
+        metavar="S",
+        read=whole_number(0, MAX_SEED),
+        key="simulator.seed",
+        help="Seed of all random draws, instead of the file's.",
+    )
+    jobs: int | None = option(
+        "-j",
+        metavar="N",
+        read=whole_number(1, MAX_JOBS),
+        help="Largest number of processes (default: one for each core). Changes time only.",
+    )
+    out: Path | None = option(
+        "-o",
+        metavar="DIR",
+        read=location,
+        help="Directory for the results (default: runs/sweep-CONFIG, numbered if taken).",
+    )
+    resume: bool = flag(
+        help="Go on with the sweep in DIR, perhaps with more values or trials; needs --out."
+    )
+    quiet: bool = flag("-q", help="Show no progress: only the table and errors.")
+
+    def resume_command(self, directory: Path) -> str:
+        """Return the command that goes on."""
+        words = [*self.words("out", "resume"), *self.table()["out"].words(directory)]
+        return shlex.join(["holdfast", "sweep", *words, "--resume"])
+
+    def arms(self) -> list[SweptArm]:
+        """Return the combinations."""
+        from holdfast.config.loader import load
+        from holdfast.tuning.sweep import arms_of
+
+        axes = combined(map(parse_values, self.assignments))
+        own = {"simulator.num_trials": self.trials, "simulator.seed": self.seed}
+        given = {key: value for key, value in own.items() if value is not None}
+        for key in given.keys() & axes.keys():
+            option_name = "--trials" if key.endswith("trials") else "--seed"
+            raise InvalidValueError(f"{option_name} and --set both say what {key} is")
+
+        def load_with(values: Mapping[str, Any]) -> Configuration:
+            return load(shown_path(self.configuration), overrides={**given, **values})
+
+        return arms_of(axes, load_with)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the sweep and return the exit code."""
+    options = SweepOptions.parse("sweep", arguments)
+    if not options.assignments:
+        raise InvalidValueError("--set is missing: which values of which key shall be compared?")
+    if options.resume and options.out is None:
+        raise InvalidValueError("--resume needs --out, the directory of the sweep that goes on")
+    with ended_by_signals():
+        return _sweep(options)
+
+
+def _sweep(options: SweepOptions) -> int:
+    from holdfast.robot.trial_pool import available_cores
+    from holdfast.tuning.sweep import Sweep
+
+    runs = _RUNS.absolute()  # before the user's code, which may change the current directory
+    arms = options.arms()
+    baseline = _baseline_of(options, arms)
+    if len(arms) == 1:
+        raise InvalidValueError(
+            f"{options.assignments[0]!r} makes one combination; a sweep compares at least two"
+        )
+    directory = options.out
+    if directory is None or not options.resume:
+        directory = claim_directory(options.out, runs, f"sweep-{options.configuration.stem}")
+    with Sweep(directory, arms) as sweep:
+        line = progress_line(sweep.total, quiet=options.quiet)
+        finished = sweep.finished
+        note = counted(len(arms), "combination")
+
+        def show(result: TrialResult) -> None:
+            nonlocal finished
+            del result
+            finished += 1
+            line.show(finished, note)
+
+        try:
+            title = f"{arms[0].configuration.problem_name}, {note}, {counted(sweep.total, 'trial')}"
+            before = f", {finished:,} finished before" if finished else ""
+            where = shown_path(directory)
+            line.start(f"{title}{before}; results in {where}", finished, note)
+            try:
+                sweep.run(options.jobs or available_cores(), show)
+            finally:
+                with contextlib.suppress(OSError):  # after SIGHUP there is no terminal
+                    line.stop()
+            comparison = sweep.comparison(baseline)
+            names = sweep.write_tables(comparison)
+        except KeyboardInterrupt as interruption:
+            kept = f"{finished:,} of {sweep.total:,} trials are finished and kept in {where}"
+            text = f"\n{interrupted_by(interruption)}. {kept}\nGo on with: "
+            sys.stderr.write(printable(f"{text}{options.resume_command(directory)}\n"))
+            raise
+        except HoldfastError as error:
+            raise RunError(error, options.resume_command(directory), EXIT_CAN_GO_ON) from error
+    table = str(comparison)
+    if sys.stdout.isatty():
+        table = comparison.fitting(shutil.get_terminal_size().columns)
+    sys.stdout.write(printable(f"{table}\n\n{where}/\n  {'  '.join(names)}\n"))
+    return 0
+
+
+def _baseline_of(options: SweepOptions, arms: Sequence[SweptArm]) -> int:
+    """Return the first combination that has the values of ``--baseline``."""
+    wanted = combined(map(parse_assignment, options.baseline))
+    for number, arm in enumerate(arms):
+        if all(
+            key in arm.values and repr(arm.values[key]) == repr(value)
+            for key, value in wanted.items()
+        ):
+            return number
+    raise InvalidValueError(
+        f"--baseline {' --baseline '.join(options.baseline)}: no combination has that; they are "
+        f"{'; '.join(arm.label for arm in arms)}"
+    )

@@ -1,0 +1,534 @@
+"""A pool of worker processes that runs simulated trials of several configurations.
+
+A trial depends on nothing but its arm (a problem, planning settings, seed and limit) and its
+number, so the order and the process in which trials are run change no result.
+
+How to use it::
+
+    with TrialPool(jobs, expected=200) as pool:
+        for finished in pool.run((arm, trial) for trial in range(100) for arm in arms):
+            finished.arm, finished.trial, finished.result, finished.elapsed_s
+
+Results come in any order. :meth:`TrialPool.run` asks for the next trial only when there is room for
+it, so an iterator of ten million trials is never queued anywhere, and one that chooses by the
+results so far (a race) has seen all but the trials of :attr:`TrialPool.waiting`. Where the next
+trials follow from results, submit them in the loop: :meth:`TrialPool.submit`, and
+:meth:`TrialPool.drop` takes back what no worker has begun. Leaving the ``with`` ends the workers at
+once, also on Ctrl-C.
+
+The first trials are run in this process, until the time that a trial takes shows that workers would
+pay for their own start. Each worker holds trials for a tenth of a second, at most 16, and answers
+with one message for each.
+"""
+
+from __future__ import annotations
+
+import os
+import traceback
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import msgspec
+
+from holdfast.config.loader import Configuration
+from holdfast.config.user_code import account_of_user_error
+from holdfast.errors import (
+    HoldfastError,
+    InvalidValueError,
+    TrialCrashError,
+    TrialError,
+    WorkerDiedError,
+)
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import LostSettings, PlanningSettings
+from holdfast.problems.problem import Problem
+from holdfast.robot.trial import (
+    NULL_OBSERVER,
+    SensingStep,
+    TaskStep,
+    TrialObserver,
+    run_trial,
+)
+from holdfast.runtime.command_line import MAX_JOBS
+from holdfast.runtime.workers import WorkerProcess, end_workers
+
+__all__ = ["Arm", "FinishedTrial", "TrialPool", "available_cores"]
+
+_WORKER_START_S = 1.0
+"""About what it costs to start workers; they must save more than this."""
+
+_LOOKAHEAD_S = 0.1
+"""A worker is sent trials for about this long, so that it never waits for the next one."""
+
+_MAX_LOOKAHEAD = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """What trials are run of. Two arms with the same seed meet the same worlds.
+
+    ``dataclasses.replace`` makes an arm with another seed or other settings. Arms are told apart by
+    identity, so they are keys of a dictionary.
+
+    Attributes
+    ----------
+    problem_name : str
+        For messages.
+    label : str
+        What tells it from other arms, for messages; empty if there is only one.
+    plain : mapping or None
+        :meth:`Configuration.plain` of the configuration that built the problem, from which a worker
+        builds it again. None: the problem itself is sent, as a pickle in the pipe.
+    """
+
+    problem: Problem
+    planning: PlanningSettings
+    seed: int
+    max_steps: int
+    lost: LostSettings
+    problem_name: str
+    label: str = ""
+    plain: dict[str, Any] | None = None
+
+    @classmethod
+    def of(cls, configuration: Configuration, label: str = "") -> Arm:
+        """Return the arm of a configuration."""
+        return cls(
+            configuration.problem,
+            configuration.planning,
+            configuration.simulator.seed,
+            configuration.simulator.max_steps,
+            configuration.lost,
+            configuration.problem_name,
+            label,
+            configuration.plain(),
+        )
+
+
+class FinishedTrial(NamedTuple):
+    """A trial that is finished, and the seconds that it took."""
+
+    arm: Arm
+    trial: int
+    result: TrialResult
+    elapsed_s: float
+
+
+class TrialPool:
+    """Runs trials in this process or in workers; the module says how to use it.
+
+    Parameters
+    ----------
+    jobs : int
+        Largest number of processes; 1 runs all trials in this one. Changes time only.
+    expected : int, optional
+        How many trials there will be, as far as known: for so few and short ones that workers would
+        not pay, none is started. None: workers are started for the first one.
+    observer : TrialObserver
+        Observes the trials that are run in this process because no worker could help: all of them
+        if ``jobs`` is 1, else the last one at most.
+
+    Attributes
+    ----------
+    waiting : int
+        Trials that were submitted and are not finished.
+    """
+
+    def __init__(
+        self, jobs: int, *, expected: int | None = None, observer: TrialObserver = NULL_OBSERVER
+    ) -> None:
+        if not 1 <= jobs <= MAX_JOBS:
+            raise InvalidValueError(f"jobs is {jobs}; it must be from 1 to {MAX_JOBS}")
+        self._jobs = jobs
+        self._expected = expected
+        self._observer = observer
+        self._queue: deque[tuple[Arm, int]] = deque()
+        self._workers: list[_Worker] = []
+        self._times: dict[Arm, _Times] = {}
+        self._all_times = _Times()
+        self._a_trial_is_long = False
+
+    def __enter__(self) -> TrialPool:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Forget all trials and end the workers at once; may be repeated."""
+        self._queue.clear()
+        end_workers(self._workers)
+        self._workers.clear()
+
+    @property
+    def waiting(self) -> int:
+        """Trials that were submitted and are not finished."""
+        return len(self._queue) + sum(len(worker.outstanding) for worker in self._workers)
+
+    @property
+    def has_room(self) -> bool:
+        """Whether further trials could keep a worker from waiting."""
+        return len(self._queue) < (1 if self._jobs == 1 else self._jobs * _MAX_LOOKAHEAD)
+
+    def submit(self, arm: Arm, trial: int) -> None:
+        """Add a trial, which :meth:`run` yields when it is finished."""
+        self._queue.append((arm, trial))
+
+    def drop(self, arm: Arm) -> None:
+        """Take back an arm's trials that no worker has; the others are still yielded."""
+        self._queue = deque(job for job in self._queue if job[0] is not arm)
+
+    def run(self, trials: Iterable[tuple[Arm, int]] = ()) -> Iterator[FinishedTrial]:
+        """Yield trials as they are finished, in any order, until none is left.
+
+        Parameters
+        ----------
+        trials : iterable of (Arm, int)
+            Submitted one by one, when there is room.
+
+        Raises
+        ------
+        TrialError
+            If holdfast refuses something in a trial, for example what a problem's function
+            returned, or if such a function raises; the message then has the frames of that
+            function. Its ``arm`` is the trial's; the others can go on in another call.
+        WorkerDiedError
+            If a worker process was killed; the message names the trial that it was running.
+        TrialCrashError
+            If anything else went wrong in a worker process. In this process that error is raised
+            as it is, with a note that names the trial.
+        """
+        more = iter(trials)
+        while True:
+            while self.has_room and (job := next(more, None)) is not None:
+                self.submit(*job)
+            if self._workers:
+                self._feed()
+                if not self.waiting:
+                    return
+                yield from self._receive()
+            elif not self._queue:
+                return
+            elif self._workers_pay():
+                self._start_workers()
+            elif (finished := self._run_here()) is not None:
+                yield finished
+
+    def _remaining(self) -> int:
+        """Return how many trials are left, as far as known; many if it is not."""
+        if self._expected is None:
+            return MAX_JOBS
+        return max(self._expected - self._all_times.count, len(self._queue))
+
+    def _workers_pay(self) -> bool:
+        remaining = self._remaining()
+        if self._jobs == 1 or remaining <= 1:
+            return False
+        if self._a_trial_is_long or self._expected is None:
+            return True
+        saved_s = remaining * self._all_times.mean_s * (1.0 - 1.0 / min(self._jobs, remaining))
+        return self._all_times.count > 0 and saved_s > _WORKER_START_S
+
+    def _run_here(self) -> FinishedTrial | None:
+        """Run the next trial in this process; return None if that takes too long."""
+        no_help = self._jobs == 1 or self._remaining() <= 1
+        arm, trial = self._queue.popleft()
+        started = perf_counter()
+        try:
+            result = _run_one(arm, trial, self._observer if no_help else _Watch())
+        except _TrialIsLongError:
+            # It decides the same when a worker runs it again; only the time so far is lost.
+            self._queue.appendleft((arm, trial))
+            self._a_trial_is_long = True
+            return None
+        return self._finished(arm, trial, result, perf_counter() - started)
+
+    def _finished(
+        self, arm: Arm, trial: int, result: TrialResult, elapsed_s: float
+    ) -> FinishedTrial:
+        for times in (self._all_times, self._times.setdefault(arm, _Times())):
+            times.add(elapsed_s)
+        return FinishedTrial(arm, trial, result, elapsed_s)
+
+    def _start_workers(self) -> None:
+        """Start workers one by one, each noted first, so that they can always be ended."""
+        count = min(self._jobs, self._remaining())
+        threads = max(1, available_cores() // count)
+        limit = self._queue[0][0].planning.active_sensing.num_cores
+        for number in range(count):
+            self._workers.append(_Worker(number, threads, min(threads, limit or threads)))
+            self._workers[-1].start()
+
+    def _feed(self) -> None:
+        """Send trials, each to the worker with the least to do."""
+        while self._queue:
+            worker = min(self._workers, key=_Worker.load)
+            arm, trial = self._queue[0]
+            times = self._times.get(arm)
+            # One whose time nobody knows may be long.
+            expected_s = _LOOKAHEAD_S if times is None else times.mean_s
+            if worker.outstanding and (
+                len(worker.outstanding) == _MAX_LOOKAHEAD
+                or worker.expected_s + expected_s > _LOOKAHEAD_S
+            ):
+                return
+            worker.send_trial(arm, trial, expected_s)
+            self._queue.popleft()
+
+    def _receive(self) -> Iterator[FinishedTrial]:
+        by_connection = {worker.connection: worker for worker in self._workers}
+        for connection in wait(list(by_connection)):
+            assert isinstance(connection, Connection)
+            worker = by_connection[connection]
+            answer = worker.receive()
+            if answer is None:
+                raise _worker_died(worker)
+            message = _ANSWERS.decode(answer)
+            arm, trial = worker.take_finished()
+            if isinstance(message, _Failed):
+                raise _error_of(arm, message)
+            yield self._finished(arm, trial, message.result, message.elapsed_s)
+
+
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class _Times:
+    """How long trials took."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.mean_s = 0.0
+
+    def add(self, elapsed_s: float) -> None:
+        self.count += 1
+        self.mean_s += (elapsed_s - self.mean_s) / self.count
+
+
+class _TrialIsLongError(Exception):
+    """Not an error: the trial that runs in this process is worth starting workers for."""
+
+
+class _Watch(TrialObserver):
+    """Gives a trial up once it has taken longer than workers need to start."""
+
+    def __init__(self) -> None:
+        self._deadline = perf_counter() + _WORKER_START_S
+
+    def sensed(self, step: SensingStep) -> None:
+        """Look at the clock."""
+        del step
+        self._check()
+
+    def acted(self, step: TaskStep) -> None:
+        """Look at the clock."""
+        del step
+        self._check()
+
+    def _check(self) -> None:
+        if perf_counter() > self._deadline:
+            raise _TrialIsLongError
+
+
+def _run_one(arm: Arm, trial: int, observer: TrialObserver) -> TrialResult:
+    where = f"trial {trial} (seed {arm.seed}){f' of {arm.label}' if arm.label else ''}"
+    try:
+        return run_trial(
+            Planner(arm.problem, arm.planning),
+            arm.seed,
+            trial,
+            max_steps=arm.max_steps,
+            observer=observer,
+            lost=arm.lost,
+        )
+    except (_TrialIsLongError, KeyboardInterrupt):
+        raise
+    except HoldfastError as error:
+        raise _trial_error(arm, f"{where}: {error}") from error
+    except BaseException as error:
+        account = account_of_user_error(error, arm.problem_name)
+        if account is not None:
+            raise _trial_error(arm, f"{where}: {account}") from error
+        error.add_note(f"in {where}")
+        raise
+
+
+def _trial_error(arm: Arm, text: str) -> TrialError:
+    error = TrialError(text)
+    error.arm = arm
+    return error
+
+
+# -- workers ---------------------------------------------------------------------------------------
+
+
+class _NewArm(msgspec.Struct, tag="arm"):
+    """An arm, sent to a worker before its first trial there; the next number is its own."""
+
+    planning: PlanningSettings
+    seed: int
+    max_steps: int
+    lost: LostSettings
+    problem_name: str
+    label: str
+    plain: dict[str, Any] | None
+    pickled: bytes
+
+
+class _Trial(msgspec.Struct, tag="trial"):
+    arm: int
+    trial: int
+
+
+class _Finished(msgspec.Struct, tag="finished"):
+    result: TrialResult
+    elapsed_s: float
+
+
+class _Failed(msgspec.Struct, tag="failed"):
+    text: str
+    expected: bool
+
+
+_REQUESTS = msgspec.msgpack.Decoder(_NewArm | _Trial)
+_ANSWERS = msgspec.msgpack.Decoder(_Finished | _Failed)
+_ENCODE = msgspec.msgpack.Encoder().encode
+
+
+class _Worker(WorkerProcess):
+    """A worker, and the trials that it has been sent."""
+
+    def __init__(self, number: int, threads: int, blas_threads: int) -> None:
+        super().__init__(f"holdfast-worker-{number}", _work, (threads,), blas_threads)
+        self.outstanding: deque[tuple[Arm, int, float]] = deque()
+        self.expected_s = 0.0
+        self._arms: dict[Arm, int] = {}
+
+    def load(self) -> float:
+        """Return how much it has to do, in seconds; least if it has nothing."""
+        return self.expected_s if self.outstanding else -1.0
+
+    def send_trial(self, arm: Arm, trial: int, expected_s: float) -> None:
+        # If it is dead, its pipe tells when it is read, where we know which trial it had.
+        if arm not in self._arms:
+            self.send(_ENCODE(_new_arm(arm)))
+            self._arms[arm] = len(self._arms)
+        self.outstanding.append((arm, trial, expected_s))
+        self.expected_s += expected_s
+        self.send(_ENCODE(_Trial(self._arms[arm], trial)))
+
+    def take_finished(self) -> tuple[Arm, int]:
+        """Return the trial that an answer was about: they come in order."""
+        arm, trial, expected_s = self.outstanding.popleft()
+        self.expected_s = self.expected_s - expected_s if self.outstanding else 0.0
+        return arm, trial
+
+
+def _new_arm(arm: Arm) -> _NewArm:
+    return _NewArm(
+        arm.planning,
+        arm.seed,
+        arm.max_steps,
+        arm.lost,
+        arm.problem_name,
+        arm.label,
+        arm.plain,
+        b"" if arm.plain is not None else _pickled(arm.problem),
+    )
+
+
+_NEEDS_CLOUDPICKLE = (
+    "a problem that a notebook or a script defines needs cloudpickle: pip install "
+    "'holdfast[tune]', or put its class into a module of its own, or use jobs=1"
+)
+
+
+def _pickled(problem: Problem) -> bytes:
+    """Return a problem for the pipe; cloudpickle takes along the class that a notebook defines."""
+    try:
+        import cloudpickle as pickler
+    except ImportError:
+        import pickle as pickler
+
+        if type(problem).__module__ == "__main__":
+            raise InvalidValueError(_NEEDS_CLOUDPICKLE) from None
+    try:
+        pickled: bytes = pickler.dumps(problem)
+    except Exception as error:
+        raise InvalidValueError(
+            f"{type(problem).__name__} cannot be sent to worker processes: {error}; with jobs=1 "
+            "its trials are run in this one"
+        ) from error
+    return pickled
+
+
+def _work(connection: Connection, threads: int) -> None:
+    """Run trials until the parent closes the pipe."""
+    arms: list[_NewArm | Arm] = []
+    while True:
+        request = _REQUESTS.decode(connection.recv_bytes())
+        if isinstance(request, _NewArm):
+            arms.append(request)
+            continue
+        started = perf_counter()
+        answer: _Finished | _Failed
+        try:
+            arm = arms[request.arm]
+            if isinstance(arm, _NewArm):
+                arms[request.arm] = arm = _arm_in_worker(arm, threads)
+            result = _run_one(arm, request.trial, NULL_OBSERVER)
+            answer = _Finished(result, perf_counter() - started)
+        except HoldfastError as error:
+            answer = _Failed(str(error), True)
+        except Exception:  # noqa: BLE001 - whatever it is, the parent raises it again
+            answer = _Failed(traceback.format_exc(), False)
+        connection.send_bytes(_ENCODE(answer))
+
+
+def _arm_in_worker(sent: _NewArm, threads: int) -> Arm:
+    """Build an arm in a worker, which has as many threads as its share of the cores."""
+    if sent.plain is not None:
+        problem = Configuration.from_plain(sent.plain).problem
+    else:
+        import pickle
+
+        try:
+            problem = pickle.loads(sent.pickled)
+        except Exception as error:
+            raise InvalidValueError(
+                f"{sent.problem_name} cannot be made again in a worker process: "
+                f"{type(error).__name__}: {error}; {_NEEDS_CLOUDPICKLE}"
+            ) from error
+    own = sent.planning.active_sensing
+    cores = min(threads, own.num_cores) if own.num_cores else threads
+    planning = msgspec.structs.replace(
+        sent.planning, active_sensing=msgspec.structs.replace(own, num_cores=cores)
+    )
+    return Arm(
+        problem, planning, sent.seed, sent.max_steps, sent.lost, sent.problem_name, sent.label
+    )
+
+
+def _error_of(arm: Arm, failed: _Failed) -> Exception:
+    if failed.expected:
+        return _trial_error(arm, failed.text)
+    return TrialCrashError(f"in a worker process:\n{failed.text}")
+
+
+def _worker_died(worker: _Worker) -> WorkerDiedError:
+    how, killed = worker.how_it_ended()
+    advice = " (often the machine is out of memory: use fewer jobs or fewer particles)"
+    what = "before it had a trial to run"
+    if worker.outstanding:
+        arm, trial, _ = worker.outstanding[0]
+        what = f"while it ran trial {trial}{f' of {arm.label}' if arm.label else ''}"
+    return WorkerDiedError(
+        f"a worker process {how} {what}{advice if killed else ''}; finished trials are kept"
+    )

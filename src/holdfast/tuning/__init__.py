@@ -1,0 +1,1 @@
+"""What simulated trials say of settings and problems: tables, comparisons, sweeps."""

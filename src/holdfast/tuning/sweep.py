@@ -1,0 +1,218 @@
+"""A grid of settings, each combination a run of its own, on the same worlds.
+
+Every combination (an arm) has a directory of a run, as ``holdfast run`` makes it, so each can be
+continued, compared and exported by the other commands. Trials are run number by number over all
+arms: whenever a sweep is interrupted, what it has is nearly all paired.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple, Self
+
+from holdfast.config.loader import Configuration
+from holdfast.errors import InvalidValueError
+from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
+from holdfast.recording.outcome_comparison import (
+    ComparedRun,
+    OutcomeComparison,
+    compare_results,
+)
+from holdfast.recording.run_directory import RunDirectory
+from holdfast.recording.table_formats import csv_rows
+from holdfast.robot.trial_pool import Arm, TrialPool
+from holdfast.runtime.files import write_atomically
+from holdfast.tuning.simulated_trials import arm_of, table_of
+
+__all__ = ["MAX_ARMS", "Sweep", "SweptArm", "arms_of"]
+
+MAX_ARMS = 200
+"""Largest number of combinations; each has an open journal."""
+
+_MAX_NAME = 100
+_UNSAFE = re.compile(r"[^\w.=,+-]+")
+_TABLE, _TRIALS = "table", "trials.csv"
+
+
+class SweptArm(NamedTuple):
+    """A combination: its name, its directory's name, and the values by ``section.key``."""
+
+    label: str
+    directory: str
+    values: Mapping[str, Any]
+    configuration: Configuration
+
+
+def arms_of(
+    axes: Mapping[str, Sequence[Any]], load: Callable[[Mapping[str, Any]], Configuration]
+) -> list[SweptArm]:
+    """Return all combinations; the last key varies fastest.
+
+    Parameters
+    ----------
+    axes : mapping
+        The values of each ``section.key``. A key with one value is set in all of them, and is in no
+        name.
+    load : callable
+        Gets values by key, and returns the configuration with them.
+
+    Raises
+    ------
+    InvalidValueError
+        If a key has a value twice, there are more than 200 combinations, or they would not have the
+        same worlds: trials, seed or limit of steps differ.
+    """
+    for key, values in axes.items():
+        for index, value in enumerate(values):
+            if any(_same(value, other) for other in values[:index]):
+                raise InvalidValueError(f"{key} has the value {_text(value)} twice")
+    count = 1
+    for values in axes.values():
+        count *= len(values)
+    if count > MAX_ARMS:
+        raise InvalidValueError(f"{count:,} combinations; a sweep has at most {MAX_ARMS}")
+    varied = [key for key, values in axes.items() if len(values) > 1]
+    arms: list[SweptArm] = []
+    for combination in itertools.product(*axes.values()):
+        chosen = dict(zip(axes, combination, strict=True))
+        label = ", ".join(f"{_short(key, varied)}={_text(chosen[key])}" for key in varied)
+        configuration = load(chosen)
+        name = _free_name(label or "run", [arm.directory for arm in arms])
+        arms.append(SweptArm(label or configuration.path.stem, name, chosen, configuration))
+        first, this = arms[0].configuration.simulator, configuration.simulator
+        for key in ("seed", "num_trials", "max_steps"):
+            if getattr(this, key) != getattr(first, key):
+                raise InvalidValueError(
+                    f"simulator.{key} is {getattr(first, key)} and {getattr(this, key)}: it cannot "
+                    "be swept, because trials are compared in pairs of the same world and limit"
+                )
+    return arms
+
+
+def _same(first: Any, second: Any) -> bool:
+    return repr(first) == repr(second)  # 1 and true are equal but not the same
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, default=str)
+
+
+def _short(key: str, keys: Sequence[str]) -> str:
+    """Return a key without its section, if no other key is called so."""
+    own = key.partition(".")[2]
+    return key if any(other != key and other.endswith(f".{own}") for other in keys) else own
+
+
+def _free_name(label: str, taken: Sequence[str]) -> str:
+    name = _UNSAFE.sub("_", label.replace(", ", ",")).strip("._")[:_MAX_NAME] or "run"
+    numbered = (f"{name}-{number}" for number in itertools.count(2))
+    return next(each for each in itertools.chain([name], numbered) if each not in taken)
+
+
+class Sweep:
+    """The open directories of all arms, to be used in a ``with`` statement.
+
+    Parameters
+    ----------
+    directory : Path
+        Gets a directory for each arm; one that has begun goes on.
+
+    Attributes
+    ----------
+    total, finished : int
+        Trials of all arms.
+    """
+
+    def __init__(self, directory: Path, arms: Sequence[SweptArm]) -> None:
+        self.directory = directory.absolute()
+        self.arms = arms
+        self._pool_arms = [arm_of(arm.configuration, arm.label) for arm in arms]
+        self._runs: list[RunDirectory] = []
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            for arm in self.arms:
+                run = RunDirectory.resume_if_begun(
+                    self.directory / arm.directory, arm.configuration
+                )
+                self._runs.append(stack.enter_context(run))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stack.close()
+
+    @property
+    def total(self) -> int:
+        """Trials of all arms."""
+        return sum(arm.configuration.simulator.num_trials for arm in self.arms)
+
+    @property
+    def finished(self) -> int:
+        """Finished trials of all arms."""
+        return sum(len(run.journal.finished()) for run in self._runs)
+
+    def run(self, jobs: int, on_result: Callable[[TrialResult], None]) -> None:
+        """Run what is not finished; raises what :meth:`TrialPool.run` raises.
+
+        However it ends, each arm's tables cover its finished trials.
+        """
+        started = perf_counter()
+        by_arm = dict(zip(self._pool_arms, self._runs, strict=True))
+        finished = {arm: run.journal.finished() for arm, run in by_arm.items()}
+        spent: dict[Arm, float] = dict.fromkeys(by_arm, 0.0)
+
+        def trials() -> Iterator[tuple[Arm, int]]:
+            for trial in range(self.arms[0].configuration.simulator.num_trials):
+                for arm, before in finished.items():
+                    if trial not in before:
+                        yield arm, trial
+
+        try:
+            with TrialPool(jobs, expected=self.total - self.finished) as pool:
+                for done in pool.run(trials()):
+                    by_arm[done.arm].add(done.result)
+                    spent[done.arm] += done.elapsed_s
+                    on_result(done.result)
+        finally:
+            # The processes work on all arms at once, so each gets its share of the time.
+            share = (perf_counter() - started) / (sum(spent.values()) or 1.0)
+            for arm, run in by_arm.items():
+                run.write_tables(spent[arm] * share)
+
+    def comparison(self, baseline: int = 0) -> OutcomeComparison:
+        """Compare all arms, which are finished, with one of them."""
+        order = [baseline, *(each for each in range(len(self.arms)) if each != baseline)]
+        return compare_results([self._compared(number) for number in order])
+
+    def _compared(self, number: int) -> ComparedRun:
+        arm, journal = self._pool_arms[number], self._runs[number].journal
+        results = {result.trial: result for result in journal.results()}
+        world = table_of(arm, ()).world
+        return ComparedRun(arm.label, results, arm.seed, arm.max_steps, world)
+
+    def write_tables(self, comparison: OutcomeComparison) -> list[str]:
+        """Write ``trials.csv`` and the comparison in three formats; return the files' names."""
+        keys = list(self.arms[0].values)
+        write_atomically(
+            self.directory / _TRIALS, csv_rows((*keys, *TRIAL_COLUMNS), self._rows(keys))
+        )
+        comparison.to_csv(self.directory / f"{_TABLE}.csv")
+        comparison.to_latex(self.directory / f"{_TABLE}.tex")
+        legend = comparison.legend().replace("\n", "\n\n")  # a paragraph for each line
+        text = f"{comparison.to_markdown()}\n{legend}\n"
+        write_atomically(self.directory / f"{_TABLE}.md", text.encode())
+        return [f"{_TABLE}.md", f"{_TABLE}.tex", f"{_TABLE}.csv", _TRIALS]
+
+    def _rows(self, keys: Sequence[str]) -> Iterator[tuple[object, ...]]:
+        for arm, run in zip(self.arms, self._runs, strict=True):
+            chosen = tuple(_text(arm.values[key]) for key in keys)
+            for result in run.journal.results():
+                yield (*chosen, *(getattr(result, name) for name in TRIAL_COLUMNS))

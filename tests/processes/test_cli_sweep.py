@@ -1,0 +1,69 @@
+"""``holdfast sweep``, as a person types it."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+from tests.processes.faults import holdfast
+
+PROBLEM = """\
+import pathlib
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+
+class Peg(PegInHole2D):
+    begun = 0
+
+    def initial_states(self, stream, count):
+        Peg.begun += 1
+        if pathlib.Path("stop").exists() and Peg.begun == 6:
+            raise KeyboardInterrupt
+        return super().initial_states(stream, count)
+"""
+CONFIGURATION = """\
+problem: swept_peg:Peg
+particle_filter: {num_particles: 30}
+simulator: {num_trials: 3, max_steps: 40, seed: 3}
+"""
+SET = ("--set", "selector.method=random,path_entropy")
+
+
+def test_ctrl_c_and_resume(tmp_path: Path) -> None:
+    (tmp_path / "swept_peg.py").write_text(PROBLEM)
+    (tmp_path / "peg.yaml").write_text(CONFIGURATION)
+    (tmp_path / "stop").touch()
+    words = ("sweep", "peg.yaml", *SET, "--jobs", "1", "--out", "out")
+    stopped = holdfast(tmp_path, *words)
+    assert stopped.returncode == 130
+    assert "trials are finished and kept in out" in stopped.stderr
+    (tmp_path / "stop").unlink()
+    command = stopped.stderr.splitlines()[-1].removeprefix("Go on with: ")
+    assert shlex.split(command)[0] == "holdfast"
+    done = holdfast(tmp_path, *shlex.split(command)[1:], "--baseline", "selector.method=random")
+    assert done.returncode == 0, done.stderr
+    assert " finished before; results in out" in done.stderr
+    head, first, second, *_ = done.stdout.splitlines()
+    assert head.split()[:2] == ["trials", "success"]
+    assert first.startswith("method=random (baseline)  3 ")
+    assert second.startswith("method=path_entropy")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        *("method=random", "method=path_entropy"),
+        *("table.md", "table.tex", "table.csv", "trials.csv"),
+    }
+
+
+def test_refusals(tmp_path: Path) -> None:
+    """None of them leaves anything behind."""
+    (tmp_path / "peg.yaml").write_text(CONFIGURATION.replace("swept_peg:Peg", "peg_in_hole_2d"))
+    for words, message in {
+        (): "--set is missing",
+        ("--set", "selector.method=random"): "makes one combination",
+        ("--set", "selector.method=rnd,random"): 'is "rnd"; expected one of',
+        (*SET, "--baseline", "selector.method=fixed"): "no combination has that; they are",
+        (*SET, "--resume"): "--resume needs --out",
+        (*SET, "--seed", "1", "--set", "simulator.seed=2"): "--seed and --set both say",
+    }.items():
+        refused = holdfast(tmp_path, "sweep", "peg.yaml", *words)
+        assert refused.returncode == 2
+        assert message in refused.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["peg.yaml"]

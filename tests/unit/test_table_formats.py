@@ -1,0 +1,60 @@
+"""One table in the formats in which it is passed on."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from holdfast.errors import HoldfastError, OutputError
+from holdfast.recording.table_formats import Table
+
+
+class Prices(Table):
+    def columns(self) -> Sequence[str]:
+        return ("what", "price")
+
+    def rows(self) -> list[tuple[object, ...]]:
+        return [("a|b, 5%_<", 0.1 + 0.2), ("=1+1", None)]
+
+    def shown(self) -> list[tuple[str, ...]]:
+        return [("", "price"), ("a|b, 5%_<", "0.3 [0.1, 0.5]")]
+
+    def legend(self) -> str:
+        return "prices in <EUR>"
+
+
+def test_formats(tmp_path: Path) -> None:
+    table = Prices()
+    markdown = table.to_markdown(tmp_path / "table.md")
+    assert markdown.splitlines() == [
+        "|           | price          |",
+        "| --------- | -------------- |",
+        r"| a\|b, 5%_< | 0.3 [0.1, 0.5] |",
+    ]
+    assert (tmp_path / "table.md").read_text() == markdown
+    assert r"a|b, 5\%\_< & 0.3 [0.1, 0.5] \\" in table.to_latex().splitlines()
+    assert "\\begin{tabular}{lr}\n" in table.to_latex()
+    # Numbers come back as they are, and no spreadsheet runs a text.
+    assert list(csv.reader(table.to_csv().splitlines())) == [
+        ["what", "price"],
+        ["a|b, 5%_<", repr(0.1 + 0.2)],
+        ["'=1+1", ""],
+    ]
+    assert repr(table).splitlines()[-1] == "prices in <EUR>"
+    assert "<td>a|b, 5%_&lt;</td>" in table._repr_html_()
+    assert "&lt;EUR&gt;" in table._repr_html_()
+    frame = table.to_pandas()
+    assert list(frame.columns) == ["what", "price"]
+    assert frame["price"][0] == 0.1 + 0.2
+
+
+def test_refusals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(OutputError, match="cannot be written"):
+        Prices().to_csv(tmp_path / "missing" / "table.csv")
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(HoldfastError, match=r"needs pandas: pip install 'holdfast\[tune\]'"):
+        Prices().to_pandas()

@@ -1,0 +1,150 @@
+"""One pool of workers for the trials of several configurations."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.unit.test_trial import configuration_of, failing_configuration, one
+
+from holdfast.errors import InvalidValueError, TrialError, WorkerDiedError
+from holdfast.planning.planner import Planner
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.robot.trial_pool import Arm, TrialPool
+
+
+def arms_of(tmp_path: Path) -> tuple[Arm, Arm]:
+    configuration = configuration_of(tmp_path)
+    first = Arm.of(configuration, "as it is")
+    planner = Planner(configuration.problem, configuration.planning, method="random")
+    return first, dataclasses.replace(first, planning=planner.settings, label="random")
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_trials_of_several_arms(tmp_path: Path, jobs: int) -> None:
+    """They decide as alone; a result leads to further trials, and an arm is given up."""
+    arms = arms_of(tmp_path)
+    found = {}
+    with TrialPool(jobs) as pool:
+        for arm in arms:
+            pool.submit(arm, 0)
+        for done in pool.run():
+            found[done.arm.label, done.trial] = done.result
+            assert done.elapsed_s > 0.0
+            if done.trial == 0:
+                pool.submit(done.arm, 2)
+        assert pool.waiting == 0
+        for trial in range(5):
+            pool.submit(arms[0], trial)
+        pool.drop(arms[0])
+        assert list(pool.run()) == []
+    assert sorted(found) == [(arm.label, trial) for arm in arms for trial in (0, 2)]
+    assert found["as it is", 2].digest == one(configuration_of(tmp_path), 2).digest
+    assert found["random", 2].digest != found["as it is", 2].digest
+
+
+def test_a_choice_by_results_waits_for_few(tmp_path: Path) -> None:
+    """With one process, an iterator has seen all results before it names the next trial."""
+    arm, _ = arms_of(tmp_path)
+    seen: list[int] = []
+
+    def trials() -> Any:
+        for trial in range(3):
+            assert len(seen) == trial
+            yield arm, trial
+
+    with TrialPool(1) as pool:
+        for done in pool.run(trials()):
+            seen.append(done.trial)  # noqa: PERF401 - the iterator reads it meanwhile
+    assert seen == [0, 1, 2]
+
+
+def test_a_class_that_only_this_process_knows(tmp_path: Path) -> None:
+    pytest.importorskip("cloudpickle")
+    configuration = configuration_of(tmp_path)
+
+    class Lazy(PegInHole2D):
+        """Nobody can import it."""
+
+        resolution = 0.5
+
+    arm = dataclasses.replace(Arm.of(configuration), problem=Lazy(), plain=None)
+    with TrialPool(2) as pool:
+        results = {done.trial: done.result for done in pool.run((arm, trial) for trial in (0, 1))}
+    with TrialPool(1) as pool:
+        assert {done.trial: done.result.digest for done in pool.run([(arm, 0), (arm, 1)])} == {
+            trial: result.digest for trial, result in results.items()
+        }
+
+
+class OfANotebook(PegInHole2D):
+    __module__ = "__main__"
+
+
+class Locked(PegInHole2D):
+    def __reduce__(self) -> Any:
+        raise TypeError("a lock")
+
+
+class Elsewhere(PegInHole2D):
+    def __reduce__(self) -> Any:
+        return int, ("x",)
+
+
+@pytest.mark.parametrize(
+    ("problem", "error", "message"),
+    [
+        (Locked, InvalidValueError, "Locked cannot be sent to worker processes: a lock; with jobs"),
+        (OfANotebook, InvalidValueError, r"needs cloudpickle: pip install 'holdfast\[tune\]', or"),
+        (Elsewhere, TrialError, "peg_in_hole_2d cannot be made again in a worker process: ValueE"),
+    ],
+)
+def test_what_cannot_be_sent_is_refused(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    problem: type[PegInHole2D],
+    error: type[Exception],
+    message: str,
+) -> None:
+    monkeypatch.setitem(sys.modules, "cloudpickle", None)
+    arm = dataclasses.replace(Arm.of(configuration_of(tmp_path)), problem=problem(), plain=None)
+    with TrialPool(2) as pool, pytest.raises(error, match=message):
+        list(pool.run([(arm, 0), (arm, 1)]))
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_the_others_go_on_without_an_arm_that_fails(tmp_path: Path, jobs: int) -> None:
+    good, _ = arms_of(tmp_path)
+    bad = Arm.of(failing_configuration(tmp_path, 'ProblemError("too heavy")'), "heavy")
+    finished: list[int] = []
+    with TrialPool(jobs) as pool:
+        for trial in range(3):
+            pool.submit(good, trial)
+            pool.submit(bad, trial)
+        failures = 0
+        while pool.waiting:
+            try:
+                finished.extend(done.trial for done in pool.run())
+            except TrialError as error:
+                assert error.arm is bad
+                assert str(error).endswith("of heavy: too heavy")
+                failures += 1
+                pool.drop(bad)
+    assert failures >= 1
+    assert sorted(finished) == [0, 1, 2]
+
+
+def test_a_dead_worker_is_named(tmp_path: Path) -> None:
+    arm, _ = arms_of(tmp_path)
+    pool = TrialPool(2)
+    with pool, pytest.raises(WorkerDiedError, match=r"SIGKILL while it ran trial \d+ of as it is"):
+        for _ in pool.run((arm, trial) for trial in range(100_000)):
+            pid = pool._workers[0]._process.pid
+            assert pid is not None
+            os.kill(pid, signal.SIGKILL)
+    assert pool.waiting == 0
