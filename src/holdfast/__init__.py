@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
     from holdfast.robot.late_sensing import SenseInBackground
     from holdfast.robot.trial import run_trial
+    from holdfast.tuning.problem_check import check_problem
 
 __all__ = [
     "LATER",
@@ -59,6 +60,7 @@ __all__ = [
     "SelectorSettings",
     "SenseInBackground",
     "SimulatedEnvironment",
+    "check_problem",
     "entropy",
     "load_configuration",
     "make",
@@ -91,6 +93,7 @@ _PLACES = {
     "Scene": "problems.problem.Scene",
     "SimulatedEnvironment": "robot.environment.SimulatedEnvironment",
     "SelectorSettings": "planning.settings.SelectorSettings",
+    "check_problem": "tuning.problem_check.check_problem",
     "entropy": "planning.estimators.entropy",
     "load_configuration": "config.loader.load",
     "make": "config.registry.make",

@@ -1,0 +1,1 @@
+"""Know that it pays: checks of a problem, comparisons, tuning."""
