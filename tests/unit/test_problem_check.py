@@ -194,6 +194,22 @@ class NeverAtTheGoal(Rover):
         return (np.abs(states - 9.0) < 0.2).all(axis=-1)
 
 
+class Slow(Rover):
+    def execute(self, actions: Any) -> Any:
+        return np.clip(actions, -0.0025, 0.0025)
+
+    def move(self, states: Any, actions: Any, stream: Any) -> Any:
+        return states + actions + 1e-3 * stream.normal(states.shape)
+
+
+class Misspelt(Rover):
+    def next_stages(self, estimates: Any, stage: Any) -> Any:
+        return stage
+
+    def sensing_cost(self) -> None:
+        """Not what holdfast asks for."""
+
+
 class AlwaysAtTheGoal(Rover):
     def is_goal(self, states: Any) -> Any:
         return (np.abs(states) < 99.0).all(axis=-1)
@@ -363,6 +379,8 @@ WRONG = {
     NotFinite: (E, "contract", "move of rover put particle"),
     KeepsItsStream: (E, "contract", "move raised ProblemError: a stream is for the one call"),
     NeverAtTheGoal: (E, "goals", "comes to the goal in 0 of 64 trials"),
+    Slow: (E, "goals", "comes to the goal in .* within max_steps, 200, it is 0"),
+    Misspelt: (W, "contract", "sensing_cost: did you mean sensing_costs"),
     AlwaysAtTheGoal: (E, "goals", "all of 64 initial states are goals"),
     NeverMoves: (E, "goals", "the policy never moves"),
     AlwaysFails: (E, "goals", "0 of 64 trials, and 64 fail"),

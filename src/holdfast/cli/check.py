@@ -107,7 +107,8 @@ def _check(options: CheckOptions) -> int:
 
     line.start(f"checking {configuration.problem_name}", 0, "")
     try:
-        with _impatient(_PATIENCE * options.budget):
+        # What the problem's code prints is no finding.
+        with contextlib.redirect_stdout(sys.stderr), _impatient(_PATIENCE * options.budget):
             found = check_problem(
                 configuration.problem,
                 configuration.planning,

@@ -77,6 +77,12 @@ class Finding(NamedTuple):
     where: str = CHECKS
     details: str = ""
 
+    def __str__(self) -> str:
+        lines = [f"{self.severity}: {self.check}: {self.seen}"]
+        lines += [self.details] if self.details else []
+        lines += [f"-> {self.advice} ({self.where})"] if self.advice else []
+        return "\n".join(lines)
+
 
 class CheckEndedError(Exception):
     """A check cannot go on, and why is among the findings."""
@@ -251,7 +257,9 @@ class Inspection:
             same = found.details == details or isinstance(error, TimeoutError)
             if found.severity == "error" and same and found.seen.endswith(end):
                 return
-        advice = "These are the lines of your own code." if details else ""
+        advice = "Look at what it returns there; the documentation says what is needed."
+        if details:
+            advice = "These are the lines of your own code."
         if isinstance(error, ValueError | IndexError | TypeError) or "need" in words:
             advice = (
                 "Make it take states of any leading shape, (), (n,) or (t, n), with the "

@@ -17,13 +17,17 @@ from holdfast.problems import checked
 from holdfast.problems.attributes import circular_actions, circular_states, has_own
 from holdfast.problems.problem import ProblemBase
 from holdfast.tuning.contract_check import truths
-from holdfast.tuning.findings import CONTRACT, Inspection, Walk, spread_out
+from holdfast.tuning.findings import CONTRACT, Inspection, Severity, Walk, spread_out
 
 __all__ = ["check_motion", "check_rewards", "follow_policy"]
 
 _TRIALS = 64
 _KEPT = 24
 """Steps of which the states are kept."""
+
+_LONGER = 4
+"""Times max_steps for which trials are followed, to tell a limit that is too low from a goal that
+is never reached."""
 
 _STREAM, _NOISE = 8, 9
 
@@ -46,19 +50,20 @@ def follow_policy(inspection: Inspection, num_trials: int = _TRIALS) -> Walk:
     kept: list[tuple[FloatArray, Any]] = []
     jumps = np.zeros((2, states.shape[1]), dtype=np.int64)
     turns = np.zeros((2, problem.action_size), dtype=np.int64)
-    step = 0
-    still = 0
-    for step in range(inspection.max_steps + 1):
+    step = still = 0
+    stride = 1
+    limit = _LONGER * inspection.max_steps
+    for step in range(limit + 1):
         done = ask("is_goal", lambda states=states: truths(problem, "is_goal", states))  # type: ignore[misc]
         lost = ask("is_failure", lambda states=states: truths(problem, "is_failure", states))  # type: ignore[misc]
         open_ones = (reached < 0) & (failed < 0)
         reached[open_ones & done] = step
         failed[open_ones & lost & ~done] = step
-        # Dense at first, then ever wider apart, so that long trials take no more memory.
-        kept.append((states, stages))
-        if len(kept) > 2 * _KEPT:
-            kept = kept[::2]
-        if step == inspection.max_steps or not ((reached < 0) & (failed < 0)).any() or late():
+        if step % stride == 0:
+            kept.append((states, stages))
+        if len(kept) > 2 * _KEPT:  # so that a long trial takes no more memory
+            kept, stride = kept[::2], 2 * stride
+        if step == limit or not ((reached < 0) & (failed < 0)).any() or late():
             break
         stages = ask(
             "next_stage",
@@ -182,29 +187,25 @@ def _report_walk(inspection: Inspection, walk: Walk, still: int) -> None:
     open_ones = count - int(reached.sum()) - int(failed.sum())
     if open_ones:
         seen += f"; {open_ones} have not ended after {steps} steps"
-    cut = open_ones and steps < inspection.max_steps
+    limit = inspection.max_steps
+    in_time = (walk.reached >= 0) & (walk.reached <= limit)
+    if (reached & ~in_time).any():
+        seen += f"; within max_steps, {limit}, it is {in_time.sum()}"
+    cut = bool(open_ones) and steps < limit
     if cut:
-        seen += f" of {inspection.max_steps}, when the time for this check was over"
-    if not reached.any() and not cut:
-        inspection.add(
-            "error",
-            "goals",
-            seen,
-            "No sensing can help where a known state does not. Look at is_goal, at the policy near "
-            "the goal, and whether max_steps is enough.",
-            CONTRACT,
-        )
-    elif reached.mean() < _FEW and not cut:
-        inspection.add(
-            "warning",
-            "goals",
-            seen,
-            "What is lost here no sensing can win. Give the policy more steps or a way out, or "
-            "expect that much less.",
-            CONTRACT,
-        )
-    else:
+        seen += f" of {limit}, when the time for this check was over"
+    advice = (
+        "What is lost here no sensing can win. Look at is_goal and at the policy near the goal, or "
+        "expect that much less."
+    )
+    if reached.mean() >= _FEW:
+        needed = int(np.quantile(walk.reached[reached], 0.9))
+        advice = f"Set simulator.max_steps to {2 * needed} or more."
+    if cut or in_time.mean() >= _FEW:
         inspection.add("information", "goals", seen)
+    else:
+        severity: Severity = "warning" if in_time.any() else "error"
+        inspection.add(severity, "goals", seen, advice, CONTRACT)
     num_stages = inspection.problem.num_stages
     greatest = int(walk.stages.max())
     if greatest + 1 < num_stages and not cut:

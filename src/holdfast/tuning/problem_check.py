@@ -116,9 +116,18 @@ def check_problem(
     )
     for name, check in parts:
         on_check(name)
+        if name == "trials":
+            # All tests are made. What follows weighs beliefs by the likelihoods.
+            _judge(inspection)
+        if name in ("trials", "sensors") and _has_wrong_likelihood(inspection):
+            continue
         with inspection.part():
             # What a check itself does with a strange object must not end the others.
             inspection.ask(f"the check of {name}", check, name)
+    return inspection.sorted_findings()
+
+
+def _judge(inspection: Inspection) -> None:
     if inspection.num_tests:
         inspection.add(
             "information",
@@ -127,17 +136,32 @@ def check_problem(
             f"error, all together, with a probability of at most {FALSE_ALARM_RATE:g}",
         )
     inspection.judge_tests()
-    return inspection.sorted_findings()
+    if _has_wrong_likelihood(inspection):
+        inspection.add(
+            "information",
+            "sensors",
+            "beliefs, sensors and resolution were not looked at: the likelihood comes first",
+        )
+
+
+def _has_wrong_likelihood(inspection: Inspection) -> bool:
+    return any(found[:2] == ("error", "likelihood") for found in inspection.findings)
 
 
 def _declares_itself(inspection: Inspection) -> bool:
     """Check all that a problem says of itself; without it nothing else can be asked."""
     problem = inspection.problem
-    with inspection.part():
+
+    def declared() -> list[str]:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            inspection.ask("the problem", lambda: attributes.check_problem(problem))
-        del caught
+            attributes.check_problem(problem)
+        return [str(each.message) for each in caught]
+
+    with inspection.part():
+        for text in inspection.ask("the problem", declared):
+            advice = "What has another name is never called."
+            inspection.add("warning", "contract", text, advice, CONTRACT)
         lacking = [
             name
             for name in ("execute", "next_stage", "reward", "scene", "resolution", "state_labels")

@@ -179,8 +179,9 @@ def _told(bins: IntArray, after: FloatArray, before: FloatArray) -> FloatArray:
     for at in range(bins.shape[1]):
         found = []
         for own in (bins[:, at], bins[order, at]):
-            masses: list[FloatArray] = [
-                np.bincount(own, weights, minlength=_BINS) for weights in (after, before)
+            masses = [
+                np.asarray(np.bincount(own, weights, minlength=_BINS), dtype=np.float64)
+                for weights in (after, before)
             ]
             found.append(_divergence(masses[0], masses[1]))
         told[at] = found[0] - found[1]

@@ -82,7 +82,7 @@ class _Watcher(TrialObserver):
         angles = circular_states(self.inspection.problem)
         apart = differences(step.before.belief.states, world.state, angles)
         # The true state beyond all particles in some coordinate.
-        outside: BoolArray = (apart > 0.0).all(axis=0) | (apart < 0.0).all(axis=0)
+        outside = (apart > 0.0).all(axis=0) | (apart < 0.0).all(axis=0)
         size = info.effective_sample_size
         self.left.append(_Left(step.sensing_action, size, info.explained, np.asarray(outside)))
 
@@ -134,6 +134,14 @@ def check_trials(inspection: Inspection) -> list[SensedBelief]:
             results.append(result)
         else:
             failed += result == "failed"
+    ended = len(results) + failed
+    if ended < _TRIALS:
+        inspection.add(
+            "information",
+            "trials",
+            f"{ended} of {_TRIALS} simulated trials came to their end in the time for this check",
+            "Give it more (--budget).",
+        )
     _report_endings(inspection, results, failed, steps)
     _report_depletion(inspection, left)
     _report_lost_truths(inspection, left, shares)
@@ -156,12 +164,6 @@ def _report_endings(
 ) -> None:
     count = len(results) + failed
     if not count:
-        inspection.add(
-            "information",
-            "trials",
-            "no simulated trial came to its end in the time for this check",
-            "Give it more (--budget).",
-        )
         return
     successes = [result.steps for result in results if result.success]
     seen = f"with random sensing, {len(successes)} of {count} trials reach the goal"
