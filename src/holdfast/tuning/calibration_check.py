@@ -7,10 +7,11 @@ Bayesian inference algorithms with simulation-based calibration", 2018). A belie
 prior that is known exactly, so nothing is approximate here: the posterior is the weights, and among
 equal states chance decides.
 
-Two orders are used: each coordinate of the state, and the likelihood itself, which finds most
-(Modrák and others, "Simulation-based calibration checking for Bayesian computation: the choice of
-test quantities shapes sensitivity", 2023). A likelihood in place of its logarithm hardly weighs,
-so the true state, which is likely, lies above nearly all others.
+Three orders are used: each coordinate of the state, the same times the observation, which finds a
+likelihood that ignores it, and the likelihood itself, which finds most (Modrák and others,
+"Simulation-based calibration checking for Bayesian computation: the choice of test quantities
+shapes sensitivity", 2023). A likelihood in place of its logarithm hardly weighs, so the true state,
+which is likely, lies above nearly all others.
 """
 
 from __future__ import annotations
@@ -21,15 +22,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.circular import differences
 from holdfast.planning.belief import Belief, uniform_weights, update
 from holdfast.problems import checked
-from holdfast.problems.attributes import has_general_observations, sensing_labels
+from holdfast.problems.attributes import (
+    circular_observation,
+    has_general_observations,
+    sensing_labels,
+)
 from holdfast.tuning.contract_check import draw_observation, kolmogorov_p
-from holdfast.tuning.findings import CHECKS, CONTRACT, Finding, Inspection
+from holdfast.tuning.findings import CHECKS, CONTRACT, Finding, Inspection, spread_out
 
 __all__ = ["Calibration", "calibrate", "check_likelihoods", "remedy_of"]
 
-_REPLICATES = 200
+_REPLICATES = 300
 """Simulated observations of a sensing action from each kind of belief."""
 
 _PARTICLES = 200
@@ -55,11 +61,13 @@ class Calibration(NamedTuple):
     truths : array of shape (r,)
         Which particle the observation was drawn in.
     states : array of shape (r, n, state_size)
+    shown : array of shape (r, observation_size)
     """
 
     log_likelihoods: FloatArray
     truths: IntArray
     states: FloatArray
+    shown: FloatArray
 
 
 def check_likelihoods(inspection: Inspection) -> None:
@@ -69,12 +77,13 @@ def check_likelihoods(inspection: Inspection) -> None:
     late = inspection.deadline(0.45)
     function = "log_likelihood" if has_general_observations(problem) else "observation_mean"
     untried = 0
+    beliefs_of = list(_beliefs(inspection))
     for action in range(min(count, _MOST_ACTIONS)):
         if late():
             untried = count - action
             break
         with inspection.part():
-            for kind, beliefs in _beliefs(inspection):
+            for kind, beliefs in beliefs_of:
                 found = inspection.ask(
                     function,
                     lambda beliefs=beliefs, action=action: calibrate(  # type: ignore[misc]
@@ -94,7 +103,7 @@ def check_likelihoods(inspection: Inspection) -> None:
 
 
 def _beliefs(inspection: Inspection) -> Iterator[tuple[str, list[FloatArray]]]:
-    """Yield beliefs as wide as the initial one, and as narrow as some moves from one state."""
+    """Yield beliefs as wide as the initial one or the way, and as narrow as some moves."""
     problem, ask = inspection.problem, inspection.ask
     own = inspection.random(_INITIAL)
     states = ask("initial_states", lambda: checked.initial_states(problem, own, _PARTICLES))
@@ -104,6 +113,7 @@ def _beliefs(inspection: Inspection) -> Iterator[tuple[str, list[FloatArray]]]:
         return
     rows = walk.states.reshape(-1, walk.states.shape[-1])
     stages = walk.stages.reshape(-1)
+    yield "states along the way", [rows[spread_out(_PARTICLES, len(rows))]]
     clouds = []
     moves = min(inspection.settings.sensing_interval + 1, 5)
     for number in range(_CLOUDS):
@@ -128,7 +138,7 @@ def calibrate(
     """Simulate observations of a sensing action in states of some beliefs, and weigh all states."""
     problem = inspection.problem
     which = inspection.random(_WHICH, action).random(_REPLICATES)
-    rows, truths, states = [], [], []
+    rows, truths, states, observations = [], [], [], []
     for number in range(_REPLICATES):
         if late() and number >= 50:
             break
@@ -139,7 +149,10 @@ def calibrate(
         rows.append(_log_likelihoods(problem, belief, action, shown))
         truths.append(truth)
         states.append(belief)
-    return Calibration(np.array(rows), np.array(truths), np.array(states))
+        # An angle is what it is on the circle: a turn more would tell what no posterior knows.
+        angles = circular_observation(problem, action, shown.size)
+        observations.append(differences(shown, np.zeros(shown.size), angles))
+    return Calibration(np.array(rows), np.array(truths), np.array(states), np.array(observations))
 
 
 def _log_likelihoods(
@@ -174,8 +187,14 @@ def _test(
     weights = _posteriors(values)
     ties = inspection.random(_TIES, action).random(len(truths))
     quantities: list[tuple[str, FloatArray]] = [("likelihood", values)]
-    coordinates = range(min(found.states.shape[-1], _MOST_COORDINATES))
-    quantities += [(inspection.coordinate(at), found.states[..., at]) for at in coordinates]
+    away = found.shown - found.shown.mean(axis=0)
+    for at in range(min(found.states.shape[-1], _MOST_COORDINATES)):
+        own_states = found.states[..., at]
+        quantities.append((inspection.coordinate(at), own_states))
+        # The order turns with the observation, so that one which is ignored shows.
+        quantities.append(
+            (f"{inspection.coordinate(at)} times the observation", own_states * away[:, :1])
+        )
     remedy: tuple[str, str] | None = None
     for name, quantity in quantities:
         places = _places(quantity, weights, truths, ties)

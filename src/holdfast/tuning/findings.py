@@ -12,6 +12,7 @@ they are collected, and only at the end, when their number is known, each is com
 from __future__ import annotations
 
 import contextlib
+import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -155,6 +156,7 @@ class Inspection:
         self._budget_s = budget_s
         self._end = perf_counter() + budget_s
         self._warned: set[str] = set()
+        self._blamed: set[str] = set()
 
     @property
     def name(self) -> str:
@@ -250,13 +252,11 @@ class Inspection:
         else:
             words = str(error) if isinstance(error, HoldfastError) else words
             seen, details = words if function in words else f"{function}: {words}", ""
-        # A function that calls a broken one, or that is given what it returned, is not to blame,
-        # and a slow one is named once, wherever it was interrupted.
-        end = one_line(words)
-        for found in self.findings:
-            same = found.details == details or isinstance(error, TimeoutError)
-            if found.severity == "error" and same and found.seen.endswith(end):
-                return
+        # One finding for what is broken, whoever calls it and with whatever states.
+        to_blame = _to_blame(words, details) or f"{function} {type(error).__name__}"
+        if to_blame in self._blamed:
+            return
+        self._blamed.add(to_blame)
         advice = "Look at what it returns there; the documentation says what is needed."
         if details:
             advice = "These are the lines of your own code."
@@ -288,6 +288,15 @@ class Inspection:
             "Harmless where the value is not used, as a logarithm of 0 that means impossible.",
             CONTRACT,
         )
+
+
+def _to_blame(words: str, details: str) -> str | None:
+    """Return the function that an error is about: the innermost of the user's, or the named one."""
+    frames = re.findall(r'^  File "(.+)", line \d+, in (.+)$', details, re.MULTILINE)
+    if frames:
+        return " ".join(frames[-1])
+    named = re.match(r"(\w+) of ", words)
+    return named[1] if named else None
 
 
 def spread_out(count: int, total: int) -> IntArray:
