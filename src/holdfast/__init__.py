@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
     from holdfast.robot.late_sensing import SenseInBackground
     from holdfast.robot.trial import run_trial
+    from holdfast.tuning.problem_check import check_problem
     from holdfast.tuning.simulated_trials import compare, run_trials
 
 __all__ = [
@@ -60,6 +61,7 @@ __all__ = [
     "SelectorSettings",
     "SenseInBackground",
     "SimulatedEnvironment",
+    "check_problem",
     "compare",
     "entropy",
     "load_configuration",
@@ -94,6 +96,7 @@ _PLACES = {
     "Scene": "problems.problem.Scene",
     "SimulatedEnvironment": "robot.environment.SimulatedEnvironment",
     "SelectorSettings": "planning.settings.SelectorSettings",
+    "check_problem": "tuning.problem_check.check_problem",
     "compare": "tuning.simulated_trials.compare",
     "entropy": "planning.estimators.entropy",
     "load_configuration": "config.loader.load",

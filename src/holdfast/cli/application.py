@@ -30,6 +30,7 @@ COMMANDS = {
     "sweep": Command("holdfast.cli.sweep", "Compare settings: runs of a grid of values."),
     "serve": Command("holdfast.service.process", "Decide for robots, as a service."),
     "doctor": Command("holdfast.cli.doctor", "Check each layer between a robot and a service."),
+    "check": Command("holdfast.cli.check", "Find what is wrong with a problem of your own."),
     "compare": Command("holdfast.cli.compare", "Compare the decisions of two runs."),
     "export": Command("holdfast.cli.export", "Write a run for RViz, Foxglove, or as tables."),
     "view": Command("holdfast.cli.view", "See a run in Rerun's viewer."),
