@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from holdfast.robot.trial import run_trial
     from holdfast.tuning.problem_check import check_problem
     from holdfast.tuning.simulated_trials import compare, run_trials
+    from holdfast.tuning.tune import tune
 
 __all__ = [
     "LATER",
@@ -69,6 +70,7 @@ __all__ = [
     "open_run",
     "run_trial",
     "run_trials",
+    "tune",
 ]
 
 __version__ = "0.1.0"
@@ -104,6 +106,7 @@ _PLACES = {
     "open_run": "recording.reading.open_run",
     "run_trial": "robot.trial.run_trial",
     "run_trials": "tuning.simulated_trials.run_trials",
+    "tune": "tuning.tune.tune",
 }
 """The module of each name, and its name there; type checkers read the imports above."""
 

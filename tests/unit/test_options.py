@@ -41,9 +41,13 @@ NUMBERS = [
     ["serve", "--max-sessions-per-robot"],
     ["serve", "--max-decision-s"],
     ["serve", "--max-decision-mb"],
+    *(["tune", "peg.yaml", f"--{name}"] for name in ("vary", "budget", "trials", "seed", "jobs")),
+    ["tune", "peg.yaml", "--max-decision-ms"],
 ]
 PATHS = [
     ["run"],
+    ["tune"],
+    ["tune", "peg.yaml", "--out"],
     ["run", "peg.yaml", "--out"],
     ["run", "peg.yaml", "--tls"],
     ["run", "peg.yaml", "--view-file"],
