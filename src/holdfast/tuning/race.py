@@ -30,10 +30,13 @@ import numpy as np
 
 from holdfast.numerics.arrays import FloatArray
 
-__all__ = ["MeasuredTrial", "Standing", "beats", "race"]
+__all__ = ["PILOT_TRIALS", "MeasuredTrial", "Standing", "beats", "race"]
 
 _BETS = np.array([1 / 64, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 9 / 10])
 """Shares of the capital: small ones find small differences, large ones soon find large ones."""
+
+PILOT_TRIALS = 2
+"""Of each candidate, which show how long a trial takes: the first one may be slower."""
 
 _FIRST_TRIALS = 10
 """Of each candidate, before any is set aside."""
@@ -136,6 +139,7 @@ def race(
     """
     costs: dict[str, FloatArray] = {name: np.empty(0) for name in candidates}
     seconds = dict.fromkeys(candidates, 0.0)
+    quickest = dict.fromkeys(candidates, math.inf)
     out: dict[str, tuple[State, str]] = {}
     level = error_rate / max(1, len(candidates) - 1)
 
@@ -153,6 +157,7 @@ def race(
         for each in run(jobs):
             found.setdefault(each.candidate, {})[each.trial] = each.cost
             seconds[each.candidate] += each.seconds
+            quickest[each.candidate] = min(quickest[each.candidate], each.seconds)
         for name, by_trial in found.items():
             new = np.array([by_trial[trial] for trial in sorted(by_trial)])
             costs[name] = np.concatenate([costs[name], new])
@@ -178,12 +183,13 @@ def race(
         """Set the slowest aside until ten trials of each fit: all of the time is for the quick."""
         for limit_s, times in ((left_s, _SLOW), (2.0 * left_s, 0.0)):
             while len(racing := [name for name in alive() if name != candidates[0]]):
-                slowest = max(racing, key=seconds.__getitem__)
-                usual_s = float(np.median([seconds[name] for name in racing]))
-                needed_s = (_FIRST_TRIALS - 1) * sum(seconds[name] for name in alive())
-                if needed_s <= limit_s or seconds[slowest] < times * usual_s:
+                slowest = max(racing, key=quickest.__getitem__)
+                usual_s = float(np.median([quickest[name] for name in racing]))
+                more = _FIRST_TRIALS - PILOT_TRIALS
+                needed_s = more * sum(quickest[name] for name in alive())
+                if needed_s <= limit_s or quickest[slowest] < times * usual_s:
                     break
-                took = f"{_FIRST_TRIALS} trials take {_FIRST_TRIALS * seconds[slowest]:.3g} s"
+                took = f"{_FIRST_TRIALS} trials take {_FIRST_TRIALS * quickest[slowest]:.3g} s"
                 out[slowest] = ("set aside", f"{took}, more than its share of the time")
 
     def affordable(names: Sequence[str], target: int, left_s: float) -> dict[str, int]:
@@ -200,7 +206,7 @@ def race(
             left_s -= each_s[name] * max(0, more)
         return targets
 
-    run_up_to(dict.fromkeys(candidates, 1))
+    run_up_to(dict.fromkeys(candidates, min(PILOT_TRIALS, most)))
     drop_slow(0.5 * (budget_s - sum(seconds.values())))
     target = min(_FIRST_TRIALS, most)
     has_run = run_up_to(dict.fromkeys(alive(), target))

@@ -42,7 +42,7 @@ from holdfast.tuning.candidates import (
     has_rewards,
     later_candidates,
 )
-from holdfast.tuning.race import MeasuredTrial, Standing, race
+from holdfast.tuning.race import PILOT_TRIALS, MeasuredTrial, Standing, race
 from holdfast.tuning.tuning_report import CandidateRow, Tuning, write_report
 from holdfast.tuning.verdict import TrialRow, cost_of, judge, mean_difference
 
@@ -196,10 +196,13 @@ class _Tuner:
         }
         barred = {name for name in rows if self._refusal(name) is not None}
         verdict = judge(rows, finalist.name, self._objective, self._limit, barred)
-        untried = sum(each.state == "set aside" and each.trials < 2 for each in standings)
+        untried = sum(
+            each.state == "set aside" and each.trials <= PILOT_TRIALS for each in standings
+        )
         sentence = verdict.sentence
         if untried:
-            sentence += f" {untried} slow candidates were not tried: a larger budget tries them."
+            what = "candidate was" if untried == 1 else "candidates were"
+            sentence += f" {untried} slow {what} not tried: a larger budget does that."
         return Tuning(
             sentence=sentence,
             choice=verdict.choice,
@@ -326,7 +329,7 @@ class _Tuner:
         changes = dict(self._candidates[name].changes) if name in self._candidates else {}
         state = f"{standing.state}{': ' * bool(standing.reason)}{standing.reason}"
         rows = self._kept.of(name)[: standing.trials]
-        if len(rows) < 2:
+        if len(rows) <= PILOT_TRIALS:
             return CandidateRow(candidate=name, changes=changes, trials=len(rows), state=state)
         costs, base = (
             np.array([cost_of(row, self._objective, self._limit) for row in each[: len(rows)]])
