@@ -46,10 +46,10 @@ def test_an_interrupted_one_goes_on(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(tuning, "tune", interrupted)
-    said = run_here(capsys, here, *WORDS, "--out", "mine")
+    said = run_here(capsys, here, *WORDS, "--budget", "1.5m", "--out", "mine")
     assert said.code == 130
     command = "holdfast tune run.yaml --vary fixed --trials 20 --jobs 1 --no-check"
-    command += " --out mine --resume"
+    command = command.replace("--trials", "--budget 1.5m --trials") + " --out mine --resume"
     assert said.stderr.endswith(f"Go on with: {command}\n")
 
 

@@ -41,8 +41,13 @@ _LONGEST_S = 30 * 86_400.0
 _UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
-def seconds(text: str) -> float:
+def duration_text(text: str) -> str:
     """Read a duration, such as 90s, 10m or 2h."""
+    _seconds(text)
+    return text
+
+
+def _seconds(text: str) -> float:
     found = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", text)
     value = float(found[1]) * _UNITS_S[found[2]] if found else 0.0
     if not 1.0 <= value <= _LONGEST_S:
@@ -88,11 +93,11 @@ class TuneOptions(Options):
         help="What decides: reward (less prices), steps (without success the limit) or success "
         "(default: reward if sensing has prices, else steps).",
     )
-    budget: float = option(
+    budget: str = option(
         metavar="TIME",
-        read=seconds,
-        default=600.0,
-        help="About how long it may take: 90s, 10m, 2h (default: 10m).",
+        read=duration_text,
+        default="10m",
+        help="About how long it may take: 90s, 10m, 2h.",
     )
     trials: int = option(
         metavar="N",
@@ -168,16 +173,16 @@ def _tune(options: TuneOptions) -> int:
         out = options.out
     else:
         out = claim_directory(options.out, runs, f"{options.configuration.stem}-tuned")
-    jobs = options.jobs or available_cores()
-    line = progress_line(round(options.budget), quiet=options.quiet, noun="second", speed=False)
+    jobs, budget_s = options.jobs or available_cores(), _seconds(options.budget)
+    line = progress_line(round(budget_s), quiet=options.quiet, noun="second", speed=False)
     doing = ""
 
     def show(progress: Progress) -> None:
         nonlocal doing
         if progress.doing != doing:
             doing = progress.doing
-            line.say(f"{doing}; at most {duration(options.budget - progress.spent_s / jobs)} left")
-        spent = min(round(progress.spent_s / jobs), round(options.budget) - 1)
+            line.say(f"{doing}; at most {duration(budget_s - progress.spent_s / jobs)} left")
+        spent = min(round(progress.spent_s / jobs), round(budget_s) - 1)
         line.show(spent, f"{progress.trials:,} trials")
 
     line.start(f"{configuration.problem_name}; results in {shown_path(out)}", 0, "")
@@ -186,7 +191,7 @@ def _tune(options: TuneOptions) -> int:
             configuration,
             vary=tuple(options.vary.split(",")),  # type: ignore[arg-type]
             objective=options.objective,  # type: ignore[arg-type]
-            budget_s=options.budget,
+            budget_s=budget_s,
             most=options.trials,
             jobs=jobs,
             max_decision_ms=options.max_decision_ms,
@@ -219,7 +224,7 @@ def _check(configuration: Configuration, options: TuneOptions) -> None:
         configuration.problem,
         configuration.planning,
         max_steps=configuration.simulator.max_steps,
-        budget_s=min(_LONGEST_CHECK_S, 0.1 * options.budget),
+        budget_s=min(_LONGEST_CHECK_S, 0.1 * _seconds(options.budget)),
     )
     errors = [each for each in found if each.severity == "error"]
     for each in found:
