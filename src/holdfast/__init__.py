@@ -35,7 +35,9 @@ if TYPE_CHECKING:
     from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
     from holdfast.robot.late_sensing import SenseInBackground
     from holdfast.robot.trial import run_trial
+    from holdfast.tuning.problem_check import check_problem
     from holdfast.tuning.simulated_trials import compare, run_trials
+    from holdfast.tuning.tune import tune
 
 __all__ = [
     "LATER",
@@ -60,6 +62,7 @@ __all__ = [
     "SelectorSettings",
     "SenseInBackground",
     "SimulatedEnvironment",
+    "check_problem",
     "compare",
     "entropy",
     "load_configuration",
@@ -67,6 +70,7 @@ __all__ = [
     "open_run",
     "run_trial",
     "run_trials",
+    "tune",
 ]
 
 __version__ = "0.1.0"
@@ -94,6 +98,7 @@ _PLACES = {
     "Scene": "problems.problem.Scene",
     "SimulatedEnvironment": "robot.environment.SimulatedEnvironment",
     "SelectorSettings": "planning.settings.SelectorSettings",
+    "check_problem": "tuning.problem_check.check_problem",
     "compare": "tuning.simulated_trials.compare",
     "entropy": "planning.estimators.entropy",
     "load_configuration": "config.loader.load",
@@ -101,6 +106,7 @@ _PLACES = {
     "open_run": "recording.reading.open_run",
     "run_trial": "robot.trial.run_trial",
     "run_trials": "tuning.simulated_trials.run_trials",
+    "tune": "tuning.tune.tune",
 }
 """The module of each name, and its name there; type checkers read the imports above."""
 

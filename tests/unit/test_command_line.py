@@ -118,6 +118,8 @@ def test_words_give_the_same_options_again(command: str) -> None:
         if each.many and each.read is location
         else Path("p").absolute()
         if each.read is location
+        else each.default or "p"
+        if each.least
         else each.default
         for name, each in options.table().items()
     }

@@ -24,6 +24,7 @@ BESIDE = {
 }
 """What is no part of the product, and its tests."""
 
+WRONG_PROBLEMS = "tests/unit/test_problem_check.py tries it, by problems that are wrong"
 WITHOUT_TESTS = {
     "__main__": "one line, which every process test runs",
     "cli/doctor": "options and printing; tests/processes/test_robot_doctor.py runs it",
@@ -36,6 +37,11 @@ WITHOUT_TESTS = {
     "ros/ros2/__main__": "one line, which tests/ros runs",
     "robot/session_configuration": "one function; tests/unit/test_reference_decisions.py calls it",
     "ros/ros2/messages": "converts rclpy's messages, which only tests/ros has",
+    "tuning/contract_check": WRONG_PROBLEMS,
+    "tuning/findings": WRONG_PROBLEMS,
+    "tuning/goal_check": WRONG_PROBLEMS,
+    "tuning/sensor_check": WRONG_PROBLEMS,
+    "tuning/trial_check": WRONG_PROBLEMS,
     "ros/ros2_connections": "needs ROS 2; tests/ros/test_ros2_environment.py",
 }
 """Modules of the product that no test is named after, and why."""

@@ -160,7 +160,7 @@ class TestEffects:
             method="percentile",
             random_state=np.random.default_rng(0),
         ).confidence_interval
-        found = outcome_comparison._bootstrap(values, difference, paired=paired)
+        found = outcome_comparison.bootstrap_interval(values, difference, paired=paired)
         assert found == pytest.approx(tuple(expected), rel=1e-12)
 
     @pytest.mark.parametrize("paired", [True, False])

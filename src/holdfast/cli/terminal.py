@@ -44,9 +44,10 @@ class ProgressLine:
     This one shows nothing.
     """
 
-    def __init__(self, total: int, noun: str) -> None:
+    def __init__(self, total: int, noun: str, *, speed: bool) -> None:
         self._total = total
         self._noun = noun
+        self._shows_speed = speed
         self._finished_before = 0
         self._started = perf_counter()
 
@@ -73,14 +74,18 @@ class ProgressLine:
         return new / elapsed_s if new and elapsed_s > 0.0 else None
 
     def _speed(self, rate: float | None) -> str:
+        if not self._shows_speed:
+            return ""
         return "-" if rate is None else f"{rate:.3g} {self._noun}s/s"
 
 
-def progress_line(total: int, *, quiet: bool, noun: str = "trial") -> ProgressLine:
+def progress_line(
+    total: int, *, quiet: bool, noun: str = "trial", speed: bool = True
+) -> ProgressLine:
     """Return what suits the standard error: a moving line, a line now and then, or nothing."""
     if quiet:
-        return ProgressLine(total, noun)
-    return (_Live if sys.stderr.isatty() else _Plain)(total, noun)
+        return ProgressLine(total, noun, speed=speed)
+    return (_Live if sys.stderr.isatty() else _Plain)(total, noun, speed=speed)
 
 
 class _Plain(ProgressLine):
@@ -98,8 +103,9 @@ class _Plain(ProgressLine):
             return
         self._last = now
         rate = self._rate(finished)
-        left = "" if rate is None else f", {duration((self._total - finished) / rate)}"
-        self.say(f"{finished}/{self._total} {self._noun}s, {note}, {self._speed(rate)}{left} left")
+        left = "" if rate is None else f"{duration((self._total - finished) / rate)} left"
+        parts = (f"{finished}/{self._total} {self._noun}s", note, self._speed(rate), left)
+        self.say(", ".join(filter(None, parts)))
 
     def say(self, text: str) -> None:
         sys.stderr.write(f"{printable(text)}\n")

@@ -34,6 +34,7 @@ __all__ = [
     "OutcomeEffect",
     "OutcomeEstimate",
     "RunOutcomes",
+    "bootstrap_interval",
     "compare_outcomes",
     "compare_results",
     "effects_of",
@@ -410,7 +411,7 @@ def estimates_of(results: Sequence[TrialResult], *, step_limit: int) -> tuple[Ou
         if measure.name.endswith("_rate"):
             interval = wilson_interval(int(values.sum()), values.size)
         elif values.size >= _LEAST_TRIALS and np.ptp(values) > 0.0:
-            interval = _bootstrap([values], measure.summarise, paired=False)
+            interval = bootstrap_interval([values], measure.summarise, paired=False)
         value = float(measure.summarise(values, 0))
         found.append(OutcomeEstimate(measure.name, values.size, value, interval))
     return tuple(found)
@@ -500,7 +501,7 @@ def _effect_of(
             return None  # a ratio to no time at all
         scatter = [compared(one, other)] if paired else [one, other]
         if max(map(np.ptp, scatter)) > 0.0:
-            interval = _bootstrap((one, other), effect_of, paired=paired)
+            interval = bootstrap_interval((one, other), effect_of, paired=paired)
     no_effect = 0.0 if measure.kind == "difference" else 1.0
     verdict: Verdict = "no difference found"
     if trials < _LEAST_FOR_A_VERDICT:
@@ -519,8 +520,12 @@ def _effect_of(
     )
 
 
-def _bootstrap(
-    values: Sequence[FloatArray], statistic: Callable[..., Any], *, paired: bool
+def bootstrap_interval(
+    values: Sequence[FloatArray],
+    statistic: Callable[..., Any],
+    *,
+    paired: bool,
+    level: float = LEVEL,
 ) -> tuple[float, float]:
     """Return the interval in which the statistic of resamples lies; pairs are drawn as pairs."""
     generator = np.random.default_rng(_SEED)
@@ -534,7 +539,7 @@ def _bootstrap(
             drawn *= len(values)
         resampled = (each[indices] for each, indices in zip(values, drawn, strict=True))
         found.append(statistic(*resampled, axis=-1))
-    low, high = np.quantile(np.concatenate(found), [0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL])
+    low, high = np.quantile(np.concatenate(found), [0.5 - 0.5 * level, 0.5 + 0.5 * level])
     return float(low), float(high)
 
 

@@ -1,1 +1,1 @@
-"""What simulated trials say of settings and problems: tables, comparisons, sweeps."""
+"""Know that it pays: checks of a problem, comparisons, tuning."""

@@ -1,0 +1,222 @@
+"""``holdfast check``: what is wrong with a problem, before a day is lost with it."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import signal
+import sys
+import textwrap
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from holdfast.cli.exit_codes import EXIT_DIFFERENT, ended_by_signals
+from holdfast.errors import ConfigurationError, InvalidValueError
+from holdfast.printable import printable
+from holdfast.runtime.command_line import (
+    MAX_SEED,
+    Options,
+    argument,
+    flag,
+    location,
+    number,
+    option,
+    whole_number,
+)
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+    from holdfast.config.loader import Configuration
+    from holdfast.tuning.findings import Finding
+
+__all__ = ["main"]
+
+_COLORS = {"error": 31, "warning": 33, "information": 0}
+"""Of a terminal: red, yellow; else its own."""
+
+_WIDEST = 110
+_INDENT = 4
+
+_PATIENCE = 3.0
+"""A call that takes so many times the budget is ended, where the system can."""
+
+
+class CheckOptions(Options):
+    """Check a problem: its functions, its likelihoods, its goal, its sensors and its resolution.
+
+    PROBLEM is a configuration file, a registered name, or module:Class of a module in the current
+    directory. Of a configuration the simulated world is used, never its environment: no robot
+    moves.
+
+    Errors make decisions wrong, warnings make them worse. The statistical tests of a right
+    problem, all together, find an error in one check of a thousand.
+    """
+
+    exit_codes: ClassVar = {0: "no error, perhaps warnings", 1: "an error in the problem"}
+    needs_arguments = True
+
+    problem: str = argument("PROBLEM", "Configuration file, name, or module:Class.")
+    assignments: tuple[str, ...] = option(
+        "--set",
+        metavar="SECTION.KEY=VALUE",
+        many=True,
+        help="A value instead of the file's, or of the default, as YAML: model.width=0.3.",
+    )
+    problem_directory: Path | None = option(
+        metavar="DIR",
+        read=location,
+        help="Where the module of module:Class is (default: here, or where the file says).",
+    )
+    seed: int = option(
+        metavar="S",
+        read=whole_number(0, MAX_SEED),
+        default=0,
+        help="Names all random draws; the same seed finds the same.",
+    )
+    budget: float = option(
+        metavar="SECONDS",
+        read=number(0.1, 86_400.0, "s"),
+        default=20.0,
+        help="Time after which no further work is begun; most problems need a few seconds.",
+    )
+    json: bool = flag(help="Print each finding as a JSON object, one a line.")
+    quiet: bool = flag("-q", help="Show no progress, and no information: errors and warnings only.")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Check the problem and return the exit code."""
+    options = CheckOptions.parse("check", arguments)
+    with ended_by_signals():
+        return _check(options)
+
+
+def _check(options: CheckOptions) -> int:
+    from holdfast.cli.terminal import progress_line
+    from holdfast.tuning.problem_check import CHECKS, check_problem
+
+    configuration = _configuration(options)
+    line = progress_line(len(CHECKS), quiet=options.quiet or options.json, noun="check")
+    begun = 0
+
+    def on_check(name: str) -> None:
+        nonlocal begun
+        line.show(begun, name)
+        begun += 1
+
+    line.start(f"checking {configuration.problem_name}", 0, "")
+    try:
+        # What the problem's code prints is no finding.
+        with contextlib.redirect_stdout(sys.stderr), _impatient(_PATIENCE * options.budget):
+            found = check_problem(
+                configuration.problem,
+                configuration.planning,
+                max_steps=configuration.simulator.max_steps,
+                seed=options.seed,
+                budget_s=options.budget,
+                on_check=on_check,
+            )
+    finally:
+        line.stop()
+    shown = [each for each in found if not options.quiet or each.severity != "information"]
+    if options.json:
+        import msgspec
+
+        for each in shown:
+            sys.stdout.write(msgspec.json.encode(each._asdict()).decode() + "\n")
+    else:
+        for each in shown:
+            sys.stdout.write(f"{_as_text(each)}\n")
+        sys.stdout.write(f"{_summary(found)}\n")
+    return EXIT_DIFFERENT if any(each.severity == "error" for each in found) else 0
+
+
+def _configuration(options: CheckOptions) -> Configuration:
+    """Return the configuration of a file, or one of defaults for a problem's name."""
+    from holdfast.cli.overrides import combined, parse_assignment
+    from holdfast.config.loader import Configuration, load
+
+    given = combined(parse_assignment(each) for each in options.assignments)
+    directory = options.problem_directory
+    if options.problem.endswith((".yaml", ".yml")) or Path(options.problem).is_file():
+        if directory is not None:
+            raise InvalidValueError(
+                "--problem-directory goes with module:Class; a configuration file has the key "
+                "problem_directory"
+            )
+        return load(Path(options.problem).absolute(), overrides=given)
+    sections: dict[str, object] = {"problem": options.problem}
+    if directory is not None:
+        sections["problem_directory"] = str(directory)
+    for name, value in given.items():
+        section, _, key = name.partition(".")
+        own = sections.setdefault(section, {})
+        if not isinstance(own, dict):
+            raise InvalidValueError(f"--set {name}: {section} has no keys")
+        own[key] = value
+    path = str(Path.cwd() / options.problem.replace("/", "_"))
+    try:
+        return Configuration.from_plain({"path": path, "configuration": sections})
+    except ConfigurationError as error:
+        # There is no such file.
+        raise type(error)(str(error).removeprefix(f"{path}: ")) from error
+
+
+@contextlib.contextmanager
+def _impatient(seconds: float) -> Iterator[None]:
+    """Raise TimeoutError in the problem's code if it takes so long: a finding with its lines."""
+    from holdfast.config.user_code import is_users_file
+
+    ours = str(Path(__file__).parents[1] / "tuning")
+
+    def end(number: int, frame: FrameType | None) -> None:
+        del number
+        while frame is not None and not frame.f_code.co_filename.startswith(ours):
+            if is_users_file(frame.f_code.co_filename):
+                raise TimeoutError(f"it was still running {seconds:g} s after the check began")
+            frame = frame.f_back
+
+    before = signal.signal(signal.SIGALRM, end)
+    # Again each second: what runs then may be ours, or a second function of the problem's.
+    signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _as_text(finding: Finding) -> str:
+    """Return the lines of a finding."""
+    width = min(shutil.get_terminal_size().columns, _WIDEST)
+    begins = f"{finding.severity:<11} "
+    lines = _wrapped(f"{finding.check}: {finding.seen}", width, begins)
+    if finding.details:
+        lines += [f"{' ' * _INDENT}{line}" for line in finding.details.splitlines()]
+    if finding.advice:
+        where = "" if finding.severity == "information" else f" ({finding.where})"
+        lines += _wrapped(f"{finding.advice}{where}", width, f"{' ' * _INDENT}-> ")
+    if sys.stdout.isatty() and (color := _COLORS[finding.severity]):
+        lines[0] = f"\x1b[{color}m{begins}\x1b[0m{lines[0].removeprefix(begins)}"
+        return "\n".join([lines[0], *map(printable, lines[1:])])
+    return printable("\n".join(lines))
+
+
+def _wrapped(text: str, width: int, begins: str) -> list[str]:
+    return textwrap.wrap(
+        text,
+        width,
+        initial_indent=begins,
+        subsequent_indent=" " * _INDENT,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def _summary(found: Sequence[Finding]) -> str:
+    from holdfast.cli.terminal import counted
+
+    errors = sum(each.severity == "error" for each in found)
+    warnings = sum(each.severity == "warning" for each in found)
+    return f"{counted(errors, 'error')}, {counted(warnings, 'warning')}"

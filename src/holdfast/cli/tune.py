@@ -1,0 +1,238 @@
+"""``holdfast tune``: find what to sense on one's own problem, by simulating it."""
+
+from __future__ import annotations
+
+import math
+import re
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from holdfast.cli.exit_codes import ended_by_signals, interrupted_by
+from holdfast.cli.overrides import combined, parse_assignment
+from holdfast.cli.terminal import counted, duration, progress_line
+from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.printable import printable
+from holdfast.runtime.command_line import (
+    MAX_JOBS,
+    MAX_SEED,
+    Options,
+    argument,
+    bad_value,
+    flag,
+    location,
+    number,
+    one_of,
+    option,
+    whole_number,
+)
+from holdfast.runtime.files import claim_directory, shown_path
+
+if TYPE_CHECKING:
+    from holdfast.config.loader import Configuration
+
+__all__ = ["TuneOptions", "main"]
+
+_MOST_TRIALS = 100_000
+_LONGEST_CHECK_S = 20.0
+_LONGEST_S = 30 * 86_400.0
+_UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
+
+
+def duration_text(text: str) -> str:
+    """Read a duration, such as 90s, 10m or 2h."""
+    _seconds(text)
+    return text
+
+
+def _seconds(text: str) -> float:
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", text)
+    value = float(found[1]) * _UNITS_S[found[2]] if found else 0.0
+    if not 1.0 <= value <= _LONGEST_S:
+        raise bad_value(text, "durations from 1s to 720h, such as 90s, 10m or 2h")
+    return value
+
+
+def variations(text: str) -> str:
+    """Read what is to be tried, separated by commas."""
+    from holdfast.tuning.candidates import VARIATIONS
+
+    for each in text.split(","):
+        if each not in VARIATIONS:
+            raise bad_value(text, f"lists of {', '.join(VARIATIONS)}, with commas")
+    return text
+
+
+class TuneOptions(Options):
+    """Find what to sense on the problem of CONFIG, by simulating it.
+
+    Methods and settings race in the same simulated worlds; what is beaten is dropped. The winner is
+    then judged beside CONFIG and random sensing on trials that had no part in the race.
+
+    DIR gets tuned.yaml (CONFIG with the keys that changed), tune.md (tables with intervals),
+    tune.png, candidates.csv and trials.csv.
+    """
+
+    needs_arguments = True
+    exit_codes: ClassVar = {}
+
+    configuration: Path = argument("CONFIG", "Configuration file (YAML).", location)
+    vary: str = option(
+        metavar="WHAT,...",
+        read=variations,
+        default="methods,looks,resolution",
+        help="What is tried: methods, looks (ahead, of expected_return), resolution (3 and 10 "
+        "times), estimators, fixed (always one sensing action); then, of the winner, interval "
+        "and particles.",
+    )
+    objective: str | None = option(
+        metavar="NAME",
+        read=one_of("reward", "steps", "success"),
+        help="What decides: reward (less prices), steps (without success the limit) or success "
+        "(default: reward if sensing has prices, else steps).",
+    )
+    budget: str = option(
+        metavar="TIME",
+        read=duration_text,
+        default="10m",
+        help="About how long it may take: 90s, 10m, 2h.",
+    )
+    trials: int = option(
+        metavar="N",
+        read=whole_number(20, _MOST_TRIALS),
+        default=200,
+        help="Most trials of a candidate in the race, and as many to judge.",
+    )
+    max_decision_ms: float = option(
+        metavar="MS",
+        read=number(1e-3, 3.6e6, "ms"),
+        default=math.inf,
+        help="No candidate may win whose median decision takes longer (default: no limit).",
+    )
+    jobs: int | None = option(
+        "-j",
+        metavar="N",
+        read=whole_number(1, MAX_JOBS),
+        help="Largest number of processes (default: one for each core).",
+    )
+    seed: int | None = option(
+        metavar="S",
+        read=whole_number(0, MAX_SEED),
+        key="simulator.seed",
+        help="Seed of all random draws, instead of the file's.",
+    )
+    assignments: tuple[str, ...] = option(
+        "--set",
+        metavar="SECTION.KEY=VALUE",
+        many=True,
+        help="A value instead of the file's, as YAML: simulator.max_steps=200.",
+    )
+    problem: str | None = option(
+        metavar="NAME",
+        help="Problem instead of the file's: a registered name or module:Class.",
+    )
+    out: Path | None = option(
+        "-o",
+        metavar="DIR",
+        read=location,
+        help="Directory for the results (default: runs/CONFIG-tuned, numbered if taken).",
+    )
+    resume: bool = flag(help="Go on with the tuning in DIR; a larger --budget finds more.")
+    check: bool = flag(
+        default=True, help="Check the problem first, and stop at an error (holdfast check)."
+    )
+    quiet: bool = flag("-q", help="Show only the sentence.")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Tune and return the exit code."""
+    options = TuneOptions.parse("tune", arguments)
+    with ended_by_signals():
+        return _tune(options)
+
+
+def _tune(options: TuneOptions) -> int:
+    from holdfast.config.loader import load
+    from holdfast.robot.trial_pool import available_cores
+    from holdfast.tuning.tune import TRIALS_NAME, Progress, tune
+    from holdfast.tuning.tuning_report import CONFIGURATION_NAME, tuning_tables
+
+    runs = Path("runs").absolute()
+    given = [parse_assignment(each) for each in options.assignments]
+    path = shown_path(options.configuration)
+    configuration = load(
+        path, problem=options.problem, seed=options.seed, overrides=combined(given)
+    )
+    if options.check and not options.resume:
+        _check(configuration, options)
+    if options.resume:
+        if options.out is None or not (options.out / TRIALS_NAME).is_file():
+            raise InvalidValueError(f"--resume needs --out DIR, of a tuning that has {TRIALS_NAME}")
+        out = options.out
+    else:
+        out = claim_directory(options.out, runs, f"{options.configuration.stem}-tuned")
+    jobs, budget_s = options.jobs or available_cores(), _seconds(options.budget)
+    line = progress_line(round(budget_s), quiet=options.quiet, noun="second", speed=False)
+    doing = ""
+
+    def show(progress: Progress) -> None:
+        nonlocal doing
+        if progress.doing != doing:
+            doing = progress.doing
+            line.say(f"{doing}; at most {duration(budget_s - progress.spent_s / jobs)} left")
+        spent = min(round(progress.spent_s / jobs), round(budget_s) - 1)
+        line.show(spent, f"{progress.trials:,} trials")
+
+    line.start(f"{configuration.problem_name}; results in {shown_path(out)}", 0, "")
+    try:
+        found = tune(
+            configuration,
+            vary=tuple(options.vary.split(",")),  # type: ignore[arg-type]
+            objective=options.objective,  # type: ignore[arg-type]
+            budget_s=budget_s,
+            most=options.trials,
+            jobs=jobs,
+            max_decision_ms=options.max_decision_ms,
+            out=out,
+            on_progress=show,
+        )
+    except KeyboardInterrupt as interruption:
+        line.stop()
+        words = [*options.words("out", "resume"), "--out", shown_path(out), "--resume"]
+        command = shlex.join(["holdfast", "tune", *words])
+        sys.stderr.write(
+            f"\n{interrupted_by(interruption)}. The finished trials are kept.\n"
+            f"Go on with: {command}\n"
+        )
+        raise
+    finally:
+        line.stop()
+    text = f"{found.sentence}\n" if options.quiet else tuning_tables(found)
+    sys.stdout.write(printable(text))
+    if not options.quiet:
+        sys.stderr.write(f"Take it: holdfast run {shown_path(out / CONFIGURATION_NAME)}\n")
+    return 0
+
+
+def _check(configuration: Configuration, options: TuneOptions) -> None:
+    """Show what is wrong with the problem; raise ProblemError if that is an error."""
+    from holdfast.tuning.problem_check import check_problem
+
+    found = check_problem(
+        configuration.problem,
+        configuration.planning,
+        max_steps=configuration.simulator.max_steps,
+        budget_s=min(_LONGEST_CHECK_S, 0.1 * _seconds(options.budget)),
+    )
+    errors = [each for each in found if each.severity == "error"]
+    for each in found:
+        if each.severity == "warning" and not options.quiet:
+            sys.stderr.write(printable(f"note: {each.check}: {each.seen}\n"))
+    if errors:
+        first = errors[0]
+        raise ProblemError(
+            f"{first.check}: {first.seen}. holdfast check {shown_path(options.configuration)} says "
+            f"more of {counted(len(errors), 'error')}; --no-check tunes all the same"
+        )

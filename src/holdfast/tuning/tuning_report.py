@@ -1,0 +1,265 @@
+"""What a tuning leaves in its directory: the configuration, tables and a figure.
+
+``tuned.yaml`` is the user's file with the keys that changed, ``tune.md`` says why,
+``candidates.csv`` has the race, ``tune.png`` shows both.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from holdfast.config.loader import Configuration
+from holdfast.config.yaml_document import read, write
+from holdfast.recording.table_formats import Table
+from holdfast.runtime.files import write_atomically
+from holdfast.tuning.candidates import Objective
+from holdfast.tuning.verdict import FAMILY_LEVEL, Comparison
+
+__all__ = ["CandidateRow", "Tuning", "tuned_yaml", "tuning_figure", "tuning_tables", "write_report"]
+
+CONFIGURATION_NAME = "tuned.yaml"
+TABLES_NAME = "tune.md"
+CANDIDATES_NAME = "candidates.csv"
+FIGURE_NAME = "tune.png"
+
+_PATHS = (
+    ("problem_directory",),
+    ("offload", "services"),
+    ("offload", "tls"),
+    ("environment", "directory"),
+)
+"""Keys of a file whose values may be relative to it; the result lies in another directory."""
+
+
+class CandidateRow(msgspec.Struct, frozen=True, kw_only=True):
+    """What the race has found of a candidate.
+
+    Attributes
+    ----------
+    changes : dict
+        Keys (``section.key``) whose values differ from the configuration's.
+    trials : int
+        In the race; of fewer trials than others' they are the first.
+    cost : float or None
+        Mean steps, rate of no success, or negative reward, whichever decides.
+    difference, interval
+        Of its cost to that of the configuration, over the trials of both. It is what the choice
+        rests on, so the best of many looks too good.
+    decision_ms : float or None
+        Median time to choose a sensing action.
+    trial_s : float
+        Seconds of a processor that a trial takes.
+    state : str
+        How it left the race, and why.
+    """
+
+    candidate: str
+    changes: dict[str, Any]
+    trials: int
+    cost: float | None = None
+    difference: float | None = None
+    interval: tuple[float, float] | None = None
+    success: float | None = None
+    decision_ms: float | None = None
+    trial_s: float = 0.0
+    state: str
+
+
+class Tuning(Table, msgspec.Struct, frozen=True, kw_only=True):
+    """What a tuning has found; as a table, a row for each candidate of the race.
+
+    Attributes
+    ----------
+    sentence : str
+        What to do, and how sure that is.
+    choice : str
+        The candidate to take.
+    changes : dict
+        Keys (``section.key``) in which it differs from the configuration; empty if that stays.
+    matters : bool
+        Whether any two of those judged differed beyond noise.
+    comparisons : tuple of Comparison
+        The choice against each other one, on ``fresh_trials`` that had no part in the race.
+    candidates : tuple of CandidateRow
+        In the order of the race's end, the winner first.
+    """
+
+    sentence: str
+    choice: str
+    changes: dict[str, Any]
+    matters: bool
+    objective: Objective
+    fresh_trials: int
+    comparisons: tuple[Comparison, ...]
+    candidates: tuple[CandidateRow, ...]
+
+    def columns(self) -> Sequence[str]:
+        """Return the names of the columns, for programs."""
+        return [*(name for name in _COLUMNS if name != "interval"), "low", "high"]
+
+    def rows(self) -> list[tuple[object, ...]]:
+        """Return a row for each candidate."""
+        plain = [[getattr(each, name) for name in self.columns()[:-2]] for each in self.candidates]
+        for values in plain:
+            values[1] = msgspec.json.encode(values[1]).decode()
+        return [
+            (*values, *(each.interval or (None, None)))
+            for values, each in zip(plain, self.candidates, strict=True)
+        ]
+
+    def shown(self) -> list[tuple[str, ...]]:
+        """Return a row for each candidate, for people."""
+        cost = {"steps": "steps", "success": "no success", "reward": "-reward"}[self.objective]
+        head = ("race", "trials", cost, "to as configured", "95 % interval")
+        more = ("success (%)", "decision (ms)", "trial (s)", "state")
+        return [(*head, *more), *map(_raced, self.candidates)]
+
+    def legend(self) -> str:
+        """Return how to read the table."""
+        return (
+            "The race, from which the winner was chosen, so that its own numbers look too good. A "
+            "difference is over the trials of both; what is slow has had fewer."
+        )
+
+
+_COLUMNS = CandidateRow.__struct_fields__
+
+
+def _raced(each: CandidateRow) -> tuple[str, ...]:
+    if each.cost is None or each.difference is None or each.interval is None:
+        return (each.candidate, str(each.trials), *6 * ("",), each.state)
+    low, high = each.interval
+    return (
+        each.candidate,
+        str(each.trials),
+        f"{each.cost:.4g}",
+        f"{each.difference:+.3g}",
+        f"[{low:+.3g}, {high:+.3g}]",
+        f"{100.0 * (each.success or 0.0):.3g}",
+        f"{each.decision_ms or 0.0:.3g}",
+        f"{each.trial_s:.3g}",
+        each.state,
+    )
+
+
+def write_report(out: Path, configuration: Configuration, found: Tuning) -> None:
+    """Write all files; the figure only if matplotlib is installed."""
+    write_atomically(out / CONFIGURATION_NAME, tuned_yaml(configuration, found).encode())
+    write_atomically(out / TABLES_NAME, tuning_tables(found).encode())
+    found.to_csv(out / CANDIDATES_NAME)
+    try:
+        picture = tuning_figure(found)
+    except ImportError:
+        return
+    write_atomically(out / FIGURE_NAME, picture)
+
+
+def tuned_yaml(configuration: Configuration, found: Tuning) -> str:
+    """Return the user's configuration file with the keys that changed, and what they were."""
+    resolved = configuration.plain()["configuration"]
+    try:
+        data: dict[str, Any] = dict(read(configuration.path.read_bytes(), "").data or {})
+    except OSError:
+        data = dict(resolved)  # it came from a pipe
+    head = [f"# {line}\n" for line in ("By holdfast tune.", found.sentence)]
+    for key, value in found.changes.items():
+        section, _, name = key.partition(".")
+        before = msgspec.json.encode(resolved[section][name]).decode()
+        head.append(f"# {key} was {before}.\n")
+        data[section] = {**(data.get(section) or {}), name: value}
+    data["problem"] = resolved["problem"]
+    for section, *names in _PATHS:
+        if not names and "problem_directory" in resolved:
+            data[section] = resolved[section]
+        for name in names:
+            if name in (data.get(section) or {}):
+                data[section] = {**data[section], name: resolved[section][name]}
+    return "".join(head) + write(data)
+
+
+# -- tables ----------------------------------------------------------------------------------------
+
+
+class _Judged(Table, msgspec.Struct, frozen=True):
+    """The comparisons on fresh trials."""
+
+    found: Tuning
+
+    def shown(self) -> list[tuple[str, ...]]:
+        """Return a row for each measure of each rival."""
+        names = ("measure", self.found.choice, "against", "its value", "difference")
+        return [(*names, "interval", "finding"), *map(self._cells, self.found.comparisons)]
+
+    @staticmethod
+    def _cells(each: Comparison) -> tuple[str, ...]:
+        scale, unit = (100.0, " (%)") if each.measure == "success" else (1.0, "")
+        low, high = (scale * end for end in each.interval)
+        return (
+            f"{each.measure}{unit}",
+            f"{scale * each.value:.4g}",
+            each.against,
+            f"{scale * each.other:.4g}",
+            f"{scale * each.difference:+.3g}",
+            f"[{low:+.3g}, {high:+.3g}]",
+            {1: "better", 0: "within noise", -1: "worse"}[each.finding],
+        )
+
+
+def tuning_tables(found: Tuning) -> str:
+    """Return the finding and its two tables as Markdown."""
+    return (
+        f"{found.sentence}\n\nJudged on {found.fresh_trials:,} fresh trials in the same worlds. "
+        f"The intervals of {found.objective} hold together at {FAMILY_LEVEL:.0%}.\n\n"
+        f"{_Judged(found).to_markdown()}\n{found.legend()}\n\n{found.to_markdown()}"
+    )
+
+
+# -- figure ----------------------------------------------------------------------------------------
+
+
+def tuning_figure(found: Tuning) -> bytes:
+    """Return a picture (PNG) of the differences to the configuration, and of those judged."""
+    import matplotlib as mpl  # slow, and perhaps not there
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from holdfast.recording.figure import STYLE
+
+    rows = [each for each in found.candidates if each.interval is not None][::-1]
+    judged = [each for each in found.comparisons if each.measure == found.objective][::-1]
+    with mpl.rc_context(STYLE):
+        height = 1.6 + 0.24 * (len(rows) + len(judged))
+        figure = Figure(figsize=(8.0, height), layout="constrained")
+        FigureCanvasAgg(figure)
+        ratios = (len(judged) + 0.5, len(rows) + 0.5) if judged else (0.5, len(rows) + 0.5)
+        above, below = figure.subplots(2, 1, height_ratios=ratios)
+        for panel, title, points in (
+            (
+                above,
+                f"{found.choice}, on {found.fresh_trials} fresh trials: {found.objective} less "
+                "that of",
+                [(each.against, each.difference, each.interval) for each in judged],
+            ),
+            (
+                below,
+                "the race: cost less that of the configuration (left is better)",
+                [(each.candidate, each.difference, each.interval) for each in rows],
+            ),
+        ):
+            panel.set_title(title, loc="left")
+            panel.axvline(0.0, color="#8A9099", linewidth=0.8)
+            for place, (_, middle, ends) in enumerate(points):
+                assert ends is not None
+                panel.plot(ends, (place, place), color="#2F6DB3", linewidth=1.6)
+                panel.plot(middle, place, "o", color="#111111", markersize=4.0)
+            panel.set_yticks(range(len(points)), [name for name, *_ in points])
+            panel.set_ylim(-0.6, len(points) - 0.4)
+            panel.grid(visible=True, axis="x")
+        picture = io.BytesIO()
+        figure.savefig(picture, format="png", dpi=150)
+    return picture.getvalue()

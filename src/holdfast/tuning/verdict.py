@@ -1,0 +1,243 @@
+"""What a race has found, judged on trials that had no part in it.
+
+Of many candidates the luckiest wins, so its mean in the race is too good to be true (the winner's
+curse). It is measured anew, beside the configuration as it was and random sensing, and only these
+trials confirm. Their few intervals hold together at 95 % (Bonferroni). If none shows a difference,
+what is sensed does not matter as far as these trials tell, and the configuration stays. Otherwise
+the least mean cost of these trials wins: not the winner of the race if it was only lucky.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from holdfast.numerics.arrays import FloatArray
+from holdfast.recording.outcome_comparison import bootstrap_interval
+from holdfast.tuning.candidates import AS_CONFIGURED, RANDOM, Objective
+
+__all__ = [
+    "FAMILY_LEVEL",
+    "Comparison",
+    "TrialRow",
+    "Verdict",
+    "cost_of",
+    "judge",
+    "mean_difference",
+]
+
+FAMILY_LEVEL = 0.95
+"""Of all intervals of the objective together."""
+
+_WIDE = 0.1
+"""An interval that reaches so far, as a share of the mean, says little."""
+
+_MUCH_SLOWER = 2.0
+"""A decision that takes so many times as long needs a reason."""
+
+
+class TrialRow(NamedTuple):
+    """What is kept of a trial; ``decision_ms`` is the median of its sensing decisions."""
+
+    candidate: str
+    trial: int
+    success: bool
+    failed: bool
+    steps: int
+    reward: float | None
+    decision_ms: float
+    seconds: float
+
+
+class Comparison(msgspec.Struct, frozen=True, kw_only=True):
+    """How a measure of a candidate differs from another one's, over the same worlds.
+
+    Attributes
+    ----------
+    measure : {"steps", "success", "reward"}
+        Mean steps, a trial without success at the limit; rate of success; mean reward.
+    value, other, difference : float
+        Means, and the candidate's less the other's.
+    interval : (float, float)
+        For the difference; those of the objective hold together.
+    """
+
+    candidate: str
+    against: str
+    measure: Objective
+    value: float
+    other: float
+    difference: float
+    interval: tuple[float, float]
+
+    @property
+    def finding(self) -> int:
+        """1 if the candidate is better beyond noise, -1 if it is worse, else 0."""
+        low, high = self.interval
+        sign = int(low > 0.0) - int(high < 0.0)
+        return -sign if self.measure == "steps" else sign
+
+
+class Verdict(NamedTuple):
+    """What to take, why, and what was compared; ``matters`` is whether anything differed."""
+
+    choice: str
+    matters: bool
+    sentence: str
+    comparisons: tuple[Comparison, ...]
+
+
+_MEASURES: Mapping[Objective, Callable[[TrialRow, int], float | None]] = {
+    "steps": lambda row, limit: float(row.steps if row.success else limit),
+    "success": lambda row, _: float(row.success),
+    "reward": lambda row, _: row.reward,
+}
+
+
+def cost_of(row: TrialRow, objective: Objective, limit: int) -> float:
+    """Return what is to be small; NaN for a trial without a reward."""
+    value = _MEASURES[objective](row, limit)
+    if value is None:
+        return float("nan")
+    return value if objective == "steps" else -value
+
+
+def mean_difference(
+    differences: FloatArray, level: float = FAMILY_LEVEL
+) -> tuple[float, tuple[float, float]]:
+    """Return the mean of paired differences, and its interval; of no scatter, none."""
+    mean = float(np.mean(differences))
+    if np.ptp(differences) == 0.0:
+        return mean, (mean, mean)
+    return mean, bootstrap_interval([differences], np.mean, paired=True, level=level)
+
+
+def judge(
+    rows: Mapping[str, Sequence[TrialRow]],
+    finalist: str,
+    objective: Objective,
+    limit: int,
+    barred: Collection[str] = (),
+) -> Verdict:
+    """Choose among the configuration as it was, the finalist and random sensing.
+
+    Parameters
+    ----------
+    rows : mapping
+        Of each candidate the same fresh trials, in the same order. That of the configuration comes
+        first; of equals, the first one is chosen.
+    limit : int
+        Steps of a trial that does not succeed.
+    barred : collection of str
+        Those that must not be chosen.
+    """
+    names = list(rows)
+    configured = names[0]
+    pairs = [
+        (one, other)
+        for other, one in combinations(names, 2)
+        if finalist in (one, other) or configured in (one, other)
+    ]
+    level = 1.0 - (1.0 - FAMILY_LEVEL) / max(1, len(pairs))
+
+    def compare(one: str, other: str, measure: Objective) -> Comparison | None:
+        values = [[_MEASURES[measure](row, limit) for row in rows[name]] for name in (one, other)]
+        if any(None in each for each in values):
+            return None
+        of_one, of_other = (np.array(each, dtype=np.float64) for each in values)
+        difference, interval = mean_difference(of_one - of_other, level)
+        return Comparison(
+            candidate=one,
+            against=other,
+            measure=measure,
+            value=float(np.mean(of_one)),
+            other=float(np.mean(of_other)),
+            difference=difference,
+            interval=interval,
+        )
+
+    decisive = [found for pair in pairs if (found := compare(*pair, objective)) is not None]
+    matters = any(each.finding for each in decisive)
+    admitted = [name for name in names if name not in barred] or names
+    choice = configured if configured in admitted else finalist
+    if matters:
+        costs = {
+            name: np.mean([cost_of(row, objective, limit) for row in rows[name]]) for name in names
+        }
+        choice = min(admitted, key=costs.__getitem__)
+        found = compare(choice, configured, objective)
+        slower = _decision_ms(rows[choice]) > _MUCH_SLOWER * _decision_ms(rows[configured])
+        if configured in admitted and found is not None and found.finding < 1 and slower:
+            choice = configured
+    against = [name for name in names if name != choice]
+    comparisons = [
+        found
+        for name in against
+        for measure in sorted(_MEASURES, key=lambda each: each != objective)
+        if (found := compare(choice, name, measure)) is not None
+    ]
+    trials = len(rows[configured])
+    sentence = _sentence(choice, configured, matters, objective, comparisons, trials)
+    return Verdict(choice, matters, sentence, tuple(comparisons))
+
+
+def _decision_ms(rows: Sequence[TrialRow]) -> float:
+    return float(np.median([row.decision_ms for row in rows]))
+
+
+# -- words -----------------------------------------------------------------------------------------
+
+
+def _sentence(
+    choice: str,
+    configured: str,
+    matters: bool,
+    objective: Objective,
+    comparisons: Sequence[Comparison],
+    trials: int,
+) -> str:
+    decisive = [each for each in comparisons if each.measure == objective]
+    effects = "; ".join(map(_effect, decisive))
+    fresh = f"{trials:,} trials that had no part in the choice"
+    if not matters:
+        text = f"What you sense does not matter here, as far as {fresh} tell"
+        keep = "Keep your configuration" if choice == configured else f"Sense by {choice}"
+        text += f": {effects}. {keep}." if effects else "."
+        reach = max((abs(end) for each in decisive for end in each.interval), default=0.0)
+        if decisive and reach > _WIDE * abs(decisive[0].value):
+            text += (
+                f" A difference of up to {_amount(reach, objective)} would not have shown: "
+                "a larger budget may find it."
+            )
+        return text
+    advice = f"Sense by {choice}"
+    if choice == configured:
+        advice = "Keep your configuration"
+    elif choice == RANDOM:
+        advice = "Sense at random"
+    value = _amount(decisive[0].value, objective)
+    text = f"{advice}: {value} on average in {fresh}; {effects}."
+    for each in comparisons:
+        if each.measure != objective and each.finding < 0:
+            text += f" But {each.measure} says otherwise: {_effect(each)}."
+    return text
+
+
+def _amount(value: float, measure: Objective) -> str:
+    if measure == "success":
+        return f"{100.0 * value:.3g} points of success"
+    return f"{value:.4g} {measure if measure == 'steps' else 'of reward'}"
+
+
+def _effect(each: Comparison) -> str:
+    scale = 100.0 if each.measure == "success" else 1.0
+    unit = {"success": "points of success", "steps": "steps", "reward": "of reward"}[each.measure]
+    low, high = (f"{scale * end:+.3g}" for end in each.interval)
+    whose = "your configuration" if each.against == AS_CONFIGURED else each.against
+    whose = "random sensing" if whose == RANDOM else whose
+    noise = "" if each.finding else ", within noise"
+    return f"{scale * each.difference:+.3g} [{low}, {high}] {unit} against {whose}{noise}"

@@ -1,0 +1,72 @@
+"""Samples against likelihood: how often a right problem is accused, and what a wrong one needs."""
+
+from __future__ import annotations
+
+import numpy as np
+from tests.unit.test_problem_check import Rover
+
+from holdfast.planning.settings import PlanningSettings
+from holdfast.tuning.calibration_check import check_likelihoods, remedy_of
+from holdfast.tuning.contract_check import check_streams, kolmogorov_p, two_sample_p
+from holdfast.tuning.findings import FALSE_ALARM_RATE, Finding, Inspection
+
+
+def least_p(seed: int) -> float:
+    """Return the least p-value of all tests of a right problem, times their number."""
+    least: list[float] = []
+
+    class Noted(Inspection):
+        def test(self, p: float, finding: Finding) -> None:
+            least.append(p)
+
+    inspection = Noted(Rover(), PlanningSettings(), 100, seed, 1e6)
+    check_streams(inspection)
+    check_likelihoods(inspection)
+    return min(least) * len(least)
+
+
+def test_the_false_alarm_rate_is_kept() -> None:
+    # By Bonferroni each is below 0.2 with a probability of at most 0.2: of 40, more than 18 with
+    # one below 1e-4.
+    assert sum(least_p(seed) < 0.2 for seed in range(40)) <= 18
+
+
+def test_p_values_of_uniform_numbers_are_uniform() -> None:
+    generator = np.random.default_rng(1)
+    pairs = [generator.random((2, 100)) for _ in range(400)]
+    p = np.array([two_sample_p(first, second) for first, second in pairs])
+    # Of 400, 40 are expected below 0.1; 5 standard deviations are 30.
+    assert 10 <= (p < 0.1).sum() <= 70
+    assert kolmogorov_p(0.0, 100.0) == 1.0
+    assert abs(kolmogorov_p(0.1340, 100.0) - 0.05) < 0.005  # tables: 0.134 for n = 100
+
+
+def test_each_test_has_its_share_of_the_false_alarms() -> None:
+    def judged(*values: float) -> list[Finding]:
+        inspection = Inspection(Rover(), PlanningSettings(), 100, 0, 10.0)
+        for number, p in enumerate(values):
+            inspection.test(p, Finding("error", "likelihood", f"{number}: seen", "do"))
+        inspection.judge_tests()
+        return inspection.findings
+
+    assert judged(*[1.0] * 9, 1.1 * FALSE_ALARM_RATE / 10) == []
+    (found,) = judged(*[1.0] * 9, 0.9 * FALSE_ALARM_RATE / 10)
+    assert found.seen == "9: seen (p = 9e-05, of 10 tests)"
+
+
+def test_remedies() -> None:
+    generator = np.random.default_rng(2)
+    states = generator.normal(size=(200, 100))
+    truths = generator.integers(100, size=200)
+    shown = states[np.arange(200), truths] + 0.3 * generator.normal(size=200)
+    right = -0.5 * ((shown[:, np.newaxis] - states) / 0.3) ** 2
+    assert remedy_of(right, truths) is None
+    for wrong, words in (
+        (np.exp(right), "logarithm"),
+        (-right, "other sign"),
+        (right * 9.0, "times as wide"),
+        (right / 9.0, "times as wide"),
+    ):
+        remedy = remedy_of(wrong, truths)
+        assert remedy is not None
+        assert words in remedy[0]

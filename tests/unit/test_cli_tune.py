@@ -1,0 +1,73 @@
+"""``holdfast tune``: its options, its files, and how it goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.command_line import run_here
+from tests.unit.test_tuning_tune import RUN
+
+from holdfast.tuning import tune as tuning
+
+WORDS = ("tune", "run.yaml", "--vary", "fixed", "--trials", "20", "-j", "1", "--no-check")
+
+
+@pytest.fixture
+def here(tmp_path: Path) -> Path:
+    (tmp_path / "run.yaml").write_text(RUN)
+    return tmp_path
+
+
+def test_it_says_what_to_do(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = run_here(capsys, here, *WORDS, "--budget", "20s")
+    assert said.code == 0, said.stderr
+    assert (here / "runs/run-tuned/tune.md").read_text() == said.stdout
+    assert said.stderr.endswith("Take it: holdfast run runs/run-tuned/tuned.yaml\n")
+    assert not (here / "runs/run-tuned/tune.png").exists()  # no matplotlib here
+    again = run_here(capsys, here, *WORDS, "--resume", "--out", "runs/run-tuned", "-q")
+    assert again.stdout == said.stdout.splitlines(keepends=True)[0]
+
+
+def test_a_wrong_problem_is_not_tuned(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """In 25 steps nobody comes to the goal, whatever is sensed."""
+    said = run_here(capsys, here, *WORDS[:-1])
+    assert said.code == 2
+    assert "holdfast: error: goals: " in said.stderr
+    assert said.stderr.endswith("--no-check tunes all the same\n")
+    assert not (here / "runs").exists()
+
+
+def test_an_interrupted_one_goes_on(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*arguments: Any, **more: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tuning, "tune", interrupted)
+    said = run_here(capsys, here, *WORDS, "--budget", "1.5m", "--out", "mine")
+    assert said.code == 130
+    command = "holdfast tune run.yaml --vary fixed --trials 20 --jobs 1 --no-check"
+    command = command.replace("--trials", "--budget 1.5m --trials") + " --out mine --resume"
+    assert said.stderr.endswith(f"Go on with: {command}\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("--budget", "10"), "--budget is '10'; allowed are durations from 1s to 720h"),
+        (
+            ("--vary", "looks,method"),
+            "--vary is 'looks,method'; allowed are lists of methods, looks",
+        ),
+        (("--resume",), "--resume needs --out DIR"),
+        (("--objective", "step"), "--objective is 'step'; allowed are reward, steps and success"),
+    ],
+)
+def test_what_is_refused(
+    here: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], complaint: str
+) -> None:
+    said = run_here(capsys, here, "tune", "run.yaml", *words)
+    assert said.code == 2
+    assert complaint in said.stderr

@@ -1,0 +1,487 @@
+"""``hf.check_problem``: right problems have no error, and wrong ones have theirs named."""
+
+from __future__ import annotations
+
+import importlib
+import random
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import holdfast as hf
+from holdfast import numerics
+from holdfast.config import registry
+from holdfast.errors import InvalidValueError
+from holdfast.planning.settings import PlanningSettings, SelectorSettings
+from holdfast.tuning.findings import Finding
+from holdfast.tuning.problem_check import CHECKS, check_problem
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+LONG_S = 3000.0
+"""So that no busy machine cuts a check short."""
+
+
+class Rover(hf.ProblemBase):
+    """A right problem: a point robot that sees x or y, with a likelihood of its own."""
+
+    name = "rover"
+    state_size = action_size = 2
+    sensing_actions: Any = ("x", "y")
+    resolution: Any = 0.1
+    motion_variance = np.array([0.0025, 0.0025])
+    deviation = 0.1
+
+    def initial_states(self, stream: Any, count: int) -> Any:
+        return np.array([2.0, 1.0]) + 0.5 * stream.normal((count, 2))
+
+    def move(self, states: Any, actions: Any, stream: Any) -> Any:
+        return states + actions + 0.05 * stream.normal(states.shape)
+
+    def log_likelihood(self, states: Any, sensing_action: int, observation: Any) -> Any:
+        deviations = (observation[0] - states[..., sensing_action]) / self.deviation
+        return -0.5 * deviations * deviations
+
+    def sample_observation(self, state: Any, sensing_action: int, stream: Any) -> Any:
+        return state[sensing_action] + self.deviation * stream.normal((1,))
+
+    def policy(self, states: Any, stage: Any) -> Any:
+        return -states
+
+    def execute(self, actions: Any) -> Any:
+        return np.clip(actions, -0.2, 0.2)
+
+    def is_goal(self, states: Any) -> Any:
+        return (np.abs(states) < 0.2).all(axis=-1)
+
+
+class LikelihoodForLogarithm(Rover):
+    def log_likelihood(self, states: Any, sensing_action: int, observation: Any) -> Any:
+        return numerics.exp(super().log_likelihood(states, sensing_action, observation))
+
+
+class DeviationForVariance(Rover):
+    def log_likelihood(self, states: Any, sensing_action: int, observation: Any) -> Any:
+        deviations = observation[0] - states[..., sensing_action]
+        return -0.5 * deviations * deviations / self.deviation
+
+
+class VarianceForDeviation(Rover):
+    def sample_observation(self, state: Any, sensing_action: int, stream: Any) -> Any:
+        return state[sensing_action] + self.deviation**2 * stream.normal((1,))
+
+
+class WrongSign(Rover):
+    def log_likelihood(self, states: Any, sensing_action: int, observation: Any) -> Any:
+        return -super().log_likelihood(states, sensing_action, observation)
+
+
+class OtherCoordinate(Rover):
+    def sample_observation(self, state: Any, sensing_action: int, stream: Any) -> Any:
+        return super().sample_observation(state, 1 - sensing_action, stream)
+
+
+class Impossible(Rover):
+    def log_likelihood(self, states: Any, sensing_action: int, observation: Any) -> Any:
+        near = np.abs(observation[0] - states[..., sensing_action]) < 0.1
+        return np.where(near, 0.0, -np.inf)
+
+
+class GlobalGenerator(Rover):
+    def move(self, states: Any, actions: Any, stream: Any) -> Any:
+        return states + actions + 0.05 * np.random.normal(size=states.shape)  # noqa: NPY002
+
+
+class PythonsGenerator(Rover):
+    def sample_observation(self, state: Any, sensing_action: int, stream: Any) -> Any:
+        return np.array([state[sensing_action] + random.gauss(0.0, self.deviation)])
+
+
+class OwnGenerator(Rover):
+    def __init__(self) -> None:
+        self.generator = np.random.default_rng(0)
+
+    def move(self, states: Any, actions: Any, stream: Any) -> Any:
+        return states + actions + 0.05 * self.generator.normal(size=states.shape)
+
+
+class FixedGenerator(Rover):
+    def move(self, states: Any, actions: Any, stream: Any) -> Any:
+        return states + actions + 0.05 * np.random.default_rng(0).normal(size=states.shape)
+
+
+class SharedNoise(Rover):
+    def move(self, states: Any, actions: Any, stream: Any) -> Any:
+        return states + actions + 0.05 * stream.normal((2,))
+
+
+class SharedStart(Rover):
+    def initial_states(self, stream: Any, count: int) -> Any:
+        return np.tile(np.array([2.0, 1.0]) + 0.5 * stream.normal((2,)), (count, 1))
+
+
+class GridStart(Rover):
+    def initial_states(self, stream: Any, count: int) -> Any:
+        x = np.linspace(1.0, 3.0, count)
+        return np.stack([x, 1.0 + 0.5 * stream.normal((count,))], axis=-1)
+
+
+class Counts(Rover):
+    calls = 0
+
+    def policy(self, states: Any, stage: Any) -> Any:
+        self.calls += 1
+        return -states + 1e-3 * self.calls
+
+
+class ChangesItsArgument(Rover):
+    def execute(self, actions: Any) -> Any:
+        actions *= 0.5
+        return actions
+
+
+class ChangesStates(Rover):
+    def policy(self, states: Any, stage: Any) -> Any:
+        states -= 1.0
+        return -states
+
+
+class OneStateOnly(Rover):
+    def policy(self, states: Any, stage: Any) -> Any:
+        return np.array([-states[0], -states[1]])
+
+
+class Branches(Rover):
+    def policy(self, states: Any, stage: Any) -> Any:
+        return -states if states[0] > 0.0 else 0.0 * states
+
+
+class MeanOfTheBelief(Rover):
+    def policy(self, states: Any, stage: Any) -> Any:
+        return -states + 0.1 * states.reshape(-1, 2).mean(axis=0)
+
+
+class OneGoalForAll(Rover):
+    def is_goal(self, states: Any) -> Any:
+        return (np.abs(states) < 0.2).all()
+
+
+class Integers(Rover):
+    def reward(self, states: Any, actions: Any) -> Any:
+        return np.full(states.shape[:-1], -1)
+
+
+class NotFinite(Rover):
+    def move(self, states: Any, actions: Any, stream: Any) -> Any:
+        moved = super().move(states, actions, stream)
+        return np.where(moved < 1.0, np.nan, moved)
+
+
+class KeepsItsStream(Rover):
+    kept: Any = None
+
+    def move(self, states: Any, actions: Any, stream: Any) -> Any:
+        self.kept = self.kept or stream
+        return states + actions + 0.05 * self.kept.normal(states.shape)
+
+
+class NeverAtTheGoal(Rover):
+    def is_goal(self, states: Any) -> Any:
+        return (np.abs(states - 9.0) < 0.2).all(axis=-1)
+
+
+class Slow(Rover):
+    def execute(self, actions: Any) -> Any:
+        return np.clip(actions, -0.0025, 0.0025)
+
+    def move(self, states: Any, actions: Any, stream: Any) -> Any:
+        return states + actions + 1e-3 * stream.normal(states.shape)
+
+
+class Misspelt(Rover):
+    def next_stages(self, estimates: Any, stage: Any) -> Any:
+        return stage
+
+    def sensing_cost(self) -> None:
+        """Not what holdfast asks for."""
+
+
+class AlwaysAtTheGoal(Rover):
+    def is_goal(self, states: Any) -> Any:
+        return (np.abs(states) < 99.0).all(axis=-1)
+
+
+class NeverMoves(Rover):
+    def execute(self, actions: Any) -> Any:
+        return 0.0 * actions
+
+
+class AlwaysFails(Rover):
+    def is_failure(self, states: Any) -> Any:
+        return states[..., 0] > -5.0
+
+
+class CoarseResolution(Rover):
+    resolution = 100.0
+
+
+class ZeroReward(Rover):
+    def reward(self, states: Any, actions: Any) -> Any:
+        return np.zeros(np.broadcast_shapes(states.shape[:-1], actions.shape[:-1]))
+
+
+class GoodReward(Rover):
+    def reward(self, states: Any, actions: Any) -> Any:
+        return np.ones(np.broadcast_shapes(states.shape[:-1], actions.shape[:-1]))
+
+
+class GivesUp(Rover):
+    def policy(self, states: Any, stage: Any) -> Any:
+        raise SystemExit(3)
+
+
+class NoExecute:
+    """Derived from nothing."""
+
+    name = "no_execute"
+    state_size = action_size = num_stages = 1
+    sensing_actions = ("x",)
+    resolution = 0.1
+    motion_variance = np.array([0.01])
+    initial_states = move = policy = is_goal = print
+    observation_mean = observation_variance = print
+
+
+class Gaussian(hf.ProblemBase):
+    """The same with a mean and a variance."""
+
+    name = "rover"
+    state_size = action_size = 2
+    sensing_actions: Any = ("x", "y")
+    resolution: Any = 0.1
+    motion_variance = np.array([0.0025, 0.0025])
+    deviations: Any = (0.1, 0.1)
+    initial_states: Any = Rover.initial_states
+    move: Any = Rover.move
+    policy: Any = Rover.policy
+    execute: Any = Rover.execute
+    is_goal: Any = Rover.is_goal
+
+    def observation_mean(self, states: Any, sensing_action: int) -> Any:
+        return states[..., sensing_action % 2, np.newaxis]
+
+    def observation_variance(self, states: Any, sensing_action: int) -> Any:
+        return np.array([self.deviations[sensing_action] ** 2])
+
+
+class Dominated(Gaussian):
+    sensing_actions = ("x", "y", "x, blurred")
+    deviations = (0.03, 0.1, 0.3)
+
+
+class Silent(Gaussian):
+    sensing_actions = ("x", "y", "nothing")
+    deviations = (0.1, 0.1, 1e6)
+
+
+class TooSharp(Gaussian):
+    deviations = (1e-4, 1e-4)
+
+
+class NegativeVariance(Gaussian):
+    def observation_variance(self, states: Any, sensing_action: int) -> Any:
+        return states[..., :1] - 1.0
+
+
+class VarianceOfTheBelief(Gaussian):
+    def observation_variance(self, states: Any, sensing_action: int) -> Any:
+        return np.full((*states.shape[:-1], 1), 0.01 + 0.01 * states.size)
+
+
+class FineBesideWeak(Gaussian):
+    """The boat of docs/problems.md."""
+
+    deviations = (0.02, 1.0)
+    resolution = 0.05
+
+    def is_goal(self, states: Any) -> Any:
+        return (np.abs(states) < 0.3).all(axis=-1)
+
+
+class Millimetres(Gaussian):
+    """The second coordinate is in millimetres."""
+
+    motion_variance = np.array([0.0025, 2500.0])
+    scale = np.array([1.0, 1000.0])
+    deviations = (0.1, 100.0)
+
+    def initial_states(self, stream: Any, count: int) -> Any:
+        return Gaussian.initial_states(self, stream, count) * self.scale
+
+    def move(self, states: Any, actions: Any, stream: Any) -> Any:
+        return states + actions + 0.05 * self.scale * stream.normal(states.shape)
+
+    def execute(self, actions: Any) -> Any:
+        return np.clip(actions, -0.2 * self.scale, 0.2 * self.scale)
+
+    def is_goal(self, states: Any) -> Any:
+        return (np.abs(states / self.scale) < 0.2).all(axis=-1)
+
+
+class NoiseAsDeviation(Gaussian):
+    motion_variance = np.array([0.05, 0.05])
+
+
+class Heading(Gaussian):
+    """A heading that wraps, not declared to be an angle."""
+
+    def initial_states(self, stream: Any, count: int) -> Any:
+        return np.array([2.0, 3.1]) + np.array([0.5, 0.2]) * stream.normal((count, 2))
+
+    def move(self, states: Any, actions: Any, stream: Any) -> Any:
+        moved = states + actions + 0.05 * stream.normal(states.shape)
+        return np.stack([moved[..., 0], numerics.wrapped(moved[..., 1])], axis=-1)
+
+    def policy(self, states: Any, stage: Any) -> Any:
+        return np.stack([-states[..., 0], numerics.wrapped(np.pi - states[..., 1])], axis=-1)
+
+    def is_goal(self, states: Any) -> Any:
+        return np.abs(states[..., 0]) < 0.2
+
+
+E, W, NOTE = "error", "warning", "information"
+WRONG = {
+    LikelihoodForLogarithm: (E, "likelihood", "seems to return the likelihood"),
+    DeviationForVariance: (E, "likelihood", "0.32 times as wide|0.35 times|0.3 times"),
+    VarianceForDeviation: (E, "likelihood", "does not fit what is sampled"),
+    WrongSign: (E, "likelihood", "with the other sign"),
+    OtherCoordinate: (E, "likelihood", "does not fit what is sampled"),
+    Impossible: (E, "likelihood", "impossible .* in the very state"),
+    GlobalGenerator: (E, "purity", "move draws from the global generator"),
+    PythonsGenerator: (E, "purity", "sample_observation draws from the global generator"),
+    OwnGenerator: (E, "purity", "move returned something else"),
+    FixedGenerator: (E, "streams", "the same with each of 200 streams"),
+    SharedNoise: (E, "streams", "move gives all states of one call the same draw"),
+    SharedStart: (E, "streams", "initial_states gives all states of one call the same draw"),
+    GridStart: (E, "streams", "initial_states draws coordinate 0 .* of a belief at random, but"),
+    Counts: (E, "purity", "policy returned something else"),
+    ChangesItsArgument: (E, "contract", "execute raised ValueError: .*read-only"),
+    ChangesStates: (E, "contract", "policy raised ValueError: .*read-only"),
+    OneStateOnly: (E, "contract", r"policy of rover returned .* of shape \(2, 2\)"),
+    Branches: (E, "contract", "policy raised ValueError: The truth value"),
+    MeanOfTheBelief: (E, "contract", "policy of a belief is .* in another leading shape"),
+    OneGoalForAll: (E, "contract", "is_goal of rover returned"),
+    Integers: (E, "contract", "reward of rover returned int64"),
+    NotFinite: (E, "contract", "move of rover put particle"),
+    KeepsItsStream: (E, "contract", "move raised ProblemError: a stream is for the one call"),
+    NeverAtTheGoal: (E, "goals", "comes to the goal in 0 of 64 trials"),
+    Slow: (E, "goals", "comes to the goal in .* within max_steps, 200, it is 0"),
+    Misspelt: (W, "contract", "sensing_cost: did you mean sensing_costs"),
+    AlwaysAtTheGoal: (E, "goals", "all of 64 initial states are goals"),
+    NeverMoves: (E, "goals", "the policy never moves"),
+    AlwaysFails: (E, "goals", "0 of 64 trials, and 64 fail"),
+    CoarseResolution: (E, "resolution", "resolution is 1e\\+02, 1e\\+02, .* all of them are the"),
+    ZeroReward: (NOTE, "goals", "the reward is 0 in all"),
+    GoodReward: (W, "goals", "the reward is 1 in all"),
+    GivesUp: (E, "contract", "policy raised SystemExit: 3"),
+    NoExecute: (E, "contract", "no_execute has no execute and no next_stage"),
+    Dominated: (W, "sensors", r"sensing action 2 \(x, blurred\) is dominated: .* \(x\) .*10 times"),
+    Silent: (W, "sensors", r"sensing action 2 \(nothing\) tells nothing"),
+    TooSharp: (W, "depletion", "too sharp for 300 particles"),
+    NegativeVariance: (E, "contract", "every entry must be positive and finite"),
+    VarianceOfTheBelief: (E, "contract", "observation_variance of sensing action 0 of a belief"),
+    FineBesideWeak: (W, "resolution", r"coordinate 0 .* tolerates about 0\.2[0-9]; but"),
+    Millimetres: (W, "units", "coordinates 1 and 0 of the task action"),
+    NoiseAsDeviation: (W, "motion", "coordinate 0 of a state with a variance above what move does"),
+    Heading: (W, "units", r"coordinate 1 of a state jumps by a whole turn"),
+}
+
+
+def check(problem: Any, **options: Any) -> list[Finding]:
+    return check_problem(problem, max_steps=200, budget_s=LONG_S, **options)
+
+
+@pytest.mark.parametrize("kind", WRONG, ids=lambda kind: kind.__name__)
+def test_what_is_wrong_is_named(kind: Any) -> None:
+    severity, name, pattern = WRONG[kind]
+    found = check(kind())
+    named = [
+        each for each in found if each.check == name and re.search(pattern, each.seen) is not None
+    ]
+    assert named, found
+    assert named[0].severity == severity
+    assert named[0].advice
+    if severity == E:
+        assert found[0].severity == E
+        if "raised" in named[0].seen:
+            assert f"class {kind.__name__}" not in named[0].details
+            assert "test_problem_check.py" in named[0].details
+    else:
+        assert not [each for each in found if each.severity == E]
+
+
+@pytest.fixture
+def examples() -> Iterator[None]:
+    sys.path.insert(0, str(EXAMPLES))
+    yield
+    sys.path.remove(str(EXAMPLES))
+
+
+RIGHT = [
+    *registry.BUILT_IN,
+    "light_dark_room:LightDarkRoom",
+    "corridor_doors:CorridorDoors",
+    "wrapping_heading:WrappingHeading",
+    "two_ends:TwoCues",
+    "two_ends:Sorting",
+]
+WARNED = {"two_ends:TwoCues": {"sensors", "resolution"}, "two_ends:Sorting": {"resolution"}}
+"""Checks that warn of problems on which looking one step ahead fails."""
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_right_problems_have_no_error(name: str, examples: None) -> None:
+    module, _, kind = name.partition(":")
+    problem = hf.make(name) if not kind else getattr(importlib.import_module(module), kind)()
+    found = check_problem(problem, max_steps=1500, budget_s=LONG_S)
+    assert [each for each in found if each.severity == E] == []
+    warned = {each.check for each in found if each.severity == W} - {"depletion"}
+    assert warned == WARNED.get(name, set())
+
+
+def test_the_same_seed_finds_the_same_and_says_what_it_does() -> None:
+    begun: list[str] = []
+    first = check(Rover(), seed=3, on_check=begun.append)
+    assert begun == list(CHECKS)
+    again = check(Rover(), seed=3)
+    assert [each for each in first if each.check != "time"] == [
+        each for each in again if each.check != "time"
+    ]
+
+
+def test_a_constant_reward_is_an_error_where_it_is_asked_for() -> None:
+    settings = PlanningSettings(selector=SelectorSettings(method="expected_return"))
+    found = check(ZeroReward(), settings=settings)
+    assert any("the reward is 0" in each.seen and each.severity == E for each in found)
+
+
+def test_without_time_it_says_what_was_left_out() -> None:
+    found = check_problem(Rover(), max_steps=200, budget_s=1e-9)
+    assert any("were not tested" in each.seen for each in found)
+    assert not [each for each in found if each.severity == E]
+
+
+def test_no_problem_at_all() -> None:
+    for nothing in (None, 3, "peg_in_hole_2d", Rover, object()):
+        assert check(nothing)[0].severity == E
+
+
+def test_arguments_are_checked() -> None:
+    with pytest.raises(InvalidValueError, match="budget_s is 0"):
+        check_problem(Rover(), budget_s=0.0)
+    with pytest.raises(InvalidValueError, match="max_steps"):
+        check_problem(Rover(), max_steps=0)

@@ -1,0 +1,133 @@
+"""A whole tuning, of a few short trials."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.config.loader import load
+from holdfast.errors import InvalidValueError, OutputError, TrialError
+from holdfast.tuning.candidates import AS_CONFIGURED, RANDOM
+from holdfast.tuning.tune import FRESH, Progress
+
+RUN = """
+problem: peg_in_hole_2d
+particle_filter: {num_particles: 30}
+active_sensing: {num_observation_samples: 3, num_cores: 1}
+simulator: {max_steps: 25, seed: 3, sensing_intervals: 4}
+"""
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    path = tmp_path / "run.yaml"
+    path.write_text(RUN)
+    return path
+
+
+def tuned(path: Path, **more: Any) -> Any:
+    return hf.tune(path, **{"vary": ["fixed"], "most": 6, "jobs": 1, **more})
+
+
+def test_what_it_finds_and_writes(run: Path) -> None:
+    out = run.parent / "tuned"
+    found = tuned(run, out=out)
+    names = {each.candidate for each in found.candidates}
+    assert names == {AS_CONFIGURED, RANDOM, "always x", "always y", "always θ"}
+    assert found.objective == "steps"
+    assert found.fresh_trials == 6
+    assert {each.against for each in found.comparisons} >= {RANDOM, AS_CONFIGURED} - {found.choice}
+    written = {each.name for each in out.iterdir()}
+    assert written == {
+        *("tuned.yaml", "tune.md", "candidates.csv", "trials.csv", "tune.json", "tune.png")
+    }
+    rows = (out / "trials.csv").read_text().splitlines()
+    assert len(rows) == 1 + len(set(rows[1:]))
+    trials = {int(row.rsplit(",", 7)[1]) for row in rows[1:]}
+    assert trials == {*range(6), *range(FRESH, FRESH + 6)}
+    # The same worlds, so a trial is what a run makes of it.
+    result = hf.run_trial(
+        hf.Planner(load(run).problem, load(run).planning), seed=3, trial=0, max_steps=25
+    )
+    assert rows[1].startswith(f"as configured,0,{int(result.success)},0,{result.steps},")
+
+
+def test_it_goes_on_where_it_was_interrupted(run: Path) -> None:
+    out, whole = run.parent / "tuned", run.parent / "whole"
+
+    def interrupt(progress: Progress) -> None:
+        if progress.trials == 17:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        tuned(run, out=out, on_progress=interrupt)
+    trials = out / "trials.csv"
+    kept = trials.read_text()
+    assert len(kept.splitlines()) == 1 + 17
+    trials.write_text(kept + "as configured,9,1")  # a kill has cut it short
+    found = tuned(run, out=out)
+    assert trials.read_text().startswith(kept)
+    again = tuned(run, out=whole)
+    assert (found.sentence, found.choice) == (again.sentence, again.choice)
+    assert found.comparisons == again.comparisons
+    with pytest.raises(OutputError, match=r"objective was 'steps' and is 'success'"):
+        tuned(run, out=out, objective="success")
+
+
+def test_a_candidate_that_fails_leaves_the_race(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from holdfast.robot import trial_pool
+
+    real = hf.run_trial
+
+    def failing(planner: hf.Planner, *arguments: Any, **more: Any) -> Any:
+        if planner.settings.selector.sensing_action == bad:
+            raise hf.HoldfastError("no such sensor")
+        return real(planner, *arguments, **more)
+
+    monkeypatch.setattr(trial_pool, "run_trial", failing)
+    bad = 2
+    found = tuned(run)
+    (row,) = (each for each in found.candidates if each.candidate == "always θ")
+    assert row.state.startswith("refused: it fails: trial 0 (seed 3) of always θ: no such sensor")
+    bad = 0
+    with pytest.raises(TrialError, match="no such sensor"):
+        tuned(run)
+
+
+def test_slow_decisions_are_not_admitted(run: Path) -> None:
+    with pytest.raises(InvalidValueError, match=r"as configured: a decision takes .* ms, and at"):
+        tuned(run, max_decision_ms=1e-9)
+
+
+def test_intervals_are_judged_beside_random_sensing_at_the_same(run: Path) -> None:
+    found = tuned(run, vary=["interval"], most=20)
+    (winner, *_) = found.candidates
+    assert {each.candidate for each in found.candidates} > {AS_CONFIGURED, RANDOM}
+    if "simulator.sensing_intervals" in winner.changes:
+        rivals = {each.against for each in found.comparisons} | {found.choice}
+        assert any(each.startswith("random, every") for each in rivals)
+
+
+def test_what_is_refused(run: Path) -> None:
+    with pytest.raises(InvalidValueError, match=r"vary has 'method'; allowed are methods"):
+        tuned(run, vary=["method"])
+    with pytest.raises(InvalidValueError, match=r"most is 1; "):
+        tuned(run, most=1)
+    with pytest.raises(InvalidValueError, match=r"budget_s is nan"):
+        tuned(run, budget_s=math.nan)
+    (run.parent / "bare.py").write_text(BARE)
+    run.write_text(RUN.replace("peg_in_hole_2d", "bare:Bare"))
+    with pytest.raises(InvalidValueError, match=r"bare:Bare has neither rewards nor sensing_costs"):
+        tuned(run, objective="reward")
+
+
+BARE = """
+from tests.line_problem import Line
+
+class Bare(Line):
+    pass
+"""

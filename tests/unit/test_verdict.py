@@ -1,0 +1,131 @@
+"""What fresh trials say of a race's winner."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from holdfast.tuning.candidates import AS_CONFIGURED, RANDOM
+from holdfast.tuning.verdict import TrialRow, cost_of, judge, mean_difference
+
+LIMIT = 100
+WORLDS = np.random.default_rng(5).integers(20, 60, 200)
+
+
+def rows(
+    name: str,
+    more: float,
+    *,
+    failures: Sequence[int] = (),
+    reward: float | None = None,
+    decision_ms: float = 1.0,
+) -> list[TrialRow]:
+    """Return trials that take so many steps more than others of the same worlds, about."""
+    noise = np.random.default_rng(list(name.encode())).normal(0.0, 4.0, len(WORLDS))
+    return [
+        TrialRow(
+            name,
+            n,
+            n not in failures,
+            False,
+            round(steps + more + noise[n]),
+            reward,
+            decision_ms,
+            0.1,
+        )
+        for n, steps in enumerate(WORLDS.tolist())
+    ]
+
+
+def test_a_winner_that_is_better() -> None:
+    found = judge(
+        {
+            AS_CONFIGURED: rows(AS_CONFIGURED, 10.0),
+            "state_entropy": rows("state_entropy", 0.0, decision_ms=20.0),
+            RANDOM: rows(RANDOM, 20.0),
+        },
+        "state_entropy",
+        "steps",
+        LIMIT,
+    )
+    assert (found.choice, found.matters) == ("state_entropy", True)
+    first = found.comparisons[0]
+    assert (first.against, first.measure, first.finding) == (AS_CONFIGURED, "steps", 1)
+    assert first.interval[0] < first.difference < first.interval[1] < 0.0
+    assert first.difference == pytest.approx(first.value - first.other)
+    assert found.sentence.startswith("Sense by state_entropy: ")
+    assert "steps against your configuration; " in found.sentence
+    assert "within noise" not in found.sentence
+
+
+def test_a_winner_that_was_only_lucky() -> None:
+    trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 0.0), "lucky": rows("lucky", 3.0)}
+    trials[RANDOM] = rows(RANDOM, 20.0)
+    found = judge(trials, "lucky", "steps", LIMIT)
+    assert found.choice == AS_CONFIGURED
+    assert found.sentence.startswith("Keep your configuration: ")
+
+
+def test_random_where_it_is_best() -> None:
+    trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 30.0), "path": rows("path", 20.0)}
+    trials[RANDOM] = rows(RANDOM, 0.0)
+    assert judge(trials, "path", "steps", LIMIT).sentence.startswith("Sense at random: ")
+
+
+def test_nothing_matters() -> None:
+    trials = {name: rows(name, 0.0) for name in (AS_CONFIGURED, "other", RANDOM)}
+    found = judge(trials, "other", "steps", LIMIT)
+    assert (found.choice, found.matters) == (AS_CONFIGURED, False)
+    assert found.sentence.startswith("What you sense does not matter here, as far as 200 trials")
+    assert found.sentence.endswith("Keep your configuration.")
+    # The same with few trials: what they would not have shown is said.
+    few = {name: trials[name][:10] for name in trials}
+    few["other"][3] = few["other"][3]._replace(success=False)
+    assert "would not have shown" in judge(few, "other", "steps", LIMIT).sentence
+    same = {AS_CONFIGURED: trials[AS_CONFIGURED], RANDOM: trials[AS_CONFIGURED]}
+    assert judge(same, AS_CONFIGURED, "steps", LIMIT).comparisons[0].interval == (0.0, 0.0)
+
+
+def test_other_measures_may_say_otherwise() -> None:
+    failing = range(0, 200, 10)
+    trials = {
+        AS_CONFIGURED: rows(AS_CONFIGURED, 30.0, reward=-1.0),
+        "hasty": rows("hasty", 0.0, failures=failing, reward=-3.0),
+        RANDOM: rows(RANDOM, 30.0, reward=-1.0),
+    }
+    found = judge(trials, "hasty", "steps", LIMIT)
+    assert found.choice == "hasty"
+    assert found.sentence.count("But success says otherwise: -10 [") == 2
+    assert found.sentence.count("But reward says otherwise: -2 [-2, -2] of reward") == 2
+    found = judge(trials, "hasty", "reward", LIMIT)
+    assert found.choice == AS_CONFIGURED
+    assert "But steps says otherwise: " in found.sentence
+
+
+def test_slower_decisions_need_a_reason() -> None:
+    trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 0.5), RANDOM: rows(RANDOM, 30.0)}
+    trials["slow"] = rows("slow", 0.0, decision_ms=20.0)
+    trials["quick"] = rows("quick", 0.0, decision_ms=1.5)
+    quick = {name: trials[name] for name in (AS_CONFIGURED, "quick", RANDOM)}
+    slow = {name: trials[name] for name in (AS_CONFIGURED, "slow", RANDOM)}
+    assert judge(quick, "quick", "steps", LIMIT).choice == "quick"
+    assert judge(slow, "slow", "steps", LIMIT).choice == AS_CONFIGURED
+
+
+def test_who_is_barred_is_not_chosen() -> None:
+    trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 0.0), "other": rows("other", 0.0)}
+    found = judge(trials, "other", "steps", LIMIT, {AS_CONFIGURED})
+    assert found.choice == "other"
+    assert found.sentence.endswith("Sense by other.")
+
+
+def test_costs_and_intervals() -> None:
+    row = rows("a", 0.0, failures=[0], reward=-2.0)[0]
+    assert [cost_of(row, each, LIMIT) for each in ("steps", "success", "reward")] == [100, 0, 2]
+    assert np.isnan(cost_of(row._replace(reward=None), "reward", LIMIT))
+    middle, (low, high) = mean_difference(np.random.default_rng(1).normal(size=400))
+    # Four standard errors of the mean, and of an interval's length.
+    assert abs(middle) < 0.2
+    assert 0.17 < high - low < 0.23
