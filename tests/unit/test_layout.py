@@ -66,6 +66,7 @@ ELSEWHERE = {
         "simulation/story": "tests/scenarios/test_scenarios.py",
         "simulation/world": SIMULATED,
         "testbed/faults": "lab/tests/test_chaos_schedule.py",
+        "testbed/in_process": "tests/contracts/test_transport_contract.py",
         "testbed/records": "tests/unit/test_timings.py",
         "testbed/reference_run": "lab/tests/test_chaos_command.py",
     },
