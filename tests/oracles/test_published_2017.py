@@ -84,9 +84,7 @@ import pytest
 from scipy import stats
 
 from holdfast.numerics.arrays import FloatArray
-from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.problems.problem import Problem
-from studies.emulation_2017 import drawn_particle, likelihoods, run_emulation
+from studies.emulation_2017 import run_emulation
 from studies.published_2017 import PublishedRow, published_rows, series_of
 
 SEED = 2017
@@ -183,43 +181,3 @@ def test_capsule_robot_successes() -> None:
 )
 def test_capsule_robot_mean_reward() -> None:
     check_rewards(emulated(CAPSULE_ROW, CAPSULE_ROW.num_trials), CAPSULE_ROW, 1)
-
-
-def test_the_table_has_the_rows_compared() -> None:
-    assert [row.sensing_interval for row in PEG_ROWS] == [6, 4, 2, 0, 8]
-    assert [row.sensing_interval for row in MULTITIER_ROWS] == [6, 6, 6, 12, 14, 14, 6, 4]
-    assert {row.num_trials for row in [*PEG_ROWS, *MULTITIER_ROWS, CAPSULE_ROW]} == {1000}
-
-
-@pytest.mark.parametrize("row", PEG_ROWS, ids=label)
-def test_the_comparison_rejects_a_sound_filter(row: PublishedRow) -> None:
-    # The success rate with a true systematic resampler is about 99 %.
-    assert success_p_value(990, 1000, row) < FAMILY_WISE_LEVEL / len(PEG_ROWS)
-
-
-def test_the_comparison_rejects_a_shifted_mean_and_keeps_the_same() -> None:
-    row = next(row for row in PEG_ROWS if row.sensing_interval == 8)
-    spread = np.linspace(-24.0, 24.0, row.successes)  # standard deviation 13.9, as logged rows have
-    rewards = row.mean_reward_of_successes + spread
-    assert reward_p_value(rewards, row) > 0.99
-    assert reward_p_value(rewards + 4.0, row) < FAMILY_WISE_LEVEL / len(PEG_ROWS)
-
-
-def test_trials_do_not_mix() -> None:
-    # A world far from its particles, one at a particle: only the second trial's weights survive.
-    problem: Problem = PegInHole2D()
-    world = np.array([[4.0, 2.0, 0.0], [1.0, 3.0, 0.0]])
-    particles = np.zeros((2, 3, 3))
-    particles[:, :, 0] = [[-4.0, -3.0, -2.0], [5.0, 1.0, -5.0]]
-    weights = likelihoods(problem, world, particles, 0, np.zeros((2, 1)))
-    np.testing.assert_allclose(
-        weights, [[0.0, 0.0, 0.0], [0.0, 1.0 / math.sqrt(2.0 * math.pi * 0.001), 0.0]]
-    )
-    np.testing.assert_array_equal(drawn_particle(weights, np.array([0.9, 0.5])), [0, 1])
-
-
-def test_a_particle_is_drawn_in_proportion_to_its_weight() -> None:
-    weights = np.array([0.5, 0.0, 1.5, 2.0])
-    offsets = (np.arange(4000) + 0.5) / 4000
-    drawn = drawn_particle(np.broadcast_to(weights, (4000, 4)), offsets)
-    np.testing.assert_array_equal(np.bincount(drawn, minlength=4), [500, 0, 1500, 2000])
