@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from tests.planning_settings import SEED, TRIAL, planning_settings
 
-from holdfast.config import registry
 from holdfast.errors import CheckpointError, InvalidValueError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.belief import Belief
@@ -29,13 +28,6 @@ from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem
 
 GOLDEN_DIGEST = "187f6a5a76a77f1a6f9557467062aeef0de3bd61a29ae3f838adc04014ef9c6c"
-
-
-@pytest.fixture(scope="module", params=registry.names())
-def problem(request: pytest.FixtureRequest) -> Problem:
-    built = registry.problem_class(request.param).from_settings({}, {})
-    assert isinstance(built, Problem)
-    return built
 
 
 @pytest.fixture(scope="module")
