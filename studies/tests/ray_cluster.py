@@ -109,15 +109,7 @@ def _command_line(process: int) -> bytes:
 
 
 class RayCluster:
-    """A head and some workers, each a node of its own.
-
-    Attributes
-    ----------
-    address : str
-        For ``--executor``.
-    native_address : str
-        For ``RAY_ADDRESS``.
-    """
+    """A head and some workers, each a node of its own."""
 
     def __init__(self, num_workers: int) -> None:
         # The paths of its sockets have little room.

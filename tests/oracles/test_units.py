@@ -39,19 +39,7 @@ PEG = PegInHole2D()
 
 
 class Rescaled(ProblemBase):
-    """A problem whose coordinates have other units, and so have its resolutions and its noise.
-
-    Parameters
-    ----------
-    problem : ProblemBase
-        Its sensing actions show the coordinate of their number, or all.
-    states, actions : array of shape (state_size,)
-        The new unit's numbers for one of the old unit.
-    resolution : float or array
-        Of the problem, in the old units; a float stays as it is.
-    observations : bool
-        Whether what is observed has the states' new units, too.
-    """
+    """A problem whose coordinates have other units, and so have its resolutions and its noise."""
 
     def __init__(
         self,

@@ -162,13 +162,7 @@ def test_a_name_that_is_none_is_refused(site: Site) -> None:
 
 
 class Mounted:
-    """Credentials as a cluster mounts them: a link to what is current, which is put in its place.
-
-    Parameters
-    ----------
-    first : Path
-        The credentials to begin with.
-    """
+    """Credentials as a cluster mounts them: a link to what is current, put in its place."""
 
     def __init__(self, directory: Path, first: Path) -> None:
         self.directory = directory
