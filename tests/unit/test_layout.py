@@ -53,7 +53,7 @@ ELSEWHERE = {
         "errors": PARTS,
         "simulation/checked_memo": PARTS,
         "simulation/checkers": PARTS,
-        "simulation/disk": PARTS,
+        "simulation/disk": "tests/scenarios/test_scenarios.py",
         "simulation/environment_model": PARTS,
         "simulation/event_queue": PARTS,
         "simulation/exploration": PARTS,
