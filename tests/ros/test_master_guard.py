@@ -191,6 +191,18 @@ class TestItsOwnMaster:
         if at_once:
             assert "nothing is lost" in graph.events(guard, "journal_failed")[0]["reason"]
 
+    def test_a_journal_that_cannot_be_read_is_kept(self, graph: Graph) -> None:
+        journal = graph.directory / f"master-{graph.port}.journal"
+        journal.write_text("not what it was")
+        guard = graph.guard("--no-rosout", "--directory", str(graph.directory))
+        (event,) = graph.events(guard, "journal_failed")
+        aside = journal.with_name(f"{journal.name}.unread")
+        assert str(aside) in event["reason"]
+        assert aside.read_text() == "not what it was"
+        graph.run("rosparam", "set", "/speed", "1")
+        replaced(graph, graph.kill_master())
+        assert graph.registered()["parameters"]["speed"] == 1
+
     def test_the_spare_ends_quietly(self, graph: Graph) -> None:
         guard = graph.guard("--no-rosout")
         spares: list[int] = []
