@@ -236,22 +236,6 @@ class TestDatagrams:
             client.send(b"heard")
             assert client.recv(100) == b"heard"
 
-    def test_a_cut_refuses_them(self, datagram_echo: DatagramEcho) -> None:
-        port = free_port()
-        with (
-            datagram_line(port, datagram_echo.port, 0.0, 0.0) as proxy,
-            client_of(port) as client,
-        ):
-            client.send(b"one")
-            assert client.recv(100) == b"one"
-            heal = proxy.impair(Impairment(cut=True))
-            client.send(b"lost")
-            with pytest.raises(ConnectionRefusedError):
-                client.recv(100)
-            heal()
-            client.send(b"two")
-            assert client.recv(100) == b"two"
-
     def test_streams_and_datagrams_are_cut_apart(self, datagram_echo: DatagramEcho) -> None:
         port = free_port()
         heard: list[tuple[str, str, bytes]] = []
