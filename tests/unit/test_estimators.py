@@ -76,13 +76,6 @@ class TestResolutionOfEachCoordinate:
         expected = np.log(4.0 / 3.0 * np.pi * self.SIZES.prod())
         assert abs(entropy(np.ones((1, 3)), None, NearestNeighbor(1, self.SIZES)) - expected) < 1e-9
 
-    def test_a_number_of_numpy_is_a_number(self) -> None:
-        points, weights = draw(50)
-        expected = entropy(points, weights, NearestNeighbor(5, 0.25))
-        for number in (np.float32(0.25), np.array(0.25)):
-            estimator = NearestNeighbor(5, number)  # type: ignore[arg-type]
-            assert entropy(points, weights, estimator) == expected
-
     def test_another_number_of_sizes(self) -> None:
         with pytest.raises(InvalidValueError, match=r"resolution of shape \(2,\): need .* \(3,\)"):
             entropy(draw(20)[0], None, NearestNeighbor(5, np.ones(2)))
@@ -147,15 +140,6 @@ class TestDefaults:
         normal = np.random.default_rng(4).normal(size=(2000, 1))
         exact = 0.5 * np.log(2.0 * np.pi * np.e) + np.log(scale)
         assert entropy(scale * normal) == pytest.approx(exact, abs=0.1)
-
-    def test_what_is_far_away_or_weighs_nothing_does_not_set_the_scale(self) -> None:
-        points = np.random.default_rng(4).normal(size=(500, 1))
-        sharp = entropy(points, None, NearestNeighbor(5, 1e-9))
-        far = np.vstack([points, [[1e6]]])
-        assert entropy(far) == pytest.approx(entropy(far, None, NearestNeighbor(5, 1e-9)), abs=1e-9)
-        weights = np.append(np.ones(500), 1e-30)
-        assert entropy(far, weights) == pytest.approx(sharp, abs=1e-6)
-        assert entropy(far, np.append(np.ones(500), 0.0)) == entropy(points)
 
     def test_where_most_points_are_equal_the_others_have_a_scale(self) -> None:
         tied = np.vstack([np.zeros((60, 2)), np.random.default_rng(4).normal(size=(40, 2))])
@@ -243,13 +227,3 @@ class TestBadInput:
     def test_size_of_the_variance(self, size: int) -> None:
         with pytest.raises(InvalidValueError, match=rf"variance of shape \({size},\): need \(3,\)"):
             entropy(draw(20)[0], None, GaussianMixture(np.ones(size)))
-
-
-def test_the_scale_of_the_weights_does_not_matter() -> None:
-    """Not even where weights are exactly the fractions at which others become negligible."""
-    points = np.random.default_rng(0).normal(size=(200, 2))
-    weights = np.power(10.0, -np.random.default_rng(3).integers(0, 8, 200)).astype(np.float64)
-    expected = entropy(points, weights, NearestNeighbor(3, 0.01))
-    for scale in (0.1, 3.0, 1e-7, 1e12):
-        scaled = entropy(points, scale * weights, NearestNeighbor(3, 0.01))
-        assert scaled == pytest.approx(expected, abs=1e-12)

@@ -119,18 +119,6 @@ class TestReplay:
             rest = list(go_on(fresh, configured, resumed, observations, STEPS))
             assert [again[1:] for again in rest] == [first[1:] for first in whole[at:]]
 
-    def test_observations_draw_nothing(self, peg: Problem) -> None:
-        """How often a robot has sensed changes none of the random numbers to come."""
-        configured = planning_settings(resampling_threshold=0.0)
-        planner = Planner(peg, configured)
-        state = planner.init(SEED, TRIAL)
-        sensed, _ = planner.observe(state, 0, [4.0])
-        action = np.array([0.1, 0.0, 0.0])
-        moved = [
-            planner.advance(either, action).belief.states.tobytes() for either in (state, sensed)
-        ]
-        assert moved[0] == moved[1]
-
 
 class TestPurity:
     def test_nothing_is_changed_and_nothing_is_shared(self, problem: Problem) -> None:
@@ -214,18 +202,6 @@ class TestFunctions:
         # Of equals the first.
         _, info = planner.choose_task_action(state)
         assert info.estimate.tolist() == state.belief.states[0].tolist()
-
-    def test_stages_advance_once_a_step(self) -> None:
-        """By the estimate, and one at a time, however far it is already."""
-        problem = registry.problem_class("capsule_robot").from_settings({}, {})
-        configured = planning_settings()
-        planner = Planner(problem, configured)
-        state = planner.init(SEED, TRIAL)
-        via_point = Belief.uniform(np.repeat([[4.5, 2.5]], 40, axis=0))
-        there = state._replace(belief=via_point)
-        action, info = planner.choose_task_action(there)
-        assert info.stage == 1
-        assert planner.advance(there, action).stage == 1
 
 
 class Broken(PegInHole2D):

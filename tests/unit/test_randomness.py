@@ -118,12 +118,6 @@ class TestDraws:
         assert draw(()).item() == draw() == many[0]
         assert draw((0, 3)).shape == (0, 3)
 
-    def test_the_array_belongs_to_the_caller(self) -> None:
-        first = named().normal(10)
-        kept = first.tobytes()
-        first[:] = 0.0
-        assert named().normal(10).tobytes() == kept
-
     def test_golden_numbers(self) -> None:
         """The first numbers of one stream, as every machine must give them."""
         of_all = partial(stream, 1, 2, 3, Purpose.INITIAL_BELIEF)
@@ -156,12 +150,6 @@ class TestGoingOn:
         assert [draw.tobytes() for draw in draws] == [
             np.ravel(self.DRAWS[kind](other)).tobytes() for _ in range(20)
         ]
-
-    def test_a_substream_is_named_and_not_drawn(self) -> None:
-        own = named()
-        before = own.substream(3).normal(4)
-        own.normal(4)
-        assert own.substream(3).normal(4).tobytes() == before.tobytes()
 
     def test_anew_begins_again(self) -> None:
         own = named()

@@ -99,14 +99,6 @@ class TestBlindChoices:
             assert chosen == index
             assert info == SensingInfo(None, None, 0, 0)
 
-    @pytest.mark.parametrize("index", [2, 7])
-    def test_fixed_out_of_range(self, index: int) -> None:
-        selector = SelectorSettings(method="fixed", sensing_action=index)
-        with pytest.raises(
-            InvalidValueError, match=rf"selector\.sensing_action {index}: .* actions 0 to 1"
-        ):
-            choose(Coordinates(), settings_of(selector), belief_of(1.0, 1.0))
-
     @pytest.mark.parametrize("count", [1, 2, 3, 7])
     def test_random_is_uniform(self, count: int) -> None:
         """Chi-square at 1e-6 over 7,000 steps, and no memory from one step to the next."""
@@ -140,11 +132,6 @@ class TestBlindChoices:
         first = choose(problem, settings, belief_of(1.0, 1.0))
         assert choose(problem, settings, belief_of(3.0, 0.1, count=10)) == first
         assert first[1] == SensingInfo(None, None, 0, 0)
-
-    @pytest.mark.parametrize("method", ["random", "fixed"])
-    def test_one_particle_will_do(self, method: str) -> None:
-        selector = SelectorSettings(method=method)  # type: ignore[arg-type]
-        choose(Coordinates(), settings_of(selector), Belief.uniform([[1.0, 2.0]]))
 
 
 def unequal(belief: Belief) -> Belief:
@@ -397,14 +384,6 @@ class TestBadInput:
         same = msgspec.structs.replace(selector, resolution=Flat.resolution)
         self.assert_same_entropies(Flat(), selector, same)
 
-    def test_mixture_of_a_problem_without_motion_noise(self) -> None:
-        class Exact(Coordinates):
-            motion_variance = np.array([0.0, 0.0])
-
-        selector = SelectorSettings(method="action_entropy", estimator="gaussian_mixture_lower")
-        same = msgspec.structs.replace(selector, resolution=Exact.resolution)
-        self.assert_same_entropies(Exact(), selector, same)
-
     def test_a_resolution_of_states_blurs_the_states_of_a_mixture(self) -> None:
         class OfStates(Coordinates):
             state_resolution = np.array([0.1, 0.5])
@@ -426,18 +405,6 @@ class TestBadInput:
         selector = SelectorSettings(method="action_entropy", estimator="gaussian_mixture_lower")
         same = msgspec.structs.replace(selector, resolution=(0.5, 0.25))
         self.assert_same_entropies(problem, selector, same)
-
-    @pytest.mark.parametrize("method", ["action_entropy", "state_entropy", "action_covariance"])
-    def test_another_number_of_resolutions_is_named(self, method: str) -> None:
-        selector = SelectorSettings(method=method, resolution=(0.1, 0.1, 0.1))  # type: ignore[arg-type]
-        with pytest.raises(InvalidValueError, match=r"selector.resolution is .*, 3 numbers; need"):
-            choose(Coordinates(), settings_of(selector), belief_of(1.0, 1.0))
-
-    @pytest.mark.parametrize("method", ["action_entropy", "state_entropy", "action_covariance"])
-    def test_a_resolution_out_of_bounds_is_named(self, method: str) -> None:
-        selector = SelectorSettings(method=method, resolution=(0.1, 1e-200))  # type: ignore[arg-type]
-        with pytest.raises(InvalidValueError, match=r"resolution \[1.e-001 1.e-200\]: allowed are"):
-            choose(Coordinates(), settings_of(selector), belief_of(1.0, 1.0))
 
     @staticmethod
     def assert_same_entropies(
