@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import random
 from typing import Any, get_args
 
 import pytest
 from tests.fuzz.hostile_settings import (
     hostile_settings,
     numeric_keys,
+    random_settings,
     with_key,
 )
 
@@ -21,6 +23,7 @@ from holdfast.protocol.decision_cost import (
     TYPICAL_PROBLEM,
     CallCost,
     Cost,
+    ProblemCost,
     cost_of_answer,
     cost_of_sensing,
     describe_cost,
@@ -159,3 +162,10 @@ def test_the_words_name_the_keys_of_the_method() -> None:
         assert f"selector.{key}" in words
     assert "3 sensing actions" in words
     assert "path_offsets" not in words
+
+
+def test_drawn_settings_can_be_used() -> None:
+    chance = random.Random(4)
+    for _ in range(200):
+        cost = cost_of_sensing(PEG, random_settings(chance), ProblemCost(*TYPICAL_PROBLEM))
+        assert cost.seconds > 0.0
