@@ -10,11 +10,7 @@ import pytest
 from holdfast.errors import EnvironmentFailedError
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.robot.environment import SimulatedEnvironment
-from holdfast_lab.testbed.world import (
-    WitnessedWorld,
-    difference_of_performances,
-    performances,
-)
+from holdfast_lab.testbed.world import WitnessedWorld, difference_of_performances, performances
 
 ACTIONS = [np.array([-0.1 * step, 0.2, 1.0 / 3.0]) for step in range(5)]
 

@@ -3,13 +3,7 @@
 import numpy as np
 import pytest
 
-from studies.cost_model import (
-    Curve,
-    Scaling,
-    break_even,
-    busy_cores,
-    parallel_share,
-)
+from studies.cost_model import Curve, Scaling, break_even, busy_cores, parallel_share
 
 
 def scaling(share: float = 0.9, pieces: int | None = None) -> Scaling:

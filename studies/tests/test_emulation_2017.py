@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 from scipy import special
 
-from studies.emulation_2017 import (
-    _neighborhoods,
-    entropy_of_neighborhoods,
-    least_of,
-)
+from studies.emulation_2017 import _neighborhoods, entropy_of_neighborhoods, least_of
 
 
 def literal_entropy(points: np.ndarray, weights: np.ndarray, k: int) -> float:

@@ -16,9 +16,7 @@ from studies import offload_break_even
 from studies.errors import TaskError
 from studies.exchange_times import measure_exchange
 from studies.executors import LocalExecutor
-from studies.offload_break_even import (
-    OffloadBreakEven,
-)
+from studies.offload_break_even import OffloadBreakEven
 from studies.running import Workload, compute, write_report
 from studies.sensing_times import Sensed, history_of, measure_sensing, state_in
 from studies.study import Scale

@@ -23,12 +23,7 @@ from holdfast.errors import HoldfastError, InvalidValueError, OutputError
 from studies import executors, tasks
 from studies.command import studies_of
 from studies.errors import TaskError
-from studies.executors import (
-    LocalExecutor,
-    compute_encoded,
-    encode_task,
-    table_of,
-)
+from studies.executors import LocalExecutor, compute_encoded, encode_task, table_of
 from studies.running import ResultCache, Workload, compute, write_report
 from studies.statistics import Interval
 from studies.study import Number, Part, Report, Scale, Study

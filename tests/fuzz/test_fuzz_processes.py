@@ -12,10 +12,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from tests.fuzz.attack_messages import (
-    IN_AN_OBSTACLE,
-    checkpoints_in_obstacles,
-)
+from tests.fuzz.attack_messages import IN_AN_OBSTACLE, checkpoints_in_obstacles
 from tests.fuzz.attacker import TRANSPORTS, attacked
 from tests.fuzz.hostile_settings import keys_of
 from tests.fuzz.soak import run_soak

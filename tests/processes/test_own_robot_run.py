@@ -18,14 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from tests.processes.faults import (
-    LOST,
-    PATIENT,
-    RESTORED,
-    Site,
-    assert_identical,
-    wait_until,
-)
+from tests.processes.faults import LOST, PATIENT, RESTORED, Site, assert_identical, wait_until
 
 from holdfast.config.loader import load
 from holdfast.planning.planner import Planner

@@ -7,12 +7,7 @@ import random
 from typing import Any, get_args
 
 import pytest
-from tests.fuzz.hostile_settings import (
-    hostile_settings,
-    numeric_keys,
-    random_settings,
-    with_key,
-)
+from tests.fuzz.hostile_settings import hostile_settings, numeric_keys, random_settings, with_key
 
 from holdfast.config import registry
 from holdfast.planning.settings import Method, PlanningSettings

@@ -19,10 +19,7 @@ from holdfast.planning.planner import (
     digest,
     encode_checkpoint,
 )
-from holdfast.planning.settings import (
-    ParticleFilterSettings,
-    PlanningSettings,
-)
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem

@@ -9,14 +9,7 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 import pytest
-from tests.robot_world import (
-    LOCAL,
-    PLANNING,
-    PROBLEM,
-    FailingWorld,
-    Misleading,
-    World,
-)
+from tests.robot_world import LOCAL, PLANNING, PROBLEM, FailingWorld, Misleading, World
 
 from holdfast.errors import HeldError, UnknownPerformanceError
 from holdfast.planning.outcome import ending_of
@@ -34,11 +27,7 @@ from holdfast.protocol.events import (
     Sensed,
     WriteRecords,
 )
-from holdfast.protocol.messages import (
-    Refused,
-    Reply,
-    SensingAnswer,
-)
+from holdfast.protocol.messages import Refused, Reply, SensingAnswer
 from holdfast.protocol.question import InProcessSource
 from holdfast.protocol.records import (
     ActingRecord,

@@ -63,13 +63,7 @@ from holdfast.protocol.messages import (
     unpack_configuration,
 )
 from holdfast.protocol.service import Service
-from holdfast.protocol.service_jobs import (
-    EndCall,
-    Job,
-    SendReply,
-    ServiceEffect,
-    StartJob,
-)
+from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect, StartJob
 from holdfast.protocol.service_limits import ServiceLimits
 from holdfast.robot.environment import SimulatedEnvironment
 
