@@ -60,7 +60,6 @@ from holdfast.protocol.messages import (
     decode_reply,
     encode,
     encode_floats,
-    unpack_configuration,
 )
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect, StartJob
@@ -715,23 +714,6 @@ class TestCapacity:
         bench.run_all()
         assert content(bench.replies[call]) == other.right_answer()
 
-    def test_prefetches_do_not_starve_behind_newcomers(self) -> None:
-        bench = Bench(max_wait_ms=100.0, prefetch_patience_ms=20.0)
-        known = Robot(key=1)
-        bench.ask(known.request())
-        known.sense()
-        call = bench.send(known.request())
-        for key in range(2, 60):
-            bench.send(Robot(key=key).request())
-        bench.run()  # the task part; the sensing part is ahead of its robot
-        assert len(bench.replies[call]) == 1
-        jobs = 0
-        while call not in bench.ended:
-            bench.now += 0.005
-            bench.run()
-            jobs += 1
-        assert jobs <= 20 / 5 + 3
-
     def test_one_job_that_was_held_up_turns_nobody_away(self) -> None:
         bench = Bench(max_wait_ms=100.0)
         first = Robot(key=1)
@@ -809,36 +791,6 @@ class TestCapacity:
             content(bench.ask(robots[-1].request(session_configuration=False)))
             == robots[-1].right_answer()
         )
-
-    def test_bytes_of_openings(self) -> None:
-        """A plate with a thousand holes is 24 KB as it is sent, and half a megabyte unpacked."""
-        holes = [{"center": [4.0, 6.0 - 0.01 * number], "depth": 0.01} for number in range(900)]
-        session_configuration = SessionConfiguration(
-            "multitier_peg_in_hole_2d", {"holes": holes}, {}, planning_of(), 5
-        )
-        bench = Bench(max_configuration_bytes=250_000)
-        for key in range(1, 31):
-            bench.ask(Robot(key=key).request())
-        assert bench.service.statistics.sessions == 30
-        for key in range(31, 61):
-            request = msgspec.structs.replace(
-                Robot(key=key).request(), session_configuration=session_configuration
-            )
-            bench.ask(request)
-            held = [session.configuration for session in bench.service._sessions._sessions.values()]
-            assert sum(map(len, held)) <= 250_000
-            assert unpack_configuration(held[-1]) == session_configuration
-        assert 4 <= bench.service.statistics.sessions <= 8
-        # Each by itself is served, however large it is beside the limit.
-        small = Bench(max_configuration_bytes=100)
-        robot = Robot()
-        assert content(small.ask(robot.request())) == robot.right_answer()
-        other = small.send(Robot(key=2).request())
-        assert small.replies[other] == []
-        third = small.send(Robot(key=3).request())
-        assert isinstance(only(small.replies[third]), Busy)
-        small.run_all()
-        assert small.service.statistics.sessions == 1
 
     def test_requests_that_wait_hold_no_opening(self) -> None:
         bench = Bench()
