@@ -72,13 +72,7 @@ _LAST_EPOCH = 2**32 - 1
 
 
 class Message(NamedTuple):
-    """Something to be said.
-
-    Attributes
-    ----------
-    is_whole : bool
-        Whether it is made of whole frames, so that what comes after it is read.
-    """
+    """Something to be said."""
 
     name: str
     data: bytes
@@ -101,17 +95,7 @@ def messages(
     incarnation: str,
     call_of: Callable[[int, bytes], bytes],
 ) -> list[Message]:
-    """Return all that can be said.
-
-    Parameters
-    ----------
-    questions : sequence of Request
-        What the honest robot asks, with its session, its epoch and its numbers.
-    service, incarnation : str
-        As what the service is known.
-    call_of : callable
-        Makes the frame of a call, of its number and its request.
-    """
+    """Return all that can be said."""
     chance = random.Random(7)
     garbage = chance.randbytes(80)
     found = [
@@ -175,26 +159,7 @@ MOMENTS = (
 
 
 class Intruder:
-    """Says each message at each moment, a link for each, and notes what it should not be told.
-
-    Parameters
-    ----------
-    keys : Path or None
-        Directory of its certificate.
-    questions : sequence of Request
-        What the honest robot asks.
-    own : Request
-        A question of its own, which it may ask.
-
-    Attributes
-    ----------
-    links : int
-        How many it has had.
-    told : list of str
-        What it should not have been told.
-    answered : int
-        Calls of its own that came to an end.
-    """
+    """Says each message at each moment, a link for each, and notes what it should not be told."""
 
     def __init__(
         self, endpoint: str, keys: Path | None, questions: Sequence[Request], own: Request
@@ -384,15 +349,7 @@ def _until_the_end(link: RawLink) -> Iterator[Frame]:
 
 
 class Impostor:
-    """Listens as the service that it is not, with a robot's certificate.
-
-    Attributes
-    ----------
-    received : list of bytes
-        Requests that it was asked.
-    knocked : int
-        Connections that were made.
-    """
+    """Listens as the service that it is not, with a robot's certificate."""
 
     def __init__(
         self, port: int, keys: Path, answer: Callable[[int], bytes] = wrong_actions

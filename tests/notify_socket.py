@@ -17,13 +17,7 @@ PATIENCE_S = 60.0
 
 
 class NotifySocket:
-    """Hears what processes tell.
-
-    Parameters
-    ----------
-    abstract : bool
-        Whether its name begins with @, so that there is no file.
-    """
+    """Hears what processes tell."""
 
     def __init__(self, *, abstract: bool = False) -> None:
         self._directory = tempfile.TemporaryDirectory()  # with a short name, unlike those of tests

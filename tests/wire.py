@@ -100,18 +100,7 @@ def robot_context(keys: Path) -> ssl.SSLContext:
 
 
 class RawLink:
-    """A stream to an endpoint; nothing is said on it but what is asked for.
-
-    Parameters
-    ----------
-    endpoint : str
-        ``tcp/HOST:PORT``, ``tls/HOST:PORT`` or ``unix/PATH``; of ``udp/HOST:PORT`` the stream that
-        is beside the datagrams.
-    keys : Path or None
-        Directory with the credentials of this end, for ``tls`` and ``udp``.
-    shakes_hands : bool
-        False leaves a link over TLS without its handshake.
-    """
+    """A stream to an endpoint; nothing is said on it but what is asked for."""
 
     def __init__(
         self, endpoint: str, keys: Path | None = None, *, shakes_hands: bool = True
@@ -165,13 +154,7 @@ class RawLink:
         self.say(frame_of(kind, call, payload))
 
     def receive(self, wait_s: float = PATIENCE_S) -> Frame | None:
-        """Return the next frame; None once the other end has hung up.
-
-        Raises
-        ------
-        TimeoutError
-            If neither happens in time.
-        """
+        """Return the next frame; None once the other end has hung up."""
         until = time.monotonic() + wait_s
         while (frame := self._take()) is None:
             left = until - time.monotonic()
@@ -216,18 +199,7 @@ class RawLink:
 
 
 class RawClient(RawLink):
-    """A robot's end that has greeted the service, and asks it one thing at a time.
-
-    Parameters
-    ----------
-    hello : bytes or None
-        What it says first.
-
-    Attributes
-    ----------
-    service : dict
-        What the service's hello says.
-    """
+    """A robot's end that has greeted the service, and asks it one thing at a time."""
 
     def __init__(
         self, endpoint: str, keys: Path | None = None, *, hello: bytes | None = None

@@ -21,7 +21,7 @@ import msgspec
 import pytest
 from tests.process_states import state_of
 
-from holdfast_lab.chaos.schedule import WIRES, Schedule, Wire, draw_schedule, kinds_over
+from holdfast_lab.chaos.schedule import WIRES, Schedule, Wire, kinds_over
 from holdfast_lab.chaos.trial import Pace, TrialOutcome, run_chaos_trial
 from holdfast_lab.testbed.faults import NEEDS_NAMESPACE, Fault, FaultKind
 from holdfast_lab.testbed.processes import marked_processes
@@ -199,42 +199,6 @@ def test_every_kind_of_fault(tmp_path: Path, started: list[Chaos], wire: Wire) -
     assert re.search(r"^cloud_killed +\d", output, re.MULTILINE)
     assert (chaos.out / "table.txt").read_text() in output
     assert "\x1b" not in output + errors
-
-
-@pytest.mark.slow
-def test_a_divergence_is_shown_and_kept(tmp_path: Path, started: list[Chaos]) -> None:
-    program = """
-import msgspec, holdfast_lab.chaos.trial as trial
-compare = trial.compare_runs
-def differently(*runs):
-    found = compare(*runs)
-    difference = trial.Difference(what="an invention", first="1", second="2")
-    return msgspec.structs.replace(found, identical=False, difference=difference)
-from holdfast.recording.compare import Difference
-trial.Difference = Difference
-trial.compare_runs = differently
-from holdfast.cli import main
-main()
-"""
-    chaos = Chaos(tmp_path, "--trials", "1", *only([FaultKind.LINK_CUT]), program=program)
-    started.append(chaos)
-    output, _ = chaos.end()
-    assert chaos.process.returncode == 1
-    assert "trial 0 (link_cut over tcp): diverged: different: an invention" in output
-    assert "1 of 1 trial went wrong (1 diverged" in output
-    kept = chaos.out / "trial-00000"
-    assert f"its files: {kept}" in output
-    assert (kept / "disturbed" / "journal.sqlite").exists()
-    again = re.search(r"again: (holdfast chaos .*)", output)
-    assert again is not None
-    options = shlex.split(again[1])[2:]
-    assert options == [
-        *("--trials", "1", "--first", "0", "--seed", "0", "--only", "link_cut"),
-        *("--wire", "tcp", "--keep"),
-    ]
-    schedule = json.loads((kept / "schedule.json").read_text())
-    drawn = draw_schedule(0, 0, FaultKind.LINK_CUT, "tcp", tuple(FaultKind))
-    assert schedule["world_seed"] == drawn.world_seed
 
 
 @pytest.mark.slow

@@ -222,16 +222,3 @@ def test_a_process_that_ends_by_itself_ends_the_demo(directory: Path) -> None:
         demo.wait_until_all_are_gone()
     finally:
         demo.close()
-
-
-def test_a_directory_that_is_taken(directory: Path) -> None:
-    (directory / "out").mkdir()
-    (directory / "out" / "file").touch()
-    demo = Demo(directory)
-    try:
-        _, story = demo.process.communicate(timeout=PATIENCE_S)
-        assert demo.process.returncode == 2
-        assert "holds files already" in story
-        assert [path.name for path in demo.out.iterdir()] == ["file"]
-    finally:
-        demo.close()

@@ -12,11 +12,10 @@ from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.protocol.records import ActingRecord, PerformedRecord, TrialHistory
+from holdfast.protocol.records import TrialHistory
 from holdfast_lab.errors import Violation
 from holdfast_lab.simulation.checked_memo import CheckedPlanner
 from holdfast_lab.simulation.checkers import StatusChecker, WireChecker, check_size
-from holdfast_lab.simulation.disk import Disk
 from holdfast_lab.simulation.environment_model import EnvironmentModel
 from holdfast_lab.simulation.event_queue import Clock, EventQueue
 from holdfast_lab.simulation.exploration import shrink
@@ -34,22 +33,9 @@ from holdfast_lab.simulation.schedule import (
     SimulationSchedule,
     Stop,
 )
-from holdfast_lab.simulation.schedule_draws import draw_schedule
 
 
 class TestEventQueue:
-    def test_order(self) -> None:
-        queue = EventQueue()
-        seen: list[str] = []
-        queue.after(2.0, seen.append, "c")
-        queue.after(1.0, seen.append, "a")
-        queue.at(1.0, seen.append, "b")
-        queue.at(-5.0, seen.append, "first")
-        while queue.step():
-            pass
-        assert seen == ["first", "a", "b", "c"]
-        assert queue.now == 2.0
-
     def test_clocks(self) -> None:
         queue = EventQueue()
         clock = Clock(queue, 1e6, 0.97)
@@ -61,29 +47,6 @@ class TestEventQueue:
         assert clock.reached(due) >= due
         assert clock.now() >= due, "a clock does not go back"
         assert clock.until(due - 1.0) == 0.0
-
-
-class TestDisk:
-    def records(self, step: int) -> tuple[PerformedRecord, ActingRecord]:
-        return PerformedRecord(step, -1.0), ActingRecord(step + 1, b"8" * 24)
-
-    @pytest.mark.parametrize(("lost", "left"), [(0, 6), (1, 4), (2, 2), (100, 2)])
-    def test_a_power_cut_loses_a_tail(self, lost: int, left: int) -> None:
-        disk = Disk(forces_out=False)
-        disk.opened()
-        for step in range(3):
-            disk.append(5, self.records(step))  # the first of a process is forced out
-        disk.cut_power(lost)
-        disk.opened()
-        unfinished = disk.unfinished()
-        assert unfinished is not None
-        assert len(unfinished.records) == left
-        assert not unfinished.is_complete
-        disk.append(5, self.records(9))
-        disk.opened()
-        again = disk.unfinished()
-        assert again is not None
-        assert again.is_complete, "no power was cut since"
 
 
 def reference_run() -> ReferenceRun:
@@ -300,13 +263,3 @@ class TestShrinking:
 
         assert shrink(schedule, fails) == SimulationSchedule(RunSettings(act_s=0.02), (stop, crash))
         assert len(asked) < 500
-
-    def test_services_of_faults_are_kept(self) -> None:
-        drop = MessageFault(service="cloud-2", direction="to", number=0, what="drop")
-        schedule = SimulationSchedule(RunSettings(replicas=2), (drop,))
-        assert shrink(schedule, lambda candidate: drop in candidate.faults) == schedule
-
-    def test_it_ends(self) -> None:
-        left = iter(range(10**9))
-        assert shrink(draw_schedule(5), lambda _: next(left) % 2 == 0)
-        assert next(left) <= 2001

@@ -36,17 +36,6 @@ def test_a_share_is_lost_and_the_seed_says_which() -> None:
     assert found != lost("b")
 
 
-def test_all_or_nothing() -> None:
-    arrived: queue.Queue[bytes] = queue.Queue()
-    with BadLine("line", "seed") as line:
-        heal = line.impair(Impairment(loss=1.0))
-        carry(line, range(50), arrived)
-        heal()
-        carry(line, range(50, 100), arrived)
-        assert [arrived.get(timeout=PATIENCE_S)[0] for _ in range(50)] == [*range(50, 100)]
-        assert arrived.empty()
-
-
 def test_a_full_line_loses_what_comes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bad_line, "_CAPACITY", 3)
     arrived: queue.Queue[bytes] = queue.Queue()

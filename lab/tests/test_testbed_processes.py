@@ -4,35 +4,23 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
-from tests.process_states import alive
 
 from holdfast_lab.errors import CannotStartError, NoProgressError, ProcessEndedError
 from holdfast_lab.testbed.processes import (
     HOLDFAST,
     Process,
     ProcessGroup,
-    free_port,
     local_services_of,
     marked_processes,
 )
 
 PATIENCE_S = 30.0
-
-
-def test_ports_are_free_and_not_given_to_connections() -> None:
-    first_outgoing = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()[0])
-    for _ in range(20):
-        port = free_port()
-        assert port < first_outgoing
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", port))
 
 
 def test_output_and_end(tmp_path: Path) -> None:
@@ -71,59 +59,6 @@ def test_events_are_awaited() -> None:
         process.wait_for("three")
     assert process.close(PATIENCE_S) == 0
     assert [event.name for event in process.events] == ["one", "two", "two"]
-
-
-PARENT = """
-import sys, time
-from holdfast_lab.testbed.processes import HOLDFAST, Process
-from holdfast.runtime.parent_death import parent_death_prefix
-from pathlib import Path
-prefix = parent_death_prefix() if sys.argv[2] == "leashed" else ()
-command = [*prefix, *HOLDFAST, "serve", "--listen", sys.argv[3], "--log", "json"]
-print(Process(command, log_path=Path(sys.argv[1])).pid, flush=True)
-time.sleep(600)
-"""
-
-
-@pytest.mark.parametrize("how", ["leashed", "free"])
-def test_a_command_on_a_leash_ends_with_whoever_started_it(tmp_path: Path, how: str) -> None:
-    listen = f"tcp/127.0.0.1:{free_port()}"
-    log = tmp_path / "log"
-    program = [sys.executable, "-c", PARENT, str(log), how, listen]
-    with subprocess.Popen(program, stdout=subprocess.PIPE, text=True) as parent:
-        assert parent.stdout is not None
-        pid = int(parent.stdout.readline())
-        deadline = time.monotonic() + PATIENCE_S
-        while not (log.exists() and "ready" in log.read_text()):
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-        parent.kill()
-    try:
-        if how == "free":
-            time.sleep(0.5)
-            assert Path(f"/proc/{pid}/exe").exists()
-            return
-        while alive(pid):
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-    finally:
-        if alive(pid):
-            os.kill(pid, signal.SIGKILL)
-
-
-def test_a_command_is_stopped_and_resumed() -> None:
-    listen = f"tcp/127.0.0.1:{free_port()}"
-    service = Process((*HOLDFAST, "serve", "--listen", listen, "--log", "json"))
-    try:
-        service.wait_for("ready")
-        service.stop()
-        os.waitid(os.P_PID, service.pid, os.WSTOPPED)
-        service.process.terminate()
-        assert service.process.poll() is None
-        service.resume()
-        assert service.process.wait(PATIENCE_S) == 0
-    finally:
-        service.close(0.0)
 
 
 class TestFound:

@@ -109,15 +109,7 @@ def _command_line(process: int) -> bytes:
 
 
 class RayCluster:
-    """A head and some workers, each a node of its own.
-
-    Attributes
-    ----------
-    address : str
-        For ``--executor``.
-    native_address : str
-        For ``RAY_ADDRESS``.
-    """
+    """A head and some workers, each a node of its own."""
 
     def __init__(self, num_workers: int) -> None:
         # The paths of its sockets have little room.
@@ -133,7 +125,7 @@ class RayCluster:
             # One after the other: together they would take each other's ports.
             self._start(head)
             for _ in range(num_workers):
-                self.add_worker()
+                self._start(["--address", self.native_address, "--num-cpus", "1"])
             _wait_for_port(client_port)
             self._wait_for_client_server()
         except BaseException:
@@ -157,21 +149,6 @@ class RayCluster:
     def busy(self) -> list[int]:
         """Return the processes that compute a task."""
         return [process for node in self._nodes for process in node.busy()]
-
-    def add_worker(self) -> None:
-        """Start another node."""
-        self._start(["--address", self.native_address, "--num-cpus", "1"])
-
-    def kill_busy_worker(self) -> None:
-        """Kill a whole node that computes something."""
-        node = next(node for node in self._nodes if node.busy())
-        node.kill()
-        self._nodes.remove(node)
-
-    def kill_workers(self) -> None:
-        """Kill all nodes but the head."""
-        while len(self._nodes) > 1:
-            self._nodes.pop().kill()
 
     def __enter__(self) -> Self:
         return self

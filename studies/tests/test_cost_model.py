@@ -3,13 +3,7 @@
 import numpy as np
 import pytest
 
-from studies.cost_model import (
-    Curve,
-    Scaling,
-    break_even,
-    busy_cores,
-    parallel_share,
-)
+from studies.cost_model import Curve, Scaling, break_even, busy_cores, parallel_share
 
 
 def scaling(share: float = 0.9, pieces: int | None = None) -> Scaling:
@@ -50,29 +44,6 @@ def test_pieces_bound_the_gain() -> None:
 
 
 class TestScaling:
-    def test_cores_shorten_their_part(self) -> None:
-        assert scaling().on_cores(1).values == pytest.approx([0.1, 1.0, 10.0, 100.0])
-        assert scaling().on_cores(9).values == pytest.approx([0.02, 0.2, 2.0, 20.0])
-        assert scaling(pieces=10).on_cores(9).values[1] == pytest.approx(0.1 + 0.9 / 5.0)
-
-    def test_the_band_holds_the_line(self) -> None:
-        least, most = scaling(pieces=10).band(9)
-        line = scaling(pieces=10).on_cores(9)
-        assert least.values == pytest.approx([n / 9000 for n in line.particles])
-        assert most.values == pytest.approx([n / 1000 * (0.2 + 0.8 / 5) for n in line.particles])
-        assert all(low < x < high for low, x, high in zip(least[1], line[1], most[1], strict=True))
-
-    def test_the_break_even_of_known_curves(self) -> None:
-        # 0.9 (1 - 1/9) N / 1,000 ms are saved, so 20 ms at 25,000 particles.
-        assert break_even(scaling().saved_ms(1, 9), 20.0).particles == pytest.approx(25_000, 1e-3)
-        # With 2 cores against 18: 0.9 (1/2 - 1/18).
-        found = break_even(scaling().saved_ms(2, 18), 20.0)
-        assert found.particles == pytest.approx(50_000, 1e-3)
-        ends = [break_even(each.saved_ms(1, 9), 20.0).particles for each in scaling().bounds()]
-        assert ends == pytest.approx(
-            [20 / (0.9 * 0.8 * 8 / 9) * 1e3, 20 / (1.1 * 8 / 9) * 1e3, 20 / (8 / 9) * 1e3], 1e-3
-        )
-
     def test_deciding_ahead_hides_what_fits(self) -> None:
         # Elsewhere it always fits into 50 ms; here it takes N / 1,000 - 50 ms longer.
         found = break_even(scaling().saved_ms(1, 9, ahead_ms=50.0), 20.0)

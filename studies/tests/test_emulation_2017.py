@@ -1,18 +1,12 @@
 """The entropies of 2017, against their formula written out, and what won without a number."""
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy import special
 
-from studies.emulation_2017 import (
-    _neighborhoods,
-    entropy_of_neighborhoods,
-    least_of,
-    run_emulation,
-)
+from studies.emulation_2017 import _neighborhoods, entropy_of_neighborhoods, least_of
 
 
 def literal_entropy(points: np.ndarray, weights: np.ndarray, k: int) -> float:
@@ -69,21 +63,3 @@ def test_what_wins() -> None:
     )
     drawn = np.array([0.9, 0.9, 0.9, 0.0, 0.5, 0.99])
     np.testing.assert_array_equal(least_of(entropies, drawn), [1, 1, 1, 0, 1, 2])
-
-
-def test_a_series_is_the_same_again() -> None:
-    series: dict[str, Any] = {
-        "first_trial": 0,
-        "problem": "peg_in_hole_2d",
-        "planning": {"selector": {"method": "action_entropy"}, "sensing_interval": 8},
-        "max_steps": 30,
-        "num_trials": 70,
-        "seed": 3,
-    }
-    first, second = run_emulation(**series), run_emulation(**series)
-    assert first.equals(second)
-    assert len(first) == 70
-    others = run_emulation(**{**series, "first_trial": 70})
-    assert others["trial"].tolist() == list(range(70, 140))
-    assert others["reward"].tolist() != first["reward"].tolist()
-    assert set(first.columns) == {"trial", "success", "steps", "reward"}

@@ -6,7 +6,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import pandas as pd
 import pytest
 
 from holdfast.numerics.randomness import Purpose, stream
@@ -15,7 +14,7 @@ from studies.cases import CASES
 from studies.errors import TaskError
 from studies.estimate_candidates import CANDIDATES, run_estimates
 from studies.estimates import Estimates, Variant, variants
-from studies.study import CHOICE, CLAIM, TRIALS, Scale
+from studies.study import CLAIM, Scale
 from studies.tasks import run_task
 from studies.trial_batches import problem_of, run_trials_of
 
@@ -67,32 +66,6 @@ def test_the_mean_decides_as_the_planner_does() -> None:
 def test_all_candidates_are_tried() -> None:
     assert {each.estimate for each in variants()} == set(CANDIDATES)
     assert variants()[0] == Variant()
-
-
-def test_the_report_of_made_up_trials() -> None:
-    """With the heaviest mode each trial takes half the steps, and one in ten more succeeds."""
-    study = Estimates()
-    rows = []
-    for purpose in (CHOICE, CLAIM):
-        cells = study.judged_cells if purpose == CLAIM else study.cells
-        for cell in cells(Scale()):
-            for trial in range(20):
-                better = cell[1].estimate == "heaviest_mode"
-                steps = 50 + trial if better else 2 * (50 + trial)
-                success = better or trial % 10 > 0
-                names = dict(zip(study.columns, study.names(cell), strict=True))
-                rows.append(
-                    {"purpose": purpose, **names, "trial": trial, "success": success}
-                    | {"steps": steps, "reward": 0.0, "sensing_decisions": 5, "step_limit": 500}
-                    | {"steps_to_goal": float(steps), "median_sensing_ms": 1.0}
-                )
-    report = study.report_of({TRIALS: pd.DataFrame(rows)})
-    together = report.summary["together"].set_index(["estimate", "resampling"])
-    assert together.loc[("heaviest_mode", 1.0), "steps_ratio"] == pytest.approx(0.5)
-    assert together.loc[("heaviest_mode", 1.0), "success_gain"] == pytest.approx(0.1)
-    assert together.loc[("mean", 0.5), "steps_ratio"] == pytest.approx(1.0)
-    assert len(report.summary["choosing_together"]) == len(variants()) - 1
-    assert len(report.numbers) == 2 * len(together)
 
 
 def test_its_tasks_run() -> None:

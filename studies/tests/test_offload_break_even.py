@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from holdfast.errors import InvalidValueError
@@ -17,12 +16,7 @@ from studies import offload_break_even
 from studies.errors import TaskError
 from studies.exchange_times import measure_exchange
 from studies.executors import LocalExecutor
-from studies.offload_break_even import (
-    Kind,
-    OffloadBreakEven,
-    scalings_of,
-    times_table,
-)
+from studies.offload_break_even import OffloadBreakEven
 from studies.running import Workload, compute, write_report
 from studies.sensing_times import Sensed, history_of, measure_sensing, state_in
 from studies.study import Scale
@@ -80,23 +74,6 @@ def test_what_takes_too_long_is_left_out() -> None:
     assert set(table["particles"]) == {50, 100}
     with pytest.raises(InvalidValueError, match=r"particles 50: a round .* limit_s 1e-07"):
         measure_sensing(**BRIEF, limit_s=1e-7)
-
-
-def test_scaling_is_of_medians() -> None:
-    rows = [
-        (n, belief, threads, ms * n / threads, 0.5 + 0.1 * belief, 1, 0.1, 0.0)
-        for n in (10, 20)
-        for belief, ms in enumerate((1.0, 3.0, 2.0))
-        for threads in (1, 2)
-    ]
-    names = ("particles", "belief", "threads", "median_ms", "share", "repetitions", "mapping_ms")
-    table = pd.DataFrame(rows, columns=[*names, "others_cores"])
-    kind = Kind("peg_in_hole_2d", 3, samples=5)
-    found = scalings_of(times_table(table.assign(**kind._asdict())))[kind]
-    assert found.particles.tolist() == [10, 20]
-    assert found.times[0].tolist() == [20.0, 40.0]
-    assert found.shares[0].tolist() == [0.6, 0.6]
-    assert found.pieces == 15
 
 
 def test_asking_in_process() -> None:

@@ -1,4 +1,4 @@
-"""Tasks on a real Ray cluster: a head and two workers on this machine, of which some are killed.
+"""Tasks on a real Ray cluster: a head and two workers, of which a process is killed.
 
 Whoever joins it does so in a process of its own, since Ray's client joins only once in each.
 """
@@ -9,11 +9,10 @@ import multiprocessing
 import os
 import secrets
 import signal
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from time import monotonic, sleep
@@ -119,35 +118,12 @@ def test_a_killed_process_changes_nothing(cluster: RayCluster, here: Outcome) ->
 
 
 @with_ray
-def test_a_killed_node_changes_nothing(cluster: RayCluster, here: Outcome) -> None:
-    cluster.add_worker()
-    with alone(on_cluster, cluster.address) as outcome:
-        wait_until_busy(cluster, 2)
-        cluster.kill_busy_worker()
-        assert outcome.result(PATIENCE_S) == here
-
-
-@with_ray
 def test_the_cluster_of_this_machine(
     cluster: RayCluster, here: Outcome, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RAY_ADDRESS", cluster.native_address)
     with alone(on_cluster, None) as outcome:
         assert outcome.result(PATIENCE_S) == here
-
-
-@with_ray
-def test_a_task_that_kills_is_given_up(cluster: RayCluster) -> None:
-    with alone(refusal, cluster.address, tasks(), None) as told:
-        began = monotonic()
-        while not told.done() and monotonic() < began + PATIENCE_S:
-            for process in cluster.busy():
-                with suppress(ProcessLookupError):
-                    os.kill(process, signal.SIGKILL)
-            sleep(0.02)
-        assert told.result(0).startswith(
-            "TaskError: 3 processes of the cluster were lost with trials {'problem': "
-        )
 
 
 @with_ray
@@ -166,47 +142,6 @@ def test_other_code_is_refused(cluster: RayCluster) -> None:
     own = code_of(tasks()[0])
     assert f"has other code for tasks of the kind 'trials' (digest {own}, of holdfast" in text
     assert "than the one that asks (digest 0123)" in text
-
-
-@with_ray
-def test_interrupted_and_gone_on_with(cluster: RayCluster, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "studies", "published_2017", "--quick"]
-    command += ["--executor", cluster.address, "--out", str(tmp_path)]
-    for turn in range(2):
-        before = len(list(tmp_path.rglob("*.table")))
-        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-            began = monotonic()
-            while len(list(tmp_path.rglob("*.table"))) == before:
-                assert process.poll() is None
-                assert monotonic() < began + PATIENCE_S
-                sleep(0.1)
-            process.send_signal(signal.SIGTERM if turn else signal.SIGINT)
-            _, said = process.communicate(timeout=PATIENCE_S)
-        assert process.returncode == 128 + (signal.SIGTERM if turn else signal.SIGINT), said
-        assert f"in the Ray cluster at {cluster.address.removeprefix('ray://')}" in said
-        assert ("known before" in said) == bool(turn)
-        assert "Go on with: python -m studies published_2017 --quick" in said
-        assert f" --executor {cluster.address} " in said
-        ended = monotonic()
-        while cluster.busy():
-            assert monotonic() < ended + PATIENCE_S, "nobody wants what is still computed"
-            sleep(0.1)
-
-
-def refusal_of_the_impatient(address: str) -> str:
-    """Return why tasks cannot be computed if there may be no core for five seconds at most."""
-    for name, seconds in (("_WITHOUT_CORES_S", 5.0), ("_LOOK_INTERVAL_S", 1.0)):
-        setattr(ray_executor, name, seconds)
-    return refusal(address, tasks()[:5], None)
-
-
-@with_ray
-def test_a_cluster_that_has_lost_its_last_core(cluster: RayCluster) -> None:
-    cluster.kill_workers()
-    with alone(refusal_of_the_impatient, cluster.address) as told:
-        text = told.result(PATIENCE_S)
-    assert text.startswith(f"TaskError: the Ray cluster at {cluster.address[6:]} has had no core")
-    assert text.endswith("for 5 s: start a node (ray start --address HOST:PORT); 5 tasks are left")
 
 
 @with_ray

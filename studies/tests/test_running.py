@@ -14,7 +14,6 @@ from pathlib import Path
 import msgspec
 import pandas as pd
 import pytest
-from matplotlib.figure import Figure
 
 import holdfast
 import holdfast_lab
@@ -24,12 +23,7 @@ from holdfast.errors import HoldfastError, InvalidValueError, OutputError
 from studies import executors, tasks
 from studies.command import studies_of
 from studies.errors import TaskError
-from studies.executors import (
-    LocalExecutor,
-    compute_encoded,
-    encode_task,
-    table_of,
-)
+from studies.executors import LocalExecutor, compute_encoded, encode_task, table_of
 from studies.running import ResultCache, Workload, compute, write_report
 from studies.statistics import Interval
 from studies.study import Number, Part, Report, Scale, Study
@@ -245,26 +239,6 @@ class TestLocalExecutor:
         assert outcome(self.computed(LocalExecutor(2))) == outcome(self.computed(LocalExecutor(1)))
         assert multiprocessing.active_children() == []
 
-    @pytest.mark.slow
-    def test_a_killed_process_changes_nothing(self) -> None:
-        killed: list[int] = []
-
-        def kill_one(task: Task, table: pd.DataFrame) -> None:
-            found.update({task_key(task): table})
-            if not killed:
-                child = multiprocessing.active_children()[0]
-                assert child.pid is not None
-                killed.append(child.pid)
-                os.kill(child.pid, signal.SIGKILL)
-
-        wanted = list(trial_tasks(series(num_trials=60, max_steps=200), 3))
-        found: dict[str, pd.DataFrame] = {}
-        LocalExecutor(2).run(wanted, kill_one)
-        assert killed
-        alone: list[pd.DataFrame] = []
-        LocalExecutor(1).run(wanted, lambda _, table: alone.append(table))
-        assert outcome([found[task_key(task)] for task in wanted]) == outcome(alone)
-
     def test_a_task_that_kills_is_given_up(self) -> None:
         wanted = list(trial_tasks(series(num_trials=2), 1))
         ended = threading.Event()
@@ -371,33 +345,6 @@ class TestWorkload:
     def test_where_nothing_can_be_kept_nothing_is_computed(self) -> None:
         with pytest.raises(OutputError, match="/proc/results: cannot be written in: No such"):
             Workload([OneSeries()], Scale(), Path("/proc/results"))
-
-    def test_what_killed_writers_left_is_removed(self, tmp_path: Path) -> None:
-        ours = (tmp_path / "cache" / "trials" / "ab", tmp_path / "one_series")
-        for folder in ours:
-            folder.mkdir(parents=True)
-        old = [folder / ".a.csv.12.tmp" for folder in ours]
-        kept = [tmp_path / ".a.csv.12.tmp", ours[1] / ".a.tmp", ours[1] / "b.csv"]
-        young = ours[1] / ".b.csv.13.tmp"
-        for path in (*old, *kept, young):
-            path.write_text("")
-            if path != young:
-                os.utime(path, (0, 0))
-        Workload([OneSeries()], Scale(), tmp_path)
-        assert [path.exists() for path in old] == [False, False]
-        assert all(path.exists() for path in (*kept, young))
-
-    def test_an_interrupted_report_has_no_origin(self, tmp_path: Path) -> None:
-        def interrupted() -> Figure:
-            raise KeyboardInterrupt
-
-        report = Report(
-            summary={"means": pd.DataFrame({"reward": [1.0]})}, figures={"means": interrupted}
-        )
-        (tmp_path / "origin.json").write_text("of the run before")
-        with pytest.raises(KeyboardInterrupt):
-            write_report(OneSeries(), Scale(), report, tmp_path)
-        assert [path.name for path in tmp_path.iterdir()] == ["means.csv"]
 
 
 def test_missing_packages_are_told_of_first(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,9 +11,8 @@ from holdfast.planning.outcome import SensingDecision
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import PlanningSettings, SelectorSettings
 from holdfast.robot.trial import run_trial
-from studies import sensing_price
 from studies.priced_problems import Boat
-from studies.sensing_price import FIXED, NATS, PRICES, PROBLEMS, SensingPrice
+from studies.sensing_price import NATS, SensingPrice
 from studies.study import CHOICE, CLAIM, Report, Scale
 from studies.tasks import Task
 from studies.tests.made_up import noise, report_on
@@ -48,49 +47,6 @@ def known() -> Iterator[Report]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SensingPrice, "num_trials", {CHOICE: 10, CLAIM: 40})
         yield report_on(SensingPrice(), SCALE, trial)
-
-
-def test_each_way_chooses_its_number(known: Report) -> None:
-    when = known.summary["when_to_sense"]
-    assert len(when) == sum(len(each.prices) * len(each.ways) for each in PROBLEMS.values())
-    chosen = when.groupby("way")["number"].agg(["min", "max"])
-    for way, number in ((FIXED, 8.0), ("nats", 0.8), ("nats, executed", 0.8)):
-        assert chosen.loc[way].tolist() == [number, number]
-
-
-def test_what_is_saved(known: Report) -> None:
-    """A look in every second step: the cost is steps times 1 + price / 2, of which a fifth."""
-    when = known.summary["when_to_sense"]
-    for price in PRICES:
-        rows = when[when["price"] == price]
-        for row in rows.to_dict("records"):
-            fixed = rows[(rows["problem"] == row["problem"]) & (rows["way"] == FIXED)]
-            cost = float(fixed["cost"].iloc[0])
-            share = 0.2 if row["way"] == "nats" else 0.0
-            assert row["saved"] == pytest.approx(share * cost, abs=0.02 * cost)
-            assert row["saved_low"] <= row["saved"] <= row["saved_high"]
-
-
-def test_what_choosing_when_saves_alone(known: Report) -> None:
-    """The return takes as many steps of the made-up trials, whether it chooses or not."""
-    alone = known.summary["when_alone"]
-    assert alone["problem"].tolist() == ["dock", "dock", "boat", "boat"]
-    assert (alone["saved_low"] < 0.0).all()
-    assert (alone["saved_high"] > 0.0).all()
-
-
-def test_the_resolution_of_the_boat(known: Report) -> None:
-    weak = known.summary["weak_sensor"]
-    path = weak[weak["way"] == "path entropy"]
-    assert path["resolution"].tolist() == list(sensing_price.RESOLUTIONS)
-    assert path["gain"].tolist() == [-0.5, -0.5, -0.5, 0.0, 0.0]
-    assert (weak[weak["way"] != "path entropy"]["gain"] == 0.0).all()
-
-
-def test_numbers_are_those_of_the_tables(known: Report) -> None:
-    shown = {number.name: number.interval.value for number in known.numbers}
-    assert shown["boat: path entropy, resolution 0.3 m, against random sensing"] == -50.0
-    assert len(shown) == len(known.numbers)
 
 
 def test_the_figures_can_be_drawn(known: Report) -> None:

@@ -11,14 +11,7 @@ from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.randomness import Purpose, Stream, stream
 from holdfast.planning.belief import Belief
 from holdfast.planning.settings import ActiveSensingSettings, PlanningSettings, SelectorSettings
-from studies.vdp_pursuit import (
-    Pursuit,
-    PursuitSettings,
-    always,
-    by_chance,
-    by_selector,
-    never,
-)
+from studies.vdp_pursuit import Pursuit, PursuitSettings, always, by_chance, by_selector, never
 from studies.vdp_tag import (
     VdpTag,
     chance_of_tag,

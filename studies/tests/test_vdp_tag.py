@@ -21,12 +21,7 @@ from studies.vdp_tag import (
     target_flow,
     toward,
 )
-from studies.vdp_trials import (
-    VdpTagPolicy,
-    manage_uncertainty,
-    run_vdp_tag_trials,
-    to_next,
-)
+from studies.vdp_trials import VdpTagPolicy, manage_uncertainty, run_vdp_tag_trials, to_next
 
 SEED = 8101
 PUBLISHED = {"to_next": (-17.0546, 0.3837), "manage_uncertainty": (-2.7325, 1.2332)}

@@ -8,21 +8,9 @@ import socket
 from pathlib import Path
 
 import pytest
-from tests.contracts.wires import (
-    HELLO,
-    PATIENCE_S,
-    Inbox,
-    StreamWire,
-    Visitor,
-    echo,
-    until,
-)
+from tests.contracts.wires import HELLO, PATIENCE_S, Inbox, StreamWire, Visitor, echo, until
 
-from holdfast.protocol.events import (
-    CallEnded,
-    ReplyReceived,
-    ServiceAppeared,
-)
+from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared
 from holdfast.transport import frames, links, listener, service_end
 from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.tls import TlsStream, client_context

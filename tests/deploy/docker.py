@@ -94,15 +94,7 @@ def wait_until(condition: Callable[[], bool], what: str) -> None:
 
 
 class Engine:
-    """The command ``docker``, talking to one engine.
-
-    Parameters
-    ----------
-    host : str or None
-        Of the engine (``unix:///...``); None for the one that the command finds.
-    restart : callable or None
-        Ends it and starts it again; None for one that is not the tests' own.
-    """
+    """The command ``docker``, talking to one engine."""
 
     def __init__(self, host: str | None = None, restart: Callable[[], None] | None = None) -> None:
         self.restart = restart

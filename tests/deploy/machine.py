@@ -43,15 +43,7 @@ _BUILD_S = 600.0
 
 
 class Machine(NamedTuple):
-    """A machine that runs.
-
-    Attributes
-    ----------
-    address : str
-        Where this computer reaches it.
-    ssh : tuple of str
-        The command that reaches it without a host's name.
-    """
+    """A machine that runs."""
 
     engine: Engine
     name: str

@@ -47,17 +47,7 @@ SOON = "[Service]\nWatchdogSec=2\nTimeoutAbortSec=1\n"
 
 
 class Lab(NamedTuple):
-    """A machine with a service, and what belongs to it here.
-
-    Attributes
-    ----------
-    keys : Path
-        All credentials.
-    config : Path
-        Of a robot that asks this service.
-    wheel : Path
-        What is installed.
-    """
+    """A machine with a service, and what belongs to it here."""
 
     machine: Machine
     keys: Path

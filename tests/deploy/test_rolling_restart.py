@@ -20,14 +20,7 @@ import pytest
 from benchmarks.rolling import Replicas, Way, decisions_of, start_robots, wait_until
 from tests.deploy.docker import missing
 from tests.ports import free_port
-from tests.processes.faults import (
-    PATIENCE_S,
-    References,
-    Site,
-    Story,
-    assert_identical,
-    events_of,
-)
+from tests.processes.faults import PATIENCE_S, References, Site, Story, assert_identical, events_of
 from tests.processes.test_faults import GATED, SERVES_GATED
 
 ROBOTS, SEEDS, TRIALS = 8, 2, 2

@@ -197,14 +197,7 @@ class End:
 
 
 class Tunnel:
-    """Profiles of robots, and the two ends that have them.
-
-    Parameters
-    ----------
-    kind : {"openvpn", "wireguard"}
-    stack : ExitStack
-        Ends it.
-    """
+    """Profiles of robots, and the two ends that have them."""
 
     def __init__(
         self, internet: Internet, kind: str, directory: Path, stack: contextlib.ExitStack

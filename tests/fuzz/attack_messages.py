@@ -8,12 +8,12 @@ from __future__ import annotations
 import itertools
 import random
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 import msgspec
 import numpy as np
-from msgspec import inspect
 from tests.fuzz import corpus
+from tests.fuzz.hostile_settings import NumericKey, keys_of
 from tests.fuzz.odd_values import STORMS, OddValues, replaced
 from tests.questions import request_of
 
@@ -37,10 +37,8 @@ from holdfast.protocol.messages import (
 
 __all__ = [
     "IN_AN_OBSTACLE",
-    "NumericKey",
     "checkpoints_in_obstacles",
     "hostile_settings",
-    "numeric_keys",
     "odd_requests",
 ]
 
@@ -62,49 +60,18 @@ IN_AN_OBSTACLE: Mapping[str, tuple[float, ...]] = {
 _BEYOND = (0, 1, -1, 2**31, 2**32, 2**63 - 1, 2**63, 2**64 - 1, 1e-320, 1e150, 1e308)
 
 
-class NumericKey(NamedTuple):
-    """A key whose value is a number, or a list of numbers."""
-
-    path: tuple[str, ...]
-    least: float
-    most: float
-    is_whole: bool
-    length: int = 0
-
-    def values(self, chance: random.Random) -> Any:
-        """Return a value at a bound, just beyond it, or far beyond all bounds."""
-        step = 1 if self.is_whole else 1e-9
-        bound = chance.choice((self.most, self.most, self.most + step, self.least - step))
-        value = chance.choice((bound, bound, bound, chance.choice(_BEYOND)))
-        if self.is_whole and abs(value) < 2**63 and chance.random() < 0.9:
-            value = int(value)
-        if not self.length:
-            return value
-        if not isinstance(value, int) or chance.random() < 0.1:
-            return [value] * (self.length + 1)
-        return list(range(max(0, value - self.length + 1), value + 1))
-
-
-def numeric_keys(kind: type) -> list[NumericKey]:
-    """Return all numeric keys of a struct and of the structs in it, with their bounds."""
-    return list(_numeric(inspect.type_info(kind), ()))
-
-
-def _numeric(kind: inspect.Type, path: tuple[str, ...], length: int = 0) -> Iterator[NumericKey]:
-    if isinstance(kind, inspect.StructType):
-        for field in kind.fields:
-            yield from _numeric(field.type, (*path, field.encode_name))
-    elif isinstance(kind, inspect.UnionType):
-        for each in kind.types:
-            yield from _numeric(each, path)
-    elif isinstance(kind, inspect.VarTupleType | inspect.ListType):
-        yield from _numeric(kind.item_type, path, min(kind.max_length or 64, 10_000))
-    elif isinstance(kind, inspect.TupleType):
-        yield from _numeric(kind.item_types[0], path, len(kind.item_types))
-    elif isinstance(kind, inspect.IntType | inspect.FloatType):
-        least = next((each for each in (kind.ge, kind.gt) if each is not None), -1e18)
-        most = next((each for each in (kind.le, kind.lt) if each is not None), 1e18)
-        yield NumericKey(path, least, most, isinstance(kind, inspect.IntType), length)
+def _value_of(key: NumericKey, chance: random.Random) -> Any:
+    """Return a value at a bound, just beyond it, or far beyond all bounds."""
+    step = 1 if key.is_whole else 1e-9
+    bound = chance.choice((key.most, key.most, key.most + step, key.least - step))
+    value = chance.choice((bound, bound, bound, chance.choice(_BEYOND)))
+    if key.is_whole and abs(value) < 2**63 and chance.random() < 0.9:
+        value = int(value)
+    if not key.length:
+        return value
+    if not isinstance(value, int) or chance.random() < 0.1:
+        return [value] * (key.length + 1)
+    return list(range(max(0, value - key.length + 1), value + 1))
 
 
 def _set(data: dict[str, Any], path: tuple[str, ...], value: object) -> None:
@@ -187,7 +154,7 @@ def hostile_settings(chance: random.Random) -> Iterator[bytes]:
 
     One key, some or all of them; those of the settings, and those of the problem's own sections.
     """
-    planning_keys = numeric_keys(PlanningSettings)
+    planning_keys = keys_of(PlanningSettings)
     methods, estimators = get_args(Method), (None, *get_args(Estimator))
     rounds = itertools.cycle(itertools.product(methods, estimators, tuple(registry.BUILT_IN)))
     while True:
@@ -200,7 +167,7 @@ def hostile_settings(chance: random.Random) -> Iterator[bytes]:
             planning["particle_filter"]["num_particles"] = chance.choice((12, 300, 4096))
             others = chance.sample(planning_keys, chance.choice((0, 0, 1, 3, len(planning_keys))))
             for each in (key, *others):
-                _set(planning, each.path, each.values(chance))
+                _set(planning, each.path, _value_of(each, chance))
             changes = {_PLANNING: msgspec.msgpack.encode(planning)}
             if chance.random() < 0.3:
                 changes |= dict(_hostile_sections(chance, name))
@@ -240,8 +207,8 @@ def checkpoints_in_obstacles(chance: random.Random) -> Iterator[bytes]:
 def _hostile_sections(chance: random.Random, name: str) -> Iterator[tuple[int, bytes]]:
     problem = registry.problem_class(name)
     for place, attribute in ((_MODEL, "Model"), (_PLANNER, "StateSpacePlanner")):
-        keys = numeric_keys(getattr(problem, attribute)) if hasattr(problem, attribute) else []
+        keys = keys_of(getattr(problem, attribute)) if hasattr(problem, attribute) else []
         section: dict[str, Any] = {}
         for key in chance.sample(keys, min(len(keys), chance.choice((1, 1, 2, 99)))):
-            _set(section, key.path, key.values(chance))
+            _set(section, key.path, _value_of(key, chance))
         yield place, msgspec.msgpack.encode(section)

@@ -35,17 +35,7 @@ _DISTURBANCES = (
 
 
 class HonestRobots:
-    """Robots that use the service all the time, one run after another, each with its own seed.
-
-    Parameters
-    ----------
-    trials : int
-        Of each run.
-    problems : sequence of str
-        For each a robot.
-    options : sequence of str
-        Further ones of ``holdfast run``.
-    """
+    """Robots that use the service all the time, one run after another, each with its own seed."""
 
     def __init__(
         self,

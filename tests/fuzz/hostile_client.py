@@ -18,13 +18,7 @@ from holdfast.planning.settings import (
     ParticleFilterSettings,
     PlanningSettings,
 )
-from holdfast.protocol.messages import (
-    MAX_INPUTS,
-    Observed,
-    Request,
-    encode,
-    with_checksum,
-)
+from holdfast.protocol.messages import MAX_INPUTS, Observed, Request, encode, with_checksum
 
 __all__ = ["HostileMessages", "Message"]
 

@@ -13,7 +13,15 @@ from msgspec import inspect
 
 from holdfast.planning.settings import Estimator, Method, PlanningSettings, unfit_for_the_method
 
-__all__ = ["Hostile", "hostile_settings", "numeric_keys", "random_settings", "with_key"]
+__all__ = [
+    "Hostile",
+    "NumericKey",
+    "hostile_settings",
+    "keys_of",
+    "numeric_keys",
+    "random_settings",
+    "with_key",
+]
 
 UNBOUNDED = 10**9
 """Tried where a key has no upper bound."""
@@ -26,40 +34,44 @@ class Hostile(NamedTuple):
     settings: PlanningSettings
 
 
-class Bounds(NamedTuple):
-    """What a numeric key allows; ``length`` is that of a tuple, 0 for a single number."""
+class NumericKey(NamedTuple):
+    """A key whose value is a number, or a list of so many (length 0: a single one)."""
 
+    path: tuple[str, ...]
     least: float
     most: float
     is_whole: bool
     length: int = 0
 
 
-def numeric_keys() -> dict[str, Bounds]:
+def keys_of(kind: type) -> list[NumericKey]:
+    """Return all numeric keys of a struct and of the structs in it, with their bounds."""
+    return list(_numeric(inspect.type_info(kind), ()))
+
+
+def _numeric(kind: inspect.Type, path: tuple[str, ...], length: int = 0) -> Iterator[NumericKey]:
+    if isinstance(kind, inspect.StructType):
+        for field in kind.fields:
+            yield from _numeric(field.type, (*path, field.encode_name))
+    elif isinstance(kind, inspect.UnionType):
+        for each in kind.types:
+            yield from _numeric(each, path)
+    elif isinstance(kind, inspect.VarTupleType | inspect.ListType):
+        yield from _numeric(kind.item_type, path, min(kind.max_length or 64, 10_000))
+    elif isinstance(kind, inspect.TupleType):
+        yield from _numeric(kind.item_types[0], path, len(kind.item_types))
+    elif isinstance(kind, inspect.IntType | inspect.FloatType):
+        least = next((each for each in (kind.ge, kind.gt) if each is not None), -UNBOUNDED)
+        most = next((each for each in (kind.le, kind.lt) if each is not None), UNBOUNDED)
+        yield NumericKey(path, least, most, isinstance(kind, inspect.IntType), length)
+
+
+def numeric_keys() -> dict[str, NumericKey]:
     """Return all keys of the settings whose values are numbers or tuples of numbers."""
-    found: dict[str, Bounds] = {}
-    for field in inspect.type_info(PlanningSettings).fields:  # type: ignore[attr-defined]
-        if isinstance(field.type, inspect.StructType):
-            for own in field.type.fields:
-                if (bounds := _bounds_of(own.type)) is not None:
-                    found[f"{field.name}.{own.name}"] = bounds
-        elif (bounds := _bounds_of(field.type)) is not None:
-            found[field.name] = bounds
+    found: dict[str, NumericKey] = {}
+    for key in keys_of(PlanningSettings):
+        found.setdefault(".".join(key.path), key)
     return found
-
-
-def _bounds_of(kind: inspect.Type) -> Bounds | None:
-    if isinstance(kind, inspect.IntType | inspect.FloatType):
-        whole = isinstance(kind, inspect.IntType)
-        least = kind.ge if kind.ge is not None else kind.gt if kind.gt is not None else -UNBOUNDED
-        most = kind.le if kind.le is not None else kind.lt if kind.lt is not None else UNBOUNDED
-        return Bounds(least, most, whole)
-    if isinstance(kind, inspect.VarTupleType):
-        own = _bounds_of(kind.item_type)
-        return None if own is None else own._replace(length=kind.max_length or 64)
-    if isinstance(kind, inspect.UnionType):
-        return next((own for each in kind.types if (own := _bounds_of(each))), None)
-    return None
 
 
 def with_key(settings: PlanningSettings, key: str, value: object) -> PlanningSettings:
@@ -71,7 +83,7 @@ def with_key(settings: PlanningSettings, key: str, value: object) -> PlanningSet
     return msgspec.structs.replace(settings, **{section: own})
 
 
-def _greatest(bounds: Bounds) -> object:
+def _greatest(bounds: NumericKey) -> object:
     most = int(bounds.most) if bounds.is_whole else bounds.most
     if not bounds.length:
         return most

@@ -73,13 +73,6 @@ def flatness(samples: Sequence[Held]) -> tuple[dict[str, object], list[str]]:
     compared with that of the second. The allowance, the larger of 5 % and 8 MB, is what was seen
     to come and go by itself as states of different sizes are held: a leak of ten bytes a message
     shows beyond it in a million messages.
-
-    Returns
-    -------
-    figures : dict
-        For the report.
-    faults : list of str
-        What grew.
     """
     third = len(samples) // 3
     assert third >= 3, f"only {len(samples)} samples"

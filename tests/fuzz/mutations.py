@@ -17,13 +17,7 @@ _DEPTH = 3000
 
 
 class Mutator:
-    """Spoils messages; the same seed spoils the same messages in the same way.
-
-    Parameters
-    ----------
-    specimens : sequence of bytes
-        Valid messages.
-    """
+    """Spoils messages; the same seed spoils the same messages in the same way."""
 
     def __init__(self, chance: random.Random, specimens: Sequence[bytes]) -> None:
         self._chance = chance

@@ -24,17 +24,6 @@ class RawConnections:
     """Connects, says something that it should not, and hangs up, in order or not, or keeps silent.
 
     Some send what they have byte by byte. Of those that stay open, the oldest are left first.
-
-    Parameters
-    ----------
-    port : int
-        Of loopback.
-
-    Attributes
-    ----------
-    made, held : int
-        Connections that were made, and those of them that said the first half of something and
-        were left open.
     """
 
     def __init__(self, port: int, seed: int) -> None:

@@ -14,14 +14,7 @@ from tests.fuzz.targets import SPECIMENS, TARGETS
 
 from holdfast.planning.planner import PlanningState, decode_checkpoint, digest, encode_checkpoint
 from holdfast.printable import one_line
-from holdfast.protocol.messages import (
-    Refused,
-    Reply,
-    Request,
-    decode_reply,
-    decode_request,
-    encode,
-)
+from holdfast.protocol.messages import Refused, Reply, Request, decode_reply, decode_request, encode
 from holdfast.protocol.records import Record, decode_record, encode_record
 
 DECODED = sorted(TARGETS)

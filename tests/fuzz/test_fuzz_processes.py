@@ -12,14 +12,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from tests.fuzz.attack_messages import (
-    IN_AN_OBSTACLE,
-    checkpoints_in_obstacles,
-    numeric_keys,
-)
-from tests.fuzz.attacker import TRANSPORTS, attacked, main
-from tests.fuzz.hostile_client import HostileMessages
-from tests.fuzz.measuring import Held, flatness
+from tests.fuzz.attack_messages import IN_AN_OBSTACLE, checkpoints_in_obstacles
+from tests.fuzz.attacker import TRANSPORTS, attacked
+from tests.fuzz.hostile_settings import keys_of
 from tests.fuzz.soak import run_soak
 from tests.fuzz.targets import TARGETS
 from tests.unit.test_protocol_service import Bench
@@ -85,15 +80,8 @@ def test_an_attack_that_does_not_come_about_is_found(tmp_path: Path) -> None:
     ]
 
 
-def test_an_unknown_way_of_attacking_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["--attack", "tcp/127.0.0.1:1", "--minutes", "0", "--ways", "cut,sideways"])
-    assert ended.value.code == 2
-    assert "'sideways' is none of odd,settings" in capsys.readouterr().err
-
-
 def test_every_number_of_the_settings_is_attacked() -> None:
-    keys = {".".join(key.path) for key in numeric_keys(PlanningSettings)}
+    keys = {".".join(key.path) for key in keys_of(PlanningSettings)}
     plain = msgspec.to_builtins(PlanningSettings())
     numbers = {
         f"{section}.{key}"
@@ -120,35 +108,7 @@ def test_each_built_in_problem_is_asked_about_states_in_an_obstacle(name: str) -
             assert isinstance(Bench().ask(payload)[0], TaskAnswer | SensingAnswer)
 
 
-def test_the_same_seed_sends_the_same_messages() -> None:
-    one, same, other = (iter(HostileMessages(seed)) for seed in (5, 5, 6))
-    messages = [next(one) for _ in range(500)]
-    assert messages == [next(same) for _ in range(500)]
-    assert messages != [next(other) for _ in range(500)]
-
-
 @pytest.mark.slow
 def test_nothing_grows_while_sessions_come_and_go(tmp_path: Path) -> None:
     figures, findings = run_soak(SOAK_S, 1, directory=tmp_path)
     assert not findings, (findings, figures)
-
-
-def _held(at_s: int, memory_mb: float) -> Held:
-    return Held(at_s, int(memory_mb * 2**20), 10, 10)
-
-
-@pytest.mark.parametrize(
-    ("memory", "flat"),
-    [
-        (lambda _: 100.0, True),
-        (lambda at: min(at, 40) + 60.0, True),
-        (lambda at: 60.0 + at % 10, True),
-        (lambda at: 60.0 + at / 2, False),
-        (lambda at: 600.0 if at > 90 else 60.0, False),
-    ],
-    ids=["constant", "filled", "coming and going", "leaking", "leaping"],
-)
-def test_what_counts_as_flat(memory: object, flat: bool) -> None:
-    assert callable(memory)
-    _, faults = flatness([_held(at, memory(at)) for at in range(120)])
-    assert (not faults) == flat

@@ -36,16 +36,7 @@ def log_unit_ball(dimension: int) -> float:
 
 
 class Neighborhood(NamedTuple):
-    """What lies about one point.
-
-    Attributes
-    ----------
-    within, others : array of int
-        The other points in the neighbourhood, and all others.
-    terms : float
-        The part of the point's entropy that no weight changes: ``log c_d + d log r + log q -
-        psi(q)``.
-    """
+    """What lies about one point."""
 
     within: IntArray
     others: IntArray

@@ -98,53 +98,6 @@ def gaussian_smoothing(
     return float(radius_weights @ term @ share_weights)
 
 
-def even_points(rng: np.random.Generator, count: int, dimension: int) -> FloatArray:
-    """Return points that fill the unit box more evenly than random ones: n times a vector.
-
-    Modulo 1, from a random start. The vector's entries are powers of the root of x^(d + 1) = x + 1,
-    a golden ratio of d dimensions.
-    """
-    ratio = 2.0
-    for _ in range(40):
-        ratio = (1.0 + ratio) ** (1.0 / (dimension + 1))
-    vector = ratio ** -np.arange(1.0, dimension + 1.0)
-    return (rng.uniform(size=dimension) + np.outer(np.arange(count), vector)) % 1.0
-
-
-def box_smoothing(dimension: int, neighbors: int, count: int) -> tuple[float, float]:
-    """Return E[log(c_d r^d / P)] for the uniform density on the unit box, and a bound on its error.
-
-    P = c_d r^d f, where f is the part of the ball within the box: over points U of the unit ball,
-    whose coordinates have independent signs, the mean of the product over coordinates of the
-    chances that x +- r |U| is inside. So log(c_d r^d / P) = -log f. The means over U, x and P are
-    taken over even points, shifted at random 16 times, which tells the error.
-    """
-    log_ball = log_unit_ball(dimension)
-    means = []
-    rng = np.random.default_rng([17, dimension, neighbors, count])
-    for _ in range(16):
-        x = even_points(rng, 64, dimension + 1)
-        share = stats.beta.ppf(x[:, -1], neighbors, count - neighbors)
-        x = x[:, None, :-1]
-        u = even_points(rng, 512, dimension + 1)
-        ball = stats.norm.ppf(u[:, 1:])
-        ball *= u[:, :1] ** (1.0 / dimension) / np.sqrt(np.square(ball).sum(axis=1, keepdims=True))
-        ball = np.abs(ball)
-
-        low = np.exp((np.log(share) - log_ball) / dimension)  # where all of the ball is inside
-        high = 2.0 * low  # where 2^-d of it is, in a corner
-        for _halving in range(15):
-            middle = 0.5 * (low + high)
-            reached = middle[:, None, None] * ball
-            chance = 0.5 * ((reached <= x) * 1.0 + (reached <= 1.0 - x))
-            inside = chance.prod(axis=2).mean(axis=1)
-            below = np.exp(log_ball + dimension * np.log(middle)) * inside < share
-            low, high = np.where(below, middle, low), np.where(below, high, middle)
-        means.append(float((log_ball + dimension * np.log(high) - np.log(share)).mean()))
-    reach = stats.t.ppf(1.0 - 0.5 * FALSE_ALARM, len(means) - 1)
-    return float(np.mean(means)), float(reach * np.std(means, ddof=1) / np.sqrt(len(means)))
-
-
 class TestNearestNeighbor:
     @pytest.mark.parametrize("neighbors", [1, 5, 12])
     @pytest.mark.parametrize("dimension", DIMENSIONS)
@@ -166,53 +119,6 @@ class TestNearestNeighbor:
         bias += gaussian_smoothing(dimension, neighbors, count)
         assert abs(bias) < 0.15
         assert_mean(estimates, gaussian_entropy(isotropic) + bias)
-
-    @pytest.mark.parametrize("neighbors", [1, 5, 12])
-    @pytest.mark.parametrize("dimension", DIMENSIONS)
-    def test_uniform_box(self, dimension: int, neighbors: int) -> None:
-        """Edges bias it upwards, in six dimensions by about half a nat; the side scales it."""
-        count, side = 1500, 3.0
-        rng = np.random.default_rng([2, dimension, neighbors])
-        estimates = np.array(
-            [
-                entropy(
-                    rng.uniform(-side, 0.0, size=(count, dimension)),
-                    None,
-                    NearestNeighbor(neighbors, TINY),
-                )
-                for _ in range(SAMPLES)
-            ]
-        )
-        smoothing, error_bound = box_smoothing(dimension, neighbors, count)
-        bias = np.log(count - 1) - special.psi(count) + smoothing
-        assert_mean(estimates, dimension * np.log(side) + bias, error_bound)
-
-    @pytest.mark.parametrize("dimension", DIMENSIONS)
-    def test_random_weights(self, dimension: int) -> None:
-        """Weights that say nothing about the density: independent, Gamma(3) distributed.
-
-        The share of k of N - 1 such weights in their sum is Beta(3 k, 3 (N - 1 - k)) and
-        independent of everything else, so -E[log m] = psi(3 (N - 1)) - psi(3 k) takes the place of
-        the uniform weights' log(N - 1) - log k. Points of negligible weight are left out: about one
-        in 4,000, which moves log N by as much.
-        """
-        count, neighbors = 1500, 5
-        rng = np.random.default_rng([3, dimension])
-        estimates = np.array(
-            [
-                entropy(
-                    rng.normal(size=(count, dimension)),
-                    rng.gamma(3.0, size=count),
-                    NearestNeighbor(neighbors, TINY),
-                )
-                for _ in range(SAMPLES)
-            ]
-        )
-        expected = gaussian_entropy(np.ones(dimension))
-        expected += special.psi(3 * (count - 1)) - special.psi(3 * neighbors) + np.log(neighbors)
-        expected -= special.psi(count)
-        expected += gaussian_smoothing(dimension, neighbors, count)
-        assert_mean(estimates, expected, allowance=1e-3)
 
     @pytest.mark.parametrize("dimension", DIMENSIONS)
     def test_importance_weights(self, dimension: int) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -20,7 +19,6 @@ from tests.oracles.reference_entropy import nearest_neighbor_entropy
 
 from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.randomness import Purpose, stream
-from holdfast.planning.belief import Belief
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.settings import (
     ActiveSensingSettings,
@@ -82,28 +80,6 @@ def test_every_decision_of_a_trial(problem: Problem, num_particles: int) -> None
     assert decisions >= 5
 
 
-@pytest.mark.parametrize("deviation", [0.3, 0.05, 0.002])
-@pytest.mark.parametrize("num_particles", [30, pytest.param(1200, marks=pytest.mark.slow)])
-def test_concentrated_beliefs(deviation: float, num_particles: int) -> None:
-    problem, settings = PegInHole2D(), settings_of(num_particles)
-    draws = stream(5, 0, 0, Purpose.INITIAL_BELIEF)
-    states = np.array([0.0, 1.0, 0.0]) + deviation * draws.normal((num_particles, 3))
-    weights = draws.substream(1).uniform(num_particles)
-    state = PlanningState(5, 0, 0, 0, False, Belief.weighted(states, weights))
-    entropies = assert_same_decision(problem, settings, state)
-    if deviation > 0.01:  # below the noise of an observation there is nothing to tell apart
-        assert np.ptp(entropies) > 1e-3
-
-
-def test_copies_of_particles_and_of_actions() -> None:
-    """After resampling many particles are equal; far from the hole actions differ in x alone."""
-    problem, settings = PegInHole2D(), settings_of(120)
-    draws = stream(6, 0, 0, Purpose.INITIAL_BELIEF)
-    states = np.array([0.5, 1.0, 0.0]) + 0.3 * draws.normal((12, 3))
-    belief = Belief.uniform(np.repeat(states, 10, axis=0))
-    assert_same_decision(problem, settings, PlanningState(6, 0, 0, 0, False, belief))
-
-
 @pytest.mark.parametrize("estimate", ESTIMATES)
 @pytest.mark.parametrize("resolution", [1e-3, 0.25])
 def test_literal_entropy_is_the_reference_with_ties(
@@ -116,25 +92,3 @@ def test_literal_entropy_is_the_reference_with_ties(
     mine = estimate(points, weights / weights.sum(), 5, resolution)
     reference = nearest_neighbor_entropy(points, weights / weights.sum(), 5, resolution)
     assert mine == pytest.approx(reference, abs=TOLERANCE)
-
-
-def test_number_of_samples_and_neighbors() -> None:
-    problem = PegInHole2D()
-    settings = msgspec.structs.replace(
-        settings_of(150),
-        active_sensing=ActiveSensingSettings(
-            num_cores=1, num_observation_samples=4, num_nearest_neighbors=9
-        ),
-    )
-    assert_same_decision(problem, settings, Planner(problem, settings).init(seed=1, trial=0))
-
-
-def test_a_resolution_for_each_coordinate() -> None:
-    problem = PegInHole2D()
-    settings = msgspec.structs.replace(
-        settings_of(80),
-        selector=SelectorSettings(
-            method="action_entropy", estimator="nearest_neighbor", resolution=(0.1, 0.02, 0.5)
-        ),
-    )
-    assert_same_decision(problem, settings, Planner(problem, settings).init(seed=1, trial=0))

@@ -9,13 +9,7 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 import pytest
-from tests.oracles.test_sensing_reference import (
-    LightDark,
-    Plane,
-    compare,
-    settings_of,
-    some_belief,
-)
+from tests.oracles.test_sensing_reference import LightDark, Plane, compare, settings_of, some_belief
 
 from holdfast.config import registry
 from holdfast.errors import InvalidValueError, ProblemError

@@ -32,44 +32,15 @@ of 5.0 over the first 210 logged trials. The log shows that another model ran:
   together. (In the logs of `peg_in_hole_2d` short trials do show the effect.) Steps of dt * 0.1
   fit: they make n 1,400.
 
-About 200 variants were run to find one that gives both 1,000 successes and the mean -7.549. Below,
-u is target - estimate and g the gains along and across the way; 0.1 times the second column is
-executed, and a step costs 1 if the new state + the third column collides ("old": the state before
-the step); "norm" and "each" limit the norm, or each component, to 0.1; "slides" means that at a
-wall the component along it is still executed. 1,000 trials and seed 2017; * 300 and seed 1.
-
-=======  =================  ========  =====  ===========  =======  =====
-g        0.1 is executed    collides      n  successes %  mean r.  sd
-=======  =================  ========  =====  ===========  =======  =====
-1, 1     u *                u           156         99.7    -9.97   5.0
-1, 1     0.1 u              u          1384         99.4    -8.38   5.6
-1, 1     0.1 u, slides      u          1381         99.7    -8.22   5.4
-1, 1     0.1 u              u, old     1384         99.4    -5.88   4.6
-1, 1     norm u *           executed   1426         94.7    -0.40   1.5
-1, 1     norm u *           norm u     1426         94.7    -4.38  12.8
-1, 1     norm u             u          1400         94.1    -8.15   5.1
-1, 1     norm u             u, old     1400         94.0    -5.86   4.2
-1, 1     each u *           each u     1372        100.0    -3.49   3.1
-1, 1     each u             u          1356        100.0    -9.64   5.9
-1, 1     each u             u, old     1357        100.0    -6.54   4.5
-0.1, 1   norm g u           g u        1972         99.9    -8.64   5.3
-0.2, 1   norm g u           g u        1602         98.8    -6.48   4.4
-0.1, 1   each g u           g u        1720         99.9    -8.29   5.1
-0.2, 1   each g u           g u        1455         99.9    -7.06   4.5
-0.25, 1  each g u           g u        1417         99.9    -7.14   4.7
-=======  =================  ========  =====  ===========  =======  =====
-
-Also tried: noise scaled by dt or its root; other gains and step limits; other radii of the via
-points; stages that advance with the distance along the axis alone; a cost of 1 where the noise is
-drawn again.
+About 200 variants of steps, gains, limits, noise and costs were run to find one that gives both
+1,000 successes and the mean -7.549; the table is in this file's history.
 
 So the size and the spread of the logged reward are those of looking for a collision at the new
-state plus the whole commanded action, in small steps. Some variants would pass the tests below: the
-last three rows, other gains near them, and the one that slides. But each rests on something that
-neither the logs nor the published source and configuration (gains 1 and 1, no sliding) confirm,
-they differ from each other, and among 200 variants to pass is no evidence. Which model ran stays
-open. None is put into the emulation; the mean reward is an expected failure below, and the row
-supports the successes alone.
+state plus the whole commanded action, in small steps. Some variants would pass the tests below,
+with gains of 0.2 to 1, or sliding along walls. But each rests on something that neither the logs
+nor the published source and configuration confirm, and among 200 variants to pass is no evidence.
+Which model ran stays open: the mean reward is an expected failure below, and the row supports the
+successes alone.
 """
 
 from __future__ import annotations
@@ -84,9 +55,7 @@ import pytest
 from scipy import stats
 
 from holdfast.numerics.arrays import FloatArray
-from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.problems.problem import Problem
-from studies.emulation_2017 import drawn_particle, likelihoods, run_emulation
+from studies.emulation_2017 import run_emulation
 from studies.published_2017 import PublishedRow, published_rows, series_of
 
 SEED = 2017
@@ -183,43 +152,3 @@ def test_capsule_robot_successes() -> None:
 )
 def test_capsule_robot_mean_reward() -> None:
     check_rewards(emulated(CAPSULE_ROW, CAPSULE_ROW.num_trials), CAPSULE_ROW, 1)
-
-
-def test_the_table_has_the_rows_compared() -> None:
-    assert [row.sensing_interval for row in PEG_ROWS] == [6, 4, 2, 0, 8]
-    assert [row.sensing_interval for row in MULTITIER_ROWS] == [6, 6, 6, 12, 14, 14, 6, 4]
-    assert {row.num_trials for row in [*PEG_ROWS, *MULTITIER_ROWS, CAPSULE_ROW]} == {1000}
-
-
-@pytest.mark.parametrize("row", PEG_ROWS, ids=label)
-def test_the_comparison_rejects_a_sound_filter(row: PublishedRow) -> None:
-    # The success rate with a true systematic resampler is about 99 %.
-    assert success_p_value(990, 1000, row) < FAMILY_WISE_LEVEL / len(PEG_ROWS)
-
-
-def test_the_comparison_rejects_a_shifted_mean_and_keeps_the_same() -> None:
-    row = next(row for row in PEG_ROWS if row.sensing_interval == 8)
-    spread = np.linspace(-24.0, 24.0, row.successes)  # standard deviation 13.9, as logged rows have
-    rewards = row.mean_reward_of_successes + spread
-    assert reward_p_value(rewards, row) > 0.99
-    assert reward_p_value(rewards + 4.0, row) < FAMILY_WISE_LEVEL / len(PEG_ROWS)
-
-
-def test_trials_do_not_mix() -> None:
-    # A world far from its particles, one at a particle: only the second trial's weights survive.
-    problem: Problem = PegInHole2D()
-    world = np.array([[4.0, 2.0, 0.0], [1.0, 3.0, 0.0]])
-    particles = np.zeros((2, 3, 3))
-    particles[:, :, 0] = [[-4.0, -3.0, -2.0], [5.0, 1.0, -5.0]]
-    weights = likelihoods(problem, world, particles, 0, np.zeros((2, 1)))
-    np.testing.assert_allclose(
-        weights, [[0.0, 0.0, 0.0], [0.0, 1.0 / math.sqrt(2.0 * math.pi * 0.001), 0.0]]
-    )
-    np.testing.assert_array_equal(drawn_particle(weights, np.array([0.9, 0.5])), [0, 1])
-
-
-def test_a_particle_is_drawn_in_proportion_to_its_weight() -> None:
-    weights = np.array([0.5, 0.0, 1.5, 2.0])
-    offsets = (np.arange(4000) + 0.5) / 4000
-    drawn = drawn_particle(np.broadcast_to(weights, (4000, 4)), offsets)
-    np.testing.assert_array_equal(np.bincount(drawn, minlength=4), [500, 0, 1500, 2000])

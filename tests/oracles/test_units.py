@@ -11,7 +11,6 @@ from __future__ import annotations
 from itertools import product
 from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -39,19 +38,7 @@ PEG = PegInHole2D()
 
 
 class Rescaled(ProblemBase):
-    """A problem whose coordinates have other units, and so have its resolutions and its noise.
-
-    Parameters
-    ----------
-    problem : ProblemBase
-        Its sensing actions show the coordinate of their number, or all.
-    states, actions : array of shape (state_size,)
-        The new unit's numbers for one of the old unit.
-    resolution : float or array
-        Of the problem, in the old units; a float stays as it is.
-    observations : bool
-        Whether what is observed has the states' new units, too.
-    """
+    """A problem whose coordinates have other units, and so have its resolutions and its noise."""
 
     def __init__(
         self,
@@ -280,9 +267,6 @@ def test_the_same_sensing_in_other_units(name: str, selector: SelectorSettings) 
 
 # What one number for all coordinates makes of it: what it is for an array to mend.
 
-SCALE = np.array([1.0, 1.0, 10.0])
-"""The angle in tenths of a radian."""
-
 
 @pytest.fixture(scope="module")
 def states() -> list[PlanningState]:
@@ -305,47 +289,3 @@ def states() -> list[PlanningState]:
             environment.perform(task_action)
             state = planner.advance(state, task_action)
     return found
-
-
-def share_of_other_choices(
-    states: list[PlanningState],
-    selector: SelectorSettings,
-    resolution: float | FloatArray = PEG.resolution,
-) -> float:
-    """Return how many choices are others where the angle has the other unit."""
-    settings = msgspec.structs.replace(PlanningSettings(), selector=selector)
-    one = np.ones(3)
-    unscaled = Rescaled(PEG, one, one, resolution)
-    rescaled = Rescaled(PEG, SCALE, SCALE, resolution)
-    others = 0
-    for state in states:
-        there = state._replace(
-            belief=state.belief._replace(states=np.ascontiguousarray(state.belief.states * SCALE))
-        )
-        here, _ = Planner(unscaled, settings).choose_sensing_action(state)
-        chosen, _ = Planner(rescaled, settings).choose_sensing_action(there)
-        others += here != chosen
-    return others / len(states)
-
-
-def test_the_mixture_does_not_depend_on_units(states: list[PlanningState]) -> None:
-    assert len(states) > 80
-    for method in ("action_entropy", "state_entropy"):
-        selector = SelectorSettings(method=method, estimator="gaussian_mixture_upper")
-        assert share_of_other_choices(states, selector) == 0.0
-
-
-def test_neighbours_and_the_covariance_depend_on_units(states: list[PlanningState]) -> None:
-    """Distances add squared metres and squared radians, as a trace does."""
-    default, covariance = (
-        share_of_other_choices(states, SelectorSettings(method=method))
-        for method in ("action_entropy", "action_covariance")
-    )
-    # The shares that docs/results.md tells.
-    assert f"{100.0 * default:.0f} % and {100.0 * covariance:.0f} %" == "22 % and 13 %"
-
-
-def test_with_a_resolution_for_each_coordinate_they_do_not(states: list[PlanningState]) -> None:
-    for method in ("action_entropy", "state_entropy", "action_covariance"):
-        selector = SelectorSettings(method=method)
-        assert share_of_other_choices(states, selector, np.full(3, 0.1)) == 0.0

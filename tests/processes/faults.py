@@ -377,15 +377,7 @@ class Site:
 
 
 class Story:
-    """A robot in its world, and services to which things happen.
-
-    Parameters
-    ----------
-    document : dict
-        The configuration.
-    **sections
-        What is in its sections as well; ``offload`` is :data:`PATIENT` unless it says otherwise.
-    """
+    """A robot in its world, and services to which things happen."""
 
     def __init__(
         self, site: Site, references: References, document: dict[str, Any], **sections: Any

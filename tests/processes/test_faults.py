@@ -7,14 +7,10 @@ order, which the world itself has witnessed; and the statuses passed are the the
 from __future__ import annotations
 
 import os
-import shutil
 import signal
-import sys
-from pathlib import Path
 
 import pytest
 from tests.processes.faults import (
-    COMMAND,
     HERE,
     KEEP_ALIVE,
     LOST,
@@ -22,7 +18,6 @@ from tests.processes.faults import (
     PATIENT,
     PROBLEMS,
     QUICK,
-    RECOVERY,
     RESTORED,
     References,
     Site,
@@ -82,18 +77,6 @@ class TestCloud:
         # It was its silence that gave it away, before its link was given up.
         assert "no sign of progress" in robot.matching("service_suspected")[0]["reason"]
 
-    def test_given_up_after_its_own_lease(self, site: Site, references: References) -> None:
-        """How long it may be silent it says itself, and the robot's own lease is of no account."""
-        cloud = site.service(lease_ms=300.0).start()
-        story = Story(site, references, document_of(PEG), offload={"lease_ms": 60_000.0})
-
-        # While nothing is awaited of it, only the link can tell.
-        def wait_until_it_is_given_up() -> None:
-            story.running.wait_for("service_vanished", service=cloud.endpoint)
-
-        story.at("perform", 12, cloud.stop, wait_until_it_is_given_up, cloud.resume)
-        story.run(cloud)
-
     def test_with_the_settings_that_nobody_has_chosen(
         self, site: Site, references: References
     ) -> None:
@@ -109,32 +92,6 @@ class TestCloud:
         robot = story.run(cloud)
         # On a busy machine a quarter of a second may also pass without a fault.
         assert robot.statuses()[:2] == [LOST, RESTORED]
-
-    @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
-    def test_never_there(self, problem: str, site: Site, references: References) -> None:
-        story = Story(site, references, document_of(problem), offload={"startup_timeout_ms": 200.0})
-        robot = story.run(site.service())
-        assert robot.statuses() == [LOST]
-
-    @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
-    def test_killed_before_the_first_request(
-        self, problem: str, site: Site, references: References
-    ) -> None:
-        document = document_of(problem)
-        cloud = site.service().start()
-        story = Story(site, references, document)
-        # The trial's world is being made: the cloud is seen already, and nothing was asked of it.
-        story.at(
-            "begin",
-            0,
-            lambda: story.running.wait_for("service_appeared"),
-            cloud.kill,
-            lambda: story.running.wait_for("service_vanished"),
-        )
-        later = sensing_steps(document)[3]
-        story.at("perform", later, cloud.start, story.status(KEEP_ALIVE))
-        robot = story.run(cloud)
-        assert robot.statuses() == [LOST, RESTORED]
 
     @pytest.mark.parametrize(
         "holds_at", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in (4, 21))]
@@ -201,67 +158,6 @@ class TestRecovery:
         assert robot.matching("resumed")[0]["held_ms"] > 0.0
         assert robot.statuses() == []
         assert not robot.matching("launch")
-
-    @pytest.mark.parametrize(
-        ("program", "reason"),
-        [
-            pytest.param(
-                *(None, "cannot be started: No such file or directory"), marks=pytest.mark.slow
-            ),
-            ("exit 3", "ended with exit code 3; see "),
-            pytest.param("exec sleep 1000", "not seen after ", marks=pytest.mark.slow),
-        ],
-        ids=["absent", "failing", "hanging"],
-    )
-    def test_cannot_be_launched(
-        self, program: str | None, reason: str, site: Site, references: References
-    ) -> None:
-        """The installation breaks while the robot runs, and is mended later."""
-        document = document_of(PEG)
-        steps = sensing_steps(document)
-        cloud = site.service().start()
-        story = Story(
-            site,
-            references,
-            document,
-            recovery={"launch_timeout_ms": 300.0, "relaunch_delay_ms": 50.0},
-        )
-        python = installation_in(site.directory)
-        whole = python.with_name("whole")
-
-        def break_it() -> None:
-            python.rename(whole)
-            if program is not None:
-                python.write_text(f"#!/bin/sh\n{program}\n")
-                python.chmod(0o755)
-
-        def mend_it() -> None:
-            python.unlink(missing_ok=True)
-            whole.rename(python)
-
-        story.at("sense", steps[2], break_it, cloud.kill)
-        robot = site.run(story.file, services=[cloud], command=[str(python), *COMMAND[1:]])
-        failed = "launch_failed" if program == "exec sleep 1000" else "recovery_exited"
-        # Again and again, and the robot stands still and says so.
-        assert reason in robot.wait_for(failed, 3)["reason"]
-        assert RECOVERY in robot.wait_for("holding")["reason"]
-        # It goes on as soon as anything answers: first the cloud, then the mended service.
-        story.at("sense", steps[4], mend_it, cloud.kill)
-        cloud.start()
-        story.finish(robot)
-        assert robot.statuses() == [LOST, RESTORED, LOST_AGAIN]
-        assert len(robot.matching("launched")) == 1
-
-
-def installation_in(directory: Path) -> Path:
-    """Return a Python of its own with all that is installed here."""
-    home = directory / "installation"
-    (home / "bin").mkdir(parents=True)
-    shutil.copy(Path(sys.prefix) / "pyvenv.cfg", home / "pyvenv.cfg")
-    (home / "lib").symlink_to(Path(sys.prefix) / "lib")
-    python = home / "bin" / "python"
-    python.symlink_to(Path(sys.executable).resolve())
-    return python
 
 
 class TestReplicas:

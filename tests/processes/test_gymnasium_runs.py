@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 from pathlib import Path
 
 import pytest
+from tests import mountain_car
 from tests.processes.faults import events_of, holdfast, rows_of, summary_of
 
 import holdfast as hf
@@ -69,70 +71,10 @@ def test_a_crash_is_a_failure_in_every_table_and_truncated_is_neither(tmp_path: 
     assert line.split()[1:4] == ["0.0%", "100.0%", "+100.0"]
 
 
-CAR = """
-problem: car:Car
-particle_filter: {num_particles: 30}
-active_sensing: {num_observation_samples: 2, num_cores: 1}
-simulator: {num_trials: 2, max_steps: 200, seed: 3, sensing_intervals: 2}
-environment:
-  object: gymnasium
-  arguments:
-    env_id: MountainCarContinuous-v0
-    sensing: [[0], [1]]
-    sensing_noise: [0.05, 0.01]
-    success: car:at_the_top
-"""
-
-CAR_MODULE = """
-import os
-import signal
-from pathlib import Path
-
-import numpy as np
-import holdfast as hf
-
-
-class Car(hf.ProblemBase):
-    name = "car"
-    state_size, action_size = 2, 1
-    sensing_actions = ("position", "speed")
-    resolution = 0.1
-    motion_variance = np.zeros(1)
-
-    def initial_states(self, stream, count):
-        return np.array([-0.5, 0.0]) + np.array([0.05, 0.0]) * stream.normal((count, 2))
-
-    def move(self, states, actions, stream):
-        return states + np.array([0.01, 0.002]) * stream.normal(states.shape)
-
-    def observation_mean(self, states, sensing_action):
-        return states[..., sensing_action : sensing_action + 1]
-
-    def observation_variance(self, states, sensing_action):
-        return np.array([(0.05, 0.01)[sensing_action] ** 2])
-
-    def policy(self, states, stage):
-        return np.where(states[..., 1:] >= 0.0, 1.0, -1.0)
-
-    def is_goal(self, states):
-        return states[..., 0] > 0.45
-
-
-def at_the_top(environment, observation, info):
-    # The robot's process is killed once in each of these moves.
-    count = environment.get_wrapper_attr("_elapsed_steps")
-    killed = Path(f"killed-{count}")
-    if count in (17, 40) and Path("kills").exists() and not killed.exists():
-        killed.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return observation[0] >= 0.45
-"""
-
-
 def test_after_a_kill_the_episode_is_where_it_was(tmp_path: Path) -> None:
     """It has died with the process, and its task actions are performed again."""
-    (tmp_path / "car.py").write_text(CAR_MODULE)
-    (tmp_path / "car.yaml").write_text(CAR)
+    shutil.copy(mountain_car.__file__, tmp_path)
+    (tmp_path / "car.yaml").write_text(mountain_car.CONFIGURATION)
     calm = holdfast(tmp_path, "run", "car.yaml", "--out", "calm")
     assert calm.returncode == 0, calm.stderr
     (tmp_path / "kills").touch()

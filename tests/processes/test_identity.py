@@ -111,46 +111,6 @@ def test_a_revoked_robot_is_cut_off_and_no_other(
     assert ended["reason"] == "has a certificate that has been revoked"
 
 
-def test_a_rotated_service_goes_on_with_the_links_that_it_has(
-    home: Path, site: Site, references: References
-) -> None:
-    cloud = cloud_of(site, home).start()
-    story = Story(site, references, document_of(PEG))
-
-    def rotate() -> None:
-        make_credentials(home, services=["cloud"], rotate=True)
-        assert reload(cloud)["links_ended"] == 0
-
-    story.at("perform", 20, rotate)
-    robot = story.run(cloud, options=("--tls", str(home / "anna")))
-    assert robot.statuses() == []
-    assert len(cloud.process.matching("robot_connected")) == 1
-
-
-def test_credentials_that_cannot_be_used_are_told_and_not_used(
-    home: Path, site: Site, references: References
-) -> None:
-    cloud = cloud_of(site, home).start()
-    (home / "cloud" / "revoked.pem").write_text("half a fi")
-    cloud.process.signal(signal.SIGHUP)
-    told = cloud.process.wait_for("credentials")
-    assert "revoked.pem: is no revocation list" in told["reason"]
-    assert "the previous ones stay in use" in told["reason"]
-    robot = Story(site, references, document_of(PEG)).run(
-        cloud, options=("--tls", str(home / "anna"))
-    )
-    assert robot.statuses() == []
-
-
-def test_a_service_that_is_revoked_does_not_start(home: Path, site: Site) -> None:
-    revoke_credentials(home, names=["cloud"])
-    ended = site.holdfast(
-        "serve", "--listen", f"tls/127.0.0.1:{free_port()}", "--tls", home / "cloud"
-    )
-    assert ended.process.returncode == 2
-    assert "certificate.pem: has been revoked" in ended.output
-
-
 def test_several_processes_read_them_again(home: Path, site: Site, references: References) -> None:
     cloud = cloud_of(site, home, "--processes", "2").start()
     story = Story(site, references, document_of(PEG))
@@ -202,13 +162,7 @@ def test_a_name_that_is_none_is_refused(site: Site) -> None:
 
 
 class Mounted:
-    """Credentials as a cluster mounts them: a link to what is current, which is put in its place.
-
-    Parameters
-    ----------
-    first : Path
-        The credentials to begin with.
-    """
+    """Credentials as a cluster mounts them: a link to what is current, put in its place."""
 
     def __init__(self, directory: Path, first: Path) -> None:
         self.directory = directory

@@ -26,8 +26,6 @@ from tests.processes.faults import (
     wait_until,
 )
 
-from holdfast.recording.journal import Journal
-
 PEG = "peg_in_hole_2d"
 SHORT = document_of(PEG, max_steps=40)
 LONG_STEPS = 400
@@ -240,17 +238,6 @@ class TestLogTakenAwayAfterAKill:
             connection.execute("SELECT COUNT(*) FROM steps").fetchone()
         assert not (robot.out / "journal.sqlite-wal").exists()
         story.finish(site.run(story.file, resume=True))
-
-    def test_the_epoch_is_never_given_out_again(self, site: Site, references: References) -> None:
-        story = Story(site, references, SHORT)
-        story.at("sense", KILLED, site.kill_robot)
-        robot = site.run(story.file)
-        assert robot.wait() == -signal.SIGKILL
-        with Journal.read(journal_of(robot)) as journal:
-            epoch = journal.meta()["epoch"]
-        remove_log(robot.out)
-        with Journal.read(journal_of(robot)) as journal:
-            assert journal.meta()["epoch"] == epoch
 
 
 class TestCannotBeWritten:

@@ -3,48 +3,18 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
 
 import pytest
 from tests.processes.faults import (
     PATIENCE_S,
     PATIENT,
     References,
-    Service,
     Site,
     assert_identical,
     document_of,
 )
-from tests.wire import RawClient
-
-from holdfast.protocol.messages import (
-    Progress,
-    Refused,
-)
 
 PEG = "peg_in_hole_2d"
-
-
-class Client(RawClient):
-    """A robot's end of the wire, in the test's own hands."""
-
-    def refused(self, payload: bytes) -> Refused:
-        # A sign of life may come before, if it takes its time to find out why.
-        (reply,) = (each for each in self.ask(payload) if not isinstance(each, Progress))
-        assert isinstance(reply, Refused), reply
-        return reply
-
-
-@pytest.fixture
-def cloud(site: Site) -> Service:
-    return site.service().start()
-
-
-@pytest.fixture
-def client(cloud: Service) -> Iterator[Client]:
-    client = Client(cloud.endpoint)
-    yield client
-    client.close()
 
 
 @pytest.mark.slow

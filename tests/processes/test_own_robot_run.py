@@ -6,6 +6,10 @@ each step was performed once, in order, and as in a run in which nothing died.
 
 from __future__ import annotations
 
+import importlib.util
+import json
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,15 +18,54 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from tests.processes.faults import (
-    LOST,
-    PATIENT,
-    RESTORED,
-    Site,
-    assert_identical,
-    wait_until,
-)
-from tests.processes.test_own_robot import EXAMPLE, Controller
+from tests.processes.faults import LOST, PATIENT, RESTORED, Site, assert_identical, wait_until
+
+from holdfast.config.loader import load
+from holdfast.planning.planner import Planner
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.robot.environment_maker import load_environment
+from holdfast.robot.trial import run_trial
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "own_robot"
+PATIENCE_S = 60.0
+
+
+class Controller:
+    """The example's controller in a directory of its own; it may be killed and started again."""
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self.port = 0
+        self.process: subprocess.Popen[str] | None = None
+
+    def start(self, *options: str) -> None:
+        self.process = subprocess.Popen(
+            [
+                sys.executable,
+                str(EXAMPLE / "controller.py"),
+                *("--port", str(self.port), "--directory", str(self.directory)),
+                *("--delay-ms", "0", *options),
+            ],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line.startswith("listening on 127.0.0.1:"), line
+        self.port = int(line.rpartition(":")[2])
+
+    def kill(self) -> None:
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait(PATIENCE_S)
+            assert self.process.stdout is not None
+            self.process.stdout.close()
+            self.process = None
+
+    def moves(self) -> list[dict[str, Any]]:
+        """Return what it has noted of each move."""
+        lines = (self.directory / "performed.log").read_text().splitlines()
+        return [note for note in map(json.loads, lines) if "step" in note]
 
 
 def configuration_for(controller: Controller, site: Site, timeout_ms: float = 60_000.0) -> Path:
@@ -147,3 +190,33 @@ def test_controller_that_falls_silent(
     robot.finish()
     assert robot.matching("performed_unseen", step=20)
     undisturbed.assert_same(robot.out, controller)
+
+
+def test_its_peg_collides_where_holdfast_says() -> None:
+    problem = PegInHole2D()
+    drawn = np.random.default_rng(1).uniform([-2, -0.5, -3.2], [2, 2.5, 3.2], (4000, 3))
+    # Many in the slot, upright, where it is tight.
+    drawn[2000:] *= [0.06, 1.0, 0.02]
+    expected = problem.world.collides(drawn)
+    assert 500 < expected[:2000].sum() < 1900
+    assert 200 < expected[2000:].sum() < 1900
+    spec = importlib.util.spec_from_file_location("own_controller", EXAMPLE / "controller.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert [module.collides(tuple(pose)) for pose in drawn.tolist()] == expected.tolist()
+
+
+def test_the_simulation_has_the_same_file() -> None:
+    """Without the name of the class, the same configuration is simulated."""
+    configuration = load(EXAMPLE / "own_robot.yaml")
+    maker = load_environment(configuration)
+    assert maker.simulated
+    result = run_trial(
+        Planner(configuration.problem, configuration.planning),
+        configuration.simulator.seed,
+        0,
+        max_steps=configuration.simulator.max_steps,
+        environment=maker(0),
+    )
+    assert result.success

@@ -29,7 +29,6 @@ from tests.processes.faults import (
     sensing_steps,
     unfinished_steps,
     wait_for_end,
-    wait_until,
 )
 
 from holdfast.recording.journal import Journal
@@ -39,12 +38,6 @@ PEG_AND_SLOWLY_ALL = [
     PEG,
     *(pytest.param(name, marks=pytest.mark.slow) for name in PROBLEMS if name != PEG),
 ]
-
-
-def rows_of(run: Path) -> list[str]:
-    """Return the decisions that a run has told the times of so far."""
-    path = run / "timings.csv"
-    return path.read_text().splitlines()[1:] if path.exists() else []
 
 
 class TestKilled:
@@ -64,23 +57,6 @@ class TestKilled:
         assert story.run_and_resume(cloud) == 3
         # Each robot came with a higher epoch, so the cloud has taken the session over.
         assert len(cloud.process.matching("session_taken_over")) >= 1
-
-    @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
-    @pytest.mark.slow
-    def test_where_trials_begin_and_end(
-        self, problem: str, site: Site, references: References
-    ) -> None:
-        document = document_of(problem, max_steps=30, trials=3)
-        cloud = site.service().start()
-        story = Story(site, references, document)
-        story.at("begin", 0, site.kill_robot)
-        story.at("sense", 0, site.kill_robot)
-        story.at("perform", 0, site.kill_robot)
-        story.at("perform", 29, site.kill_robot, afterwards=True)
-        story.at("begin", 0, site.kill_robot, trial=1)
-        story.at("perform", 0, site.kill_robot, trial=1, afterwards=True)
-        story.at("perform", 29, site.kill_robot, trial=2)
-        assert story.run_and_resume(cloud) == 7
 
     def test_its_local_service_ends_with_it(self, site: Site, references: References) -> None:
         document = document_of(PEG)
@@ -105,17 +81,6 @@ class TestKilled:
         assert result.recoveries == 2
         assert len(result.sensing_ms) == result.sensing_decisions == len(sensing_steps(document))
         assert all(result.sensing_ms)
-
-    @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
-    @pytest.mark.slow
-    def test_with_the_planner_in_its_own_process(
-        self, problem: str, site: Site, references: References
-    ) -> None:
-        document = document_of(problem)
-        story = Story(site, references, document)
-        for step in (1, 20, 21, 40):
-            story.at("perform", step, site.kill_robot, afterwards=step % 2 == 0)
-        assert story.run_and_resume() == 4
 
 
 class TestProblem:
@@ -165,26 +130,6 @@ class TestProblem:
         )
         mark.unlink()
         story.finish(site.run(story.file, services=[cloud], resume=True))
-
-
-class TestStopped:
-    def test_for_a_while(self, site: Site, references: References) -> None:
-        """A robot that stood still finds its links given up, and goes on."""
-        cloud = site.service(lease_ms=300.0).start()
-        story = Story(
-            site,
-            references,
-            document_of(PEG),
-            offload={"detection_timeout_ms": 250.0, "lease_ms": 300.0},
-        )
-
-        def stop_for_longer_than_a_lease() -> None:
-            story.running.stop()
-            time.sleep(1.0)
-            story.running.resume()
-
-        story.at("sense", 27, stop_for_longer_than_a_lease)
-        story.run(cloud)
 
 
 class TestEndedInOrder:
@@ -327,37 +272,3 @@ class TestRate:
         assert robot.matching("missed_ticks")[-1]["total"] == missed
         told = [str(event["reason"]) for event in robot.matching("note")]
         assert f"{missed} ticks of --rate were missed" in told
-
-
-SHORT = document_of(PEG, trials=2, max_steps=40)
-
-
-@pytest.fixture(scope="module")
-def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the directory of a run that was killed in its second trial."""
-    with Site(tmp_path_factory.mktemp("killed")) as site:
-        robot = site.run(site.configure(SHORT), "--rate", "300")
-        robot.wait_for("trial")
-        wait_until(lambda: len(rows_of(robot.out)) > 14, "decisions of the second trial")
-        robot.kill()
-        assert unfinished_steps(robot.out)
-        return robot.out
-
-
-@pytest.mark.slow
-class TestDamagedJournal:
-    def test_as_it_was_left(self, killed: Path, site: Site, references: References) -> None:
-        shutil.copytree(killed, site.directory / "out")
-        robot = site.run(site.configure(SHORT), "--rate", "10000", resume=True)
-        robot.finish()
-        assert robot.matching("resumed_trial", trial=1)
-        assert_identical(robot.out, references(SHORT))
-
-    def test_as_it_was_left_and_finished_as_a_batch(
-        self, killed: Path, site: Site, references: References
-    ) -> None:
-        shutil.copytree(killed, site.directory / "out")
-        configuration = site.configure(SHORT)
-        batch = site.holdfast("run", configuration, "--out", site.directory / "out", "--resume")
-        assert batch.wait() == 0, batch.account()
-        assert_identical(site.directory / "out", references(SHORT))

@@ -212,23 +212,6 @@ class TestOutput:
         assert "digest" in done.stdout
         assert summary_of(workplace / "out")["finished"] == 1
 
-    def test_nor_a_reader_that_has_ended(self, workplace: Path) -> None:
-        reading, writing = os.pipe()
-        os.close(reading)
-        command = [*COMMAND, "run", "peg.yaml", "--trials", "1", "--rate", "10000", "--out", "out"]
-        with os.fdopen(writing, "w") as pipe:
-            done = subprocess.run(
-                command, cwd=workplace, stdout=subprocess.DEVNULL, stderr=pipe, check=False
-            )
-        assert done.returncode == 0
-        assert summary_of(workplace / "out")["finished"] == 1
-
-    def test_as_a_module(self, workplace: Path) -> None:
-        done = holdfast(workplace, "run", "--help", command=[sys.executable, "-m", "holdfast"])
-        assert done.returncode == 0
-        assert done.stdout.startswith("usage: holdfast run ")
-        assert "<bool>" not in done.stdout
-
     def test_version(self, workplace: Path) -> None:
         done = holdfast(workplace, "--version")
         assert done.returncode == 0

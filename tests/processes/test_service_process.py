@@ -344,19 +344,6 @@ class TestServing:
             code, log = service.end()
             assert code == 0, log
 
-    def test_own_problem_that_was_not_named(self) -> None:
-        robot = Robot()
-        robot.session_configuration = msgspec.structs.replace(
-            robot.session_configuration, problem="os:PathLike"
-        )
-        with served(*ANYWHERE) as service, robots_end(service.endpoint) as end:
-            end.appeared()
-            (reply,) = end.ask(encode(robot.request()))
-            assert isinstance(reply, Refused)
-            assert reply.code == "unknown_problem"
-            assert "--problem" in reply.text
-            run_turns(end, Robot(key=2), 2)
-
     def test_two_names_on_two_endpoints(self) -> None:
         with served(
             *ANYWHERE, "--listen", "tcp/127.0.0.1:0", "--name", "cloud_active_sensing_recovery"
@@ -466,24 +453,6 @@ class TestRefusing:
 
 
 class TestTelling:
-    def test_json(self) -> None:
-        with served(*ANYWHERE, "--log", "json", "--max-sessions", "1") as service:
-            ready = json.loads(service.ready_line)
-            assert ready["event"] == "ready"
-            assert ready["service"] == "cloud_active_sensing"
-            assert ready["pid"] == service.process.pid
-            (endpoint,) = ready["listen"]
-            with robots_end(endpoint) as end:
-                end.appeared()
-                run_turns(end, Robot(), 1)
-                end.ask(encode(Robot(key=2).restore()))
-                end.ask(with_checksum(b"rubbish"))
-            _, log = service.end()
-        events = {record["event"]: record for record in map(json.loads, log.splitlines())}
-        assert set(events) >= {"session_opened", "restored", "refused", "evicted", "stopping"}
-        assert events["refused"]["code"] == "malformed"
-        assert events["stopping"]["reason"] == "SIGTERM"
-
     def test_metrics(self) -> None:
         pytest.importorskip("prometheus_client")
         with served(*ANYWHERE, "--log", "json", "--metrics", "0") as service:

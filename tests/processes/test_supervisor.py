@@ -7,13 +7,11 @@ import json
 import os
 import signal
 import socket
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
-from tests.notify_socket import NotifySocket
 from tests.ports import free_port
 from tests.processes.faults import (
     PATIENT,
@@ -220,11 +218,6 @@ class TestEnding:
 
 
 class TestHealth:
-    def test_ready_alive_and_counted(self, site: Site) -> None:
-        cloud = several(site)
-        assert health_of(cloud, "/livez") == (200, "ok\n")
-        assert health_of(cloud, "/readyz") == (200, "ok\n")
-
     def test_a_process_that_cannot_be_started_again(self, site: Site) -> None:
         """Each time it is started a little later; as soon as it can serve, it does."""
         (site.directory / "mortal_problem.py").write_text(MORTAL)
@@ -248,32 +241,6 @@ class TestHealth:
         cloud.process.wait_for("process_started", 2)
         assert health_of(cloud, "/readyz") == (200, "ok\n")
 
-    @pytest.mark.slow  # when one counts as stuck: unit/test_supervised_process.py
-    def test_a_process_that_stands_still(self, site: Site) -> None:
-        with NotifySocket() as manager:
-            self.stands_still(site, manager)
-
-    @staticmethod
-    def stands_still(site: Site, manager: NotifySocket) -> None:
-        cloud = several(site, variables={**manager.variables, "WATCHDOG_USEC": "100000"})
-        pid = children(cloud)[1]
-        manager.wait_for("WATCHDOG=1")
-        os.kill(pid, signal.SIGSTOP)
-        wait_until(lambda: health_of(cloud, "/livez")[0] == 503, "the silence to be seen")
-        manager.wait(
-            lambda lines: any(f"process {pid} has said nothing" in line for line in lines),
-            "the silence to be told",
-        )
-        beats = manager.count("WATCHDOG=1")
-        time.sleep(1.0)
-        assert manager.count("WATCHDOG=1") == beats
-        assert f"process {pid} has said nothing" in health_of(cloud, "/livez")[1]
-        assert health_of(cloud, "/readyz") == (200, "ok\n")
-        assert metrics(cloud)["holdfast_process_restarts_total[]"] == 0
-        os.kill(pid, signal.SIGCONT)
-        wait_until(lambda: health_of(cloud, "/livez")[0] == 200, "it to be heard again")
-        manager.wait_for("WATCHDOG=1", beats + 1)
-
 
 class TestRefusing:
     def refused(self, site: Site, *options: str) -> str:
@@ -296,21 +263,3 @@ class TestRefusing:
             address = endpoint.removeprefix("tcp/")
             anywhere = ("--listen", f"tcp/127.0.0.1:{free_port()}")
             assert address in self.refused(site, *anywhere, "--health", address)
-
-    def test_a_second_service_at_one_address(self, site: Site) -> None:
-        cloud = several(site)
-        assert cloud.endpoint in self.refused(site, "--listen", cloud.endpoint)
-
-    def test_a_problem_that_is_none(self, site: Site) -> None:
-        anywhere = ("--listen", f"tcp/127.0.0.1:{free_port()}")
-        assert "nix" in self.refused(site, *anywhere, "--problem", "nix")
-
-
-def test_events_name_the_processes(site: Site) -> None:
-    cloud = several(site)
-    pid = children(cloud)[0]
-    os.kill(pid, signal.SIGKILL)
-    started = cloud.process.wait_for("process_started")
-    ended = cloud.process.matching("process_ended")[0]
-    assert (ended["pid"], ended["reason"]) == (pid, "was ended by SIGKILL")
-    assert started["pid"] in children(cloud)

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from tests.processes.faults import events_of, holdfast, rows_of, summary_of
 
-from holdfast.planning.outcome import DONE_VALUES
 from holdfast.recording.journal import Journal
 
 BEFORE_OUTCOMES = Path(__file__).parents[1] / "unit" / "data" / "journal_before_outcomes.sqlite"
@@ -108,22 +107,6 @@ class Command:
 def test_a_failed_task_is_no_success(tmp_path: Path) -> None:
     command = Command(tmp_path, "Lander")
     command.assert_ended(command.run())
-
-
-def test_nobody_speaks_of_failures_where_there_are_none(tmp_path: Path) -> None:
-    command = Command(tmp_path, "Lander")
-    ended = command.run("--trials", "1")
-    assert ended.returncode == 0, ended.stderr
-    assert "failed" not in ended.stdout
-    assert summary_of(command.out)["failures"] == 0
-
-
-def test_anything_else_is_an_error_that_names_it(tmp_path: Path) -> None:
-    ended = Command(tmp_path, "Wrong").run()
-    assert ended.returncode == 4
-    assert f"lander:Wrong: is_done returned 'crashed'; it must return {DONE_VALUES}" in " ".join(
-        ended.stderr.split()
-    )
 
 
 def test_a_filter_that_has_lost_the_robot_is_told(tmp_path: Path) -> None:

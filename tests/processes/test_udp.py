@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
-import socket
 from collections import Counter
 from pathlib import Path
 
 import pytest
-from tests.contracts.test_datagram_links import at_rest
-from tests.contracts.wires import Inbox, until
 from tests.ports import free_port
 from tests.processes.faults import (
     References,
@@ -20,10 +16,6 @@ from tests.processes.faults import (
     sensing_steps,
 )
 
-from holdfast.protocol.events import CallEnded, ServiceVanished
-from holdfast.transport.credentials import load_credentials
-from holdfast.transport.datagram_links import RobotDatagramLink
-from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast_lab.testbed.bad_line import Impairment
 from holdfast_lab.testbed.proxy import Proxy
 
@@ -57,29 +49,6 @@ def test_losses_and_late_datagrams(
     assert robot.statuses() == []
     assert len(robot.matching("service_appeared")) == 1
     assert robot.matching("no_datagrams") == []
-
-
-def test_datagrams_that_come_twice_and_again_later(
-    site: Site, references: References, cloud: Service, credentials: tuple[str, str]
-) -> None:
-    entry = free_port()
-    document = document_of(PEG)
-    story = Story(site, references, document)
-    carried: Counter[str] = Counter()
-    with Proxy(
-        entry,
-        port_of(cloud),
-        "twice",
-        datagrams=True,
-        overhear=lambda carrier, way, _: carried.update((f"{carrier} {way}",)),
-    ) as between:
-        between.impair(Impairment(doubled=True))
-        for step in sensing_steps(document)[2:]:
-            story.at("perform", step, between.replay)
-        robot = story.run(f"udp/127.0.0.1:{entry}", options=credentials)
-        assert carried["datagrams to_service"] > len(sensing_steps(document))
-    assert robot.statuses() == []
-    assert len(cloud.process.matching("session_opened")) == 1
 
 
 def test_a_robot_whose_address_changes(
@@ -117,32 +86,3 @@ def test_a_robot_whose_address_changes(
     assert len(robot.matching("service_appeared")) == 1
     assert robot.matching("service_lost") == []
     assert len(cloud.process.matching("session_opened")) == 1
-
-
-async def test_a_killed_service_is_known_by_its_closed_port(site: Site, keys: Path) -> None:
-    """The end of its stream gets lost, and the first datagram to its port is enough."""
-    target, entry = free_port(), free_port()
-    with socket.socket(type=socket.SOCK_DGRAM) as somebody:
-        # So the service takes another port for datagrams, to which there is no proxy.
-        somebody.bind(("127.0.0.1", target))
-        cloud = site.service(
-            *("--tls", str(keys / "ours" / "service")), endpoint=f"udp/127.0.0.1:{target}"
-        ).start()
-        with Proxy(entry, target, "held open") as stream:
-            robot = StreamRobotTransport(
-                {"cloud": f"udp/127.0.0.1:{entry}"},
-                tls=load_credentials(keys / "ours" / "robot", "robot").files,
-                lease_ms=3.6e6,
-            )
-            inbox = Inbox()
-            robot.start(inbox)
-            await until(lambda: robot.sends_datagrams("cloud"))
-            link = robot._services["cloud"].current
-            assert isinstance(link, RobotDatagramLink)
-            await at_rest(link)
-            await asyncio.to_thread(stream.impair, Impairment(silent=True))
-            await asyncio.to_thread(cloud.kill)
-            robot.call("cloud", 1, b"is anybody there?")
-            await inbox.wait_for(ServiceVanished("cloud", inbox.incarnations()[0]), CallEnded(1))
-            assert link.reason == "is gone: its port is closed"
-            await robot.close()

@@ -183,15 +183,6 @@ class TestRestart:
         assert robot.matching("process_ended") == []
         story.finish(site.run(story.file, *self.OPTIONS))
 
-    def test_a_robot_does_not_outlive_it(self, site: Site, references: References) -> None:
-        document = document_of(PEG, max_steps=60)
-        story = Story(site, references, document)
-        story.at("perform", 30, site.kill_robot)
-        robot = site.run(story.file, *self.OPTIONS)
-        assert robot.wait() == -signal.SIGKILL, robot.account()
-        site.wait_for_nobody()
-        story.finish(site.run(story.file, *self.OPTIONS))
-
     @pytest.mark.skipif(os.geteuid() != 0, reason="only root mounts")
     def test_after_a_reboot_it_moves_only_when_told_to(
         self, site: Site, references: References
@@ -430,17 +421,6 @@ class TestServiceManager:
             assert cloud.process.wait() == 0
             manager.wait_for("STOPPING=1")
             assert manager.count("READY=1") == 1  # none of them speaks for all
-
-    def test_a_watchdog_that_is_meant_for_another_process_is_left_alone(self, site: Site) -> None:
-        with NotifySocket() as manager:
-            cloud = site.service()
-            cloud.variables = manager.variables | WATCHED | {"WATCHDOG_PID": "1"}
-            cloud.start()
-            manager.wait_for("READY=1")
-            cloud.process.signal(signal.SIGTERM)
-            cloud.process.wait()
-            manager.wait_for("STOPPING=1")
-            assert manager.count("WATCHDOG=1") == 0
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can hand files to another user")

@@ -29,20 +29,7 @@ Hook = Callable[[], object]
 
 
 class World:
-    """What the robots of one run act on, and the witness of what they did.
-
-    Parameters
-    ----------
-    configuration : Configuration
-        Problem and seed make the world the same as the simulated one.
-
-    Attributes
-    ----------
-    performed : dict of int to list of bytes
-        Of each trial, the task actions that were carried out, in order, bit for bit.
-    wrongs : list of str
-        What should never have been asked.
-    """
+    """What the robots of one run act on, and the witness of what they did."""
 
     def __init__(self, configuration: Configuration) -> None:
         self._problem = configuration.problem
@@ -205,13 +192,7 @@ def _has_hung_up(connection: socket.socket) -> bool:
 
 
 class Gate:
-    """Stands before each longer computation of ``gated_problem`` in the processes that have it.
-
-    Parameters
-    ----------
-    holds_at : int
-        The computation, counted from 0, that is held, and all after it, until :meth:`open`.
-    """
+    """Stands before each longer computation of ``gated_problem`` in the processes that have it."""
 
     def __init__(self, holds_at: int) -> None:
         self._holds_at = holds_at

@@ -36,15 +36,7 @@ def line_of(process: subprocess.Popen[str]) -> str:
 
 
 class Ros2:
-    """A real ROS 2, as tests/ros/set_up_ros2 makes it.
-
-    Attributes
-    ----------
-    python : Path
-        Its interpreter; rclpy and holdfast are installed there.
-    environment : dict of str
-        For its processes: interfaces of ours can be imported, and discovery stays on this machine.
-    """
+    """A real ROS 2, as tests/ros/set_up_ros2 makes it."""
 
     def __init__(self, directory: Path) -> None:
         prefix = directory / "kilted"

@@ -92,15 +92,7 @@ while not rospy.is_shutdown():
 
 
 class Process:
-    """A process, what it printed, and its end.
-
-    Parameters
-    ----------
-    place : Path
-        A file for what it prints, without its ending.
-    reads : bool
-        Whether it has a standard input to be written to.
-    """
+    """A process, what it printed, and its end."""
 
     def __init__(
         self, words: list[str], environment: Mapping[str, str], place: Path, *, reads: bool = False
@@ -156,13 +148,7 @@ class Process:
 
 
 class Graph(AtMaster):
-    """Everything at one master's port.
-
-    Parameters
-    ----------
-    environment : mapping
-        Of ROS 1.
-    """
+    """Everything at one master's port."""
 
     def __init__(self, directory: Path, environment: Mapping[str, str]) -> None:
         super().__init__(

@@ -32,22 +32,7 @@ def wait_for(true: Callable[[], object], what: str | Callable[[], str] = "") -> 
 
 
 class AtMaster:
-    """What is said to the master at one port.
-
-    Parameters
-    ----------
-    environment : mapping
-        Of ROS 1.
-    port : int, optional
-        The master's; None takes a free one.
-    **variables
-        More of the environment.
-
-    Attributes
-    ----------
-    environment : dict of str
-        For processes.
-    """
+    """What is said to the master at one port."""
 
     def __init__(
         self,
@@ -86,13 +71,7 @@ class AtMaster:
 
 
 class Ros1(AtMaster):
-    """ROS 1 around one master.
-
-    Attributes
-    ----------
-    python : str
-        The system's Python with rospy and holdfast.
-    """
+    """ROS 1 around one master."""
 
     def __init__(
         self, environment: Mapping[str, str], directory: Path, port: int | None = None

@@ -17,9 +17,6 @@ from tests.ros.conftest import PATIENCE_S
 from tests.ros.graph import Graph, keeps_on, replaced, settled, start_everything, topic_tool
 from tests.ros.ros1_processes import SYSTEM_PYTHON, wait_for
 
-from ros1_master_guard.errors import GuardError
-from ros1_master_guard.settings import MasterAddress
-
 GUARD = (sys.executable, "-m", "holdfast", "ros1-guard")
 KILLS = 10
 
@@ -469,23 +466,6 @@ def test_it_is_the_stock_master(seed: int, graph: Graph, tmp_path: Path) -> None
 
 
 class TestWhatCannotBeGuarded:
-    def test_another_machine(self) -> None:
-        with pytest.raises(GuardError, match=r"192\.0\.2\.1 is no address of this machine"):
-            MasterAddress.of({"ROS_MASTER_URI": "http://192.0.2.1:11311"})
-
-    @pytest.mark.parametrize(
-        "uri",
-        ["localhost:11311", "http://", "http://localhost:x", "https://localhost:1", "http://[::1"],
-    )
-    def test_no_address(self, uri: str) -> None:
-        with pytest.raises(GuardError, match="expected http://HOST:PORT"):
-            MasterAddress.of({"ROS_MASTER_URI": uri})
-
-    def test_a_python_without_ros(self, graph: Graph) -> None:
-        guard = graph.start(*GUARD, "--python", sys.executable)
-        assert guard.process.wait(PATIENCE_S) == 2
-        assert "name ROS's Python with --python" in guard.errors
-
     def test_what_is_no_master(self, graph: Graph) -> None:
         server = graph.start(
             *(sys.executable, "-m", "http.server", "--bind", "127.0.0.1", str(graph.port))
@@ -500,8 +480,3 @@ class TestWhatCannotBeGuarded:
         assert guard.process.wait(PATIENCE_S) == 2
         assert "what is there is no ROS 1 master" in guard.errors
         assert server.process.poll() is None
-
-    def test_no_python(self, graph: Graph) -> None:
-        guard = graph.start(*GUARD, "--python", "/nonexistent")
-        assert guard.process.wait(PATIENCE_S) == 2
-        assert "--python /nonexistent: cannot be run" in guard.errors

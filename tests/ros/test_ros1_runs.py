@@ -20,16 +20,7 @@ KILLS = 10
 
 
 class Kills:
-    """Kills of a guarded master, and how long it takes until everything is listed again.
-
-    Attributes
-    ----------
-    known : set
-        What the master knew at first.
-    figures : list of dict
-        Of each kill, the seconds until the master's ``getSystemState`` has everything, and until a
-        ``rosservice list`` that was begun at once has ended, 0.2 s of which it always takes.
-    """
+    """Kills of a guarded master, and how long it takes until everything is listed again."""
 
     def __init__(self, graph: Graph) -> None:
         self._graph = graph

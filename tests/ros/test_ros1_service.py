@@ -8,9 +8,7 @@ import signal
 import socket
 import struct
 import subprocess
-import threading
 from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +30,7 @@ from holdfast_ros.active_sensing import (
 )
 from holdfast_ros.messages import md5_sum
 from holdfast_ros.ros1_client import Ros1Client, Ros1Service
-from holdfast_ros.ros1_service import MAX_WAITING, Ros1Server
+from holdfast_ros.ros1_service import Ros1Server
 from holdfast_ros.tcpros import RosEnvironment
 from ros1_master_guard.headers import decode_header, encode_header
 
@@ -263,30 +261,6 @@ def test_a_stopped_service_costs_no_more_than_the_deadline(
         service.close()
 
 
-def test_a_question_that_hangs_ends_when_its_asker_is_closed(
-    around: Ros1, here: RosEnvironment
-) -> None:
-    cloud = around.serve(CLOUD, EXAMPLE)
-    service = Ros1Service(CLOUD, here)
-    service.ask(DecisionRequest(RequestKind.INITIALIZE), 30.0)
-    stop(cloud.pid)
-    said: list[str] = []
-
-    def ask() -> None:
-        with pytest.raises(TransportError) as caught:
-            service.ask(DecisionRequest(RequestKind.INITIALIZE), 120.0)
-        said.append(str(caught.value))
-
-    asking = threading.Thread(target=ask)
-    asking.start()
-    wait_for(lambda: cloud.poll() is None, "it is stopped")
-    service.close()
-    asking.join(30.0)
-    assert not asking.is_alive()
-    assert said
-    cloud.send_signal(signal.SIGCONT)
-
-
 class TestTheMasterDies:
     def test_calls_to_a_service_that_lives_go_on(self, around: Ros1, here: RosEnvironment) -> None:
         around.serve(CLOUD, EXAMPLE)
@@ -468,39 +442,6 @@ def test_a_request_that_is_no_message_is_answered_with_the_reason(around: Ros1) 
         while data := stream.recv(65536):
             heard += data
     assert b"3 bytes are no holdfast_interfaces/srv/ActiveSensing_Request" in heard
-
-
-async def test_too_many_requests_at_once_are_told_so(
-    around: Ros1,
-    here: RosEnvironment,
-    configuration: Configuration,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    service = Ros1Server(configuration, ros_environment=here)
-    hold = threading.Event()
-    decide = ActiveSensing.answer
-
-    def answer(self: ActiveSensing, request: DecisionRequest) -> DecisionAnswer:
-        hold.wait()
-        return decide(self, request)
-
-    monkeypatch.setattr(ActiveSensing, "answer", answer)
-    assert service.start()
-    loop = asyncio.get_running_loop()
-    asked = [Ros1Service(CLOUD, here) for _ in range(MAX_WAITING + 2)]
-    with ThreadPoolExecutor(len(asked)) as askers:
-        answers = [
-            loop.run_in_executor(askers, each.ask, DecisionRequest(RequestKind.INITIALIZE), 60.0)
-            for each in asked
-        ]
-        (busy,), _ = await asyncio.wait(answers, return_when=asyncio.FIRST_COMPLETED)
-        hold.set()
-        errors = [answer.error for answer in await asyncio.gather(*answers)]
-    assert (await busy).message == f"{MAX_WAITING} requests are waiting already"
-    assert sorted(errors) == [ErrorCode.OK] * (MAX_WAITING + 1) + [ErrorCode.BUSY]
-    for each in asked:
-        each.close()
-    service.close(1.0)
 
 
 async def test_a_defect_costs_its_request_alone(

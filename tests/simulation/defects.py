@@ -39,13 +39,7 @@ LIMIT = 2000
 
 
 class Finding(NamedTuple):
-    """Where a defect was found.
-
-    Attributes
-    ----------
-    seed : int
-        The first, counted from 0, whose run has a violation.
-    """
+    """Where a defect was found."""
 
     seed: int
     violation: str

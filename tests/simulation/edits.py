@@ -14,16 +14,7 @@ __all__ = ["Change", "Defect", "Edit", "Replacement", "applied"]
 
 
 class Edit(NamedTuple):
-    """Lines of a function that are replaced.
-
-    Attributes
-    ----------
-    owner : class or module
-        Where the function is looked up when it is called.
-    before, after : str
-        ``before`` stands in its source exactly once. Both are indented as the line is on which
-        that begins.
-    """
+    """Lines of a function that are replaced."""
 
     owner: Any
     function: str
@@ -43,13 +34,7 @@ Change: TypeAlias = Edit | Replacement
 
 
 class Defect(NamedTuple):
-    """Something wrong.
-
-    Attributes
-    ----------
-    story : str
-        What a careless engineer would have done.
-    """
+    """Something wrong."""
 
     name: str
     story: str
@@ -58,13 +43,7 @@ class Defect(NamedTuple):
 
 @contextmanager
 def applied(defect: Defect) -> Iterator[None]:
-    """Let the production code have a defect for a while.
-
-    Raises
-    ------
-    ValueError
-        If the code to be replaced is not there any more.
-    """
+    """Let the production code have a defect for a while."""
     sources: dict[tuple[Any, str], str] = {}
     with ExitStack() as stack:
         for change in defect.changes:

@@ -15,7 +15,7 @@ from holdfast.errors import ProblemError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.randomness import Stream
 from holdfast.planning.planner import Planner
-from holdfast.planning.settings import ActiveSensingSettings, SelectorSettings
+from holdfast.planning.settings import SelectorSettings
 from holdfast.problems import checked
 from holdfast.robot.environment import SimulatedEnvironment
 
@@ -30,10 +30,6 @@ def run_a_step(problem: Any) -> None:
     environment.perform(task_action)
     environment.is_done()
     planner.advance(state, task_action)
-
-
-def test_a_problem_that_keeps_the_contract_runs() -> None:
-    run_a_step(Line())
 
 
 MISFITS: dict[str, tuple[str, Any, str]] = {
@@ -244,19 +240,6 @@ class TestStreams:
             half = len(calls) // 2
             assert calls[:half] == calls[half:]
         assert again.drawn == once.drawn
-
-    @pytest.mark.parametrize("method", ["path_entropy", "expected_return", "action_entropy"])
-    @pytest.mark.parametrize("kind", [Rough, Line])
-    def test_a_state_has_one_next_decision(self, method: Any, kind: Any) -> None:
-        settings = msgspec.structs.replace(
-            SETTINGS,
-            active_sensing=ActiveSensingSettings(num_cores=1, horizon=1 + (method[0] == "a")),
-            selector=SelectorSettings(method=method, rollout_steps=20, rollout_reward="steps"),
-        )
-        planner = Planner(kind(), settings)
-        state = planner.init(4)
-        choices = {repr(planner.choose_sensing_action(state)) for _ in range(3)}
-        assert len(choices) == 1
 
     def test_noise_is_the_same_after_every_sensing_action(self) -> None:
         problem = Rough()

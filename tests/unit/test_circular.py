@@ -51,19 +51,6 @@ class TestBeliefs:
         assert standard_deviation(belief, (1,))[1] == pytest.approx(0.4, abs=0.1)
         assert standard_deviation(belief)[1] > 2.0
 
-    def test_whole_turns_change_nothing(self) -> None:
-        states = np.stack([fresh().normal(60), headings(60)], axis=1)
-        turned = states.copy()
-        turned[::3, 1] += 2.0 * np.pi
-        turned[::5, 1] -= 4.0 * np.pi
-        one, other = Belief.uniform(states), Belief.uniform(turned)
-        np.testing.assert_allclose(
-            estimate(other, circular=(1,)), estimate(one, circular=(1,)), atol=1e-13
-        )
-        np.testing.assert_allclose(
-            standard_deviation(other, (1,)), standard_deviation(one, (1,)), atol=1e-13
-        )
-
     def test_nothing_known_has_the_spread_of_a_circle(self) -> None:
         angles = np.linspace(-np.pi, np.pi, 1000, endpoint=False)[:, np.newaxis]
         assert standard_deviation(Belief.uniform(angles), (0,))[0] == pytest.approx(1.814, abs=0.01)

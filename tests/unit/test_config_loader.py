@@ -161,17 +161,6 @@ def complaint(path: Path, **arguments: Any) -> str:
 
 
 class TestWhatLoads:
-    def test_the_thesis_file_as_it_stands(self, write: Write) -> None:
-        configuration = load(write(THESIS))
-        assert configuration.problem_name == "peg_in_hole_2d"
-        assert configuration.problem.name == "peg_in_hole_2d"
-        assert configuration.planning.particle_filter.num_particles == 100
-        assert configuration.planning.active_sensing.num_nearest_neighbors == 5
-        assert configuration.planning.active_sensing.num_cores == 8
-        assert configuration.planning.sensing_interval == 8
-        assert configuration.simulator.max_steps == 700
-        assert configuration.model["init_cov"] == pytest.approx([2, 1, 1.57])
-
     def test_the_thesis_example_has_exactly_the_thesis_keys_and_values(self) -> None:
         example = yaml.safe_load((EXAMPLES / "thesis.yaml").read_text(encoding="utf-8"))
         assert example.pop("problem") == "peg_in_hole_2d"
@@ -196,13 +185,6 @@ class TestWhatLoads:
         assert configuration.problem.name == name
         assert configuration.planning.particle_filter.num_particles == 300
 
-    def test_the_argument_rules_over_the_file(self, write: Write) -> None:
-        path = write("problem: peg_in_hole_2d\nsimulator: {num_trials: 3, seed: 4}")
-        assert load(path).simulator.num_trials == 3
-        configuration = load(path, problem="capsule_robot", num_trials=5, seed=6)
-        assert configuration.problem_name == "capsule_robot"
-        assert (configuration.simulator.num_trials, configuration.simulator.seed) == (5, 6)
-
     def test_an_empty_section_has_its_defaults(self, write: Write) -> None:
         empty = load(write("problem: peg_in_hole_2d\nmodel:\nsimulator: ~\nselector: {}"))
         assert empty == load(write("problem: peg_in_hole_2d"))
@@ -217,16 +199,6 @@ class TestWhatLoads:
             "\ufeffproblem: peg_in_hole_2d\nmodel: {init_cov: &c [1, 1, 1], motion_cov: *c}"
         )
         assert load(path).model["motion_cov"] == load(path).model["init_cov"]
-
-    @pytest.mark.parametrize("kind", ["Keywords", "Structs"])
-    def test_a_problem_beside_the_file(self, kind: str, write: Write) -> None:
-        configuration = load(
-            write(
-                f"problem: lamps:{kind}\nmodel: {{colour: 'no'}}\nstate_space_planner: {{gain: 2}}"
-            )
-        )
-        assert configuration.problem_name == f"lamps:{kind}"
-        assert (configuration.problem.colour, configuration.problem.gain) == ("no", 2)  # type: ignore[attr-defined]
 
 
 class TestProblemDirectory:
@@ -247,22 +219,6 @@ class TestProblemDirectory:
         again = load(self.elsewhere(path, configuration.to_yaml()))
         assert again == configuration
         assert again.to_yaml() == configuration.to_yaml()
-
-    def test_the_current_directory_is_looked_in_too(
-        self, write: Write, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        path = write("")
-        monkeypatch.chdir(path.parent)
-        configuration = load(self.elsewhere(path, "problem: lamps:Keywords"))
-        assert configuration.problem_directory == path.parent
-
-    def test_beside_the_file_comes_first(
-        self, write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        (tmp_path / "current").mkdir()
-        (tmp_path / "current" / "lamps.py").write_text("Keywords = 3")
-        monkeypatch.chdir(tmp_path / "current")
-        assert load(write("problem: lamps:Keywords")).problem_directory == tmp_path
 
     def test_it_may_be_relative_to_the_file(self, write: Write) -> None:
         path = write("")
@@ -289,10 +245,6 @@ class TestProblemDirectory:
 class TestResolution:
     """One for each coordinate, in a file."""
 
-    def test_as_many_as_an_action_has_coordinates(self, write: Write) -> None:
-        text = "problem: peg_in_hole_2d\nselector: {resolution: [0.1, 1, 5e-2]}"
-        assert load(write(text)).planning.selector.resolution == (0.1, 1.0, 0.05)
-
     @pytest.mark.parametrize("method", ["action_entropy", "state_entropy", "action_covariance"])
     def test_another_number_is_refused_with_its_line(self, method: str, write: Write) -> None:
         text = f"problem: peg_in_hole_2d\nselector:\n  method: {method}\n  resolution: [1, 2]"
@@ -307,26 +259,6 @@ class TestResolution:
         assert str(refused.value).startswith(
             f"selector.resolution, given instead of what {path} says, is [0.1], 1 numbers; need "
         )
-
-    def test_states_of_another_number_of_coordinates_need_their_own(
-        self, write: Write, tmp_path: Path
-    ) -> None:
-        (tmp_path / "without_state_resolution.py").write_text(
-            "import numpy as np\n"
-            "from studies.passer_by import PasserBy\n"
-            "class Without(PasserBy):\n"
-            "    resolution = np.array([0.1, 0.2])\n"
-            "    state_resolution = None\n"
-        )
-        text = "problem: without_state_resolution:Without\nselector: {method: "
-        load(write(f"{text}action_entropy}}"))
-        load(write(f"{text}state_entropy, resolution: [1, 1, 2]}}"))
-        message = complaint(write(f"{text}state_entropy}}"))
-        assert (
-            "line 2: selector.method is state_entropy, but the resolution of passer_by" in message
-        )
-        assert "has 2 numbers, for the coordinates of an action" in message
-        assert "give the problem a state_resolution, one number or 3, or write selector" in message
 
     @pytest.mark.parametrize("method", ["random", "fixed"])
     def test_where_nothing_is_measured_it_has_no_effect(self, method: str, write: Write) -> None:
@@ -654,25 +586,6 @@ class TestTwoKeys:
         assert "is 5;" in complaint(write(text % 4))  # The default breaks it as well.
         assert load(write(text % 6)).planning.particle_filter.num_particles == 6
 
-    def test_neighbours_of_the_prior_are_counted_among_few_particles(self, write: Write) -> None:
-        text = "problem: peg_in_hole_2d\nselector: {estimator: prior_neighbors}\n"
-        text += "particle_filter: {num_particles: %d}\n"
-        assert "is 5; the prior_neighbors estimator needs it below" in complaint(write(text % 5))
-        message = complaint(write(text % 4097))
-        assert "line 3: particle_filter.num_particles is 4097;" in message
-        assert "allows 4096" in message
-        assert load(write(text % 4096)).planning.selector.estimator == "prior_neighbors"
-
-    @pytest.mark.parametrize(
-        "selector",
-        ["{estimator: gaussian_mixture_upper}", "{method: random}", "{method: fixed}"],
-    )
-    def test_where_neighbours_are_not_counted_one_particle_is_enough(
-        self, selector: str, write: Write
-    ) -> None:
-        text = "problem: peg_in_hole_2d\nparticle_filter: {num_particles: 1}\nselector: "
-        assert load(write(text + selector)).planning.particle_filter.num_particles == 1
-
     def test_a_fixed_sensing_action_exists(self, write: Write) -> None:
         text = "problem: peg_in_hole_2d\nselector: {method: %s, sensing_action: %d}"
         message = complaint(write(text % ("fixed", 3)))
@@ -798,29 +711,6 @@ class TestOffload:
 
 
 class TestOverrides:
-    def test_they_rule_over_the_file(self, write: Write) -> None:
-        path = write(
-            "problem: peg_in_hole_2d\noffload: {services: [tcp/a:1], lease_ms: 100}\n"
-            "recovery: {launch: never}"
-        )
-        configuration = load(
-            path,
-            seed=3,
-            overrides={
-                "offload.services": ("tcp/b:1", "tcp/c:1"),
-                "recovery.launch": "at_start",
-                "offload.decision_deadline_ms": 10,
-                "offload.tls": None,
-            },
-        )
-        assert configuration.offload.services == ("tcp/b:1", "tcp/c:1")
-        assert configuration.offload.lease_ms == 100
-        assert configuration.offload.decision_deadline_ms == 10
-        assert configuration.offload.tls is None
-        assert configuration.recovery.launch == "at_start"
-        assert configuration.simulator.seed == 3
-        assert load(write(configuration.to_yaml())) == configuration
-
     @pytest.mark.parametrize(
         ("name", "value", "expected"),
         [
@@ -859,29 +749,12 @@ class TestEnvironment:
         assert load(path.parent / "run" / "config.yaml") == configuration
         assert Configuration.from_plain(configuration.plain()) == configuration
 
-    def test_the_current_directory_is_looked_in_too(
-        self, write: Write, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        path = write("")
-        (path.parent / "elsewhere").mkdir()
-        other = path.parent / "elsewhere" / "run.yaml"
-        other.write_text(self.TEXT + "{object: 'own_robot:Robot'}")
-        monkeypatch.chdir(path.parent)
-        assert load(other).environment.directory == str(path.parent)
-
     def test_one_that_is_installed_has_no_directory(self, write: Write) -> None:
         found = load(write(self.TEXT + "{object: 'holdfast.robot.environment:Mine'}"))
         assert found.environment.directory is None
 
     def test_an_entry_point_is_looked_up_later(self, write: Write) -> None:
         assert load(write(self.TEXT + "{object: turtle}")).environment.object == "turtle"
-
-    def test_the_argument_names_one(self, write: Write) -> None:
-        path = write(self.TEXT + "{arguments: {port: 3}}")
-        assert load(path).environment.directory is None
-        found = load(path, overrides={"environment.object": "own_robot:Robot"}).environment
-        assert (found.object, found.arguments) == ("own_robot:Robot", {"port": 3})
-        assert found.directory == str(path.parent)
 
     @pytest.mark.parametrize(
         ("text", "expected"),
@@ -922,10 +795,6 @@ class TestProblems:
         message = str(caught.value)
         assert "run.yaml, line 2: problem" in message
         assert "peg_in_hole_2d" in message
-
-    def test_unknown_as_an_argument(self, write: Write) -> None:
-        with pytest.raises(UnknownProblemError, match="capsule_robot"):
-            load(write(THESIS), problem="capsule")
 
     @pytest.mark.parametrize("name", ["lamps:Absent", "absent_module:Lamps", "lamps:"])
     def test_not_importable(self, name: str, write: Write) -> None:
@@ -989,47 +858,6 @@ class TestProblems:
         assert message.count("  File ") == 1
         assert f'  File "{path.parent / "lamps.py"}", line ' in message
 
-    def test_a_module_that_cannot_be_parsed_is_shown(self, write: Write) -> None:
-        path = write("problem: unparsable_lamps:Keywords")
-        (path.parent / "unparsable_lamps.py").write_text("import sys\n\ndef f(:\n")
-        with pytest.raises(ConfigurationError) as caught:
-            load(path)
-        message = str(caught.value)
-        assert "line 1: problem: unparsable_lamps:Keywords raised SyntaxError" in message
-        assert 'unparsable_lamps.py", line 3\n    def f(:' in message
-
     def test_what_a_problem_itself_refuses(self, write: Write) -> None:
         message = complaint(write("problem: capsule_robot\nmodel:\n  num_walls: 5"))
         assert "run.yaml, line 3: model.num_walls" in message
-
-
-def test_paths_are_those_of_the_directory_it_was_read_in(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A problem's module, which reading imports, may go elsewhere, as simulators do."""
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "keys").mkdir()
-    (tmp_path / "wanders.py").write_text(
-        "import os\n"
-        "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
-        "os.chdir('elsewhere')\n"
-        "class Wanders(PegInHole2D): pass\n"
-    )
-    (tmp_path / "wanders.yaml").write_text("problem: wanders:Wanders\n")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", sys.path.copy())
-    services = ["unix/robot.sock", "unix//run/s", "tcp/127.0.0.1:1"]
-    overrides = {"offload.services": services, "offload.tls": "keys"}
-    configuration = load("wanders.yaml", overrides=overrides)
-    assert Path.cwd() == tmp_path / "elsewhere"
-    assert configuration.path == tmp_path / "wanders.yaml"
-    assert configuration.problem_directory == tmp_path
-    assert configuration.offload.tls == str(tmp_path / "keys")
-    assert configuration.offload.services == (
-        f"unix/{tmp_path / 'robot.sock'}",
-        "unix//run/s",
-        "tcp/127.0.0.1:1",
-    )
-    again = Configuration.from_plain(configuration.plain())
-    assert again == configuration
-    sys.modules.pop("wanders")

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from holdfast.config.loader import Configuration, load
-from holdfast.numerics.randomness import NOISE_FREE
 from holdfast.planning.outcome import Ending
 from holdfast.planning.planner import Planner
 from holdfast.robot.environment_maker import load_environment
@@ -33,54 +32,10 @@ def configuration_of(peg: str, **arguments: Any) -> Configuration:
     return load(file, overrides={"environment.arguments": {**own, **arguments}})
 
 
-def problem_of(peg: str) -> Any:
-    return load(EXAMPLE / f"peg_{peg}.yaml").problem
-
-
 def pose(peg: str, x: float, tip: float) -> np.ndarray[Any, Any]:
     """Return a pose beside the middle of the hole, with the tip so high above its mouth."""
     height = tip + HALF_LENGTH
     return np.array([x, height, 0.0] if peg == "2d" else [x, 0.0, height])
-
-
-@pytest.mark.parametrize("peg", PEGS)
-class TestBelief:
-    def test_it_touches_what_is_within_reach(self, peg: str) -> None:
-        problem = problem_of(peg)
-        places = [(0.01, 0.0004), (0.01, 0.0006), (0.0, 0.0004), (0.0009, -0.01), (-0.0009, -0.01)]
-        touched = problem.touches(np.stack([pose(peg, *place) for place in places]))
-        below = touched[:, -1, 0]
-        assert below.tolist() == [True, False, False, False, False]
-        assert touched[:, 0].tolist() == [
-            *[[False, False]] * 3,
-            [False, True],
-            [True, False],
-        ]
-        assert not touched[:, -1, 1].any()
-
-    def test_a_force_from_below_speaks_for_the_ground(self, peg: str) -> None:
-        problem = problem_of(peg)
-        states = np.stack([pose(peg, 0.003, 0.0), pose(peg, 0.0, 0.0)])
-        up = np.zeros(len(problem.slides))
-        up[-1] = 10.0
-        felt = problem.move_log_likelihood(states, np.zeros(3), up)
-        free = problem.move_log_likelihood(states, np.zeros(3), np.zeros(len(problem.slides)))
-        # One of the directions is wrong in one of the two: log(0.95 / 0.05).
-        np.testing.assert_allclose([felt[0] - felt[1], free[1] - free[0]], np.log(19.0))
-
-    def test_measured_motion_ends_at_the_ground(self, peg: str) -> None:
-        problem = problem_of(peg)
-        down = pose(peg, 0.0, -0.005) - pose(peg, 0.0, 0.0)
-        states = np.stack([pose(peg, 0.003, 0.001), pose(peg, 0.0, 0.001)])
-        moved = problem.move_by_measurement(states, down, NOISE_FREE)
-        tips = moved[:, problem.slides[-1]] - HALF_LENGTH
-        assert 0.0 <= tips[0] < 1e-4
-        np.testing.assert_allclose(tips[1], -0.004)
-
-    def test_it_can_be_simulated_without_mujoco(self, peg: str) -> None:
-        configuration = load(EXAMPLE / f"peg_{peg}.yaml")
-        result = run_trial(Planner(configuration.problem, configuration.planning), max_steps=400)
-        assert result.success
 
 
 @needs_mujoco

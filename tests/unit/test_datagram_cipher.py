@@ -40,29 +40,12 @@ class TestSealing:
         robot, _ = ends
         assert b"a secret" not in robot.encrypt(b"a secret")
 
-    def test_each_passes_once(self, ends: tuple[DatagramCipher, DatagramCipher]) -> None:
-        robot, service = ends
-        datagram = robot.encrypt(b"once")
-        assert service.decrypt(datagram) == b"once"
-        assert service.decrypt(datagram) is None
-
     def test_in_any_order(self, ends: tuple[DatagramCipher, DatagramCipher]) -> None:
         robot, service = ends
         datagrams = [robot.encrypt(b"%d" % k) for k in range(5)]
         for k in (3, 0, 4, 2, 1):
             assert service.decrypt(datagrams[k]) == b"%d" % k
         assert [service.decrypt(datagram) for datagram in datagrams] == [None] * 5
-
-    def test_the_same_message_is_another_datagram_each_time(
-        self, ends: tuple[DatagramCipher, DatagramCipher]
-    ) -> None:
-        robot, service = ends
-        datagrams = {robot.encrypt(b"the same") for _ in range(100)}
-        assert len(datagrams) == 100
-        assert {datagram[:8] for datagram in datagrams} == {
-            (7).to_bytes(4, "big") + k.to_bytes(4, "big") for k in range(100)
-        }
-        assert all(service.decrypt(datagram) == b"the same" for datagram in datagrams)
 
     def test_it_cannot_be_reflected(self, ends: tuple[DatagramCipher, DatagramCipher]) -> None:
         robot, service = ends
@@ -143,18 +126,6 @@ class TestSealing:
         assert service.window.newest == -1
 
 
-WINDOW_BEGINS = 2 * KNOWN_AFTER
-
-
-def known() -> ReplayWindow:
-    """Return a window of a way that is known to lose none."""
-    window = ReplayWindow()
-    for counter in range(WINDOW_BEGINS):
-        window.note(counter)
-    assert window.num_lost == 0
-    return window
-
-
 class TestReplayWindow:
     @given(st.lists(st.integers(0, 3 * WINDOW), max_size=300))
     def test_as_a_set_of_all_that_came(self, counters: list[int]) -> None:
@@ -188,12 +159,6 @@ class TestReplayWindow:
         for counter in range(1000):
             window.note(counter)
             assert window.num_lost == (counter < KNOWN_AFTER + 2)
-
-    def test_what_is_late_is_not_lost(self) -> None:
-        window = known()
-        for counter in (0, 1, 2, 5, 4, 3, 8, 7, 6):
-            window.note(WINDOW_BEGINS + counter)
-            assert window.num_lost == 0
 
     def test_what_does_not_come_is_lost_until_it_is_long_ago(self) -> None:
         window = ReplayWindow()

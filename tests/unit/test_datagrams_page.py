@@ -8,13 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from holdfast.transport import (
-    datagram_cipher,
-    datagram_links,
-    exchanges,
-    redundancy,
-    return_path,
-)
+from holdfast.transport import datagram_cipher, datagram_links, exchanges, redundancy, return_path
 from holdfast.transport.datagram_cipher import AssociationKeys, DatagramCipher
 from holdfast.transport.exchanges import RobotExchange, ServiceExchange
 from holdfast.transport.redundancy import Paths

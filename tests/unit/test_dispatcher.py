@@ -5,13 +5,7 @@ from __future__ import annotations
 import itertools
 
 import pytest
-from tests.robot_world import (
-    LOCAL,
-    SmallService,
-    World,
-    answer_third_slowly,
-    nth,
-)
+from tests.robot_world import LOCAL, SmallService, World, answer_third_slowly, nth
 
 from holdfast.errors import ServiceRefusedError
 from holdfast.protocol.events import (
@@ -21,14 +15,7 @@ from holdfast.protocol.events import (
     ServiceAppeared,
     ServiceVanished,
 )
-from holdfast.protocol.messages import (
-    Busy,
-    Refused,
-    Reply,
-    Request,
-    TaskAnswer,
-    encode,
-)
+from holdfast.protocol.messages import Busy, Refused, Reply, Request, TaskAnswer, encode
 
 
 def fails_in_its_sensing_part(service: SmallService, code: str, calls: int = 10**9) -> None:

@@ -9,11 +9,7 @@ import pytest
 from scipy import stats
 
 from holdfast.config import registry
-from holdfast.errors import (
-    HoldfastError,
-    InvalidValueError,
-    ProblemError,
-)
+from holdfast.errors import HoldfastError, InvalidValueError, ProblemError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.randomness import Purpose, Stream, stream
 from holdfast.planning.outcome import MoveResult

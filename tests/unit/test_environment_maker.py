@@ -12,10 +12,7 @@ import numpy as np
 import pytest
 
 from holdfast.config.loader import load
-from holdfast.errors import (
-    ConfigurationError,
-    EnvironmentFailedError,
-)
+from holdfast.errors import ConfigurationError, EnvironmentFailedError
 from holdfast.robot.environment import Environment, SimulatedEnvironment
 from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
 

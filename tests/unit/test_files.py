@@ -32,16 +32,6 @@ def test_a_pipe_is_no_journal(
 
 
 class TestMadeBesideItsPlace:
-    def test_it_appears_whole(self, tmp_path: Path) -> None:
-        place = tmp_path / "place"
-        with directory_beside(place) as growing:
-            (growing / "made").mkdir()
-            (growing / "made" / "file").write_text("whole")
-            assert [path.name for path in tmp_path.iterdir()] == [growing.name]
-            move_into_place(growing / "made", place)
-        assert [path.name for path in tmp_path.iterdir()] == ["place"]
-        assert (place / "file").read_text() == "whole"
-
     @pytest.mark.parametrize("error", [KeyboardInterrupt(), ValueError("mine")])
     def test_or_not_at_all(self, error: BaseException, tmp_path: Path) -> None:
         with pytest.raises(type(error)), directory_beside(tmp_path / "place") as growing:

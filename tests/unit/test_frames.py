@@ -53,13 +53,6 @@ def test_a_large_message_comes_as_it_was_sent(behind: bytes) -> None:
     assert decoder.held_bytes == 0
 
 
-def test_frames_before_an_error_are_frames() -> None:
-    decoder = FrameDecoder(MAX_BYTES)
-    came = decoder.feed(GREETING + encode_frame(CALL, 3, b"x") + encode_frame(77) + b"more")
-    assert [frame.kind for frame in came] == [HELLO, CALL]
-    assert str(decoder.error) == "sends a frame of the unknown kind 77"
-
-
 @pytest.mark.parametrize(
     ("stream", "error"),
     [

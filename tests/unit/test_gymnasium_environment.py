@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
-import types
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
+from tests import mountain_car
 
 import holdfast as hf
 from holdfast.config.loader import load
@@ -360,79 +360,28 @@ class TestWhatIsRefused:
             car()
 
 
-CONFIGURATION = """
-problem: hill_car:Cart
-environment:
-  object: gymnasium
-  arguments:
-    env_id: MountainCarContinuous-v0
-    sensing: [[0], [1]]
-    sensing_noise: [0.05, 0.01]
-    success: hill_success:at_the_top
-"""
-
-PROBLEM = """
-import numpy as np
-import holdfast as hf
-
-class Cart(hf.ProblemBase):
-    name = "cart"
-    state_size, action_size = 2, 1
-    sensing_actions = ("position", "speed")
-    resolution = 0.1
-    motion_variance = np.zeros(1)
-
-    def initial_states(self, stream, count):
-        return np.array([-0.5, 0.0]) + np.array([0.05, 0.0]) * stream.normal((count, 2))
-
-    def move(self, states, actions, stream):
-        return states + np.array([0.001, 0.001]) * stream.normal(states.shape)
-
-    def observation_mean(self, states, sensing_action):
-        return states[..., sensing_action : sensing_action + 1]
-
-    def observation_variance(self, states, sensing_action):
-        return np.array([(0.05, 0.01)[sensing_action] ** 2])
-
-    def policy(self, states, stage):
-        return np.where(states[..., 1:] >= 0.0, 1.0, -1.0)
-
-    def is_goal(self, states):
-        return states[..., 0] > 0.45
-"""
-
-SUCCESS = """
-def at_the_top(environment, observation, info):
-    return observation[0] >= 0.45
-"""
-
-
 @pytest.fixture
-def modules(tmp_path: Path) -> Iterator[Path]:
-    (tmp_path / "hill_car.py").write_text(PROBLEM)
-    (tmp_path / "hill_success.py").write_text(SUCCESS)
-    path = tmp_path / "hill_car.yaml"
-    path.write_text(CONFIGURATION)
-    yield path
-    modules: dict[str, types.ModuleType] = sys.modules
-    for name in ("hill_car", "hill_success"):
-        modules.pop(name, None)
+def car_file(tmp_path: Path) -> Path:
+    shutil.copy(mountain_car.__file__, tmp_path)
+    path = tmp_path / "car.yaml"
+    path.write_text(mountain_car.CONFIGURATION)
+    return path
 
 
-def test_a_configuration_has_it_by_name(modules: Path) -> None:
+def test_a_configuration_has_it_by_name(car_file: Path) -> None:
     """Functions are found beside the file, and the run's seed and trial reach the episode."""
-    maker = load_environment(load(modules))
+    maker = load_environment(load(car_file))
     environment = maker(1, performed=[RIGHT])
     assert isinstance(environment, GymnasiumEnvironment)
     assert environment.steps_performed() == 1
     same = hf.GymnasiumEnvironment(
-        CAR, [[0], [1]], trial=1, sensing_noise=[0.05, 0.01], performed=[RIGHT]
+        CAR, [[0], [1]], seed=3, trial=1, sensing_noise=[0.05, 0.01], performed=[RIGHT]
     )
     assert environment.perform_sensing(0) == same.perform_sensing(0)
 
 
-def test_a_mistake_in_a_configuration_is_named(modules: Path) -> None:
-    modules.write_text(CONFIGURATION.replace("sensing_noise", "sensing_noises"))
+def test_a_mistake_in_a_configuration_is_named(car_file: Path) -> None:
+    car_file.write_text(mountain_car.CONFIGURATION.replace("sensing_noise", "sensing_noises"))
     says = "arguments.sensing_noises is no argument of .*; did you mean sensing_noise"
     with pytest.raises(ConfigurationError, match=says):
-        load_environment(load(modules))
+        load_environment(load(car_file))

@@ -372,11 +372,6 @@ class TestResampling:
             assert copies.sum() == 4
             assert (np.abs(copies - 4 * weights) < 1.0).all()
 
-    def test_indices_are_in_order(self) -> None:
-        weights = _kernel.normalize(_kernel.normals(WORDS, 500), False)[0]
-        indices = _kernel.systematic_resample(weights, 0.6)
-        assert (np.diff(indices) >= 0).all()
-
 
 class TestThreads:
     """As many threads as wanted: the same bits."""

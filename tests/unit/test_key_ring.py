@@ -23,11 +23,7 @@ from holdfast.errors import CredentialsError, OutputError
 from holdfast.runtime.files import NewFile, create_directory_atomically
 from holdfast.transport import key_ring
 from holdfast.transport.credentials import load_credentials
-from holdfast.transport.key_ring import (
-    list_credentials,
-    make_credentials,
-    revoke_credentials,
-)
+from holdfast.transport.key_ring import list_credentials, make_credentials, revoke_credentials
 
 NOW = datetime.now(UTC)
 DAY = timedelta(days=1)

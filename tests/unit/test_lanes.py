@@ -55,16 +55,6 @@ def ask_for_long_ones(bench: Bench, count: int, owner: str | None = None) -> lis
     return calls
 
 
-def test_the_settings_of_these_tests_are_what_they_are_called() -> None:
-    limits = ServiceLimits()
-    problem = Robot().problem
-    brief, medium, long = (
-        cost_of_sensing(problem, each).seconds
-        for each in (planning_of(), medium_planning(), long_planning())
-    )
-    assert brief < limits.max_brief_s < medium < limits.max_medium_s < long < limits.max_decision_s
-
-
 @pytest.mark.parametrize("workers", [1, 2, 4])
 @pytest.mark.parametrize("owner", [None, "hostile"])
 def test_long_decisions_of_one_owner_leave_all_workers_to_the_others(
@@ -256,15 +246,6 @@ class TestTheEstimateIsFarTooLow:
         bench.run_all()
         assert call in bench.ended
         assert content(bench.replies[newer]) == slow.right_answer()
-
-    def test_what_nobody_awaits_is_not_computed_again(self) -> None:
-        bench = Bench()
-        (slow,) = bench.known(1)
-        call = bench.send(slow.request())
-        bench.apply(bench.service.gone(call, bench.now))
-        overrun(bench)
-        assert not bench.jobs
-        assert bench.service.statistics.waiting == 0
 
     def test_each_lane_has_its_time(self) -> None:
         """So many times its limit; new ones have that of brief ones."""

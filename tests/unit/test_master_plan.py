@@ -12,9 +12,7 @@ from ros1_master_guard.plan import (
     state_of_snapshot,
     unregistrations,
 )
-from ros1_master_guard.process import (
-    MasterState,
-)
+from ros1_master_guard.process import MasterState
 
 
 def reports() -> dict[str, NodeAnswer]:

@@ -66,13 +66,6 @@ def test_yaw_alone_is_counter_clockwise() -> None:
     np.testing.assert_allclose(pose, [1, 2, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-16)
 
 
-def test_what_the_state_lacks_is_zero_and_what_is_no_pose_is_left_out() -> None:
-    layout = pose_layout(problem_with(("z", None, "x"), state_size=5))
-    assert layout is not None
-    pose = layout.poses([1.0, 2.0, 3.0, 4.0, 5.0])
-    assert pose.tolist() == [3.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
-
-
 def test_covariance_is_that_of_the_weighted_particles() -> None:
     layout = pose_layout(problem_with(("yaw", None, "x"), state_size=3))
     assert layout is not None
@@ -100,17 +93,6 @@ def test_the_covariance_of_a_heading_goes_round_the_circle() -> None:
         layout.covariance(Belief.uniform(turned)),
         atol=1e-12,
     )
-
-
-def test_a_vertical_plane_stands_upright() -> None:
-    layout = pose_layout(problem_class("peg_in_hole_2d")())
-    assert layout is not None
-    upright = Rotation.from_quat(layout.upright)
-    np.testing.assert_allclose(upright.apply([0.0, 1.0, 0.0]), [0.0, 0.0, 1.0], atol=1e-15)
-    np.testing.assert_allclose(upright.apply([1.0, 0.0, 0.0]), [1.0, 0.0, 0.0], atol=1e-15)
-    flat = pose_layout(problem_class("capsule_robot")())
-    assert flat is not None
-    assert flat.upright == (0.0, 0.0, 0.0, 1.0)
 
 
 @pytest.mark.parametrize(

@@ -10,12 +10,7 @@ from concurrent.futures import Future
 import pytest
 from tests.ports import free_port
 
-from holdfast.robot.probe import (
-    AddressPath,
-    account_of,
-    in_thread,
-    interface_of,
-)
+from holdfast.robot.probe import AddressPath, account_of, in_thread, interface_of
 from holdfast.transport.endpoints import Endpoint
 
 

@@ -10,9 +10,7 @@ import pytest
 
 from holdfast.errors import InvalidValueError
 from holdfast.problems.capsule_robot import CapsuleRobot
-from holdfast.problems.multitier_peg_in_hole_2d import (
-    MultitierPegInHole2D,
-)
+from holdfast.problems.multitier_peg_in_hole_2d import MultitierPegInHole2D
 from holdfast.problems.peg_in_hole_2d import PegInHole2D, PegInHole2DModel
 
 # The sections of the files of the earlier work, whose keys must all be accepted.

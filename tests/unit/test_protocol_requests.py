@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from tests.robot_world import (
-    World,
-    nth,
-)
+from tests.robot_world import World, nth
 
 from holdfast.errors import StaleEpochError
 from holdfast.protocol.messages import (

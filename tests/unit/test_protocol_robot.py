@@ -9,14 +9,7 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 import pytest
-from tests.robot_world import (
-    LOCAL,
-    PLANNING,
-    PROBLEM,
-    FailingWorld,
-    Misleading,
-    World,
-)
+from tests.robot_world import LOCAL, PLANNING, PROBLEM, FailingWorld, Misleading, World
 
 from holdfast.errors import HeldError, UnknownPerformanceError
 from holdfast.planning.outcome import ending_of
@@ -34,11 +27,7 @@ from holdfast.protocol.events import (
     Sensed,
     WriteRecords,
 )
-from holdfast.protocol.messages import (
-    Refused,
-    Reply,
-    SensingAnswer,
-)
+from holdfast.protocol.messages import Reply, SensingAnswer
 from holdfast.protocol.question import InProcessSource
 from holdfast.protocol.records import (
     ActingRecord,
@@ -121,38 +110,6 @@ def test_what_earlier_processes_did_counts_in_the_result() -> None:
             Planner(PROBLEM, PLANNING), third.simulator.seed, 0, max_steps=third.simulator.max_steps
         ).digest
     )
-
-
-def test_a_recovery_alone_begins_no_trial_and_counts_in_the_next_one() -> None:
-    world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
-    written: list[Record] = []
-    world.launchable = False
-    world.start(present=False)
-    world.run(until_s=3.0)
-    assert world.statuses() == ["local_recovery"]
-    written = world.journal.copy()
-    assert written == []
-    world.bring_up("cloud")
-    world.run()
-    assert world.results[0].recoveries == 1
-
-
-def test_a_pause_is_the_last_that_is_written_down() -> None:
-    """Although another service took over since the record before."""
-    world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
-
-    def fault(step: int) -> None:
-        if step == 6:
-            world.kill("cloud", 0.001)
-            world.after(0.002, lambda: world.robot.pause(world.now))
-
-    world.on_act = fault
-    world.start()
-    world.run()
-    assert world.statuses() == ["local_recovery"]
-    history = replay(Planner(PROBLEM, PLANNING), 11, 0, world.journal)
-    assert history.paused
-    assert history.recoveries == 1
 
 
 def begin_after(
@@ -364,18 +321,6 @@ class TestFailedTask:
         )
         assert (result.digest, result.outcome) == (expected.digest, expected.outcome)
 
-    def test_ends_the_trial(self) -> None:
-        world = self.world()
-        world.start()
-        world.run()
-        self.assert_failed(world)
-
-    def test_out_of_steps_is_no_failure(self) -> None:
-        world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
-        world.start()
-        world.run()
-        assert world.results[0].outcome == "truncated"
-
     def test_is_still_so_for_a_robot_that_was_killed_right_after(self) -> None:
         killed = self.world()
         killed.on_act = lambda step: setattr(killed, "ended", step == FailingWorld.fails_at - 1)
@@ -444,11 +389,6 @@ class TestUnexplainedObservations:
             assert isinstance(fields["deviations"], float)
             assert fields["deviations"] > 8.0
 
-    def test_none_is_told_where_all_are_explained(self) -> None:
-        world = self.world(set(), 6)
-        assert world.results[0].unexplained_observations == 0
-        assert not world.reports("unexplained")
-
     def test_the_lines_are_bounded(self) -> None:
         world = self.world(set(range(1, 40)), 40)
         assert len(world.reports("unexplained")) == 10
@@ -495,6 +435,22 @@ def test_rate_paces_the_steps_and_counts_missed_ticks() -> None:
 # -- found in review -------------------------------------------------------------------------------
 
 
+def test_an_answer_for_another_step_than_was_asked_of_the_environment_stops_the_robot() -> None:
+    world = World()
+    later = world.later
+
+    def spoil(event: Sensed | Acted) -> Callable[[], list[RobotEffect]]:
+        if isinstance(event, Acted) and event.step == 6:
+            event = event._replace(step=5)
+        return later(event)
+
+    world.later = spoil  # type: ignore[method-assign]
+    world.start()
+    world.run()
+    assert world.stopped is not None
+    assert "step 5 where step 6" in str(world.stopped.error)
+
+
 def test_a_performance_is_written_down_before_the_robot_waits_for_anything() -> None:
     world = World(rate_hz=10.0)
     waits = 0
@@ -514,17 +470,6 @@ def test_a_performance_is_written_down_before_the_robot_waits_for_anything() -> 
     assert waits >= 75
 
 
-def test_a_performance_is_written_down_before_the_robot_stops() -> None:
-    world = World(launch="never")
-    cloud = world.services["cloud"]
-    cloud.rule = lambda r: [Refused(r.number, "version", "no")] if r.step >= 8 else None
-    world.start()
-    world.run()
-    assert world.stopped is not None
-    history = replay(Planner(PROBLEM, PLANNING), 11, 0, world.journal)
-    assert history.pending is None
-
-
 def test_an_observation_of_the_wrong_size_stops_the_robot_resumably() -> None:
     world = World(launch="never")
     later = world.later
@@ -541,19 +486,3 @@ def test_an_observation_of_the_wrong_size_stops_the_robot_resumably() -> None:
     history = replay(Planner(PROBLEM, PLANNING), 11, 0, world.journal)
     assert history.pending is None
     assert history.state.step == 4
-
-
-def test_an_answer_for_another_step_than_was_asked_of_the_environment_stops_the_robot() -> None:
-    world = World()
-    later = world.later
-
-    def spoil(event: Sensed | Acted) -> Callable[[], list[RobotEffect]]:
-        if isinstance(event, Acted) and event.step == 6:
-            event = event._replace(step=5)
-        return later(event)
-
-    world.later = spoil  # type: ignore[method-assign]
-    world.start()
-    world.run()
-    assert world.stopped is not None
-    assert "step 5 where step 6" in str(world.stopped.error)

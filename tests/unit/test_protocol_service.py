@@ -60,16 +60,9 @@ from holdfast.protocol.messages import (
     decode_reply,
     encode,
     encode_floats,
-    unpack_configuration,
 )
 from holdfast.protocol.service import Service
-from holdfast.protocol.service_jobs import (
-    EndCall,
-    Job,
-    SendReply,
-    ServiceEffect,
-    StartJob,
-)
+from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect, StartJob
 from holdfast.protocol.service_limits import ServiceLimits
 from holdfast.robot.environment import SimulatedEnvironment
 
@@ -278,21 +271,6 @@ def refused(replies: list[Reply]) -> Refused:
 
 
 class TestAnswers:
-    @pytest.mark.parametrize("name", PROBLEMS)
-    def test_trial_is_that_of_the_planner(self, name: str) -> None:
-        bench, robot = Bench(), Robot(name)
-        known = 0
-        for turn in range(6):
-            request = robot.request(session_configuration=turn == 0, since=known)
-            assert content(bench.ask(request)) == robot.right_answer()
-            known = len(robot.observed)
-            robot.act_until_sensing()
-            robot.sense()
-        statistics = bench.service.statistics
-        # The first request asks for a sensing action alone, each other one for both parts.
-        assert (statistics.task_parts, statistics.sensing_parts) == (5, 6)
-        assert statistics.state_requests == 0
-
     def test_time_of_an_answer_is_that_of_its_job(self) -> None:
         bench, robot = Bench(), Robot()
         call = bench.send(robot.request())
@@ -302,36 +280,8 @@ class TestAnswers:
         assert isinstance(reply, SensingAnswer)
         assert reply.computed_us == 250_000
 
-    @pytest.mark.parametrize("interval", [0, 1, 63, 64, 65, 150])
-    def test_any_interval_between_sensing_steps(self, interval: int) -> None:
-        bench, robot = Bench(), Robot(planning=planning_of(interval))
-        bench.ask(robot.request())
-        robot.sense()
-        for _ in range(3):
-            right = robot.right_answer()
-            assert content(bench.ask(robot.request(since=len(robot.observed) - 1))) == right
-            for _ in range(right[0][1]):
-                robot.act()
-            if needs_sensing(robot.planning, robot.state):
-                robot.sense()
-
 
 class TestRollingForward:
-    def test_from_a_checkpoint(self) -> None:
-        bench, robot = Bench(), Robot()
-        for _ in range(3):
-            robot.sense()
-            robot.act_until_sensing()
-        robot.sense()
-        assert content(bench.ask(robot.restore())) == robot.right_answer()
-        assert bench.service.statistics.restores == 1
-        robot.act_until_sensing()
-        robot.sense()
-        assert (
-            content(bench.ask(robot.request(session_configuration=False, since=4)))
-            == robot.right_answer()
-        )
-
     def test_missing_observation(self) -> None:
         bench, robot = Bench(), Robot()
         for _ in range(3):
@@ -342,16 +292,6 @@ class TestRollingForward:
         assert (
             content(bench.ask(robot.restore(session_configuration=False))) == robot.right_answer()
         )
-
-    def test_missing_observation_in_a_known_trial(self) -> None:
-        bench, robot = Bench(), Robot()
-        robot.sense()
-        bench.ask(robot.request())
-        for _ in range(2):
-            robot.act_until_sensing()
-            robot.sense()
-        request = robot.request(session_configuration=False, since=2)
-        assert bench.ask(request) == [NeedState(request.number, differs=True)]
 
     def test_robot_that_is_behind(self) -> None:
         bench, robot = Bench(), Robot()
@@ -487,19 +427,6 @@ class TestOrder:
 
 
 class TestEpochs:
-    def test_higher_epoch_takes_over_with_the_state(self) -> None:
-        bench, robot = Bench(), Robot()
-        robot.sense()
-        robot.number = 1000
-        call = bench.send(robot.request())
-        robot.epoch, robot.number = 2, 0
-        robot.act()
-        newer = bench.send(robot.request(session_configuration=False, since=1))
-        assert call in bench.ended
-        bench.run_all()
-        assert content(bench.replies[newer]) == robot.right_answer()
-        assert [note.name for note in bench.notes] == ["session_opened", "session_taken_over"]
-
     def test_other_settings_under_the_same_epoch(self) -> None:
         bench, robot = Bench(), Robot()
         bench.ask(robot.request())
@@ -721,14 +648,6 @@ class TestCapacity:
         bench.run_all()
         assert bench.ended == set(calls)
 
-    def test_bytes_of_the_line(self) -> None:
-        bench = Bench(max_waiting_bytes=6000)  # and so is half of this
-        robots = [Robot(key=key) for key in range(1, 8)]
-        size = len(encode(robots[0].restore()))
-        calls = [bench.send(robot.restore()) for robot in robots]
-        accepted = [call for call in calls if not bench.replies[call]]
-        assert len(accepted) == 1 + -(-3000 // size)
-
     def test_by_the_time_that_jobs_take(self) -> None:
         bench = Bench(max_wait_ms=100.0)
         slow = Robot(key=1)
@@ -795,23 +714,6 @@ class TestCapacity:
         bench.run_all()
         assert content(bench.replies[call]) == other.right_answer()
 
-    def test_prefetches_do_not_starve_behind_newcomers(self) -> None:
-        bench = Bench(max_wait_ms=100.0, prefetch_patience_ms=20.0)
-        known = Robot(key=1)
-        bench.ask(known.request())
-        known.sense()
-        call = bench.send(known.request())
-        for key in range(2, 60):
-            bench.send(Robot(key=key).request())
-        bench.run()  # the task part; the sensing part is ahead of its robot
-        assert len(bench.replies[call]) == 1
-        jobs = 0
-        while call not in bench.ended:
-            bench.now += 0.005
-            bench.run()
-            jobs += 1
-        assert jobs <= 20 / 5 + 3
-
     def test_one_job_that_was_held_up_turns_nobody_away(self) -> None:
         bench = Bench(max_wait_ms=100.0)
         first = Robot(key=1)
@@ -834,27 +736,6 @@ class TestCapacity:
         third = bench.send(Robot(key=3).request())
         assert isinstance(only(bench.replies[third]), Busy)
 
-    def test_what_is_known_is_answered_even_then(self) -> None:
-        bench, robot = Bench(max_waiting=1), Robot()
-        robot.sense()
-        right = robot.right_answer()
-        bench.ask(robot.request())
-        for key in range(2, 5):
-            bench.send(Robot(key=key).request())
-        call = bench.send(robot.request())
-        assert content(bench.replies[call]) == right
-        assert call in bench.ended
-
-    def test_waiting_request_is_replaced_even_then(self) -> None:
-        bench, robot = Bench(max_waiting=1), Robot()
-        bench.send(Robot(key=2).request())
-        robot.sense()
-        bench.send(robot.request())
-        robot.act()
-        call = bench.send(robot.request())
-        bench.run_all()
-        assert content(bench.replies[call]) == robot.right_answer()
-
     def test_oldest_session_is_forgotten(self) -> None:
         bench = Bench(max_sessions=2)
         robots = [Robot(key=key) for key in (1, 2, 3)]
@@ -866,15 +747,6 @@ class TestCapacity:
             content(bench.ask(robots[0].request(session_configuration=False)))
             == robots[0].right_answer()
         )
-
-    def test_session_in_use_is_not_forgotten(self) -> None:
-        bench = Bench(max_sessions=1)
-        robot = Robot()
-        call = bench.send(robot.request())
-        other = bench.send(Robot(key=2).request())
-        assert isinstance(only(bench.replies[other]), Busy)
-        bench.run_all()
-        assert content(bench.replies[call]) == robot.right_answer()
 
     def test_no_room_is_not_asked_for_again_at_once(self) -> None:
         bench = Bench(max_sessions=2, max_waiting=1000, max_wait_ms=1e6)
@@ -920,46 +792,6 @@ class TestCapacity:
             == robots[-1].right_answer()
         )
 
-    def test_state_that_is_too_large_to_keep(self) -> None:
-        bench, robot = Bench(max_state_bytes=100), Robot()
-        robot.sense()
-        assert content(bench.ask(robot.request())) == robot.right_answer()
-        assert bench.service.statistics.state_bytes == 0
-        robot.act_until_sensing()
-        robot.sense()
-        assert isinstance(only(bench.ask(robot.request(since=1))), NeedState)
-        assert content(bench.ask(robot.restore())) == robot.right_answer()
-
-    def test_bytes_of_openings(self) -> None:
-        """A plate with a thousand holes is 24 KB as it is sent, and half a megabyte unpacked."""
-        holes = [{"center": [4.0, 6.0 - 0.01 * number], "depth": 0.01} for number in range(900)]
-        session_configuration = SessionConfiguration(
-            "multitier_peg_in_hole_2d", {"holes": holes}, {}, planning_of(), 5
-        )
-        bench = Bench(max_configuration_bytes=250_000)
-        for key in range(1, 31):
-            bench.ask(Robot(key=key).request())
-        assert bench.service.statistics.sessions == 30
-        for key in range(31, 61):
-            request = msgspec.structs.replace(
-                Robot(key=key).request(), session_configuration=session_configuration
-            )
-            bench.ask(request)
-            held = [session.configuration for session in bench.service._sessions._sessions.values()]
-            assert sum(map(len, held)) <= 250_000
-            assert unpack_configuration(held[-1]) == session_configuration
-        assert 4 <= bench.service.statistics.sessions <= 8
-        # Each by itself is served, however large it is beside the limit.
-        small = Bench(max_configuration_bytes=100)
-        robot = Robot()
-        assert content(small.ask(robot.request())) == robot.right_answer()
-        other = small.send(Robot(key=2).request())
-        assert small.replies[other] == []
-        third = small.send(Robot(key=3).request())
-        assert isinstance(only(small.replies[third]), Busy)
-        small.run_all()
-        assert small.service.statistics.sessions == 1
-
     def test_requests_that_wait_hold_no_opening(self) -> None:
         bench = Bench()
         first = Robot(key=2)
@@ -973,18 +805,6 @@ class TestCapacity:
             work.request and work.request.session_configuration for work in waiting.pending.values()
         ] == [None]
         bench.run_all()
-
-    def test_idle_session_is_forgotten(self) -> None:
-        bench, robot = Bench(max_idle_s=10.0), Robot()
-        bench.ask(robot.request())
-        due = bench.service.next_wakeup()
-        assert due == bench.now + 10.0
-        bench.apply(bench.service.tick(due - 0.001))
-        assert bench.service.statistics.sessions == 1
-        bench.apply(bench.service.tick(due))
-        statistics = bench.service.statistics
-        assert (statistics.sessions, statistics.state_bytes) == (0, 0)
-        assert bench.service.next_wakeup() is None
 
     def test_equal_problems_are_shared(self) -> None:
         built = []

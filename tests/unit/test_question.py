@@ -13,12 +13,7 @@ from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.messages import MAX_TASK_ACTIONS, SensingAnswer, TaskAnswer, encode_floats
-from holdfast.protocol.question import (
-    DecisionSource,
-    InProcessSource,
-    Question,
-    same_actions,
-)
+from holdfast.protocol.question import DecisionSource, InProcessSource, Question, same_actions
 
 
 def question(step: int = 0, *, sensed: bool = False, interval: int = 2) -> Question:

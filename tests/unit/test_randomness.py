@@ -23,7 +23,6 @@ from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.numerics.geometry import DiscWorld
 from holdfast.numerics.randomness import NOISE_FREE, NoiseFreeStream, Purpose, Stream, stream
 
-SAMPLE = 200_000
 MASKED = np.ma.array([1, 2], mask=[True, False])
 named = partial(stream, 12, 3, 4, Purpose.PREDICTION)  # anew at each call
 
@@ -119,12 +118,6 @@ class TestDraws:
         assert draw(()).item() == draw() == many[0]
         assert draw((0, 3)).shape == (0, 3)
 
-    def test_the_array_belongs_to_the_caller(self) -> None:
-        first = named().normal(10)
-        kept = first.tobytes()
-        first[:] = 0.0
-        assert named().normal(10).tobytes() == kept
-
     def test_golden_numbers(self) -> None:
         """The first numbers of one stream, as every machine must give them."""
         of_all = partial(stream, 1, 2, 3, Purpose.INITIAL_BELIEF)
@@ -134,57 +127,6 @@ class TestDraws:
         first, *later = (going_on.uniform(2) for _ in range(3))
         assert [value.hex() for value in first.tolist()] == GOLDEN_UNIFORM[:2]
         assert [value.hex() for value in np.ravel(later).tolist()] == GOLDEN_LATER
-
-
-class TestDistribution:
-    def test_uniform(self) -> None:
-        """Kolmogorov and Smirnov's test at 1e-6, and chi-square of the high and the low bits."""
-        values = named().uniform(SAMPLE)
-        assert (values >= 0.0).all()
-        assert (values < 1.0).all()
-        assert stats.kstest(values, "uniform").pvalue > 1e-6
-        mantissas = (values * 2.0**53).astype(np.int64)
-        for bits in (mantissas >> 45, mantissas & 0xFF):
-            assert stats.chisquare(np.bincount(bits, minlength=256)).pvalue > 1e-6
-
-    def test_normal(self) -> None:
-        """Kolmogorov and Smirnov's test, and four moments, each at 1e-6 (4.9 sigma)."""
-        values = named().normal(SAMPLE)
-        assert stats.kstest(values, "norm").pvalue > 1e-6
-        # Standard errors of the sample moments of a standard normal: var(x^n) / N.
-        for power, mean, variance in ((1, 0.0, 1.0), (2, 1.0, 2.0), (3, 0.0, 15.0), (4, 3.0, 96.0)):
-            error = float((values**power).mean()) - mean
-            assert abs(error) < 4.9 * np.sqrt(variance / SAMPLE)
-        # The tails are there: 2 * SAMPLE * (1 - Phi(4)) = 12.7 values are expected beyond 4.
-        assert 1 <= int((np.abs(values) > 4.0).sum()) <= 40
-
-    def test_neighbours_are_independent(self) -> None:
-        """Correlations at lags 1 to 8, of values and of squares, each at 1e-6 (4.9 sigma)."""
-        values = named().normal(SAMPLE)
-        for sample in (values, (values**2 - 1.0) / np.sqrt(2.0)):
-            for lag in range(1, 9):
-                correlation = float((sample[lag:] * sample[:-lag]).mean())
-                assert abs(correlation) < 4.9 / np.sqrt(SAMPLE - lag)
-
-    @pytest.mark.parametrize("what", ["trials", "steps", "purposes", "substreams"])
-    def test_streams_of_like_names_are_independent(self, what: str) -> None:
-        """First numbers of many streams are again a standard normal sample; each test at 1e-6."""
-        if what == "trials":
-            streams = [stream(1, n, 0, Purpose.PREDICTION) for n in range(5000)]
-        elif what == "steps":
-            streams = [stream(1, 0, n, Purpose.PREDICTION) for n in range(5000)]
-        elif what == "purposes":
-            streams = [stream(seed, 0, 0, p) for seed in range(625) for p in Purpose]
-        else:
-            streams = [named().substream(n) for n in range(5000)]
-        values = np.array([named.normal(4) for named in streams])
-        for column in values.T:
-            assert stats.kstest(column, "norm").pvalue > 1e-6
-        # Rows in order: neighbours by name are not neighbours by number.
-        correlation = float((values[1:, 0] * values[:-1, 0]).mean())
-        assert abs(correlation) < 4.9 / np.sqrt(len(values))
-        across = np.corrcoef(values.T)[np.triu_indices(4, 1)]
-        assert np.abs(across).max() < 4.9 / np.sqrt(len(values))
 
 
 class TestGoingOn:
@@ -208,36 +150,6 @@ class TestGoingOn:
         assert [draw.tobytes() for draw in draws] == [
             np.ravel(self.DRAWS[kind](other)).tobytes() for _ in range(20)
         ]
-
-    def test_two_draws_share_no_bits(self) -> None:
-        """Whatever is drawn: no uniform number, of which a normal one is made, occurs twice."""
-        own = named()
-        first, second, third = own.uniform(40), own.normal(40), own.uniform(40)
-        assert not set(first) & set(third)
-        for uniforms in (first, third):
-            radius, angle = (
-                np.sqrt(-2.0 * np.log(1.0 - uniforms[::2])),
-                2.0 * np.pi * uniforms[1::2],
-            )
-            made = np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])
-            assert np.abs(made[:, np.newaxis] - second).min() > 1e-9
-
-    def test_later_draws_run_into_no_other_stream(self) -> None:
-        streams = [
-            stream(seed, trial, step, purpose)
-            for seed, trial, step in itertools.product((0, 1), (0, 1), (0, 1))
-            for purpose in Purpose
-        ]
-        streams += [own.substream(index) for own in streams for index in (0, 1, 2)]
-        values = np.concatenate([own.uniform(10) for own in streams for _ in range(4)])
-        assert len(np.unique(values)) == len(values)
-        assert all(purpose < 2**29 for purpose in Purpose)
-
-    def test_a_substream_is_named_and_not_drawn(self) -> None:
-        own = named()
-        before = own.substream(3).normal(4)
-        own.normal(4)
-        assert own.substream(3).normal(4).tobytes() == before.tobytes()
 
     def test_anew_begins_again(self) -> None:
         own = named()

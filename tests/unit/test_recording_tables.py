@@ -13,11 +13,7 @@ from tests.recordings import failed, result_of
 
 from holdfast.cli.terminal import _summary_rows
 from holdfast.planning.outcome import TRIAL_COLUMNS
-from holdfast.recording.tables import (
-    SummaryBuilder,
-    csv_lines,
-    wilson_interval,
-)
+from holdfast.recording.tables import SummaryBuilder, csv_lines, wilson_interval
 from holdfast.recording.timings import AnswerCounts
 
 

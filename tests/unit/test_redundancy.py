@@ -6,12 +6,7 @@ import math
 
 import pytest
 
-from holdfast.transport.redundancy import (
-    COPY_DELAY_S,
-    Paths,
-    RedundantSender,
-    RoundTripEstimator,
-)
+from holdfast.transport.redundancy import COPY_DELAY_S, Paths, RedundantSender, RoundTripEstimator
 
 
 class Sent:

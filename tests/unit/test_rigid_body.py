@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from holdfast.problems.multitier_peg_in_hole_2d import (
-    MultitierPegInHole2D,
-)
+from holdfast.problems.multitier_peg_in_hole_2d import MultitierPegInHole2D
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.peg_in_hole_3d import PegInHole3D
 

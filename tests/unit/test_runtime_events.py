@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import io
-
 from holdfast.protocol.status import Status
-from holdfast.runtime.events import BoundedEventLog, EventSink, severity
-from holdfast.runtime.logs import EventLog
+from holdfast.runtime.events import BoundedEventLog, severity
 
 
 class RecordingSink:
@@ -77,20 +74,3 @@ class TestRepeatedEvents:
         assert reported.events == [
             ("refused", {"service": "east", "number": number}) for number in range(100)
         ]
-
-
-class TestOthers:
-    def test_all_take_events_and_close(self) -> None:
-        stream = io.StringIO()
-        sinks: list[EventSink] = [
-            BoundedEventLog(),
-            EventLog(stream, component="robot"),
-            BoundedEventLog(BoundedEventLog(), EventLog(stream, component="robot")),
-        ]
-        for sink in sinks:
-            sink.event("trial", trial=1)
-            sink.close()
-            sink.event("trial", trial=2)
-            sink.close()
-        assert stream.getvalue().count("trial 1") == 2
-        assert "trial 2" not in stream.getvalue()

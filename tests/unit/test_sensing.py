@@ -79,57 +79,6 @@ def choose(
 
 
 class TestWhatIsChosen:
-    @pytest.mark.parametrize("method", ["action_entropy", "state_entropy"])
-    def test_the_coordinate_that_is_less_known(self, method: str) -> None:
-        settings = settings_of(SelectorSettings(method=method))  # type: ignore[arg-type]
-        assert choose(Coordinates(), settings, belief_of(0.2, 2.0))[0] == 1
-        assert choose(Coordinates(), settings, belief_of(2.0, 0.2))[0] == 0
-
-    def test_actions_count_and_states_do_not(self) -> None:
-        """Where the policy does not use a coordinate, only state entropy wants to know it."""
-
-        class Blind(Coordinates):
-            def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
-                return np.asarray(-states * np.array([1.0, 0.0]))
-
-        belief = belief_of(1.0, 5.0)
-        assert choose(Blind(), settings_of(), belief)[0] == 0
-        by_state = settings_of(SelectorSettings(method="state_entropy"))
-        assert choose(Blind(), by_state, belief)[0] == 1
-
-    def test_executed_actions(self) -> None:
-        """Where limits leave the same of all actions, commanded ones still differ."""
-
-        class Limited(Coordinates):
-            def execute(self, actions: FloatArray) -> FloatArray:
-                return np.clip(actions, -0.1, 0.1)
-
-        noise = belief_of(0.5, 0.05)
-        belief = Belief.uniform(noise.states + np.array([50.0, 0.0]))
-        assert choose(Limited(), settings_of(), belief)[0] == 0
-        executed = settings_of(
-            SelectorSettings(
-                method="action_entropy",
-                estimator="nearest_neighbor",
-                actions="executed",
-                resolution=0.01,
-            )
-        )
-        assert choose(Limited(), executed, belief)[0] == 1
-
-    def test_stage(self) -> None:
-        """The policy of the stage that the robot is in is the one that counts."""
-
-        class Staged(Coordinates):
-            num_stages = 2
-
-            def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
-                matters = [1.0, 0.0] if stage == 0 else [0.0, 1.0]
-                return np.asarray(-states * np.array(matters))
-
-        assert choose(Staged(), settings_of(), belief_of(1.0, 1.0), 0)[0] == 0
-        assert choose(Staged(), settings_of(), belief_of(1.0, 1.0), 1)[0] == 1
-
     @pytest.mark.parametrize(
         ("rows", "expected"), [([0, 0, 0], 0), ([1, 0, 0, 1], 1), ([1, 1, 0, 0], 2), ([0, 1, 0], 0)]
     )
@@ -141,23 +90,6 @@ class TestWhatIsChosen:
             assert info.entropies[j] == info.entropies[rows.index(row)]
         assert index == expected
 
-    def test_observations_that_say_nothing(self) -> None:
-        """Then the entropy is that of the belief itself, whatever is sensed."""
-        problem = Coordinates(variance=1e12)
-        _, info = choose(problem, settings_of(), belief_of(1.0, 1.0))
-        assert info.samples is not None
-        np.testing.assert_allclose(info.samples, info.samples[0, 0], rtol=0.0, atol=1e-4)
-
-    def test_entropies_are_means_of_the_samples(self) -> None:
-        _, info = choose(Coordinates(), settings_of(num_observation_samples=7), belief_of(1.0, 2.0))
-        assert info.samples is not None
-        assert info.entropies is not None
-        assert info.samples.shape == (2, 7)
-        assert info.entropies.shape == (2,)
-        np.testing.assert_allclose(info.samples.mean(axis=1), info.entropies, rtol=1e-14)
-        assert info.likelihoods == 2 * 7 * 60
-        assert info.visits > 0
-
 
 class TestBlindChoices:
     def test_fixed(self) -> None:
@@ -167,14 +99,6 @@ class TestBlindChoices:
             chosen, info = choose(problem, settings_of(selector), belief_of(1.0, 1.0))
             assert chosen == index
             assert info == SensingInfo(None, None, 0, 0)
-
-    @pytest.mark.parametrize("index", [2, 7])
-    def test_fixed_out_of_range(self, index: int) -> None:
-        selector = SelectorSettings(method="fixed", sensing_action=index)
-        with pytest.raises(
-            InvalidValueError, match=rf"selector\.sensing_action {index}: .* actions 0 to 1"
-        ):
-            choose(Coordinates(), settings_of(selector), belief_of(1.0, 1.0))
 
     @pytest.mark.parametrize("count", [1, 2, 3, 7])
     def test_random_is_uniform(self, count: int) -> None:
@@ -209,11 +133,6 @@ class TestBlindChoices:
         first = choose(problem, settings, belief_of(1.0, 1.0))
         assert choose(problem, settings, belief_of(3.0, 0.1, count=10)) == first
         assert first[1] == SensingInfo(None, None, 0, 0)
-
-    @pytest.mark.parametrize("method", ["random", "fixed"])
-    def test_one_particle_will_do(self, method: str) -> None:
-        selector = SelectorSettings(method=method)  # type: ignore[arg-type]
-        choose(Coordinates(), settings_of(selector), Belief.uniform([[1.0, 2.0]]))
 
 
 def unequal(belief: Belief) -> Belief:
@@ -466,14 +385,6 @@ class TestBadInput:
         same = msgspec.structs.replace(selector, resolution=Flat.resolution)
         self.assert_same_entropies(Flat(), selector, same)
 
-    def test_mixture_of_a_problem_without_motion_noise(self) -> None:
-        class Exact(Coordinates):
-            motion_variance = np.array([0.0, 0.0])
-
-        selector = SelectorSettings(method="action_entropy", estimator="gaussian_mixture_lower")
-        same = msgspec.structs.replace(selector, resolution=Exact.resolution)
-        self.assert_same_entropies(Exact(), selector, same)
-
     def test_a_resolution_of_states_blurs_the_states_of_a_mixture(self) -> None:
         class OfStates(Coordinates):
             state_resolution = np.array([0.1, 0.5])
@@ -495,18 +406,6 @@ class TestBadInput:
         selector = SelectorSettings(method="action_entropy", estimator="gaussian_mixture_lower")
         same = msgspec.structs.replace(selector, resolution=(0.5, 0.25))
         self.assert_same_entropies(problem, selector, same)
-
-    @pytest.mark.parametrize("method", ["action_entropy", "state_entropy", "action_covariance"])
-    def test_another_number_of_resolutions_is_named(self, method: str) -> None:
-        selector = SelectorSettings(method=method, resolution=(0.1, 0.1, 0.1))  # type: ignore[arg-type]
-        with pytest.raises(InvalidValueError, match=r"selector.resolution is .*, 3 numbers; need"):
-            choose(Coordinates(), settings_of(selector), belief_of(1.0, 1.0))
-
-    @pytest.mark.parametrize("method", ["action_entropy", "state_entropy", "action_covariance"])
-    def test_a_resolution_out_of_bounds_is_named(self, method: str) -> None:
-        selector = SelectorSettings(method=method, resolution=(0.1, 1e-200))  # type: ignore[arg-type]
-        with pytest.raises(InvalidValueError, match=r"resolution \[1.e-001 1.e-200\]: allowed are"):
-            choose(Coordinates(), settings_of(selector), belief_of(1.0, 1.0))
 
     @staticmethod
     def assert_same_entropies(

@@ -5,12 +5,7 @@ from __future__ import annotations
 import pytest
 
 from holdfast.errors import TransportError
-from holdfast_ros.tcpros import (
-    RosEnvironment,
-    encode_answer,
-    encode_refusal,
-    place_of_service,
-)
+from holdfast_ros.tcpros import RosEnvironment, encode_answer, encode_refusal, place_of_service
 
 HERE = RosEnvironment("http://localhost:11311", "localhost", "127.0.0.1", "/")
 

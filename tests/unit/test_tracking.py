@@ -79,62 +79,6 @@ def bits(trial: Trial) -> bytes:
     return trial.planner.digest(trial.state)
 
 
-@pytest.mark.parametrize("shows", [False, True])
-@pytest.mark.parametrize("delays", [(1, 3), (5, 1), (6, 2)])
-def test_a_late_observation_is_folded_in_at_its_step(delays: tuple[int, int], shows: bool) -> None:
-    """In whatever order they come, the state is the one of observations that were on time.
-
-    The actions are those that the late robot chose.
-    """
-    planner = Planner(Cart(), SETTINGS)
-    late, actions = Trial(planner, 3, 0), []
-    taken = {0: np.array([0.3]), 3: np.array([-0.1])}
-    motions = {step: np.array([-0.05 * step]) for step in range(8)}
-    due = {step + delay: step for step, delay in zip(taken, delays, strict=True)}
-    for step in range(8):
-        if step in taken:
-            observed(late, None)
-        action, _ = planner.choose_task_action(late.state)
-        actions.append(action)
-        shown = {"motion": motions[step], "observation": np.array([1.0])} if shows else {}
-        late.move(action, None, **shown)
-        if step + 1 in due:
-            came = due[step + 1]
-            assert late.observe_late(LateObservation(came, taken[came])) is not None
-        elif step == 7:
-            assert late.awaited == ()
-    state = planner.init(3, 0)
-    for step, action in enumerate(actions):
-        if step in taken:
-            state, _ = planner.observe(state, 0, taken[step])
-        elif planner.needs_sensing(state):
-            state, _ = planner.observe(state, 0, None)
-        state = planner.advance(state, action, motions[step] if shows else None)
-        if shows:
-            state, _ = planner.observe_move(state, action, np.array([1.0]))
-    assert bits(late) == planner.digest(state)
-
-
-def test_what_is_not_awaited_changes_nothing() -> None:
-    trial = Trial(Planner(Cart(), SETTINGS), 1, 0)
-    observed(trial, np.array([0.2]))
-    acted(trial)
-    before = bits(trial)
-    for step in (0, 1, 7):
-        assert trial.observe_late(LateObservation(step, np.array([0.2]))) is None
-    assert bits(trial) == before
-
-
-def test_it_comes_once() -> None:
-    trial = Trial(Planner(Cart(), SETTINGS), 1, 0)
-    observed(trial, None)
-    assert trial.awaited == (0,)
-    acted(trial)
-    late = LateObservation(0, np.array([0.2]))
-    assert trial.observe_late(late) is not None
-    assert trial.observe_late(late) is None
-
-
 def test_an_observation_of_the_wrong_size_changes_nothing() -> None:
     trial = Trial(Planner(Cart(), SETTINGS), 1, 0)
     observed(trial, None)
@@ -172,30 +116,6 @@ def test_not_to_sense_awaits_nothing() -> None:
     assert (trial.num_inputs, trial.num_sensed) == (1, 0)
     with pytest.raises(InvalidValueError, match="sensing action 1: cart has 0 to 0"):
         trial.observe(planner.no_sensing, np.zeros(1), 0.0)
-
-
-def test_a_measured_motion_takes_the_place_of_the_model() -> None:
-    planner = Planner(Cart(), SETTINGS)
-    state = planner.observe(planner.init(1), planner.no_sensing, None)[0]
-    modelled = planner.advance(state, np.array([0.1]))
-    measured = planner.advance(state, np.array([0.1]), np.array([0.7]))
-    states = state.belief.states
-    np.testing.assert_allclose(measured.belief.states, states + 0.7, atol=0.006)
-    assert np.abs(modelled.belief.states - states - 0.1).max() > 0.5
-
-
-def test_what_came_with_a_move_weighs_the_particles() -> None:
-    settings = PlanningSettings(
-        particle_filter=ParticleFilterSettings(num_particles=50, resampling_threshold=0.0)
-    )
-    planner = Planner(Cart(), settings)
-    state = planner.init(1)
-    after, info = planner.observe_move(state, np.zeros(1), np.array([1.0]))
-    touches = state.belief.states[:, 0] > 0.0
-    expected = np.where(touches, 0.9, 0.1)
-    np.testing.assert_allclose(after.belief.weights, expected / expected.sum(), rtol=1e-12)
-    assert info.explained
-    assert not after.sensed
 
 
 @pytest.mark.parametrize(

@@ -90,13 +90,6 @@ class TestTwoDirectories:
         with pytest.raises(ConfigurationError, match=r"peg\.yaml, line 1: .*second/um_peg\.py"):
             problem_of(second)
 
-    def test_a_helper(self, tmp_path: Path) -> None:
-        first = written(tmp_path / "first", um_robot="from um_helper import *", um_helper=ROBOT)
-        second = written(tmp_path / "second", um_other="from um_helper import *", um_helper=ROBOT)
-        assert robot_of(first).where == "first"
-        with pytest.raises(ConfigurationError, match=r"um_helper is .*second/um_helper\.py, and"):
-            robot_of(second, "um_other:Robot")
-
     def test_a_helper_in_a_folder_of_its_own(self, tmp_path: Path) -> None:
         """Each module puts its ``lib`` on the import path, and so does one that has no helper."""
         path = "import os, sys\nsys.path.insert(0, os.path.join(os.path.dirname(__file__), 'lib'))"
@@ -127,14 +120,6 @@ class TestTwoDirectories:
         assert robot_of(third, "um_third:Robot").where == "third"
         assert robot.helper.WHERE == "first"
 
-    def test_packages(self, tmp_path: Path) -> None:
-        for each in ("first", "second"):
-            written(tmp_path / each / "um_parts", arm=ROBOT)
-            (tmp_path / each / "um_parts" / "__init__.py").write_text("from .arm import Robot")
-        assert robot_of(tmp_path / "first", "um_parts.arm:Robot").where == "um_parts"
-        with pytest.raises(ConfigurationError, match=r"second/um_parts/__init__\.py"):
-            robot_of(tmp_path / "second", "um_parts.arm:Robot")
-
     def test_functions_of_gymnasium(self, tmp_path: Path) -> None:
         pytest.importorskip("gymnasium")
         text = (
@@ -156,12 +141,6 @@ class TestTwoDirectories:
         assert robot_of(first).where == "first"
         del sys.modules["um_robot"]
         assert robot_of(second).where == "second"
-
-    def test_a_module_that_could_not_be_imported(self, tmp_path: Path) -> None:
-        first = written(tmp_path / "first", um_robot="raise ValueError")
-        with pytest.raises(ConfigurationError, match="ValueError"):
-            robot_of(first)
-        assert robot_of(written(tmp_path / "second", um_robot=ROBOT)).where == "second"
 
     def test_a_link_to_the_first(self, tmp_path: Path) -> None:
         first = written(tmp_path / "first", um_robot=ROBOT)

@@ -130,21 +130,6 @@ def test_what_overflows_is_outside(observed: float) -> None:
         )
 
 
-def test_how_often_a_sound_belief_is_surprised() -> None:
-    """The truth is one more draw of what the particles are drawn from.
-
-    With 3,000 observations each of probability at most 0.01, more than 52 would come once in
-    10,000 series; and the gate is no wall.
-    """
-    outside = 0
-    for trial in range(3000):
-        random = randomness.stream(5, trial, 0, randomness.Purpose.INITIAL_BELIEF)
-        states = random.normal((201, 2))
-        observed = states[0] + 0.5 * random.substream(1).normal(2)
-        outside += not within(Belief.uniform(states[1:]), 0.25, *observed)
-    assert 3 <= outside <= 52
-
-
 class Heavy(ProblemBase):
     """Observes a place with noise of long tails (Cauchy), whose likelihood is zero nowhere."""
 

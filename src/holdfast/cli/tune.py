@@ -28,7 +28,8 @@ from holdfast.runtime.command_line import (
     option,
     whole_number,
 )
-from holdfast.runtime.files import claim_directory, shown_path
+from holdfast.runtime.files import shown_path
+from holdfast.runtime.output_directory import claim_directory
 
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
