@@ -271,7 +271,7 @@ def test_one_real_number(number: Any) -> None:
 @pytest.mark.parametrize("wrong", ["0.5", True, np.ma.masked, Fraction(1, 2), [0.5], np.nan])
 def test_a_reward_that_is_no_number(wrong: Any) -> None:
     with pytest.raises(
-        hf.HoldfastError, match=r"reward of step 0 is .*; it must be a finite number"
+        hf.HoldfastError, match=r"perform returned .*; it must return a finite number, the reward"
     ):
         trial(world=World(result=wrong))
 

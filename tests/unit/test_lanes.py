@@ -26,13 +26,13 @@ from holdfast.protocol.service_limits import ServiceLimits
 def long_planning() -> PlanningSettings:
     """Return settings whose decisions take seconds."""
     planning = with_key(planning_of(), "selector.method", "expected_return")
-    planning = with_key(planning, "selector.max_observation_samples", 100)
+    planning = with_key(planning, "selector.max_observation_samples", 7000)
     return with_key(planning, "selector.rollout_steps", 2000)
 
 
 def medium_planning() -> PlanningSettings:
     planning = with_key(planning_of(), "selector.method", "expected_return")
-    return with_key(planning, "selector.rollout_steps", 50)
+    return with_key(planning, "selector.max_observation_samples", 500)
 
 
 def robot_of(planning: PlanningSettings, key: int) -> Robot:

@@ -41,6 +41,7 @@ NUMBERS = [
     ["serve", "--max-sessions-per-robot"],
     ["serve", "--max-decision-s"],
     ["serve", "--max-decision-mb"],
+    *(["sweep", "peg.yaml", f"--{name}"] for name in ("trials", "seed", "jobs")),
     *(["tune", "peg.yaml", f"--{name}"] for name in ("vary", "budget", "trials", "seed", "jobs")),
     ["tune", "peg.yaml", "--max-decision-ms"],
 ]
@@ -48,6 +49,8 @@ PATHS = [
     ["run"],
     ["tune"],
     ["tune", "peg.yaml", "--out"],
+    ["sweep"],
+    ["sweep", "peg.yaml", "--out"],
     ["run", "peg.yaml", "--out"],
     ["run", "peg.yaml", "--tls"],
     ["run", "peg.yaml", "--view-file"],

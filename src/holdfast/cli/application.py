@@ -28,11 +28,11 @@ class Command(NamedTuple):
 
 COMMANDS = {
     "run": Command("holdfast.cli.run", "Run the trials of a configuration."),
-    "sweep": Command("holdfast.cli.sweep", "Compare settings: runs of a grid of values."),
     "serve": Command("holdfast.service.process", "Decide for robots, as a service."),
     "doctor": Command("holdfast.cli.doctor", "Check each layer between a robot and a service."),
     "check": Command("holdfast.cli.check", "Find what is wrong with a problem of your own."),
     "tune": Command("holdfast.cli.tune", "Find what to sense on your problem, by simulating it."),
+    "sweep": Command("holdfast.cli.sweep", "Compare settings: runs of a grid of values."),
     "compare": Command("holdfast.cli.compare", "Compare the decisions of two runs."),
     "export": Command("holdfast.cli.export", "Write a run for RViz, Foxglove, or as tables."),
     "view": Command("holdfast.cli.view", "See a run in Rerun's viewer."),
