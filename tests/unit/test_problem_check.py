@@ -485,3 +485,20 @@ def test_arguments_are_checked() -> None:
         check_problem(Rover(), budget_s=0.0)
     with pytest.raises(InvalidValueError, match="max_steps"):
         check_problem(Rover(), max_steps=0)
+
+
+def test_the_places_that_findings_name_are_there() -> None:
+    root = EXAMPLES.parent
+    sources = (root / "src" / "holdfast" / "tuning").glob("*_check.py")
+    named = {
+        place
+        for path in [*sources, root / "src" / "holdfast" / "tuning" / "findings.py"]
+        for place in re.findall(r'"(docs/[\w./#-]+)"', path.read_text(encoding="utf-8"))
+    }
+    assert len(named) > 3
+    for place in named:
+        page, _, anchor = place.partition("#")
+        text = (root / page).read_text(encoding="utf-8")
+        headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+        anchors = {re.sub(r"[^\w-]", "", each.lower().replace(" ", "-")) for each in headings}
+        assert anchor in {*anchors, ""}, place
