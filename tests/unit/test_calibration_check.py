@@ -16,7 +16,7 @@ def least_p(seed: int) -> float:
     least: list[float] = []
 
     class Noted(Inspection):
-        def test(self, p: float, finding: Finding) -> None:
+        def test(self, p: float, check: str, seen: str, advice: str) -> None:
             least.append(p)
 
     inspection = Noted(Rover(), PlanningSettings(), 100, seed, 1e6)
@@ -45,7 +45,7 @@ def test_each_test_has_its_share_of_the_false_alarms() -> None:
     def judged(*values: float) -> list[Finding]:
         inspection = Inspection(Rover(), PlanningSettings(), 100, 0, 10.0)
         for number, p in enumerate(values):
-            inspection.test(p, Finding("error", "likelihood", f"{number}: seen", "do"))
+            inspection.test(p, "likelihood", f"{number}: seen", "do")
         inspection.judge_tests()
         return inspection.findings
 

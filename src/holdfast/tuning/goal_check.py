@@ -7,17 +7,19 @@ will. They also show where the robot goes, for the checks that need states from 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.circular import differences
 from holdfast.numerics.randomness import NoiseFreeStream
 from holdfast.problems import checked
-from holdfast.problems.attributes import circular_actions, circular_states, has_own
+from holdfast.problems.attributes import circular_actions, circular_states
 from holdfast.problems.problem import ProblemBase
-from holdfast.tuning.contract_check import truths
-from holdfast.tuning.findings import CONTRACT, Inspection, Severity, Walk, spread_out
+from holdfast.tuning.contract_check import acted, truths
+from holdfast.tuning.findings import Inspection, Walk, spread_out
 
 __all__ = ["check_motion", "check_rewards", "follow_policy"]
 
@@ -29,212 +31,142 @@ _LONGER = 4
 """Times max_steps for which trials are followed, to tell a limit that is too low from a goal that
 is never reached."""
 
-_STREAM, _NOISE = 8, 9
+_INITIAL, _WAY, _NOISE = 8, 9, 10
+"""Trial numbers of the streams here."""
 
-_FEW = 0.5
+_ENOUGH = 0.5
 """Share of the trials that should reach the goal."""
 
-_TURN = 2.0 * np.pi
-_NEARLY = 0.5
-"""A coordinate that jumps by a whole turn, give or take this, is an angle (rad)."""
+_DRAWS, _STATES = 100, 12
+"""Moves from each of some states, whose noise is compared."""
 
 
-def follow_policy(inspection: Inspection, num_trials: int = _TRIALS) -> Walk:
+def follow_policy(inspection: Inspection) -> Walk:
     """Simulate trials in which the state is known, until all have ended or the steps are over."""
     problem, ask = inspection.problem, inspection.ask
     late = inspection.deadline(0.2)
-    own = inspection.random(_STREAM)
-    states = ask("initial_states", lambda: checked.initial_states(problem, own, num_trials))
-    stages = np.zeros(num_trials, dtype=np.int64)
-    reached, failed = np.full(num_trials, -1), np.full(num_trials, -1)
-    kept: list[tuple[FloatArray, Any]] = []
+    own = inspection.random(_INITIAL)
+    states = ask("initial_states", checked.initial_states, problem, own, _TRIALS)
+    stages = np.zeros(_TRIALS, dtype=np.int64)
+    reached, failed = np.full((2, _TRIALS), -1)
+    kept: list[tuple[FloatArray, IntArray]] = []
     jumps = np.zeros((2, states.shape[1]), dtype=np.int64)
     turns = np.zeros((2, problem.action_size), dtype=np.int64)
     step = still = 0
     stride = 1
-    limit = _LONGER * inspection.max_steps
-    for step in range(limit + 1):
-        done = ask("is_goal", lambda states=states: truths(problem, "is_goal", states))  # type: ignore[misc]
-        lost = ask("is_failure", lambda states=states: truths(problem, "is_failure", states))  # type: ignore[misc]
-        open_ones = (reached < 0) & (failed < 0)
-        reached[open_ones & done] = step
-        failed[open_ones & lost & ~done] = step
+    while True:
+        done = ask("is_goal", truths, problem, "is_goal", states)
+        lost = ask("is_failure", truths, problem, "is_failure", states)
+        running = (reached < 0) & (failed < 0)
+        reached[running & done] = step
+        failed[running & lost & ~done] = step
         if step % stride == 0:
             kept.append((states, stages))
         if len(kept) > 2 * _KEPT:  # so that a long trial takes no more memory
             kept, stride = kept[::2], 2 * stride
-        if step == limit or not ((reached < 0) & (failed < 0)).any() or late():
+        if step == _LONGER * inspection.max_steps or not (running & ~done & ~lost).any() or late():
             break
-        stages = ask(
-            "next_stage",
-            lambda states=states, stages=stages: checked.next_stages(problem, states, stages),  # type: ignore[misc]
-        )
-        commanded = ask(
-            "policy",
-            lambda states=states, stages=stages: checked.policy(problem, states, stages),  # type: ignore[misc]
-        )
-        actions = ask(
-            "execute",
-            lambda commanded=commanded: checked.executed_action(problem, commanded),  # type: ignore[misc]
-        )
+        stages = ask("next_stage", checked.next_stages, problem, states, stages)
+        commanded = ask("policy", checked.policy, problem, states, stages)
+        actions = ask("execute", checked.executed_action, problem, commanded)
         still += bool((actions == 0.0).all())
-        noise = inspection.random(_NOISE, step)
-        moved = ask(
-            "move",
-            lambda states=states, actions=actions, noise=noise: checked.move(  # type: ignore[misc]
-                problem, states, actions, noise
-            ),
-        )
+        own = inspection.random(_WAY, step)
+        moved = ask("move", checked.move, problem, states, actions, own)
         jumps += _large_changes(moved - states)
-        following = ask(
-            "policy",
-            lambda states=moved, stages=stages: checked.policy(problem, states, stages),  # type: ignore[misc]
-        )
-        turns += _large_changes(following - commanded)
+        turns += _large_changes(ask("policy", checked.policy, problem, moved, stages) - commanded)
         states = moved
-    some = spread_out(_KEPT, len(kept))
-    walk = Walk(
-        np.stack([kept[index][0] for index in some]),
-        np.stack([kept[index][1] for index in some]),
-        reached,
-        failed,
-        step,
-    )
-    inspection.walk = walk
+        step += 1
+    some = [kept[index] for index in spread_out(_KEPT, len(kept))]
+    at, their = (np.concatenate([each[part] for each in some]) for part in (0, 1))
+    inspection.walk = walk = Walk(at, np.asarray(their, dtype=np.int64), reached)
     _report_angles(inspection, jumps, turns)
-    _report_walk(inspection, walk, still)
+    _report_walk(inspection, walk, failed, step, never_moves=0 < step == still)
+    if getattr(type(problem), "reward", None) not in (None, ProblemBase.reward):
+        actions = ask("policy", acted, problem, walk.states, walk.stages)
+        rewards = ask("reward", checked.rewards, problem, walk.states, actions)
+        inspection.rewards.extend(rewards.tolist())
     return walk
 
 
 def _large_changes(change: FloatArray) -> IntArray:
     """Count the large changes of each coordinate in a step, and those of about a whole turn."""
     size = np.abs(change)
-    counts = [(size > 0.5 * np.pi).sum(axis=0), (np.abs(size - _TURN) < _NEARLY).sum(axis=0)]
-    return np.array(counts)
-
-
-def _are_turns(counts: IntArray) -> IntArray:
-    """Return the coordinates whose large changes are whole turns, as if they were angles."""
-    return np.flatnonzero((counts[1] >= 2) & (counts[1] == counts[0]))
+    return np.array([(size > 0.5 * np.pi).sum(0), (np.abs(size - 2.0 * np.pi) < 0.5).sum(0)])
 
 
 def _report_angles(inspection: Inspection, jumps: IntArray, turns: IntArray) -> None:
-    problem = inspection.problem
-    declared = set(circular_states(problem))
-    for at in _are_turns(jumps):
-        if int(at) not in declared:
-            inspection.add(
-                "warning",
-                "units",
-                f"{inspection.coordinate(int(at))} jumps by a whole turn (2 pi) in one step, and "
-                "is not declared to be an angle: the mean of 3.1 and -3.1 is taken for 0",
-                f"Give the problem circular = ({int(at)},), and circular_observations for what "
-                "shows it.",
-                "docs/problems.md#your-own",
-            )
-    declared = set(circular_actions(problem))
-    for at in _are_turns(turns):
-        if int(at) not in declared:
-            inspection.add(
-                "warning",
-                "units",
-                f"coordinate {int(at)} of the task action jumps by a whole turn (2 pi) between two "
-                "steps, and is not declared to be an angle",
-                "Take numerics.wrapped(goal - heading) for a difference of angles in the policy, "
-                f"or give the problem circular_actions = ({int(at)},).",
-                "docs/problems.md#your-own",
-            )
+    """Warn of coordinates whose large changes are all whole turns, as if they were angles."""
+
+    def undeclared(counts: IntArray, declared: Sequence[int]) -> list[int]:
+        turning = np.flatnonzero((counts[1] >= 2) & (counts[1] == counts[0])).tolist()
+        return [at for at in turning if at not in declared]
+
+    for at in undeclared(jumps, circular_states(inspection.problem)):
+        seen = (
+            f"{inspection.coordinate(at)} jumps by a whole turn (2 pi) in one step, and is not "
+            "declared to be an angle: the mean of 3.1 and -3.1 is taken for 0"
+        )
+        advice = (
+            f"Give the problem circular = ({at},), and circular_observations for what shows it."
+        )
+        inspection.add("warning", "units", seen, advice)
+    for at in undeclared(turns, circular_actions(inspection.problem)):
+        seen = (
+            f"coordinate {at} of the task action jumps by a whole turn (2 pi) between two steps, "
+            "and is not declared to be an angle"
+        )
+        advice = (
+            "Take numerics.wrapped(goal - heading) for a difference of angles in the policy, or "
+            f"give the problem circular_actions = ({at},)."
+        )
+        inspection.add("warning", "units", seen, advice)
 
 
-def _report_walk(inspection: Inspection, walk: Walk, still: int) -> None:
-    count, steps = len(walk.reached), walk.steps
-    reached, failed = walk.reached >= 0, walk.failed >= 0
-    first = walk.reached == 0
-    if first.all():
-        inspection.add(
-            "error",
-            "goals",
-            f"all of {count} initial states are goals: each trial ends before its first step",
-            "Look at is_goal and initial_states.",
-            CONTRACT,
-        )
+def _report_walk(
+    inspection: Inspection, walk: Walk, failed: IntArray, steps: int, *, never_moves: bool
+) -> None:
+    count, limit, num_stages = _TRIALS, inspection.max_steps, inspection.problem.num_stages
+    reached, in_time = walk.reached >= 0, (walk.reached >= 0) & (walk.reached <= limit)
+    if (walk.reached == 0).all():
+        seen = f"all of {count} initial states are goals: each trial ends before its first step"
+        inspection.add("error", "goals", seen, "Look at is_goal and initial_states.")
         return
-    if first.any():
-        inspection.add(
-            "information",
-            "goals",
-            f"{first.sum()} of {count} initial states are goals already: such trials take 0 steps",
+    if never_moves and not reached.all():
+        seen = (
+            f"the policy never moves: its executed action is 0 in all of {count} trials of {steps} "
+            f"steps, and {reached.sum()} of them reach the goal"
         )
-    if steps and still == steps and not reached.all():
-        inspection.add(
-            "error",
-            "goals",
-            f"the policy never moves: its executed action is 0 in all of {count} trials of "
-            f"{steps} steps, and {reached.sum()} of them reach the goal",
-            "Look at policy and execute.",
-            CONTRACT,
-        )
+        inspection.add("error", "goals", seen, "Look at policy and execute.")
         return
-    times = ""
-    if reached.any():
-        times = f", after {np.median(walk.reached[reached]):.0f} steps (median)"
     seen = (
         f"with the state known, the policy comes to the goal in {reached.sum()} of {count} trials"
-        f"{times}"
     )
-    if failed.any():
-        seen += f", and {failed.sum()} fail"
-    open_ones = count - int(reached.sum()) - int(failed.sum())
-    if open_ones:
-        seen += f"; {open_ones} have not ended after {steps} steps"
-    limit = inspection.max_steps
-    in_time = (walk.reached >= 0) & (walk.reached <= limit)
+    if reached.any():
+        seen += f", after {np.median(walk.reached[reached]):.0f} steps (median)"
+    if (lost := (failed >= 0).sum()) > 0:
+        seen += f", and {lost} fail"
+    running = count - reached.sum() - lost
+    if running:
+        seen += f"; {running} have not ended after {steps} steps"
     if (reached & ~in_time).any():
         seen += f"; within max_steps, {limit}, it is {in_time.sum()}"
-    cut = bool(open_ones) and steps < limit
+    cut = running > 0 and steps < limit
     if cut:
         seen += f" of {limit}, when the time for this check was over"
     advice = (
         "What is lost here no sensing can win. Look at is_goal and at the policy near the goal, or "
         "expect that much less."
     )
-    if reached.mean() >= _FEW:
+    if reached.mean() >= _ENOUGH:
         needed = int(np.quantile(walk.reached[reached], 0.9))
         advice = f"Set simulator.max_steps to {2 * needed} or more."
-    if cut or in_time.mean() >= _FEW:
+    if cut or in_time.mean() >= _ENOUGH:
         inspection.add("information", "goals", seen)
     else:
-        severity: Severity = "warning" if in_time.any() else "error"
-        inspection.add(severity, "goals", seen, advice, CONTRACT)
-    num_stages = inspection.problem.num_stages
-    greatest = int(walk.stages.max())
-    if greatest + 1 < num_stages and not cut:
-        inspection.add(
-            "warning",
-            "goals",
-            f"num_stages is {num_stages}, but no trial comes beyond stage {greatest}",
-            "Look at next_stage.",
-            CONTRACT,
-        )
-    _note_rewards(inspection, walk)
-
-
-def _note_rewards(inspection: Inspection, walk: Walk) -> None:
-    problem = inspection.problem
-    if not _has_reward(problem):
-        return
-    states = walk.states.reshape(-1, walk.states.shape[-1])
-    stages = walk.stages.reshape(-1)
-
-    def found() -> FloatArray:
-        actions = checked.executed_action(problem, checked.policy(problem, states, stages))
-        return checked.rewards(problem, states, actions)
-
-    inspection.rewards.extend(inspection.ask("reward", found).tolist())
-
-
-def _has_reward(problem: Any) -> bool:
-    return getattr(type(problem), "reward", None) not in (None, ProblemBase.reward)
+        inspection.add("warning" if in_time.any() else "error", "goals", seen, advice)
+    if (greatest := int(walk.stages.max())) + 1 < num_stages and not cut:
+        seen = f"num_stages is {num_stages}, but no trial comes beyond stage {greatest}"
+        inspection.add("warning", "goals", seen, "Look at next_stage.")
 
 
 def check_rewards(inspection: Inspection) -> None:
@@ -242,22 +174,19 @@ def check_rewards(inspection: Inspection) -> None:
     rewards, selector = np.array(inspection.rewards), inspection.settings.selector
     if not rewards.size or np.ptp(rewards) > 0.0 or rewards[0] < 0.0:
         return
-    value = float(rewards[0])
     asked = selector.method == "expected_return" and selector.rollout_reward == "problem"
-    seen = f"the reward is {value:g} in all of {len(rewards)} simulated steps: "
+    seen = f"the reward is {rewards[0]:g} in all of {len(rewards)} simulated steps: "
     seen += (
         "a trial that never reaches the goal has the greatest return"
-        if value > 0.0
+        if rewards[0] > 0.0
         else "expected_return has nothing to tell sensing actions by"
     )
-    inspection.add(
-        "error" if asked else "warning" if value > 0.0 else "information",
-        "goals",
-        seen,
+    advice = (
         "With selector.rollout_reward: steps the return counts steps instead. Or leave reward out, "
-        "which does the same.",
-        "docs/problems.md#when-to-sense",
+        "which does the same."
     )
+    severity = "warning" if rewards[0] > 0.0 else "information"
+    inspection.add("error" if asked else severity, "goals", seen, advice)  # type: ignore[arg-type]
 
 
 def check_motion(inspection: Inspection) -> None:
@@ -265,80 +194,61 @@ def check_motion(inspection: Inspection) -> None:
     problem, ask, walk = inspection.problem, inspection.ask, inspection.walk
     if walk is None:
         return
-    draws = 100
-    rows = walk.states.reshape(-1, walk.states.shape[-1])
-    stages = walk.stages.reshape(-1)
     declared = np.asarray(problem.motion_variance, dtype=np.float64)
     circular = circular_states(problem)
     ratios, offsets = [], []
-    for number, at in enumerate(spread_out(12, len(rows))):
-        state = np.repeat(rows[at : at + 1], draws, axis=0)
-        action = ask(
-            "execute",
-            lambda at=at: checked.executed_action(  # type: ignore[misc]
-                problem, checked.policy(problem, rows[at], int(stages[at]))
-            ),
-        )
-        own = inspection.random(_NOISE + 1, number)
-        moved = ask("move", lambda: checked.move(problem, state, action, own))  # noqa: B023
-        expected, slopes = ask("move", lambda: _expected(problem, rows[at], action))  # noqa: B023
-        change = _shorter(moved - expected, circular)
-        spread = change.std(axis=0)
-        predicted = (slopes**2 * declared).sum(axis=1)
-        moves = (predicted > 0.0) & (spread > 0.0)
-        ratios.append(np.where(moves, spread**2 / np.where(moves, predicted, 1.0), np.nan))
+    for number, at in enumerate(spread_out(_STATES, len(walk.states))):
+        state, own = walk.states[at], inspection.random(_NOISE, number)
+        action = ask("execute", acted, problem, state, int(walk.stages[at]))
+        many = np.tile(state, (_DRAWS, 1))
+        moved = ask("move", checked.move, problem, many, action, own)
+        expected, slopes = ask("move", _expected, problem, state, action)
+        change = differences(moved, expected, circular)
+        spread, predicted = change.std(axis=0), (slopes**2 * declared).sum(axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            offsets.append(np.where(spread > 0.0, np.abs(change.mean(axis=0)) / spread, np.nan))
-    for at in range(rows.shape[1]):
-        ratio, offset = _median(ratios, at), _median(offsets, at)
-        if ratio is not None and not 1.0 / 9.0 <= ratio <= 9.0:
-            inspection.add(
-                "warning",
-                "motion",
-                f"motion_variance says that a step blurs {inspection.coordinate(at)} with a "
-                f"variance {'below' if ratio > 1.0 else 'above'} what move does: move's is "
-                f"{ratio:.2g} times as large (median of {len(ratios)} states)",
+            ratios.append(np.where(predicted > 0.0, spread**2 / predicted, np.nan))
+            offsets.append(np.abs(change.mean(axis=0)) / spread)
+    for at in range(walk.states.shape[1]):
+        ratio, offset = _typical(ratios, at, 1.0), _typical(offsets, at, 0.0)
+        name = inspection.coordinate(at)
+        if not 1.0 / 9.0 <= ratio <= 9.0:
+            seen = (
+                f"motion_variance says that a step blurs {name} with a variance "
+                f"{'below' if ratio > 1.0 else 'above'} what move does: move's is {ratio:.2g} "
+                f"times as large (median of {len(ratios)} states)"
+            )
+            advice = (
                 "motion_variance is the variance of the noise of one step, not its standard "
-                "deviation. The mixture estimators and the advice about resolution depend on it.",
-                CONTRACT,
+                "deviation. The mixture estimators and the advice about resolution depend on it."
             )
-        if offset is not None and offset > 1.5:
-            function = "expected_move" if has_own(problem, "expected_move", ("move",)) else "move"
-            inspection.add(
-                "warning",
-                "motion",
-                f"{function} without noise leads {inspection.coordinate(at)} to a place that is "
-                f"{offset:.1f} standard deviations from the mean of {draws} moves with noise",
+            inspection.add("warning", "motion", seen, advice)
+        if offset > 1.5:
+            seen = (
+                f"without noise a move leads {name} to a place that is {offset:.1f} standard "
+                f"deviations from the mean of {_DRAWS} moves with noise"
+            )
+            advice = (
                 "path_entropy, the default, follows the policy without noise. Give the problem an "
-                "expected_move that leads to the mean.",
-                CONTRACT,
+                "expected_move that leads to the mean."
             )
+            inspection.add("warning", "motion", seen, advice)
 
 
-def _median(rows: list[FloatArray], at: int) -> float | None:
+def _typical(rows: list[FloatArray], at: int, otherwise: float) -> float:
+    """Return the median of a coordinate's numbers, if at least half of them are known."""
     values = np.array([row[at] for row in rows])
-    values = values[np.isfinite(values)]
-    return float(np.median(values)) if len(values) >= len(rows) / 2 else None
-
-
-def _shorter(change: FloatArray, circular: Any) -> FloatArray:
-    for at in circular:
-        change[..., at] = (change[..., at] + np.pi) % _TURN - np.pi
-    return change
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if 2 * len(known) >= len(values) else otherwise
 
 
 def _expected(problem: Any, state: FloatArray, action: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return where an action leads without noise, and its slopes, (state_size, action_size)."""
 
-    def led(action: FloatArray) -> FloatArray:
-        return checked.expected_move(problem, state, action, NoiseFreeStream(1000))
+    def led(by: FloatArray) -> FloatArray:
+        return checked.expected_move(problem, state, action + by, NoiseFreeStream(1000))
 
-    middle = led(action)
     slopes = np.empty((state.size, action.size))
-    circular = circular_states(problem)
-    for at in range(action.size):
-        step = np.zeros(action.size)
-        step[at] = 1e-3 * max(1.0, float(np.abs(action[at])))
-        change = _shorter(led(action + step) - led(action - step), circular)
+    for at, step in enumerate(np.diag(1e-3 * np.maximum(1.0, np.abs(action)))):
+        change = differences(led(step), led(-step), circular_states(problem))
         slopes[:, at] = change / (2.0 * step[at])
-    return middle, slopes
+    return led(np.zeros(action.size)), slopes

@@ -1,35 +1,36 @@
-"""What a few simulated trials show: endings, beliefs that are worn out, and truths that are lost.
+"""What a few simulated trials show: endings, beliefs that are worn out, truths that are lost.
 
 The trials sense at random, which costs no time for choosing and favours no sensor. Their beliefs
-just before a sensing step are kept for the checks of the sensors.
+just before a sensing step are kept for the checks of the sensors and of the time of a decision.
 """
 
 from __future__ import annotations
 
+import contextlib
+import cProfile
 from collections.abc import Callable
-from typing import NamedTuple
+from time import thread_time
+from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from holdfast.errors import HoldfastError
 from holdfast.numerics.arrays import BoolArray, FloatArray
 from holdfast.numerics.circular import differences
 from holdfast.planning.belief import Belief
-from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
-from holdfast.problems.attributes import circular_states, sensing_labels
+from holdfast.problems.attributes import PARAMETERS, circular_states, sensing_labels
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 from holdfast.tuning.contract_check import truths
-from holdfast.tuning.findings import CONTRACT, Inspection, spread_out
+from holdfast.tuning.findings import Inspection, spread_out
 
-__all__ = ["SensedBelief", "check_trials"]
+__all__ = ["check_decision_time", "check_trials"]
 
-_TRIALS = 8
-_BELIEFS = 24
-"""Beliefs before sensing that are kept."""
-
-_MOST_STEPS = 1000
+_TRIALS, _MOST_STEPS = 8, 1000
+_BELIEFS, _PARTICLES = 24, 400
+"""Beliefs before sensing that are kept, and particles of each."""
 
 _FEW_LEFT = 3.0
 """Effective particles after an observation below which it leaves hardly any."""
@@ -37,14 +38,7 @@ _FEW_LEFT = 3.0
 _OFTEN = 0.2
 """Share of the observations from which on it is worth a warning."""
 
-_PARTICLES_KEPT = 400
-
-
-class SensedBelief(NamedTuple):
-    """A belief just before sensing, and the stage of the task."""
-
-    belief: Belief
-    stage: int
+_DECISIONS = 5
 
 
 class _Left(NamedTuple):
@@ -56,8 +50,8 @@ class _Left(NamedTuple):
     outside: BoolArray
 
 
-class _TimeOverError(HoldfastError):
-    """The time for this check is over."""
+class _EndedError(HoldfastError):
+    """The time for this check is over, or the trial has failed."""
 
 
 class _Watcher(TrialObserver):
@@ -71,126 +65,96 @@ class _Watcher(TrialObserver):
     def trial_began(self, environment: object, state: PlanningState) -> None:
         """Keep the world, to look at the true state."""
         del state
-        self.environment = environment
+        assert isinstance(environment, SimulatedEnvironment)
+        self.world = environment
 
     def sensed(self, step: SensingStep) -> None:
         """Note the belief, and what the observation left of it."""
         self.before.append(step.before)
-        info = step.observation_info
-        world = self.environment
-        assert isinstance(world, SimulatedEnvironment)
         angles = circular_states(self.inspection.problem)
-        apart = differences(step.before.belief.states, world.state, angles)
+        apart = differences(step.before.belief.states, self.world.state, angles)
         # The true state beyond all particles in some coordinate.
         outside = (apart > 0.0).all(axis=0) | (apart < 0.0).all(axis=0)
-        size = info.effective_sample_size
-        self.left.append(_Left(step.sensing_action, size, info.explained, np.asarray(outside)))
+        info = step.observation_info
+        size, explained = info.effective_sample_size, info.explained
+        self.left.append(_Left(step.sensing_action, size, explained, np.asarray(outside)))
 
     def acted(self, step: TaskStep) -> None:
         """End the trial if the time is over, or in a failure, which the world does not know."""
         if self.late():
-            raise _TimeOverError
+            raise _EndedError("late")
         if step.reward is not None:
             self.inspection.rewards.append(step.reward)
-        world = self.environment
-        assert isinstance(world, SimulatedEnvironment)
-        if truths(self.inspection.problem, "is_failure", world.state):
-            raise _TimeOverError("failed")
+        if truths(self.inspection.problem, "is_failure", self.world.state):
+            raise _EndedError("failed")
 
 
-def check_trials(inspection: Inspection) -> list[SensedBelief]:
-    """Run a few trials with random sensing; return beliefs from along the way."""
-    problem, settings = inspection.problem, inspection.settings
-    late = inspection.deadline(0.25)
-    import msgspec
-
+def check_trials(inspection: Inspection) -> list[PlanningState]:
+    """Run a few trials with random sensing; return states from along the way, before sensing."""
+    settings, late = inspection.settings, inspection.deadline(0.25)
     selector = msgspec.structs.replace(
         settings.selector, method="random", sensing_is_optional=False
     )
-    planner = Planner(problem, msgspec.structs.replace(settings, selector=selector))
+    planner = Planner(inspection.problem, msgspec.structs.replace(settings, selector=selector))
     steps = min(inspection.max_steps, _MOST_STEPS)
-    results: list[TrialResult] = []
-    failed = 0
-    states: list[PlanningState] = []
-    left: list[_Left] = []
-    shares: list[FloatArray] = []
-    for trial in range(_TRIALS):
-        if late():
-            break
-        watcher = _Watcher(inspection, late)
+    reached: list[int] = []
+    endings: list[str] = []
+    watchers: list[_Watcher] = []
 
-        def run(watcher: _Watcher = watcher, trial: int = trial) -> TrialResult | str:
-            try:
-                return run_trial(planner, inspection.seed, trial, max_steps=steps, observer=watcher)
-            except _TimeOverError as error:
-                return str(error)
+    def run(trial: int, watcher: _Watcher) -> str:
+        try:
+            result = run_trial(planner, inspection.seed, trial, max_steps=steps, observer=watcher)
+        except _EndedError as error:
+            return str(error)
+        reached.extend([result.steps] if result.success else [])
+        return "ended"
 
-        result = inspection.ask("a simulated trial", run, "trials")
-        states += watcher.before
-        left += watcher.left
-        if watcher.left:
-            shares.append(np.array([each.outside for each in watcher.left]))
-        if isinstance(result, TrialResult):
-            results.append(result)
-        else:
-            failed += result == "failed"
-    ended = len(results) + failed
-    if ended < _TRIALS:
-        inspection.add(
-            "information",
-            "trials",
-            f"{ended} of {_TRIALS} simulated trials came to their end in the time for this check",
-            "Give it more (--budget).",
-        )
-    _report_endings(inspection, results, failed, steps)
-    _report_depletion(inspection, left)
-    _report_lost_truths(inspection, left, shares)
+    while len(watchers) < _TRIALS and not late():
+        watchers.append(_Watcher(inspection, late))
+        endings.append(inspection.ask("a simulated trial", run, len(endings), watchers[-1]))
+    count, failed = len(endings) - endings.count("late"), endings.count("failed")
+    if count < _TRIALS:
+        seen = f"{count} of {_TRIALS} simulated trials came to their end in the time for this check"
+        inspection.add("information", "trials", seen, "Give it more (--budget).")
+    if count:
+        _report_endings(inspection, reached, count, failed, steps)
+    _report_depletion(inspection, [watcher.left for watcher in watchers if watcher.left])
+    states = [state for watcher in watchers for state in watcher.before]
     kept = [states[index] for index in spread_out(_BELIEFS, len(states))]
-    return [SensedBelief(_thinned(each.belief), each.stage) for each in kept]
+    return [state._replace(belief=_thinned(state.belief)) for state in kept]
 
 
 def _thinned(belief: Belief) -> Belief:
-    """Return a belief of at most so many particles, which is enough for the sensors' checks."""
-    count = len(belief.weights)
-    if count <= _PARTICLES_KEPT:
-        return belief
-    chosen = spread_out(_PARTICLES_KEPT, count)
+    """Return a belief of fewer particles, which is enough for the sensors' checks."""
+    chosen = spread_out(_PARTICLES, len(belief.weights))
     weights: FloatArray = belief.weights[chosen] / belief.weights[chosen].sum()
     return Belief(belief.states[chosen], weights)
 
 
 def _report_endings(
-    inspection: Inspection, results: list[TrialResult], failed: int, steps: int
+    inspection: Inspection, reached: list[int], count: int, failed: int, steps: int
 ) -> None:
-    count = len(results) + failed
-    if not count:
-        return
-    successes = [result.steps for result in results if result.success]
-    seen = f"with random sensing, {len(successes)} of {count} trials reach the goal"
-    if successes:
-        seen += f", after {np.median(successes):.0f} steps (median)"
-    if failed:
-        seen += f", and {failed} fail"
+    seen = f"with random sensing, {len(reached)} of {count} trials reach the goal"
+    seen += f", after {np.median(reached):.0f} steps (median)" if reached else ""
+    seen += f", and {failed} fail" if failed else ""
     walk = inspection.walk
-    possible = walk is not None and (walk.reached >= 0).mean() >= 0.5
-    if not successes and possible:
-        inspection.add(
-            "warning",
-            "trials",
-            f"{seen}, within {steps} steps; with the state known most do",
-            "Random sensing may be too poor, or the estimate (the mean) lies where the robot is "
-            "not. Try particle_filter.estimate: heaviest_mode, sense more often "
-            "(simulator.sensing_intervals), and look at the warnings here.",
-            "docs/problems.md#your-own",
-        )
-    else:
+    if reached or walk is None or (walk.reached >= 0).mean() < 0.5:
         inspection.add("information", "trials", seen)
-
-
-def _report_depletion(inspection: Inspection, left: list[_Left]) -> None:
-    """Report what observations leave of the particles."""
-    if not left:
         return
+    seen += f", within {steps} steps; with the state known most do"
+    advice = (
+        "Random sensing may be too poor, or the estimate (the mean) lies where the robot is not. "
+        "Try particle_filter.estimate: heaviest_mode, sense more often "
+        "(simulator.sensing_intervals), and look at the warnings here."
+    )
+    inspection.add("warning", "trials", seen, advice)
+
+
+def _report_depletion(inspection: Inspection, trials: list[list[_Left]]) -> None:
+    """Report what observations leave of the particles, and how often the truth is beyond them."""
+    if not trials:
+        return
+    left = [each for trial in trials for each in trial]
     particles = inspection.settings.particle_filter.num_particles
     few = []
     for action in range(len(sensing_labels(inspection.problem))):
@@ -198,39 +162,79 @@ def _report_depletion(inspection: Inspection, left: list[_Left]) -> None:
         if len(sizes) >= 5 and (share := (sizes < _FEW_LEFT).mean()) > _OFTEN:
             few.append(f"{inspection.label(action)} in {share:.0%} of {len(sizes)} observations")
     if few:
-        inspection.add(
-            "warning",
-            "depletion",
+        seen = (
             f"sensors are too sharp for {particles} particles: often fewer than {_FEW_LEFT:.0f} "
-            f"particles count afterwards (effective sample size), with {', '.join(few)}",
-            "Take more particles (particle_filter.num_particles), sense more often, or declare the "
-            "sensor a little less sharp than it is.",
-            "docs/settings.md",
+            f"particles count afterwards (effective sample size), with {', '.join(few)}"
         )
-
-
-def _report_lost_truths(
-    inspection: Inspection, left: list[_Left], trials: list[FloatArray]
-) -> None:
-    """Report how often the true state lies beyond all particles; each trial counts the same."""
-    if not trials:
-        return
-    unexplained = sum(not each.explained for each in left)
-    particles = inspection.settings.particle_filter.num_particles
-    shares = np.mean([outside.mean(axis=0) for outside in trials], axis=0)
-    whole = float(np.mean([outside.any(axis=1).mean() for outside in trials]))
+        advice = (
+            "Take more particles (particle_filter.num_particles), sense more often, or declare the "
+            "sensor a little less sharp than it is."
+        )
+        inspection.add("warning", "depletion", seen, advice)
+    # Each trial counts the same.
+    outside = [np.array([each.outside for each in trial]) for trial in trials]
+    shares = np.mean([each.mean(axis=0) for each in outside], axis=0)
+    whole = float(np.mean([each.any(axis=1).mean() for each in outside]))
     # Beyond all of n particles of a right belief it is twice in n + 1.
     if whole < _OFTEN + 2.0 * shares.size / (particles + 1):
         return
     at = int(shares.argmax())
-    inspection.add(
-        "warning",
-        "depletion",
+    seen = (
         f"in {whole:.0%} of the beliefs before sensing, over {len(trials)} trials with random "
         f"sensing, the true state lies beyond all {particles} particles in some coordinate, most "
-        f"often in {inspection.coordinate(at)} ({shares[at]:.0%}); {unexplained} of {len(left)} "
-        "observations are further than any particle explains",
-        "An observation of one coordinate leaves few particles for the others: take more of them, "
-        "or sense more often. A coordinate that does not move needs a little noise in move.",
-        CONTRACT,
+        f"often in {inspection.coordinate(at)} ({shares[at]:.0%}); "
+        f"{sum(not each.explained for each in left)} of {len(left)} observations are further than "
+        "any particle explains"
     )
+    advice = (
+        "An observation of one coordinate leaves few particles for the others: take more of them, "
+        "or sense more often. A coordinate that does not move needs a little noise in move."
+    )
+    inspection.add("warning", "depletion", seen, advice)
+
+
+def check_decision_time(inspection: Inspection, states: list[PlanningState]) -> None:
+    """Say how many milliseconds a choice of what to sense takes, and in which functions.
+
+    It is processor time of one thread: other work on the machine makes nothing look slow.
+    """
+    problem, settings, late = inspection.problem, inspection.settings, inspection.deadline(0.15)
+    active = msgspec.structs.replace(settings.active_sensing, num_cores=1)
+    planner = Planner(problem, msgspec.structs.replace(settings, active_sensing=active))
+    initial = inspection.ask("a decision", planner.init, inspection.seed, 0, check="time")
+    chosen = [initial, *(states[index] for index in spread_out(_DECISIONS, len(states)))]
+    taken: list[float] = []
+    profile = cProfile.Profile(thread_time)
+
+    def decide(state: PlanningState) -> None:
+        # The first one, which may load something, does not count.
+        planner.choose_sensing_action(state)
+        began = thread_time()
+        planner.choose_sensing_action(state)
+        taken.append(thread_time() - began)
+        with contextlib.suppress(ValueError):  # if a profiler runs already
+            profile.runcall(planner.choose_sensing_action, state)
+
+    for state in chosen:
+        if not (late() and taken):
+            inspection.ask("a decision", decide, state, check="time")
+    codes: dict[Any, str] = {
+        getattr(getattr(problem, name, None), "__code__", None): name for name in PARAMETERS
+    }
+    entries = sorted(profile.getstats(), key=lambda entry: -entry.totaltime)
+    whole = max((entry.totaltime for entry in entries), default=0.0)
+    parts = [
+        f"{entry.totaltime / whole:.0%} in {codes[entry.code]} ({entry.callcount} calls)"
+        for entry in entries
+        if entry.code in codes and entry.totaltime > 0.02 * whole
+    ]
+    seen = (
+        f"a choice of what to sense takes {np.median(taken) * 1e3:.2g} ms of processor time "
+        f"({settings.selector.method}, {settings.particle_filter.num_particles} particles)"
+    )
+    advice = (
+        "Use whole arrays in what takes most, no loop over states, and look whether fewer "
+        "active_sensing.num_observation_samples choose as well."
+    )
+    seen += f": {', '.join(parts)}" if parts else ""
+    inspection.add("information", "time", seen, advice if np.median(taken) > 5e-3 else "")
