@@ -47,7 +47,7 @@ def test_each_test_has_its_share_of_the_false_alarms() -> None:
         for number, p in enumerate(values):
             inspection.test(p, "likelihood", f"{number}: seen", "do")
         inspection.judge_tests()
-        return inspection.findings
+        return [each for each in inspection.findings if each.severity == "error"]
 
     assert judged(*[1.0] * 9, 1.1 * FALSE_ALARM_RATE / 10) == []
     (found,) = judged(*[1.0] * 9, 0.9 * FALSE_ALARM_RATE / 10)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -53,39 +53,27 @@ _GAINS = 0.1
 """Nats by which the true state's posterior must grow for a remedy to be named."""
 
 
-class _Calibration(NamedTuple):
-    """Of r simulated observations of a sensing action, each from a belief of n particles.
-
-    The shapes are (r, n) (log-likelihoods up to a constant of the observation), (r,) (the particle
-    of the true state), (r, n, state_size), and (r, observation_size).
-    """
-
-    log_likelihoods: FloatArray
-    truths: IntArray
-    states: FloatArray
-    shown: FloatArray
+_Calibration = tuple[FloatArray, IntArray, FloatArray, FloatArray]
+"""Log-likelihoods of r observations in n particles each, (r, n), up to a constant of each
+observation; the true particles, (r,); all particles' states, (r, n, state_size); the observations,
+(r, observation_size)."""
 
 
 def check_likelihoods(inspection: Inspection) -> None:
     """Test for each sensing action whether its samples follow its likelihood."""
-    problem, late = inspection.problem, inspection.deadline(0.45)
+    problem, late = inspection.problem, inspection.deadline(0.45, "likelihood")
     count = len(sensing_labels(problem))
     function = "log_likelihood" if has_general_observations(problem) else "observation_mean"
     kinds = list(_beliefs(inspection))
     for action in range(min(count, _MOST_ACTIONS)):
         if late():
-            seen = (
-                f"the likelihoods of {count - action} of {count} sensing actions were not tested: "
-                "the time for this check was over"
-            )
-            inspection.add("information", "likelihood", seen, "Give it more (--budget).")
             return
         with contextlib.suppress(CheckEndedError):
             for kind, beliefs in kinds:
                 found = inspection.ask(
                     function, _calibrate, inspection, action, beliefs, late, check="likelihood"
                 )
-                ties = inspection.random(_TIES, action).random(len(found.truths))
+                ties = inspection.random(_TIES, action).random(len(found[1]))
                 about = f"{function}, {inspection.label(action)}"
                 _test(inspection, about, kind, found, ties)
 
@@ -133,7 +121,8 @@ def _calibrate(
         angles = circular_observation(problem, action, shown.size)
         on_circle = differences(shown, np.zeros(shown.size), angles)
         found.append((_log_likelihoods(problem, belief, action, shown), truth, belief, on_circle))
-    return _Calibration(*(np.array(part) for part in zip(*found, strict=True)))
+    values, truths, states, shown = (np.array(part) for part in zip(*found, strict=True))
+    return values, truths, states, shown
 
 
 def _log_likelihoods(
@@ -149,23 +138,23 @@ def _log_likelihoods(
 def _test(
     inspection: Inspection, about: str, kind: str, found: _Calibration, ties: FloatArray
 ) -> None:
-    values, truths, count = found.log_likelihoods, found.truths, len(found.truths)
+    (values, truths, states, shown), count = found, len(found[1])
     if impossible := int((values[np.arange(count), truths] == -np.inf).sum()):
-        seen = (
-            f"{about}: {impossible} of {count} simulated observations are impossible (minus "
-            "infinity) in the very state in which they were drawn"
-        )
+        seen = f"{about}: {impossible} of {count} simulated observations are impossible (minus "
+        seen += "infinity) in the very state in which they were drawn"
         advice = "sample_observation and log_likelihood must be of one distribution."
         inspection.add("error", "likelihood", seen, advice)
         return
     weights = _posteriors(values)
     quantities: list[tuple[str, FloatArray]] = [("likelihood", values)]
-    away = found.shown - found.shown.mean(axis=0)
-    for at in range(min(found.states.shape[-1], _MOST_COORDINATES)):
-        name, own = inspection.coordinate(at), found.states[..., at]
+    away = shown - shown.mean(axis=0)
+    for at in range(min(states.shape[-1], _MOST_COORDINATES)):
+        name, own = inspection.coordinate(at), states[..., at]
         # The second order turns with the observation, so that one which is ignored shows.
         quantities += [(name, own), (f"{name} times the observation", own * away[:, :1])]
-    remedy: tuple[str, str] | None = None
+    remedy = None
+    usual = "Compare sample_observation with log_likelihood (observation_mean and "
+    usual += "observation_variance of one state with those of many): of one distribution."
     for name, quantity in quantities:
         places = _places(quantity, weights, truths, ties)
         # The distance from the middle is uniform, too, and shows a wrong width.
@@ -174,12 +163,7 @@ def _test(
             p = _uniform_p(numbers)
             if p < 1e-3 and remedy is None:
                 remedy = remedy_of(values, truths)
-            better, advice = remedy or (
-                "",
-                "Compare log_likelihood with sample_observation (or observation_mean and "
-                "observation_variance of one state with those of many): both must be of one "
-                "distribution.",
-            )
+            better, advice = remedy or ("", usual)
             seen = (
                 f"{about}: does not fit what is sampled. In {count} simulated observations from "
                 f"{kind}, the true state's {shape} among the particles by {name} is not uniform: "
@@ -224,19 +208,12 @@ def remedy_of(values: FloatArray, truths: IntArray) -> tuple[str, str] | None:
 
     finite = np.where(np.isfinite(values), values, np.finfo(float).min)
     negative = -finite / 1e3 if np.abs(finite).max() > 1e300 else -finite
-    found = [
-        (
-            fit(negative),
-            ". It fits better with the other sign",
-            "The log-likelihood is greatest where the observation is likely: "
-            "-0.5 * deviation * deviation.",
-        )
-    ]
+    advice = "The log-likelihood is greatest where the observation is likely: "
+    advice += "-0.5 * deviation * deviation."
+    found = [(fit(negative), ". It fits better with the other sign", advice)]
     if (values >= 0.0).all():
-        seen = (
-            ". It fits better if the logarithm of the result is taken: log_likelihood seems to "
-            "return the likelihood"
-        )
+        seen = ". It fits better if the logarithm of the result is taken: log_likelihood seems to "
+        seen += "return the likelihood"
         advice = "Return the logarithm: numerics.log(likelihood)."
         found.append((fit(np.log(np.maximum(values, 1e-300))), seen, advice))
     powers = 2.0 ** np.arange(-12.0, 12.5, 0.5)
@@ -245,11 +222,8 @@ def remedy_of(values: FloatArray, truths: IntArray) -> tuple[str, str] | None:
     width = 1.0 / np.sqrt(powers[best])
     if not 0.8 < width < 1.25:
         seen = f". It fits better if the noise is taken to be {width:.2g} times as wide"
-        advice = (
-            "A variance in place of a standard deviation, or the reverse? In a Gaussian's "
-            "logarithm, -0.5 * (d / deviation)**2, and in stream.normal(loc, scale), the scale is "
-            "the standard deviation."
-        )
+        advice = "A variance in place of a standard deviation, or the reverse? Both in "
+        advice += "-0.5 * (d / deviation)**2 and in stream.normal(loc, scale) it is the deviation."
         found.append((fits[best] - 0.01, seen, advice))
     gain, seen, advice = max(found)
     return (seen, advice) if gain > fit(values) + _GAINS else None

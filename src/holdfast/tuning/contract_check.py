@@ -8,6 +8,7 @@ states, a call with its repetition, the spread within a call with the spread bet
 from __future__ import annotations
 
 import contextlib
+import functools
 import random as python_random
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -19,12 +20,7 @@ from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
 from holdfast.numerics.floating_mode import as_caller
 from holdfast.numerics.randomness import NoiseFreeStream, Purpose, Stream, stream
 from holdfast.problems import checked
-from holdfast.problems.attributes import (
-    has_general_observations,
-    has_own,
-    name_of,
-    sensing_labels,
-)
+from holdfast.problems.attributes import has_general_observations, name_of, sensing_labels
 from holdfast.tuning.findings import CheckEndedError, Inspection
 
 __all__ = [
@@ -54,13 +50,7 @@ _INITIAL, _MOVE = 1, 2
 
 
 def truths(problem: Any, function: str, states: FloatArray) -> BoolArray:
-    """Return which states are goals, or failures (``is_failure``, which a problem need not have).
-
-    Raises
-    ------
-    ProblemError
-        If the function returns anything else than a truth value for each state.
-    """
+    """Return which states are goals, or failures, of which a problem need not know."""
     leading = states.shape[:-1]
     if getattr(problem, function, None) is None:
         return np.zeros(leading, dtype=bool)
@@ -106,87 +96,76 @@ class _Call(NamedTuple):
     which: str = ""
 
 
-def _calls(problem: Any) -> Iterator[_Call]:
-    """Yield calls of each function that the problem has."""
-    own, still = stream(0, 0, 0, Purpose.WORLD_MOTION), NoiseFreeStream(1000)
-    function = "expected_move" if has_own(problem, "expected_move", ("move",)) else "move"
+def _calls(p: Any) -> Iterator[_Call]:
+    """Yield calls of each function that a problem has."""
+    c, own, still = checked, stream(0, 0, 0, Purpose.WORLD_MOTION), NoiseFreeStream(1000)
+    do = functools.partial(acted, p)
 
-    def stage_after(states: FloatArray, stages: Any) -> Any:
-        ask = checked.next_stages if states.ndim > 1 else checked.next_stage
-        return ask(problem, states, stages)
+    def staged(s: FloatArray, k: Any) -> Any:
+        return (c.next_stages if s.ndim > 1 else c.next_stage)(p, s, k)
 
-    def reward(states: FloatArray, stages: Any) -> Any:
-        ask = checked.rewards if states.ndim > 1 else checked.reward
-        return ask(problem, states, acted(problem, states, stages))
+    def rewarded(s: FloatArray, k: Any) -> Any:
+        return (c.rewards if s.ndim > 1 else c.reward)(p, s, do(s, k))
 
     def measured(s: FloatArray, _: Any) -> FloatArray:
-        return checked.measured_motion(problem, s[0], s[1], own)
+        return c.measured_motion(p, s[0], s[1], own)
 
     def felt(s: FloatArray, k: Any) -> FloatArray:
-        return checked.move_observation(problem, s[0], acted(problem, s, k)[0], own)
+        return c.move_observation(p, s[0], do(s, k)[0], own)
 
-    yield _Call("initial_states", lambda s, _: checked.initial_states(problem, own, len(s)))
-    yield _Call("policy", lambda s, k: checked.policy(problem, s, k), True)
-    yield _Call("policy", lambda s, k: checked.policy(problem, s, int(k[0])))
-    yield _Call("execute", lambda s, k: acted(problem, s, k), True)
-    yield _Call("move", lambda s, k: checked.move(problem, s, acted(problem, s, k), own))
-    yield _Call("move", lambda s, k: checked.move(problem, s, acted(problem, s, k)[0], own))
-    yield _Call("is_goal", lambda s, _: truths(problem, "is_goal", s), True)
-    yield _Call("is_failure", lambda s, _: truths(problem, "is_failure", s), True)
-    yield _Call("reward", reward, True)
-    yield _Call("next_stage", stage_after, True)
-    yield _Call(
-        function, lambda s, k: checked.expected_move(problem, s, acted(problem, s, k), still)
-    )
-    for action in range(len(sensing_labels(problem))):
-        yield from _sensing_calls(problem, action)
-    optional = (
-        _Call("known_state_return", lambda s, k: checked.known_state_return(problem, s, k)),
-        _Call("reinitial_states", lambda s, _: checked.reinitial_states(problem, s, own)),
+    calls = [
+        _Call("initial_states", lambda s, _: c.initial_states(p, own, len(s))),
+        _Call("policy", lambda s, k: c.policy(p, s, k), True),
+        _Call("policy", lambda s, k: c.policy(p, s, int(k[0]))),
+        _Call("execute", do, True),
+        _Call("move", lambda s, k: c.move(p, s, do(s, k), own)),
+        _Call("move", lambda s, k: c.move(p, s, do(s, k)[0], own)),
+        _Call("expected_move", lambda s, k: c.expected_move(p, s, do(s, k), still)),
+        _Call("is_goal", lambda s, _: truths(p, "is_goal", s), True),
+        _Call("is_failure", lambda s, _: truths(p, "is_failure", s), True),
+        _Call("reward", rewarded, True),
+        _Call("next_stage", staged, True),
+        _Call("known_state_return", lambda s, k: c.known_state_return(p, s, k)),
+        _Call("reinitial_states", lambda s, _: c.reinitial_states(p, s, own)),
         _Call("measure_motion", measured),
         _Call(
-            "move_by_measurement",
-            lambda s, k: checked.moved_by_measurement(problem, s, measured(s, k), own),
+            "move_by_measurement", lambda s, k: c.moved_by_measurement(p, s, measured(s, k), own)
         ),
         _Call("sample_move_observation", felt),
         _Call(
             "move_log_likelihood",
-            lambda s, k: checked.move_log_likelihood(
-                problem, s, acted(problem, s, k)[0], felt(s, k)
-            ),
+            lambda s, k: c.move_log_likelihood(p, s, do(s, k)[0], felt(s, k)),
         ),
-        _Call("scene", lambda *_: checked.scene(problem) is None),
-    )
-    for call in optional:
-        if getattr(problem, call.function, None) is not None:
-            yield call
+        _Call("scene", lambda *_: c.scene(p) is None),
+    ]
+    for action in range(len(sensing_labels(p))):
+        calls += _sensing_calls(p, action)
+    yield from (call for call in calls if getattr(p, call.function, None) is not None)
 
 
-def _sensing_calls(problem: Any, action: int) -> Iterator[_Call]:
+def _sensing_calls(p: Any, action: int) -> list[_Call]:
     own = stream(0, 0, action, Purpose.WORLD_OBSERVATION)
-    if not has_general_observations(problem):
-        which = f" of sensing action {action}"
-        rows = action < _MANY_ACTIONS
-        yield _Call(
-            "observation_mean", lambda s, _: checked.prediction(problem, s, action)[0], rows, which
-        )
-        yield _Call(
-            "observation_variance", lambda s, _: _usable(problem, s, action)[1], rows, which
-        )
-        return
+    which, rows = f" of sensing action {action}", action < _MANY_ACTIONS
 
     def shown(s: FloatArray, _: Any) -> FloatArray:
-        return checked.sample_observation(problem, s[0], action, own)
+        return checked.sample_observation(p, s[0], action, own)
 
-    yield _Call("sample_observation", shown)
-    yield _Call(
-        "log_likelihood", lambda s, k: checked.log_likelihood(problem, s, action, shown(s, k))
-    )
+    if has_general_observations(p):
+        weigh = checked.log_likelihood
+        return [
+            _Call("sample_observation", shown),
+            _Call("log_likelihood", lambda s, k: weigh(p, s, action, shown(s, k))),
+        ]
+    mean = checked.prediction
+    return [
+        _Call("observation_mean", lambda s, _: mean(p, s, action)[0], rows, which),
+        _Call("observation_variance", lambda s, _: _usable(p, s, action)[1], rows, which),
+    ]
 
 
 def check_contract(inspection: Inspection, states: FloatArray, stages: IntArray) -> None:
     """Check shapes over batches, and purity, at some states, shapes (n, state_size) and (n,)."""
-    late = inspection.deadline(0.15)
+    late = inspection.deadline(0.15, "contract")
     states = np.array(states)
     states.setflags(write=False)
     tried: set[str] = set()
@@ -204,22 +183,16 @@ def check_contract(inspection: Inspection, states: FloatArray, stages: IntArray)
 
     calls = list(_calls(inspection.problem))
     first = [(call, ask("contract", call, _once)) for call in calls]
-    for call in calls:
-        ask("purity", call, _drawn_elsewhere)
     # In another order, so that what a call leaves behind shows.
     for call, before in reversed(first):
         ask("purity", call, _again, before)
     for call in calls:
-        rounded = ask("contract", call, _by_rows) if call.by_rows else None
-        if rounded:
+        if call.by_rows and (rounded := ask("contract", call, _by_rows)):
             seen = (
                 f"{call.function}{call.which} of a belief and of its single states differ in the "
                 f"last bits, by {rounded:.1g}: another machine may compute other bits"
             )
-            advice = (
-                "Take exp, log, sin, cos, arctan2 and sums from holdfast.numerics if services are "
-                "to check the robot's state bit for bit."
-            )
+            advice = "Take exp, log, sin, cos, arctan2 and sums from holdfast.numerics."
             inspection.add("information", "contract", seen, advice)
 
 
@@ -227,28 +200,24 @@ def _once(call: _Call, states: FloatArray, stages: IntArray) -> bytes:
     return np.ascontiguousarray(call.make(states, stages)).tobytes()
 
 
-def _drawn_elsewhere(call: _Call, states: FloatArray, stages: IntArray) -> None:
-    """Raise ProblemError if a call draws from a generator that all of the program shares."""
-    before = _global_generators()
-    call.make(states, stages)
-    if _global_generators() != before:
+def _again(call: _Call, states: FloatArray, stages: IntArray, before: bytes) -> None:
+    """Raise ProblemError if a call gives something else, or draws from what the program shares."""
+    generators = _global_generators()
+    same = _once(call, states, stages) == before
+    if _global_generators() != generators:
         raise ProblemError(
-            f"{call.function} draws from the global generator of NumPy or of Python's random: two "
-            "runs differ"
+            f"{call.function} draws from the global generator of NumPy or of Python's random"
+        )
+    if not same:
+        raise ProblemError(
+            f"{call.function} returned something else when it was called again with the same "
+            "arguments and the same stream"
         )
 
 
 def _global_generators() -> tuple[object, ...]:
     kind, keys, position, has_gauss, _ = np.random.get_state()  # noqa: NPY002
     return kind, np.asarray(keys).tobytes(), position, has_gauss, python_random.getstate()
-
-
-def _again(call: _Call, states: FloatArray, stages: IntArray, before: bytes) -> None:
-    if _once(call, states, stages) != before:
-        raise ProblemError(
-            f"{call.function} returned something else when it was called again with the same "
-            "arguments and the same stream"
-        )
 
 
 def _by_rows(call: _Call, states: FloatArray, stages: IntArray) -> float:
@@ -277,7 +246,7 @@ def _by_rows(call: _Call, states: FloatArray, stages: IntArray) -> float:
 def check_streams(inspection: Inspection) -> None:
     """Check where draws come from: the stream, one for each state, alike alone and together."""
     problem, ask = inspection.problem, inspection.ask
-    late = inspection.deadline(0.15)
+    late = inspection.deadline(0.15, "streams")
 
     def initial(number: int, count: int) -> FloatArray:
         own = inspection.random(_INITIAL, number)
@@ -291,19 +260,16 @@ def check_streams(inspection: Inspection) -> None:
 
     with contextlib.suppress(CheckEndedError):
         compare("initial_states", lambda number: initial(number, 1)[0], initial(_DRAWS, _DRAWS))
-    for which, state in enumerate(initial(_DRAWS + 1, 2)):
-        state.setflags(write=False)
-        many = np.tile(state, (_DRAWS, 1))
-        many.setflags(write=False)
-        action = ask("execute", acted, problem, state, 0)
+    start = initial(_DRAWS + 1, 1)
+    many = np.tile(start, (_DRAWS, 1))
+    many.setflags(write=False)
+    action = ask("execute", acted, problem, start[0], 0)
 
-        def moved(
-            number: int, states: FloatArray, which: int = which, action: FloatArray = action
-        ) -> FloatArray:
-            own = inspection.random(_MOVE + which, number)
-            return ask("move", checked.move, problem, states, action, own)
+    def moved(number: int, states: FloatArray) -> FloatArray:
+        own = inspection.random(_MOVE, number)
+        return ask("move", checked.move, problem, states, action, own)
 
-        compare("move", lambda number, s=state, m=moved: m(number, s), moved(_DRAWS, many))  # type: ignore[misc]
+    compare("move", lambda number: moved(number, start[0]), moved(_DRAWS, many))
 
 
 def _compare_draws(
@@ -313,20 +279,13 @@ def _compare_draws(
     within, between = np.ptp(together, axis=0) > 0.0, np.ptp(alone, axis=0) > 0.0
     if (differs := within != between).any():
         names = ", ".join(inspection.coordinate(int(each)) for each in np.flatnonzero(differs))
+        seen = f"{function} draws {names} of a belief at random, but for a single state it gives "
+        seen += f"the same with each of {len(alone)} streams"
         if (between & ~within).any():
-            seen = (
-                f"{function} gives all states of one call the same draw of {names}: the particles "
-                "of a belief would never spread"
-            )
-        else:
-            seen = (
-                f"{function} draws {names} of a belief at random, but for a single state it gives "
-                f"the same with each of {len(alone)} streams"
-            )
-        advice = (
-            "Draw from the stream that the function is given, with the shape of the states, for "
-            "one state as for many: stream.normal(states.shape), or stream.normal((count, 2))."
-        )
+            seen = f"{function} gives all states of one call the same draw of {names}: the "
+            seen += "particles of a belief would never spread"
+        advice = "Draw from the given stream with the shape of the states, of one as of many: "
+        advice += "stream.normal(states.shape), or stream.normal((count, 2))."
         inspection.add("error", "streams", seen, advice)
         return
     for number, (own, other) in enumerate(zip(together.T, alone.T, strict=True)):
@@ -335,10 +294,7 @@ def _compare_draws(
             f"(mean {own.mean():.3g}, deviation {own.std():.2g}) than in single states "
             f"({other.mean():.3g}, {other.std():.2g})"
         )
-        advice = (
-            "The belief draws many states in a call and the simulated world one: both must draw "
-            "each state from the same distribution."
-        )
+        advice = "The simulated world is one state: draw it as each state of a belief is drawn."
         inspection.test(two_sample_p(own, other), "streams", seen, advice)
 
 

@@ -28,14 +28,7 @@ from holdfast.planning.settings import PlanningSettings
 from holdfast.printable import one_line
 from holdfast.problems.attributes import sensing_labels, state_labels
 
-__all__ = [
-    "FALSE_ALARM_RATE",
-    "CheckEndedError",
-    "Finding",
-    "Inspection",
-    "Walk",
-    "spread_out",
-]
+__all__ = ["FALSE_ALARM_RATE", "CheckEndedError", "Finding", "Inspection", "Walk", "spread_out"]
 
 FALSE_ALARM_RATE = 0.001
 """Probability that the statistical tests of a right problem, all together, find an error."""
@@ -71,6 +64,7 @@ _REMEDIES = (
         "Make it take states of any leading shape, (), (n,) or (t, n), with the coordinates last "
         "(states[..., 0]), and return what the table there says, as float64.",
     ),
+    ("raised", "These are the lines of your own code."),
 )
 """Patterns of what is raised, and what to do; the first that fits counts."""
 
@@ -116,11 +110,7 @@ class CheckEndedError(Exception):
 
 
 class Walk(NamedTuple):
-    """Trials in which the state is known: states and stages of some steps, and when each ended.
-
-    The shapes are (m, state_size), (m,) and, for each trial, (n,): the step at which it came to the
-    goal, -1 if it did not.
-    """
+    """Trials with the state known: m states and stages of theirs, and when each was at the goal."""
 
     states: FloatArray
     stages: IntArray
@@ -128,11 +118,7 @@ class Walk(NamedTuple):
 
 
 class Inspection:
-    """What the checks of one problem share: its settings, random streams, time and findings.
-
-    ``budget_s`` is the time after which no further work is begun. What is found does not depend on
-    it unless it runs out, which is a finding.
-    """
+    """What the checks of one problem share: its settings, random streams, time and findings."""
 
     def __init__(
         self, problem: Any, settings: PlanningSettings, max_steps: int, seed: int, budget_s: float
@@ -159,10 +145,18 @@ class Inspection:
         labels = state_labels(self.problem)
         return labels[number] if labels else f"coordinate {number} of a state"
 
-    def deadline(self, share: float) -> Callable[[], bool]:
+    def deadline(self, share: float, check: str) -> Callable[[], bool]:
         """Return a function that tells whether a check has used up its share of the time."""
         end = min(self._end, perf_counter() + share * self._budget_s)
-        return lambda: perf_counter() > end
+
+        def late() -> bool:
+            if perf_counter() <= end:
+                return False
+            seen = "the time for this check was over before it had looked at all"
+            self.add("information", check, seen, "Give it more (--budget).")
+            return True
+
+        return late
 
     def add(
         self, severity: Severity, check: str, seen: str, advice: str = "", details: str = ""
@@ -179,10 +173,11 @@ class Inspection:
         self._tests.append((p, Finding("error", check, seen, advice)))
 
     def judge_tests(self) -> None:
-        """Add the findings of the tests whose p-value is below their share of the false alarms.
-
-        Of several findings of one check about one function, the one with the least p-value counts.
-        """
+        """Add what has a p-value below its share of the false alarms, one for each function."""
+        if self.num_tests:
+            seen = f"{self.num_tests} statistical tests were made; of a right problem they find an "
+            seen += f"error, all together, with a probability of at most {FALSE_ALARM_RATE:g}"
+            self.add("information", "likelihood", seen)
         judged = set()
         for p, found in sorted(self._tests, key=lambda test: test[0]):
             about = found.check, found.seen.partition(":")[0]
@@ -193,19 +188,9 @@ class Inspection:
         self._tests.clear()
 
     def ask(
-        self,
-        function: str,
-        call: Callable[..., ResultT],
-        *arguments: Any,
-        check: str = "contract",
+        self, function: str, call: Callable[..., ResultT], *arguments: Any, check: str = "contract"
     ) -> ResultT:
-        """Return what a call of the problem's code returns.
-
-        Raises
-        ------
-        CheckEndedError
-            If it raises; that is a finding about ``function`` then. Ctrl-C passes.
-        """
+        """Return what a call of the problem's code returns; what it raises is a finding."""
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -231,11 +216,8 @@ class Inspection:
         if to_blame in self._blamed:
             return
         self._blamed.add(to_blame)
-        advice = "Look at what it returns there; the documentation says what is needed."
-        if details:
-            advice = "These are the lines of your own code."
         fits = (remedy for pattern, remedy in _REMEDIES if re.search(pattern, seen))
-        self.add("error", check, seen, next(fits, advice), details)
+        self.add("error", check, seen, next(fits, "Look at what it returns there."), details)
 
 
 def spread_out(count: int, total: int) -> IntArray:

@@ -7,7 +7,6 @@ will. They also show where the robot goes, for the checks that need states from 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from holdfast.problems import checked
 from holdfast.problems.attributes import circular_actions, circular_states
 from holdfast.problems.problem import ProblemBase
 from holdfast.tuning.contract_check import acted, truths
-from holdfast.tuning.findings import Inspection, Walk, spread_out
+from holdfast.tuning.findings import Inspection, Severity, Walk, spread_out
 
 __all__ = ["check_motion", "check_rewards", "follow_policy"]
 
@@ -44,7 +43,7 @@ _DRAWS, _STATES = 100, 12
 def follow_policy(inspection: Inspection) -> Walk:
     """Simulate trials in which the state is known, until all have ended or the steps are over."""
     problem, ask = inspection.problem, inspection.ask
-    late = inspection.deadline(0.2)
+    late = inspection.deadline(0.2, "goals")
     own = inspection.random(_INITIAL)
     states = ask("initial_states", checked.initial_states, problem, own, _TRIALS)
     stages = np.zeros(_TRIALS, dtype=np.int64)
@@ -96,66 +95,48 @@ def _large_changes(change: FloatArray) -> IntArray:
 
 def _report_angles(inspection: Inspection, jumps: IntArray, turns: IntArray) -> None:
     """Warn of coordinates whose large changes are all whole turns, as if they were angles."""
-
-    def undeclared(counts: IntArray, declared: Sequence[int]) -> list[int]:
-        turning = np.flatnonzero((counts[1] >= 2) & (counts[1] == counts[0])).tolist()
-        return [at for at in turning if at not in declared]
-
-    for at in undeclared(jumps, circular_states(inspection.problem)):
-        seen = (
-            f"{inspection.coordinate(at)} jumps by a whole turn (2 pi) in one step, and is not "
-            "declared to be an angle: the mean of 3.1 and -3.1 is taken for 0"
-        )
-        advice = (
-            f"Give the problem circular = ({at},), and circular_observations for what shows it."
-        )
-        inspection.add("warning", "units", seen, advice)
-    for at in undeclared(turns, circular_actions(inspection.problem)):
-        seen = (
-            f"coordinate {at} of the task action jumps by a whole turn (2 pi) between two steps, "
-            "and is not declared to be an angle"
-        )
-        advice = (
-            "Take numerics.wrapped(goal - heading) for a difference of angles in the policy, or "
-            f"give the problem circular_actions = ({at},)."
-        )
-        inspection.add("warning", "units", seen, advice)
+    problem = inspection.problem
+    for counts, attribute, declared, whose in (
+        (jumps, "circular", circular_states(problem), "a state"),
+        (turns, "circular_actions", circular_actions(problem), "the task action"),
+    ):
+        for at in np.flatnonzero((counts[1] >= 2) & (counts[1] == counts[0])).tolist():
+            if at in declared:
+                continue
+            seen = f"coordinate {at} of {whose} jumps by a whole turn (2 pi) in one step, and is "
+            seen += "not declared to be an angle: the mean of 3.1 and -3.1 is taken for 0"
+            advice = f"Give the problem {attribute} = ({at},), and circular_observations for what "
+            advice += "shows it; in a policy take numerics.wrapped(goal - heading)."
+            inspection.add("warning", "units", seen, advice)
 
 
 def _report_walk(
     inspection: Inspection, walk: Walk, failed: IntArray, steps: int, *, never_moves: bool
 ) -> None:
-    count, limit, num_stages = _TRIALS, inspection.max_steps, inspection.problem.num_stages
+    limit, num_stages = inspection.max_steps, inspection.problem.num_stages
     reached, in_time = walk.reached >= 0, (walk.reached >= 0) & (walk.reached <= limit)
     if (walk.reached == 0).all():
-        seen = f"all of {count} initial states are goals: each trial ends before its first step"
+        seen = f"all of {_TRIALS} initial states are goals: each trial ends before its first step"
         inspection.add("error", "goals", seen, "Look at is_goal and initial_states.")
         return
     if never_moves and not reached.all():
-        seen = (
-            f"the policy never moves: its executed action is 0 in all of {count} trials of {steps} "
-            f"steps, and {reached.sum()} of them reach the goal"
-        )
+        seen = f"the policy never moves: its executed action is 0 in all of {_TRIALS} trials of "
+        seen += f"{steps} steps, and {reached.sum()} of them reach the goal"
         inspection.add("error", "goals", seen, "Look at policy and execute.")
         return
-    seen = (
-        f"with the state known, the policy comes to the goal in {reached.sum()} of {count} trials"
-    )
+    seen = f"with the state known, the policy comes to the goal in {reached.sum()} of {_TRIALS} "
+    seen += "trials"
     if reached.any():
         seen += f", after {np.median(walk.reached[reached]):.0f} steps (median)"
-    if (lost := (failed >= 0).sum()) > 0:
+    if lost := int((failed >= 0).sum()):
         seen += f", and {lost} fail"
-    running = count - reached.sum() - lost
-    if running:
+    if running := _TRIALS - int(reached.sum()) - lost:
         seen += f"; {running} have not ended after {steps} steps"
     if (reached & ~in_time).any():
         seen += f"; within max_steps, {limit}, it is {in_time.sum()}"
     cut = running > 0 and steps < limit
-    if cut:
-        seen += f" of {limit}, when the time for this check was over"
     advice = (
-        "What is lost here no sensing can win. Look at is_goal and at the policy near the goal, or "
-        "expect that much less."
+        "What is lost here no sensing can win. Look at is_goal and at the policy near the goal."
     )
     if reached.mean() >= _ENOUGH:
         needed = int(np.quantile(walk.reached[reached], 0.9))
@@ -174,19 +155,17 @@ def check_rewards(inspection: Inspection) -> None:
     rewards, selector = np.array(inspection.rewards), inspection.settings.selector
     if not rewards.size or np.ptp(rewards) > 0.0 or rewards[0] < 0.0:
         return
-    asked = selector.method == "expected_return" and selector.rollout_reward == "problem"
     seen = f"the reward is {rewards[0]:g} in all of {len(rewards)} simulated steps: "
-    seen += (
-        "a trial that never reaches the goal has the greatest return"
-        if rewards[0] > 0.0
-        else "expected_return has nothing to tell sensing actions by"
-    )
-    advice = (
-        "With selector.rollout_reward: steps the return counts steps instead. Or leave reward out, "
-        "which does the same."
-    )
-    severity = "warning" if rewards[0] > 0.0 else "information"
-    inspection.add("error" if asked else severity, "goals", seen, advice)  # type: ignore[arg-type]
+    severity: Severity = "information"
+    if rewards[0] > 0.0:
+        severity, why = "warning", "a trial that never reaches the goal has the greatest return"
+    else:
+        why = "expected_return has nothing to tell sensing actions by"
+    if selector.method == "expected_return" and selector.rollout_reward == "problem":
+        severity = "error"
+    advice = "With selector.rollout_reward: steps the return counts steps instead; so it does "
+    advice += "without a reward."
+    inspection.add(severity, "goals", seen + why, advice)
 
 
 def check_motion(inspection: Inspection) -> None:
@@ -212,25 +191,17 @@ def check_motion(inspection: Inspection) -> None:
         ratio, offset = _typical(ratios, at, 1.0), _typical(offsets, at, 0.0)
         name = inspection.coordinate(at)
         if not 1.0 / 9.0 <= ratio <= 9.0:
-            seen = (
-                f"motion_variance says that a step blurs {name} with a variance "
-                f"{'below' if ratio > 1.0 else 'above'} what move does: move's is {ratio:.2g} "
-                f"times as large (median of {len(ratios)} states)"
-            )
-            advice = (
-                "motion_variance is the variance of the noise of one step, not its standard "
-                "deviation. The mixture estimators and the advice about resolution depend on it."
-            )
+            seen = f"motion_variance says that a step blurs {name} with a variance "
+            seen += f"{'below' if ratio > 1.0 else 'above'} what move does: move's is {ratio:.2g} "
+            seen += f"times as large (median of {len(ratios)} states)"
+            advice = "motion_variance is the variance of the noise of one step, not its standard "
+            advice += "deviation. The mixture estimators depend on it."
             inspection.add("warning", "motion", seen, advice)
         if offset > 1.5:
-            seen = (
-                f"without noise a move leads {name} to a place that is {offset:.1f} standard "
-                f"deviations from the mean of {_DRAWS} moves with noise"
-            )
-            advice = (
-                "path_entropy, the default, follows the policy without noise. Give the problem an "
-                "expected_move that leads to the mean."
-            )
+            seen = f"without noise a move leads {name} to a place that is {offset:.1f} standard "
+            seen += f"deviations from the mean of {_DRAWS} moves with noise"
+            advice = "path_entropy, the default, follows the policy without noise. Give the "
+            advice += "problem an expected_move that leads to the mean."
             inspection.add("warning", "motion", seen, advice)
 
 

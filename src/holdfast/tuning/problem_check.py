@@ -23,7 +23,6 @@ from holdfast.problems import attributes, checked
 from holdfast.tuning.calibration_check import check_likelihoods
 from holdfast.tuning.contract_check import check_contract, check_streams
 from holdfast.tuning.findings import (
-    FALSE_ALARM_RATE,
     CheckEndedError,
     Finding,
     Inspection,
@@ -162,16 +161,9 @@ def _goals(inspection: Inspection, _: Beliefs) -> None:
 
 def _likelihoods(inspection: Inspection, _: Beliefs) -> None:
     """Test the likelihoods, and judge all tests: what follows weighs beliefs by likelihoods."""
-    try:
+    with contextlib.suppress(CheckEndedError):
         check_likelihoods(inspection)
-    finally:
-        if inspection.num_tests:
-            seen = (
-                f"{inspection.num_tests} statistical tests were made; of a right problem they find "
-                f"an error, all together, with a probability of at most {FALSE_ALARM_RATE:g}"
-            )
-            inspection.add("information", "likelihood", seen)
-        inspection.judge_tests()
+    inspection.judge_tests()
 
 
 def _trials(inspection: Inspection, beliefs: Beliefs) -> None:

@@ -56,16 +56,10 @@ _SCALES = 30.0
 class _Gains(NamedTuple):
     """What sensing tells, for each of b beliefs and J sensing actions.
 
-    Attributes
-    ----------
-    information : array of shape (b, J)
-        About the state, in nats.
-    of_actions : array of shape (b, J, action_size)
-        About each coordinate of the task action, in nats, less what chance would show.
-    states : array of shape (b, J, state_size)
-        The share of the variance that is taken away; NaN where there is none.
-    before : array of shape (b, action_size)
-        Standard deviations of the task actions before sensing.
+    In nats about the state, (b, J), and about each coordinate of the task action, less what chance
+    would show, (b, J, action_size); the share of each variance of the state that is taken away,
+    (b, J, state_size), NaN where there is none; and the standard deviations of the task actions
+    before sensing, (b, action_size).
     """
 
     information: FloatArray
@@ -83,14 +77,11 @@ def check_sensors(inspection: Inspection, beliefs: list[PlanningState]) -> None:
     costs = sensing_costs(problem)
     silent = (gains.information.mean(axis=0) < _NOTHING) & (gains.information.max(axis=0) < 0.1)
     for action in np.flatnonzero(silent).tolist():
-        seen = (
-            f"{inspection.label(action)} tells nothing: {gains.information[:, action].mean():.2g} "
-            f"nats in {len(gains.before)} beliefs of simulated trials"
-        )
-        advice = (
-            "If it stands for not sensing, selector.sensing_is_optional offers that for any "
-            "problem. Else leave it out, or look at its noise."
-        )
+        seen = f"{inspection.label(action)} tells nothing: "
+        seen += f"{gains.information[:, action].mean():.2g} nats in {len(beliefs)} beliefs of "
+        seen += "simulated trials"
+        advice = "Leave it out, or look at its noise. If it stands for not sensing, "
+        advice += "selector.sensing_is_optional offers that for any problem."
         free = costs[action] < costs.max()
         inspection.add("information" if free else "warning", "sensors", seen, advice)
     _report_dominated(inspection, gains, silent, costs)
@@ -106,7 +97,7 @@ def check_sensors(inspection: Inspection, beliefs: list[PlanningState]) -> None:
 def _gains_of(inspection: Inspection, beliefs: list[PlanningState]) -> _Gains:
     """Draw what each sensing action might show of each belief, and say what it tells."""
     problem, ask = inspection.problem, inspection.ask
-    late = inspection.deadline(0.2)
+    late = inspection.deadline(0.2, "sensors")
     function = "log_likelihood" if has_general_observations(problem) else "observation_mean"
     rows: list[list[tuple[Any, ...]]] = []
     before = []
@@ -205,15 +196,11 @@ def _report_dominated(
                 and np.nanmax(gains.states[:, worse] - gains.states[:, better]) < 0.3
                 and left.max() > 1.25
             ):
-                seen = (
-                    f"{inspection.label(worse)} is dominated: {inspection.label(better)} shows the "
-                    f"same at least as sharply and is no dearer ({told[:, better].mean():.2g} nats "
-                    f"and {told[:, worse].mean():.2g} in {len(told)} beliefs of simulated trials)"
-                )
-                advice = (
-                    "Leave it out, or give the better one its price (sensing_costs): estimates of "
-                    "entropy from few particles may take the worse one."
-                )
+                seen = f"{inspection.label(worse)} is dominated: {inspection.label(better)} shows "
+                seen += "the same at least as sharply and is no dearer "
+                seen += f"({told[:, better].mean():.2g} and {told[:, worse].mean():.2g} nats)"
+                advice = "Leave it out, or give the better one its price (sensing_costs): "
+                advice += "estimates of entropy from few particles may take the worse one."
                 inspection.add("warning", "sensors", seen, advice)
                 break
 
@@ -225,28 +212,17 @@ def _report_useless(
     # Where all actions are the same in practice there is nothing to change.
     matters = gains.before > 0.3 * resolution
     count = len(gains.before)
-    if not matters.any():
-        seen = (
-            f"in none of {count} beliefs of simulated trials do the task actions differ by more "
-            "than a third of the resolution: what is sensed may not matter here"
-        )
-        inspection.add("information", "sensors", seen)
-        return
     told = np.where(matters[:, np.newaxis, :], gains.of_actions, 0.0).max(axis=2)
     for action in np.flatnonzero(~silent).tolist():
         own, whole = told[:, action], float(gains.information[:, action].mean())
         most = own.mean() + 2.0 * own.std() / np.sqrt(count)
         if most < max(2.0 * _NOTHING, 0.03 * whole) and own.mean() < 0.15 * whole:
-            seen = (
-                f"{inspection.label(action)} changes no task action by itself: it tells "
-                f"{whole:.2g} nats about the state and {max(own.mean(), 0.0):.2g} about the next "
-                f"task action, in {count} beliefs of simulated trials"
-            )
-            advice = (
-                "If it counts later, or only together with another one, looking one step ahead "
-                "never chooses it: compare with selector.method: expected_return and "
-                "rollout_looks: 8, and with random. Else leave it out."
-            )
+            seen = f"{inspection.label(action)} changes no task action by itself: it tells "
+            seen += f"{whole:.2g} nats about the state and {max(own.mean(), 0.0):.2g} about the "
+            seen += f"next task action, in {count} beliefs of simulated trials"
+            advice = "If it counts later, or only together with another one, looking one step "
+            advice += "ahead never chooses it: compare with selector.method: expected_return and "
+            advice += "rollout_looks: 8, and with random. Else leave it out."
             inspection.add("warning", "sensors", seen, advice)
 
 
@@ -257,34 +233,23 @@ def _check_resolution(
     method = inspection.settings.selector.method
     widest, spread = gains.before.max(axis=0), np.median(gains.before, axis=0)
     if (widest > 0.0).any() and (resolution > 3.0 * widest).all():
-        seen = (
-            f"resolution is {_written(resolution)}, and the task actions of a belief never differ "
-            f"by more than a standard deviation of {widest.max():.3g}: to the entropy all of them "
-            "are the same, and no sensing action is better than another"
-        )
+        seen = f"resolution is {_written(resolution)}, and the task actions of a belief never "
+        seen += f"differ by more than a standard deviation of {widest.max():.3g}: to the entropy "
+        seen += "all of them are the same, and no sensing action is better than another"
         noise = _written(np.sqrt(np.asarray(inspection.problem.motion_variance)))
-        advice = (
-            "Let it be what the task tolerates, of the order of the goal's size or of the motion "
-            f"noise ({noise})."
-        )
+        advice = "Let it be what the task tolerates, of the order of the goal's size or of the "
+        advice += f"motion noise ({noise})."
         blind = method in UNINFORMED_METHODS
         inspection.add("warning" if blind else "error", "resolution", seen, advice)
         return
-    active = np.flatnonzero(spread > 0.0)
-    most, least = (
-        (active[[spread[active].argmax(), spread[active].argmin()]]) if len(active) else (0, 0)
-    )
-    if np.ptp(resolution) == 0.0 and spread[most] > _SCALES * spread[least]:
-        seen = (
-            f"coordinates {most} and {least} of the task action have standard deviations of "
-            f"{spread[most]:.3g} and {spread[least]:.3g} in a typical belief, and one resolution, "
-            f"{resolution[0]:.3g}"
-        )
-        advice = (
-            "Give each coordinate a resolution in its own unit: resolution = np.array([...]), one "
-            "number for each."
-        )
-        inspection.add("warning", "units", seen, advice)
+    if np.ptp(resolution) == 0.0 and (spread > 0.0).any():
+        most, least = spread.argmax(), np.where(spread > 0.0, spread, np.inf).argmin()
+        if spread[most] > _SCALES * spread[least]:
+            seen = f"coordinates {most} and {least} of the task action have standard deviations of "
+            seen += f"{spread[most]:.3g} and {spread[least]:.3g} in a typical belief, and one "
+            seen += f"resolution, {resolution[0]:.3g}"
+            advice = "Give each its own, in its own unit: resolution = np.array([...])."
+            inspection.add("warning", "units", seen, advice)
     tolerance = _tolerance(inspection, walk)
     if method not in ("path_entropy", "action_entropy") or not tolerance.any():
         return
@@ -297,18 +262,13 @@ def _check_resolution(
     sharp, weak = np.where(known, best, -1.0).argmax(), np.where(unknown, best, np.inf).argmin()
     if not (known.any() and unknown.any()) or best[sharp] < 1.5 * best[weak]:
         return
-    seen = (
-        f"coordinate {sharp} of the task action is known to {spread[sharp]:.2g} before sensing, "
-        f"well enough for the goal, which tolerates about {tolerance[sharp]:.2g}; but its "
-        f"resolution is {resolution[sharp]:.2g}, so one look at it gains {best[sharp]:.2g} nats, "
-        f"and a look at coordinate {weak}, known to {spread[weak]:.2g} where about "
-        f"{tolerance[weak]:.2g} is needed, at most {best[weak]:.2g}"
-    )
-    advice = (
-        f"Entropy prefers the first. Let resolution be what the task tolerates "
-        f"({_written(tolerance)}), and compare with selector.method: expected_return and with "
-        "random."
-    )
+    seen = f"coordinate {sharp} of the task action is known to {spread[sharp]:.2g} before sensing, "
+    seen += f"well enough for the goal, which tolerates about {tolerance[sharp]:.2g}; but its "
+    seen += f"resolution is {resolution[sharp]:.2g}, so one look at it gains {best[sharp]:.2g} "
+    seen += f"nats, and a look at coordinate {weak}, known to {spread[weak]:.2g} where about "
+    seen += f"{tolerance[weak]:.2g} is needed, at most {best[weak]:.2g}"
+    advice = "Entropy prefers the first. Let resolution be what the task tolerates "
+    advice += f"({_written(tolerance)}), and compare with expected_return and with random."
     inspection.add("warning", "resolution", seen, advice)
 
 

@@ -10,7 +10,6 @@ import contextlib
 import cProfile
 from collections.abc import Callable
 from time import thread_time
-from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -41,13 +40,9 @@ _OFTEN = 0.2
 _DECISIONS = 5
 
 
-class _Left(NamedTuple):
-    """What an observation leaves of a belief, and in which coordinates it had lost the truth."""
-
-    sensing_action: int
-    size: float
-    explained: bool
-    outside: BoolArray
+_Left = tuple[int, float, BoolArray]
+"""What an observation leaves of a belief: the sensing action, effective particles, and whether the
+true state lay beyond all particles in each coordinate."""
 
 
 class _EndedError(HoldfastError):
@@ -75,9 +70,8 @@ class _Watcher(TrialObserver):
         apart = differences(step.before.belief.states, self.world.state, angles)
         # The true state beyond all particles in some coordinate.
         outside = (apart > 0.0).all(axis=0) | (apart < 0.0).all(axis=0)
-        info = step.observation_info
-        size, explained = info.effective_sample_size, info.explained
-        self.left.append(_Left(step.sensing_action, size, explained, np.asarray(outside)))
+        size = step.observation_info.effective_sample_size
+        self.left.append((step.sensing_action, size, np.asarray(outside)))
 
     def acted(self, step: TaskStep) -> None:
         """End the trial if the time is over, or in a failure, which the world does not know."""
@@ -91,7 +85,7 @@ class _Watcher(TrialObserver):
 
 def check_trials(inspection: Inspection) -> list[PlanningState]:
     """Run a few trials with random sensing; return states from along the way, before sensing."""
-    settings, late = inspection.settings, inspection.deadline(0.25)
+    settings, late = inspection.settings, inspection.deadline(0.25, "trials")
     selector = msgspec.structs.replace(
         settings.selector, method="random", sensing_is_optional=False
     )
@@ -113,9 +107,6 @@ def check_trials(inspection: Inspection) -> list[PlanningState]:
         watchers.append(_Watcher(inspection, late))
         endings.append(inspection.ask("a simulated trial", run, len(endings), watchers[-1]))
     count, failed = len(endings) - endings.count("late"), endings.count("failed")
-    if count < _TRIALS:
-        seen = f"{count} of {_TRIALS} simulated trials came to their end in the time for this check"
-        inspection.add("information", "trials", seen, "Give it more (--budget).")
     if count:
         _report_endings(inspection, reached, count, failed, steps)
     _report_depletion(inspection, [watcher.left for watcher in watchers if watcher.left])
@@ -142,11 +133,9 @@ def _report_endings(
         inspection.add("information", "trials", seen)
         return
     seen += f", within {steps} steps; with the state known most do"
-    advice = (
-        "Random sensing may be too poor, or the estimate (the mean) lies where the robot is not. "
-        "Try particle_filter.estimate: heaviest_mode, sense more often "
-        "(simulator.sensing_intervals), and look at the warnings here."
-    )
+    advice = "The estimate (the mean) may lie where the robot is not, or random sensing is too "
+    advice += "poor. Try particle_filter.estimate: heaviest_mode, and sense more often "
+    advice += "(simulator.sensing_intervals)."
     inspection.add("warning", "trials", seen, advice)
 
 
@@ -158,51 +147,37 @@ def _report_depletion(inspection: Inspection, trials: list[list[_Left]]) -> None
     particles = inspection.settings.particle_filter.num_particles
     few = []
     for action in range(len(sensing_labels(inspection.problem))):
-        sizes = np.array([each.size for each in left if each.sensing_action == action])
+        sizes = np.array([size for own, size, _ in left if own == action])
         if len(sizes) >= 5 and (share := (sizes < _FEW_LEFT).mean()) > _OFTEN:
             few.append(f"{inspection.label(action)} in {share:.0%} of {len(sizes)} observations")
     if few:
-        seen = (
-            f"sensors are too sharp for {particles} particles: often fewer than {_FEW_LEFT:.0f} "
-            f"particles count afterwards (effective sample size), with {', '.join(few)}"
-        )
-        advice = (
-            "Take more particles (particle_filter.num_particles), sense more often, or declare the "
-            "sensor a little less sharp than it is."
-        )
+        seen = f"sensors are too sharp for {particles} particles: often fewer than {_FEW_LEFT:.0f} "
+        seen += f"count afterwards (effective sample size), with {', '.join(few)}"
+        advice = "Take more particles (particle_filter.num_particles), sense more often, or "
+        advice += "declare the sensor a little less sharp than it is."
         inspection.add("warning", "depletion", seen, advice)
     # Each trial counts the same.
-    outside = [np.array([each.outside for each in trial]) for trial in trials]
+    outside = [np.array([each for _, _, each in trial]) for trial in trials]
     shares = np.mean([each.mean(axis=0) for each in outside], axis=0)
     whole = float(np.mean([each.any(axis=1).mean() for each in outside]))
     # Beyond all of n particles of a right belief it is twice in n + 1.
-    if whole < _OFTEN + 2.0 * shares.size / (particles + 1):
-        return
-    at = int(shares.argmax())
-    seen = (
-        f"in {whole:.0%} of the beliefs before sensing, over {len(trials)} trials with random "
-        f"sensing, the true state lies beyond all {particles} particles in some coordinate, most "
-        f"often in {inspection.coordinate(at)} ({shares[at]:.0%}); "
-        f"{sum(not each.explained for each in left)} of {len(left)} observations are further than "
-        "any particle explains"
-    )
-    advice = (
-        "An observation of one coordinate leaves few particles for the others: take more of them, "
-        "or sense more often. A coordinate that does not move needs a little noise in move."
-    )
-    inspection.add("warning", "depletion", seen, advice)
+    if whole > _OFTEN + 2.0 * shares.size / (particles + 1):
+        at = int(shares.argmax())
+        seen = f"in {whole:.0%} of the beliefs before sensing, over {len(trials)} trials with "
+        seen += f"random sensing, the true state lies beyond all {particles} particles in some "
+        seen += f"coordinate, most often in {inspection.coordinate(at)} ({shares[at]:.0%})"
+        advice = "An observation of one coordinate leaves few particles for the others: take more, "
+        advice += "or sense more often. What does not move needs a little noise in move."
+        inspection.add("warning", "depletion", seen, advice)
 
 
 def check_decision_time(inspection: Inspection, states: list[PlanningState]) -> None:
-    """Say how many milliseconds a choice of what to sense takes, and in which functions.
-
-    It is processor time of one thread: other work on the machine makes nothing look slow.
-    """
-    problem, settings, late = inspection.problem, inspection.settings, inspection.deadline(0.15)
+    """Say how many milliseconds of one thread a choice of what to sense takes, and in what."""
+    problem, settings = inspection.problem, inspection.settings
+    late = inspection.deadline(0.15, "time")
     active = msgspec.structs.replace(settings.active_sensing, num_cores=1)
     planner = Planner(problem, msgspec.structs.replace(settings, active_sensing=active))
     initial = inspection.ask("a decision", planner.init, inspection.seed, 0, check="time")
-    chosen = [initial, *(states[index] for index in spread_out(_DECISIONS, len(states)))]
     taken: list[float] = []
     profile = cProfile.Profile(thread_time)
 
@@ -215,26 +190,20 @@ def check_decision_time(inspection: Inspection, states: list[PlanningState]) -> 
         with contextlib.suppress(ValueError):  # if a profiler runs already
             profile.runcall(planner.choose_sensing_action, state)
 
-    for state in chosen:
-        if not (late() and taken):
+    for state in [initial, *(states[index] for index in spread_out(_DECISIONS, len(states)))]:
+        if not (taken and late()):
             inspection.ask("a decision", decide, state, check="time")
-    codes: dict[Any, str] = {
-        getattr(getattr(problem, name, None), "__code__", None): name for name in PARAMETERS
-    }
+    codes = {getattr(getattr(problem, each, None), "__code__", None): each for each in PARAMETERS}
     entries = sorted(profile.getstats(), key=lambda entry: -entry.totaltime)
-    whole = max((entry.totaltime for entry in entries), default=0.0)
     parts = [
-        f"{entry.totaltime / whole:.0%} in {codes[entry.code]} ({entry.callcount} calls)"
+        f"{entry.totaltime / entries[0].totaltime:.0%} in {codes[entry.code]} "
+        f"({entry.callcount} calls)"
         for entry in entries
-        if entry.code in codes and entry.totaltime > 0.02 * whole
+        if entry.code in codes and entry.totaltime > 0.02 * entries[0].totaltime
     ]
-    seen = (
-        f"a choice of what to sense takes {np.median(taken) * 1e3:.2g} ms of processor time "
-        f"({settings.selector.method}, {settings.particle_filter.num_particles} particles)"
-    )
-    advice = (
-        "Use whole arrays in what takes most, no loop over states, and look whether fewer "
-        "active_sensing.num_observation_samples choose as well."
-    )
+    seen = f"a choice of what to sense takes {np.median(taken) * 1e3:.2g} ms of processor time "
+    seen += f"({settings.selector.method}, {settings.particle_filter.num_particles} particles)"
     seen += f": {', '.join(parts)}" if parts else ""
+    advice = "Use whole arrays in what takes most, no loop over states, and look whether fewer "
+    advice += "active_sensing.num_observation_samples choose as well."
     inspection.add("information", "time", seen, advice if np.median(taken) > 5e-3 else "")
