@@ -31,10 +31,10 @@ from holdfast.problems.attributes import (
     has_general_observations,
     sensing_labels,
 )
-from holdfast.tuning.contract_check import acted, draw_observation, kolmogorov_p
+from holdfast.tuning.contract_check import acted, draw_observation
 from holdfast.tuning.findings import CheckEndedError, Inspection, spread_out
 
-__all__ = ["check_likelihoods", "remedy_of"]
+__all__ = ["check_likelihoods", "remedy_of", "uniform_p"]
 
 _REPLICATES = 300
 """Simulated observations of a sensing action from each kind of belief."""
@@ -160,7 +160,7 @@ def _test(
         # The distance from the middle is uniform, too, and shows a wrong width.
         folded = np.abs(2.0 * places - 1.0)
         for shape, numbers in (("place", places), ("distance from the middle", folded)):
-            p = _uniform_p(numbers)
+            p = uniform_p(numbers)
             if p < 1e-3 and remedy is None:
                 remedy = remedy_of(values, truths)
             better, advice = remedy or ("", usual)
@@ -189,11 +189,20 @@ def _places(
     return places
 
 
-def _uniform_p(numbers: FloatArray) -> float:
-    """Return the p-value of Kolmogorov's test that numbers are uniform between 0 and 1."""
+def uniform_p(numbers: FloatArray) -> float:
+    """Return the p-value of Kolmogorov's test that numbers are uniform between 0 and 1.
+
+    The approximation is that of Stephens (1970), Journal of the Royal Statistical Society B 32.
+    """
     count = len(numbers)
     above = np.arange(1, count + 1) / count - np.sort(numbers)
-    return kolmogorov_p(float(max(above.max(), (1.0 / count - above).max())), count)
+    distance = max(above.max(), (1.0 / count - above).max())
+    scaled = (np.sqrt(count) + 0.12 + 0.11 / np.sqrt(count)) * distance
+    if scaled < 0.3:
+        return 1.0
+    terms = np.arange(1, 101)
+    total = 2.0 * np.sum((-1.0) ** (terms - 1) * np.exp(-2.0 * terms**2 * scaled**2))
+    return float(min(1.0, max(0.0, total)))
 
 
 def remedy_of(values: FloatArray, truths: IntArray) -> tuple[str, str] | None:

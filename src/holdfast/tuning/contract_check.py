@@ -7,7 +7,6 @@ states, a call with its repetition, the spread within a call with the spread bet
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import random as python_random
 from collections.abc import Callable, Iterator
@@ -28,9 +27,7 @@ __all__ = [
     "check_contract",
     "check_streams",
     "draw_observation",
-    "kolmogorov_p",
     "truths",
-    "two_sample_p",
 ]
 
 _SHAPES = ((1,), (3, 4))
@@ -39,8 +36,8 @@ _SHAPES = ((1,), (3, 4))
 _SAME = 1e-9
 """Relative difference up to which a batch and its rows differ by rounding alone."""
 
-_DRAWS, _FEWEST = 200, 10
-"""Of each of two samples that are compared; the second if the time is over."""
+_DRAWS = 200
+"""Of each of two samples that are compared."""
 
 _MANY_ACTIONS = 32
 """Bound on the sensing actions of which single states are tried."""
@@ -107,12 +104,6 @@ def _calls(p: Any) -> Iterator[_Call]:
     def rewarded(s: FloatArray, k: Any) -> Any:
         return (c.rewards if s.ndim > 1 else c.reward)(p, s, do(s, k))
 
-    def measured(s: FloatArray, _: Any) -> FloatArray:
-        return c.measured_motion(p, s[0], s[1], own)
-
-    def felt(s: FloatArray, k: Any) -> FloatArray:
-        return c.move_observation(p, s[0], do(s, k)[0], own)
-
     calls = [
         _Call("initial_states", lambda s, _: c.initial_states(p, own, len(s))),
         _Call("policy", lambda s, k: c.policy(p, s, k), True),
@@ -127,15 +118,6 @@ def _calls(p: Any) -> Iterator[_Call]:
         _Call("next_stage", staged, True),
         _Call("known_state_return", lambda s, k: c.known_state_return(p, s, k)),
         _Call("reinitial_states", lambda s, _: c.reinitial_states(p, s, own)),
-        _Call("measure_motion", measured),
-        _Call(
-            "move_by_measurement", lambda s, k: c.moved_by_measurement(p, s, measured(s, k), own)
-        ),
-        _Call("sample_move_observation", felt),
-        _Call(
-            "move_log_likelihood",
-            lambda s, k: c.move_log_likelihood(p, s, do(s, k)[0], felt(s, k)),
-        ),
         _Call("scene", lambda *_: c.scene(p) is None),
     ]
     for action in range(len(sensing_labels(p))):
@@ -187,13 +169,8 @@ def check_contract(inspection: Inspection, states: FloatArray, stages: IntArray)
     for call, before in reversed(first):
         ask("purity", call, _again, before)
     for call in calls:
-        if call.by_rows and (rounded := ask("contract", call, _by_rows)):
-            seen = (
-                f"{call.function}{call.which} of a belief and of its single states differ in the "
-                f"last bits, by {rounded:.1g}: another machine may compute other bits"
-            )
-            advice = "Take exp, log, sin, cos, arctan2 and sums from holdfast.numerics."
-            inspection.add("information", "contract", seen, advice)
+        if call.by_rows:
+            ask("contract", call, _by_rows)
 
 
 def _once(call: _Call, states: FloatArray, stages: IntArray) -> bytes:
@@ -220,104 +197,75 @@ def _global_generators() -> tuple[object, ...]:
     return kind, np.asarray(keys).tobytes(), position, has_gauss, python_random.getstate()
 
 
-def _by_rows(call: _Call, states: FloatArray, stages: IntArray) -> float:
-    """Return by how much a batch differs from other leading shapes; raise if it is not rounding."""
+def _by_rows(call: _Call, states: FloatArray, stages: IntArray) -> None:
+    """Raise ProblemError if a batch differs from other leading shapes by more than rounding."""
     whole = np.asarray(call.make(states, stages), dtype=np.float64)
     parts: list[Any] = [[call.make(states[n], int(stages[n])) for n in range(min(len(states), 12))]]
     for leading in _SHAPES:
         size = int(np.prod(leading))
         part = call.make(states[:size].reshape(*leading, -1), stages[:size].reshape(leading))
         parts.append(np.reshape(part, (size, *whole.shape[1:])))
-    largest = 0.0
     for part in parts:
         rows = np.array(part, dtype=np.float64)
         differs = np.abs(whole[: len(rows)] - rows)
         worst = np.unravel_index(int(differs.argmax()), differs.shape)
-        largest = max(largest, float(differs[worst]))
         if differs[worst] > _SAME * max(1.0, float(np.abs(whole).max())):
             raise ProblemError(
                 f"{call.function}{call.which} of a belief is {whole[worst]:g} for its state "
                 f"{int(worst[0])}, and {rows[worst]:g} when it is asked of that state in another "
                 "leading shape"
             )
-    return largest
 
 
 def check_streams(inspection: Inspection) -> None:
     """Check where draws come from: the stream, one for each state, alike alone and together."""
     problem, ask = inspection.problem, inspection.ask
-    late = inspection.deadline(0.15, "streams")
 
-    def initial(number: int, count: int) -> FloatArray:
+    def initial(number: int, count: int = 1) -> FloatArray:
         own = inspection.random(_INITIAL, number)
         return ask("initial_states", checked.initial_states, problem, own, count)
 
-    def compare(function: str, draw: Callable[[int], FloatArray], together: FloatArray) -> None:
-        alone = [draw(0)]
-        while len(alone) < _DRAWS and not (late() and len(alone) >= _FEWEST):
-            alone.append(draw(len(alone)))
-        _compare_draws(inspection, function, together, np.stack(alone))
-
-    with contextlib.suppress(CheckEndedError):
-        compare("initial_states", lambda number: initial(number, 1)[0], initial(_DRAWS, _DRAWS))
-    start = initial(_DRAWS + 1, 1)
+    _compare_draws(
+        inspection, "initial_states", lambda number: initial(number)[0], initial(_DRAWS + 1, _DRAWS)
+    )
+    start = initial(_DRAWS)[0]
+    start.setflags(write=False)
     many = np.tile(start, (_DRAWS, 1))
     many.setflags(write=False)
-    action = ask("execute", acted, problem, start[0], 0)
+    action = ask("execute", acted, problem, start, 0)
 
-    def moved(number: int, states: FloatArray) -> FloatArray:
-        own = inspection.random(_MOVE, number)
-        return ask("move", checked.move, problem, states, action, own)
+    def moved(number: int, states: FloatArray = start) -> FloatArray:
+        return ask("move", checked.move, problem, states, action, inspection.random(_MOVE, number))
 
-    compare("move", lambda number: moved(number, start[0]), moved(_DRAWS, many))
+    _compare_draws(inspection, "move", moved, moved(_DRAWS, many))
 
 
 def _compare_draws(
-    inspection: Inspection, function: str, together: FloatArray, alone: FloatArray
+    inspection: Inspection, function: str, draw: Callable[[int], FloatArray], together: FloatArray
 ) -> None:
-    """Compare the spread within one call with the spread between calls of other streams."""
-    within, between = np.ptp(together, axis=0) > 0.0, np.ptp(alone, axis=0) > 0.0
-    if (differs := within != between).any():
-        names = ", ".join(inspection.coordinate(int(each)) for each in np.flatnonzero(differs))
-        seen = f"{function} draws {names} of a belief at random, but for a single state it gives "
-        seen += f"the same with each of {len(alone)} streams"
-        if (between & ~within).any():
-            seen = f"{function} gives all states of one call the same draw of {names}: the "
-            seen += "particles of a belief would never spread"
-        advice = "Draw from the given stream with the shape of the states, of one as of many: "
-        advice += "stream.normal(states.shape), or stream.normal((count, 2))."
-        inspection.add("error", "streams", seen, advice)
+    """Find what differs between the states of one call alone, or between single states alone."""
+    late = inspection.deadline(0.1, "streams")
+    alone = np.stack([draw(number) for number in range(_DRAWS) if not late()] or [together[0]])
+    if len(alone) < _DRAWS:
         return
-    for number, (own, other) in enumerate(zip(together.T, alone.T, strict=True)):
-        seen = (
-            f"{function}: {inspection.coordinate(number)} has another distribution in a belief "
-            f"(mean {own.mean():.3g}, deviation {own.std():.2g}) than in single states "
-            f"({other.mean():.3g}, {other.std():.2g})"
-        )
-        advice = "The simulated world is one state: draw it as each state of a belief is drawn."
-        inspection.test(two_sample_p(own, other), "streams", seen, advice)
+    within, between = _varied(together), _varied(alone)
+    shared = between & (np.ptp(together, axis=0) == 0.0)
+    fixed = within & (np.ptp(alone, axis=0) == 0.0)
+    if not (shared | fixed).any():
+        return
+    at = np.flatnonzero(shared if shared.any() else fixed).tolist()
+    names = ", ".join(map(inspection.coordinate, at))
+    seen = f"{function} draws {names} of a belief at random, but for a single state it gives the "
+    seen += f"same with each of {_DRAWS} streams"
+    if shared.any():
+        seen = f"{function} gives all states of one call the same draw of {names}: the particles "
+        seen += "of a belief would never spread"
+    advice = "Draw from the given stream with the shape of the states, of one as of many: "
+    advice += "stream.normal(states.shape), or stream.normal((count, 2))."
+    inspection.add("error", "streams", seen, advice)
 
 
-def two_sample_p(first: FloatArray, second: FloatArray) -> float:
-    """Return the p-value of Kolmogorov and Smirnov's test that two samples are of one distribution.
-
-    With ties it is too large, which only finds less. The approximation is that of Stephens (1970),
-    Journal of the Royal Statistical Society B 32.
-    """
-    points = np.concatenate([first, second])
-    below = [
-        np.searchsorted(np.sort(each), points, side="right") / len(each) for each in (first, second)
-    ]
-    size = len(first) * len(second) / (len(first) + len(second))
-    return kolmogorov_p(float(np.abs(below[0] - below[1]).max()), size)
-
-
-def kolmogorov_p(distance: float, size: float) -> float:
-    """Return the probability of such a distance between a distribution and a sample of it."""
-    root = np.sqrt(size)
-    scaled = (root + 0.12 + 0.11 / root) * distance
-    if scaled < 0.3:
-        return 1.0
-    terms = np.arange(1, 101)
-    total = 2.0 * np.sum((-1.0) ** (terms - 1) * np.exp(-2.0 * terms**2 * scaled**2))
-    return float(min(1.0, max(0.0, total)))
+def _varied(drawn: FloatArray) -> BoolArray:
+    """Return which coordinates have no value nine times of ten, so that chance repeats none."""
+    most = [np.unique(column, return_counts=True)[1].max() for column in drawn.T]
+    return np.array(most) <= 0.9 * len(drawn)

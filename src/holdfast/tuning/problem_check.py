@@ -28,9 +28,14 @@ from holdfast.tuning.findings import (
     Inspection,
     spread_out,
 )
-from holdfast.tuning.goal_check import check_motion, check_rewards, follow_policy
 from holdfast.tuning.sensor_check import check_sensors
-from holdfast.tuning.trial_check import check_decision_time, check_trials
+from holdfast.tuning.trial_check import (
+    check_decision_time,
+    check_motion,
+    check_rewards,
+    check_trials,
+    follow_policy,
+)
 
 __all__ = ["CHECKS", "check_problem"]
 
