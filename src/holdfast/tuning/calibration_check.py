@@ -36,22 +36,12 @@ from holdfast.tuning.findings import CheckEndedError, Inspection, spread_out
 
 __all__ = ["check_likelihoods", "remedy_of", "uniform_p"]
 
-_REPLICATES = 300
-"""Simulated observations of a sensing action from each kind of belief."""
-
+_REPLICATES = 300  # simulated observations of a sensing action from each kind of belief
 _PARTICLES = 200
-_CLOUDS = 10
-"""Beliefs that come of one state each."""
-
-_MOST_COORDINATES = 8
-_MOST_ACTIONS = 64
-
-_INITIAL, _CLOUD, _WHICH, _SHOWN, _TIES = 16, 17, 18, 19, 20
-"""Trial numbers of the streams here."""
-
-_GAINS = 0.1
-"""Nats by which the true state's posterior must grow for a remedy to be named."""
-
+_CLOUDS = 10  # beliefs that come of one state each
+_MOST_COORDINATES, _MOST_ACTIONS = 8, 64
+_INITIAL, _CLOUD, _WHICH, _SHOWN, _TIES = 16, 17, 18, 19, 20  # trial numbers of the streams here
+_GAINS = 0.1  # nats by which the true state's posterior must grow for a remedy to be named
 
 _Calibration = tuple[FloatArray, IntArray, FloatArray, FloatArray]
 """Log-likelihoods of r observations in n particles each, (r, n), up to a constant of each
@@ -73,7 +63,7 @@ def check_likelihoods(inspection: Inspection) -> None:
                 found = inspection.ask(
                     function, _calibrate, inspection, action, beliefs, late, check="likelihood"
                 )
-                ties = inspection.random(_TIES, action).random(len(found[1]))
+                ties = inspection.random(_TIES, action).random((len(found[1]), 1))
                 about = f"{function}, {inspection.label(action)}"
                 _test(inspection, about, kind, found, ties)
 
@@ -156,7 +146,9 @@ def _test(
     usual = "Compare sample_observation with log_likelihood (observation_mean and "
     usual += "observation_variance of one state with those of many): of one distribution."
     for name, quantity in quantities:
-        places = _places(quantity, weights, truths, ties)
+        # How much of each posterior lies below the true state; of what is equal, a share.
+        own = quantity[np.arange(count), truths][:, np.newaxis]
+        places = (weights * ((quantity < own) + ties * (quantity == own))).sum(axis=1)
         # The distance from the middle is uniform, too, and shows a wrong width.
         folded = np.abs(2.0 * places - 1.0)
         for shape, numbers in (("place", places), ("distance from the middle", folded)):
@@ -177,16 +169,6 @@ def _posteriors(values: FloatArray) -> FloatArray:
     weights = np.exp(values - values.max(axis=1, keepdims=True))
     normal: FloatArray = weights / weights.sum(axis=1, keepdims=True)
     return normal
-
-
-def _places(
-    quantity: FloatArray, weights: FloatArray, truths: IntArray, ties: FloatArray
-) -> FloatArray:
-    """Return how much of each posterior lies below the true state; of equal ones, a share."""
-    own = quantity[np.arange(len(truths)), truths][:, np.newaxis]
-    below = np.where(quantity < own, weights, 0.0).sum(axis=1)
-    places: FloatArray = below + ties * np.where(quantity == own, weights, 0.0).sum(axis=1)
-    return places
 
 
 def uniform_p(numbers: FloatArray) -> float:

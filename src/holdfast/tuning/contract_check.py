@@ -30,20 +30,11 @@ __all__ = [
     "truths",
 ]
 
-_SHAPES = ((1,), (3, 4))
-"""Leading shapes beside () and (n,)."""
-
-_SAME = 1e-9
-"""Relative difference up to which a batch and its rows differ by rounding alone."""
-
-_DRAWS = 200
-"""Of each of two samples that are compared."""
-
-_MANY_ACTIONS = 32
-"""Bound on the sensing actions of which single states are tried."""
-
-_INITIAL, _MOVE = 1, 2
-"""Trial numbers of the streams here."""
+_SHAPES = ((1,), (3, 4))  # leading shapes beside () and (n,)
+_SAME = 1e-9  # relative difference up to which a batch and its rows differ by rounding alone
+_DRAWS = 200  # of each of two samples that are compared
+_MANY_ACTIONS = 32  # bound on the sensing actions of which single states are tried
+_INITIAL, _MOVE = 1, 2  # trial numbers of the streams here
 
 
 def truths(problem: Any, function: str, states: FloatArray) -> BoolArray:

@@ -24,6 +24,7 @@ from holdfast.config.user_code import account_of_user_error, in_words
 from holdfast.errors import HoldfastError
 from holdfast.numerics.arrays import FloatArray, IntArray
 from holdfast.numerics.randomness import Purpose, Stream, stream
+from holdfast.planning.planner import PlanningState
 from holdfast.planning.settings import PlanningSettings
 from holdfast.printable import one_line
 from holdfast.problems.attributes import sensing_labels, state_labels
@@ -126,6 +127,7 @@ class Inspection:
         self.problem, self.settings, self.max_steps, self.seed = problem, settings, max_steps, seed
         self.findings: list[Finding] = []
         self.walk: Walk | None = None
+        self.beliefs: list[PlanningState] = []
         self.rewards: list[float] = []
         self.num_tests = 0
         self._tests: list[tuple[float, Finding]] = []
@@ -133,7 +135,7 @@ class Inspection:
         self._blamed: set[str] = set()
 
     def random(self, purpose: int, number: int = 0) -> Stream:
-        """Return a stream that no other check has."""
+        """Return a stream, by the number of what it is for."""
         return stream(self.seed, purpose, number, Purpose.INITIAL_BELIEF)
 
     def label(self, sensing_action: int) -> str:

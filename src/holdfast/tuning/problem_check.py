@@ -17,32 +17,18 @@ import numpy as np
 from holdfast.errors import InvalidValueError
 from holdfast.numerics.arrays import real_number, whole
 from holdfast.numerics.floating_mode import in_own_mode
-from holdfast.planning.planner import PlanningState
 from holdfast.planning.settings import PlanningSettings, SimulatorSettings, check_settings
 from holdfast.problems import attributes, checked
 from holdfast.tuning.calibration_check import check_likelihoods
 from holdfast.tuning.contract_check import check_contract, check_streams
-from holdfast.tuning.findings import (
-    CheckEndedError,
-    Finding,
-    Inspection,
-    spread_out,
-)
+from holdfast.tuning.findings import CheckEndedError, Finding, Inspection
 from holdfast.tuning.sensor_check import check_sensors
-from holdfast.tuning.trial_check import (
-    check_decision_time,
-    check_motion,
-    check_rewards,
-    check_trials,
-    follow_policy,
-)
+from holdfast.tuning.trial_check import check_decision_time, check_goals, check_trials
 
 __all__ = ["CHECKS", "check_problem"]
 
 _STATES = 48
 _NEEDED = ("execute", "next_stage", "reward", "scene", "resolution", "state_labels")
-
-Beliefs = list[PlanningState]
 
 
 @in_own_mode
@@ -96,11 +82,10 @@ def check_problem(
             f"budget_s is {budget_s!r:.80}; allowed are numbers above 0 to 86400"
         )
     inspection = Inspection(problem, settings, max_steps, seed, budget)
-    beliefs: Beliefs = []
     for name, check in CHECKS.items():
         errors = {each.check for each in inspection.findings if each.severity == "error"}
         if name == "contract" and errors:
-            break
+            break  # without its declarations nothing else can be asked
         on_check(name)
         if name in ("trials", "sensors") and "likelihood" in errors:
             seen = "beliefs, sensors and resolution were not looked at: the likelihood comes first"
@@ -108,13 +93,15 @@ def check_problem(
             continue
         with contextlib.suppress(CheckEndedError):
             # What a check itself does with a strange object must not end the others.
-            inspection.ask(f"the check of {name}", check, inspection, beliefs, check=name)
+            inspection.ask(f"the check of {name}", check, inspection, check=name)
+        if name == "likelihoods":  # what follows weighs beliefs by them
+            inspection.judge_tests()
     order = ("error", "warning", "information")
     return sorted(inspection.findings, key=lambda each: order.index(each.severity))
 
 
-def _declarations(inspection: Inspection, _: Beliefs) -> None:
-    """Check all that a problem says of itself; without it nothing else can be asked."""
+def _declarations(inspection: Inspection) -> None:
+    """Check all that a problem says of itself."""
     problem = inspection.problem
 
     def warned() -> list[str]:
@@ -132,7 +119,7 @@ def _declarations(inspection: Inspection, _: Beliefs) -> None:
         inspection.add("error", "contract", seen, advice)
 
 
-def _contract(inspection: Inspection, _: Beliefs) -> None:
+def _contract(inspection: Inspection) -> None:
     """Check the contract in initial states, and say what was understood of noises."""
     problem, own = inspection.problem, inspection.random(0)
     states = inspection.ask("initial_states", checked.initial_states, problem, own, 200)
@@ -155,34 +142,13 @@ def _contract(inspection: Inspection, _: Beliefs) -> None:
     inspection.add("information", "noises", seen)
 
 
-def _goals(inspection: Inspection, _: Beliefs) -> None:
-    """Follow the policy, and check the contract again in states from along the way."""
-    walk = follow_policy(inspection)
-    chosen = spread_out(_STATES, len(walk.states))
-    if len(chosen) == _STATES:
-        check_contract(inspection, walk.states[chosen], walk.stages[chosen])
-    check_motion(inspection)
-
-
-def _likelihoods(inspection: Inspection, _: Beliefs) -> None:
-    """Test the likelihoods, and judge all tests: what follows weighs beliefs by likelihoods."""
-    with contextlib.suppress(CheckEndedError):
-        check_likelihoods(inspection)
-    inspection.judge_tests()
-
-
-def _trials(inspection: Inspection, beliefs: Beliefs) -> None:
-    beliefs.extend(check_trials(inspection))
-    check_rewards(inspection)
-
-
-CHECKS: Mapping[str, Callable[[Inspection, Beliefs], None]] = {
+CHECKS: Mapping[str, Callable[[Inspection], None]] = {
     "declarations": _declarations,
     "contract": _contract,
-    "streams": lambda inspection, _: check_streams(inspection),
-    "goals": _goals,
-    "likelihoods": _likelihoods,
-    "trials": _trials,
+    "streams": check_streams,
+    "goals": check_goals,
+    "likelihoods": check_likelihoods,
+    "trials": check_trials,
     "sensors": check_sensors,
     "time": check_decision_time,
 }

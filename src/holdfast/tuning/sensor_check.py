@@ -32,48 +32,30 @@ from holdfast.tuning.findings import Inspection, Walk
 
 __all__ = ["check_sensors"]
 
-_SAMPLES = 8
-"""Hypothetical observations of a sensing action from each belief."""
-
-_HYPOTHESES = 32
-"""Trial number of the first of the streams here."""
-
+_SAMPLES = 8  # hypothetical observations of a sensing action from each belief
+_HYPOTHESES = 32  # trial number of the first of the streams here
 _MOST_ACTIONS = 32
-
-_BINS = 8
-"""Of the values of a task action's coordinate, to see whether an observation changes them."""
-
-_NOTHING = 0.02
-"""Nats of information below which a sensing action tells nothing."""
-
-_FEW_VALUES = 10
-"""Of a coordinate in all trials, below which it is a kind and no number."""
-
-_SCALES = 30.0
-"""Between coordinates of the task action with one resolution for all."""
+_BINS = 8  # of a task action's coordinate, to see whether an observation changes it
+_NOTHING = 0.02  # nats of information below which a sensing action tells nothing
+_FEW_VALUES = 10  # of a coordinate in all trials, below which it is a kind and no number
+_SCALES = 30.0  # between coordinates of the task action with one resolution for all
 
 
 class _Gains(NamedTuple):
-    """What sensing tells, for each of b beliefs and J sensing actions.
+    """What sensing tells, for each of b beliefs and J sensing actions."""
 
-    In nats about the state, (b, J), and about each coordinate of the task action, less what chance
-    would show, (b, J, action_size); the share of each variance of the state that is taken away,
-    (b, J, state_size), NaN where there is none; and the standard deviations of the task actions
-    before sensing, (b, action_size).
-    """
-
-    information: FloatArray
-    of_actions: FloatArray
-    states: FloatArray
-    before: FloatArray
+    information: FloatArray  # about the state, in nats, (b, J)
+    of_actions: FloatArray  # about each coordinate of the task action, less what chance shows
+    states: FloatArray  # the share of each variance that is taken away; NaN where there is none
+    before: FloatArray  # standard deviations of the task actions before sensing
 
 
-def check_sensors(inspection: Inspection, beliefs: list[PlanningState]) -> None:
+def check_sensors(inspection: Inspection) -> None:
     """Look for sensing actions that tell nothing, or nothing that another does not tell."""
-    problem, walk = inspection.problem, inspection.walk
+    problem, walk, beliefs = inspection.problem, inspection.walk, inspection.beliefs
     if not beliefs or walk is None:
         return
-    gains = _gains_of(inspection, beliefs)
+    gains = _gains_of(inspection)
     costs = sensing_costs(problem)
     silent = (gains.information.mean(axis=0) < _NOTHING) & (gains.information.max(axis=0) < 0.1)
     for action in np.flatnonzero(silent).tolist():
@@ -94,14 +76,14 @@ def check_sensors(inspection: Inspection, beliefs: list[PlanningState]) -> None:
     _check_resolution(inspection, gains, resolution, walk)
 
 
-def _gains_of(inspection: Inspection, beliefs: list[PlanningState]) -> _Gains:
+def _gains_of(inspection: Inspection) -> _Gains:
     """Draw what each sensing action might show of each belief, and say what it tells."""
     problem, ask = inspection.problem, inspection.ask
     late = inspection.deadline(0.2, "sensors")
     function = "log_likelihood" if has_general_observations(problem) else "observation_mean"
     rows: list[list[tuple[Any, ...]]] = []
     before = []
-    for number, state in enumerate(beliefs):
+    for number, state in enumerate(inspection.beliefs):
         if late() and rows:
             break
         points, weights = state.belief.states, state.belief.weights
@@ -212,6 +194,8 @@ def _report_useless(
     # Where all actions are the same in practice there is nothing to change.
     matters = gains.before > 0.3 * resolution
     count = len(gains.before)
+    if not matters.any():
+        return
     told = np.where(matters[:, np.newaxis, :], gains.of_actions, 0.0).max(axis=2)
     for action in np.flatnonzero(~silent).tolist():
         own, whole = told[:, action], float(gains.information[:, action].mean())
@@ -250,9 +234,9 @@ def _check_resolution(
             seen += f"resolution, {resolution[0]:.3g}"
             advice = "Give each its own, in its own unit: resolution = np.array([...])."
             inspection.add("warning", "units", seen, advice)
-    tolerance = _tolerance(inspection, walk)
-    if method not in ("path_entropy", "action_entropy") or not tolerance.any():
+    if method not in ("path_entropy", "action_entropy"):
         return
+    tolerance = _tolerance(inspection, walk)
     # Entropy counts what is known well enough, beside what is not. Of each coordinate the sensing
     # action counts that tells most about it.
     best = np.maximum(gains.of_actions.mean(axis=0).max(axis=0), 0.0)
@@ -279,24 +263,22 @@ def _tolerance(inspection: Inspection, walk: Walk) -> FloatArray:
     at_goal = ask("is_goal", truths, problem, "is_goal", rows)
     goals, stages = rows[at_goal][:50], walk.stages[at_goal][:50]
     tolerated = np.full(problem.action_size, np.inf)
+    if len(goals) < 3:
+        return np.zeros(problem.action_size)
     base = ask("policy", checked.policy, problem, goals, stages)
-    # A coordinate of a few values is a bit or a kind, and has no width.
-    wide = [at for at in range(rows.shape[1]) if len(np.unique(rows[:, at])) >= _FEW_VALUES]
-    for at in wide if len(goals) >= 3 else []:
+    for at in range(rows.shape[1]):
+        if len(np.unique(rows[:, at])) < _FEW_VALUES:
+            continue  # a bit or a kind has no width
         apart = np.zeros(rows.shape[1])
         apart[at] = 4.0 * rows[:, at].std()
-        widths = []
-        for sign in (-1.0, 1.0):
-            low, high = 0.0, 1.0
-            for _ in range(20):
-                middle = 0.5 * (low + high)
-                states = goals + sign * middle * apart
-                inside = ask("is_goal", truths, problem, "is_goal", states)
-                low, high = (middle, high) if inside.mean() > 0.5 else (low, middle)
-            widths.append(low)
-        if 0.0 < np.mean(widths) < 0.97:
-            beside = goals + np.mean(widths) * apart
-            asked = ask("policy", checked.policy, problem, beside, stages)
+        low, high = 0.0, 1.0
+        for _ in range(20):
+            width = 0.5 * (low + high)
+            beside = np.concatenate([goals - width * apart, goals + width * apart])
+            inside = ask("is_goal", truths, problem, "is_goal", beside)
+            low, high = (width, high) if inside.mean() > 0.5 else (low, width)
+        if 0.0 < low < 0.97:
+            asked = ask("policy", checked.policy, problem, goals + low * apart, stages)
             change = np.median(np.abs(differences(asked, base, circular_actions(problem))), axis=0)
             tolerated = np.where(change > 1e-9, np.minimum(tolerated, change), tolerated)
     return np.where(np.isfinite(tolerated), tolerated, 0.0)

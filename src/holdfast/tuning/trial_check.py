@@ -35,48 +35,33 @@ from holdfast.problems.attributes import (
 from holdfast.problems.problem import ProblemBase
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
-from holdfast.tuning.contract_check import acted, truths
+from holdfast.tuning.contract_check import acted, check_contract, truths
 from holdfast.tuning.findings import Inspection, Severity, Walk, spread_out
 
-__all__ = [
-    "check_decision_time",
-    "check_motion",
-    "check_rewards",
-    "check_trials",
-    "follow_policy",
-]
+__all__ = ["check_decision_time", "check_goals", "check_trials"]
 
 _WALKS = 64
-_KEPT = 24
-"""Steps of which the states are kept."""
-
-_LONGER = 4
-"""Times max_steps for which trials are followed, to tell a limit that is too low from a goal that
-is never reached."""
-
-_INITIAL, _WAY, _NOISE = 8, 9, 10
-"""Trial numbers of the streams here."""
-
-_ENOUGH = 0.5
-"""Share of the trials that should reach the goal."""
-
-_DRAWS, _STATES = 100, 12
-"""Moves from each of some states, whose noise is compared."""
-
-_TRIALS, _MOST_STEPS = 8, 1000
-_BELIEFS, _PARTICLES = 24, 400
-"""Beliefs before sensing that are kept, and particles of each."""
-
-_FEW_LEFT = 3.0
-"""Effective particles after an observation below which it leaves hardly any."""
-
-_OFTEN = 0.2
-"""Share of the observations from which on it is worth a warning."""
-
-_DECISIONS = 5
+_KEPT, _CHOSEN = 24, 48  # steps whose states are kept, and states whose contract is checked
+_LONGER = 4  # times max_steps, to tell a limit that is too low from a trial that is lost
+_INITIAL, _WAY, _NOISE = 8, 9, 10  # trial numbers of the streams here
+_DRAWS, _STATES = 100, 12  # moves from each of some states, whose noise is compared
+_TRIALS, _MOST_STEPS, _DECISIONS = 8, 1000, 5
+_BELIEFS, _PARTICLES = 24, 400  # beliefs before sensing that are kept, and particles of each
+_ENOUGH = 0.5  # share of the trials that should reach the goal
+_OFTEN = 0.2  # share of the observations from which on it is worth a warning
+_FEW_LEFT = 3.0  # effective particles below which an observation leaves hardly any
 
 
-def follow_policy(inspection: Inspection) -> Walk:
+def check_goals(inspection: Inspection) -> None:
+    """Follow the policy with the state known, and check the contract again along the way."""
+    walk = _follow_policy(inspection)
+    chosen = spread_out(_CHOSEN, len(walk.states))
+    if len(chosen) == _CHOSEN:
+        check_contract(inspection, walk.states[chosen], walk.stages[chosen])
+    _check_motion(inspection, walk)
+
+
+def _follow_policy(inspection: Inspection) -> Walk:
     """Simulate trials in which the state is known, until all have ended or the steps are over."""
     problem, ask = inspection.problem, inspection.ask
     late = inspection.deadline(0.2, "goals")
@@ -186,7 +171,7 @@ def _report_walk(
         inspection.add("warning", "goals", seen, "Look at next_stage.")
 
 
-def check_rewards(inspection: Inspection) -> None:
+def _check_rewards(inspection: Inspection) -> None:
     """Look at the rewards of all simulated steps: whether they tell anything."""
     rewards, selector = np.array(inspection.rewards), inspection.settings.selector
     if not rewards.size or np.ptp(rewards) > 0.0 or rewards[0] < 0.0:
@@ -204,11 +189,9 @@ def check_rewards(inspection: Inspection) -> None:
     inspection.add(severity, "goals", seen + why, advice)
 
 
-def check_motion(inspection: Inspection) -> None:
+def _check_motion(inspection: Inspection, walk: Walk) -> None:
     """Compare the noise of ``move`` with what the problem says of it."""
-    problem, ask, walk = inspection.problem, inspection.ask, inspection.walk
-    if walk is None:
-        return
+    problem, ask = inspection.problem, inspection.ask
     declared = np.asarray(problem.motion_variance, dtype=np.float64)
     circular = circular_states(problem)
     ratios = []
@@ -290,8 +273,8 @@ class _Watcher(TrialObserver):
             raise _EndedError("failed")
 
 
-def check_trials(inspection: Inspection) -> list[PlanningState]:
-    """Run a few trials with random sensing; return states from along the way, before sensing."""
+def check_trials(inspection: Inspection) -> None:
+    """Run a few trials with random sensing, and keep beliefs from before sensing."""
     settings, late = inspection.settings, inspection.deadline(0.25, "trials")
     selector = msgspec.structs.replace(
         settings.selector, method="random", sensing_is_optional=False
@@ -319,14 +302,11 @@ def check_trials(inspection: Inspection) -> list[PlanningState]:
     _report_depletion(inspection, [watcher.left for watcher in watchers if watcher.left])
     states = [state for watcher in watchers for state in watcher.before]
     kept = [states[index] for index in spread_out(_BELIEFS, len(states))]
-    return [state._replace(belief=_thinned(state.belief)) for state in kept]
-
-
-def _thinned(belief: Belief) -> Belief:
-    """Return a belief of fewer particles, which is enough for the sensors' checks."""
-    chosen = spread_out(_PARTICLES, len(belief.weights))
-    weights: FloatArray = belief.weights[chosen] / belief.weights[chosen].sum()
-    return Belief(belief.states[chosen], weights)
+    for state in kept:
+        (points, weights), chosen = state.belief, spread_out(_PARTICLES, len(state.belief.weights))
+        thinned = Belief(points[chosen], weights[chosen] / weights[chosen].sum())
+        inspection.beliefs.append(state._replace(belief=thinned))
+    _check_rewards(inspection)
 
 
 def _report_endings(
@@ -378,7 +358,7 @@ def _report_depletion(inspection: Inspection, trials: list[list[_Left]]) -> None
         inspection.add("warning", "depletion", seen, advice)
 
 
-def check_decision_time(inspection: Inspection, states: list[PlanningState]) -> None:
+def check_decision_time(inspection: Inspection) -> None:
     """Say how many milliseconds of one thread a choice of what to sense takes, and in what."""
     problem, settings = inspection.problem, inspection.settings
     late = inspection.deadline(0.15, "time")
@@ -397,7 +377,8 @@ def check_decision_time(inspection: Inspection, states: list[PlanningState]) -> 
         with contextlib.suppress(ValueError):  # if a profiler runs already
             profile.runcall(planner.choose_sensing_action, state)
 
-    for state in [initial, *(states[index] for index in spread_out(_DECISIONS, len(states)))]:
+    some = spread_out(_DECISIONS, len(inspection.beliefs))
+    for state in [initial, *(inspection.beliefs[index] for index in some)]:
         if not (taken and late()):
             inspection.ask("a decision", decide, state, check="time")
     codes = {getattr(getattr(problem, each, None), "__code__", None): each for each in PARAMETERS}
