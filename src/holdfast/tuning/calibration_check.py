@@ -7,11 +7,9 @@ Bayesian inference algorithms with simulation-based calibration", 2018). A belie
 prior that is known exactly, so nothing is approximate here: the posterior is the weights, and among
 equal states chance decides.
 
-Three orders are used: each coordinate of the state, the same times the observation, which finds a
-likelihood that ignores it, and the likelihood itself, which finds most (Modrák and others,
-"Simulation-based calibration checking for Bayesian computation: the choice of test quantities
-shapes sensitivity", 2023). A likelihood in place of its logarithm hardly weighs, so the true state,
-which is likely, lies above nearly all others.
+The orders are by each coordinate of the state, by the same times the observation, which finds a
+likelihood that ignores it, and by the likelihood itself, which finds most (Modrák and others,
+"Simulation-based calibration checking for Bayesian computation", 2023).
 """
 
 from __future__ import annotations

@@ -230,11 +230,6 @@ def _slopes(problem: Any, state: FloatArray, action: FloatArray) -> FloatArray:
     return slopes
 
 
-_Left = tuple[int, float, BoolArray]
-"""What an observation leaves of a belief: the sensing action, effective particles, and whether the
-true state lay beyond all particles in each coordinate."""
-
-
 class _EndedError(HoldfastError):
     """The time for this check is over, or the trial has failed."""
 
@@ -244,8 +239,8 @@ class _Watcher(TrialObserver):
 
     def __init__(self, inspection: Inspection, late: Callable[[], bool]) -> None:
         self.inspection, self.late = inspection, late
-        self.before: list[PlanningState] = []
-        self.left: list[_Left] = []
+        self.steps: list[SensingStep] = []
+        self.outside: list[BoolArray] = []
 
     def trial_began(self, environment: object, state: PlanningState) -> None:
         """Keep the world, to look at the true state."""
@@ -254,14 +249,11 @@ class _Watcher(TrialObserver):
         self.world = environment
 
     def sensed(self, step: SensingStep) -> None:
-        """Note the belief, and what the observation left of it."""
-        self.before.append(step.before)
+        """Note the step, and in which coordinates the true state was beyond all particles."""
+        self.steps.append(step)
         angles = circular_states(self.inspection.problem)
         apart = differences(step.before.belief.states, self.world.state, angles)
-        # The true state beyond all particles in some coordinate.
-        outside = (apart > 0.0).all(axis=0) | (apart < 0.0).all(axis=0)
-        size = step.observation_info.effective_sample_size
-        self.left.append((step.sensing_action, size, np.asarray(outside)))
+        self.outside.append(np.asarray((apart > 0.0).all(axis=0) | (apart < 0.0).all(axis=0)))
 
     def acted(self, step: TaskStep) -> None:
         """End the trial if the time is over, or in a failure, which the world does not know."""
@@ -299,8 +291,8 @@ def check_trials(inspection: Inspection) -> None:
     count, failed = len(endings) - endings.count("late"), endings.count("failed")
     if count:
         _report_endings(inspection, reached, count, failed, steps)
-    _report_depletion(inspection, [watcher.left for watcher in watchers if watcher.left])
-    states = [state for watcher in watchers for state in watcher.before]
+    _report_depletion(inspection, [each for each in watchers if each.steps])
+    states = [step.before for watcher in watchers for step in watcher.steps]
     kept = [states[index] for index in spread_out(_BELIEFS, len(states))]
     for state in kept:
         (points, weights), chosen = state.belief, spread_out(_PARTICLES, len(state.belief.weights))
@@ -326,15 +318,19 @@ def _report_endings(
     inspection.add("warning", "trials", seen, advice)
 
 
-def _report_depletion(inspection: Inspection, trials: list[list[_Left]]) -> None:
+def _report_depletion(inspection: Inspection, trials: list[_Watcher]) -> None:
     """Report what observations leave of the particles, and how often the truth is beyond them."""
     if not trials:
         return
-    left = [each for trial in trials for each in trial]
+    left = [
+        (step.sensing_action, step.observation_info.effective_sample_size)
+        for trial in trials
+        for step in trial.steps
+    ]
     particles = inspection.settings.particle_filter.num_particles
     few = []
     for action in range(len(sensing_labels(inspection.problem))):
-        sizes = np.array([size for own, size, _ in left if own == action])
+        sizes = np.array([size for own, size in left if own == action])
         if len(sizes) >= 5 and (share := (sizes < _FEW_LEFT).mean()) > _OFTEN:
             few.append(f"{inspection.label(action)} in {share:.0%} of {len(sizes)} observations")
     if few:
@@ -344,7 +340,7 @@ def _report_depletion(inspection: Inspection, trials: list[list[_Left]]) -> None
         advice += "declare the sensor a little less sharp than it is."
         inspection.add("warning", "depletion", seen, advice)
     # Each trial counts the same.
-    outside = [np.array([each for _, _, each in trial]) for trial in trials]
+    outside = [np.array(trial.outside) for trial in trials]
     shares = np.mean([each.mean(axis=0) for each in outside], axis=0)
     whole = float(np.mean([each.any(axis=1).mean() for each in outside]))
     # Beyond all of n particles of a right belief it is twice in n + 1.
