@@ -29,15 +29,24 @@ from holdfast.planning.settings import PlanningSettings
 from holdfast.printable import one_line
 from holdfast.problems.attributes import sensing_labels, state_labels
 
-__all__ = ["FALSE_ALARM_RATE", "CheckEndedError", "Finding", "Inspection", "Walk", "spread_out"]
+__all__ = [
+    "CONTRACT",
+    "FALSE_ALARM_RATE",
+    "WHERE",
+    "CheckEndedError",
+    "Finding",
+    "Inspection",
+    "Walk",
+    "spread_out",
+]
 
 FALSE_ALARM_RATE = 0.001
 """Probability that the statistical tests of a right problem, all together, find an error."""
 
 Severity = Literal["error", "warning", "information"]
 
-_CONTRACT = "docs/problems.md#your-own"
-_WHERE = {
+CONTRACT = "docs/problems.md#your-own"
+WHERE = {
     "depletion": "docs/settings.md",
     "likelihood": "docs/problems.md#check-it",
     "resolution": "docs/problems.md#a-sharp-sensor-beside-a-weak-one",
@@ -95,7 +104,7 @@ class Finding(NamedTuple):
     check: str
     seen: str
     advice: str = ""
-    where: str = _CONTRACT
+    where: str = CONTRACT
     details: str = ""
 
     def __str__(self) -> str:
@@ -164,7 +173,7 @@ class Inspection:
         self, severity: Severity, check: str, seen: str, advice: str = "", details: str = ""
     ) -> None:
         """Add a finding, unless it is there."""
-        where = _WHERE.get(check, _CONTRACT)
+        where = WHERE.get(check, CONTRACT)
         found = Finding(severity, check, one_line(seen), advice, where, details)
         if found not in self.findings:
             self.findings.append(found)
