@@ -126,7 +126,9 @@ def _report_angles(inspection: Inspection, jumps: IntArray, turns: IntArray) -> 
                 continue
             seen = f"coordinate {at} of {whose} jumps by a whole turn (2 pi) in one step, and is "
             seen += "not declared to be an angle: the mean of 3.1 and -3.1 is taken for 0"
-            advice = f"Give the problem {attribute} = ({at},), and circular_observations for what "
+            advice = (
+                f"Give the problem {attribute} = ({at},), and circular_observations if a sensor "
+            )
             advice += "shows it; in a policy take numerics.wrapped(goal - heading)."
             inspection.add("warning", "units", seen, advice)
 
