@@ -39,7 +39,6 @@ WITHOUT_TESTS = {
     "ros/ros2/messages": "converts rclpy's messages, which only tests/ros has",
     "tuning/contract_check": WRONG_PROBLEMS,
     "tuning/findings": WRONG_PROBLEMS,
-    "tuning/goal_check": WRONG_PROBLEMS,
     "tuning/sensor_check": WRONG_PROBLEMS,
     "tuning/trial_check": WRONG_PROBLEMS,
     "ros/ros2_connections": "needs ROS 2; tests/ros/test_ros2_environment.py",

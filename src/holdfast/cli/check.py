@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import shutil
 import signal
 import sys
@@ -29,15 +30,10 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from holdfast.config.loader import Configuration
-    from holdfast.tuning.findings import Finding
 
 __all__ = ["main"]
 
-_COLORS = {"error": 31, "warning": 33, "information": 0}
-"""Of a terminal: red, yellow; else its own."""
-
 _WIDEST = 110
-_INDENT = 4
 
 _PATIENCE = 3.0
 """A call that takes so many times the budget is ended, where the system can."""
@@ -93,18 +89,12 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _check(options: CheckOptions) -> int:
-    from holdfast.cli.terminal import progress_line
+    from holdfast.cli.terminal import counted, progress_line
     from holdfast.tuning.problem_check import CHECKS, check_problem
 
     configuration = _configuration(options)
     line = progress_line(len(CHECKS), quiet=options.quiet or options.json, noun="check")
-    begun = 0
-
-    def on_check(name: str) -> None:
-        nonlocal begun
-        line.show(begun, name)
-        begun += 1
-
+    names = list(CHECKS)
     line.start(f"checking {configuration.problem_name}", 0, "")
     try:
         # What the problem's code prints is no finding.
@@ -115,21 +105,20 @@ def _check(options: CheckOptions) -> int:
                 max_steps=configuration.simulator.max_steps,
                 seed=options.seed,
                 budget_s=options.budget,
-                on_check=on_check,
+                on_check=lambda name: line.show(names.index(name), name),
             )
     finally:
         line.stop()
     shown = [each for each in found if not options.quiet or each.severity != "information"]
-    if options.json:
-        import msgspec
-
-        for each in shown:
-            sys.stdout.write(msgspec.json.encode(each._asdict()).decode() + "\n")
-    else:
-        for each in shown:
-            sys.stdout.write(f"{_as_text(each)}\n")
-        sys.stdout.write(f"{_summary(found)}\n")
-    return EXIT_DIFFERENT if any(each.severity == "error" for each in found) else 0
+    for each in shown:
+        text = json.dumps(each._asdict()) if options.json else printable(_wrapped(str(each)))
+        sys.stdout.write(f"{text}\n")
+    errors, warnings = (
+        sum(each.severity == kind for each in found) for kind in ("error", "warning")
+    )
+    if not options.json:
+        sys.stdout.write(f"{counted(errors, 'error')}, {counted(warnings, 'warning')}\n")
+    return EXIT_DIFFERENT if errors else 0
 
 
 def _configuration(options: CheckOptions) -> Configuration:
@@ -187,36 +176,12 @@ def _impatient(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def _as_text(finding: Finding) -> str:
-    """Return the lines of a finding."""
+def _wrapped(text: str) -> str:
+    """Break the long lines of a finding, but for those of the user's code, which are indented."""
     width = min(shutil.get_terminal_size().columns, _WIDEST)
-    begins = f"{finding.severity:<11} "
-    lines = _wrapped(f"{finding.check}: {finding.seen}", width, begins)
-    if finding.details:
-        lines += [f"{' ' * _INDENT}{line}" for line in finding.details.splitlines()]
-    if finding.advice:
-        where = "" if finding.severity == "information" else f" ({finding.where})"
-        lines += _wrapped(f"{finding.advice}{where}", width, f"{' ' * _INDENT}-> ")
-    if sys.stdout.isatty() and (color := _COLORS[finding.severity]):
-        lines[0] = f"\x1b[{color}m{begins}\x1b[0m{lines[0].removeprefix(begins)}"
-        return "\n".join([lines[0], *map(printable, lines[1:])])
-    return printable("\n".join(lines))
-
-
-def _wrapped(text: str, width: int, begins: str) -> list[str]:
-    return textwrap.wrap(
-        text,
-        width,
-        initial_indent=begins,
-        subsequent_indent=" " * _INDENT,
-        break_long_words=False,
-        break_on_hyphens=False,
+    wrapper = textwrap.TextWrapper(
+        width, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False
     )
-
-
-def _summary(found: Sequence[Finding]) -> str:
-    from holdfast.cli.terminal import counted
-
-    errors = sum(each.severity == "error" for each in found)
-    warnings = sum(each.severity == "warning" for each in found)
-    return f"{counted(errors, 'error')}, {counted(warnings, 'warning')}"
+    return "\n".join(
+        line if line.startswith("      ") else wrapper.fill(line) for line in text.splitlines()
+    )

@@ -7,17 +7,16 @@ Bayesian inference algorithms with simulation-based calibration", 2018). A belie
 prior that is known exactly, so nothing is approximate here: the posterior is the weights, and among
 equal states chance decides.
 
-Three orders are used: each coordinate of the state, the same times the observation, which finds a
-likelihood that ignores it, and the likelihood itself, which finds most (Modrák and others,
-"Simulation-based calibration checking for Bayesian computation: the choice of test quantities
-shapes sensitivity", 2023). A likelihood in place of its logarithm hardly weighs, so the true state,
-which is likely, lies above nearly all others.
+The orders are by each coordinate of the state, by the same times the observation, which finds a
+likelihood that ignores it, and by the likelihood itself, which finds most (Modrák and others,
+"Simulation-based calibration checking for Bayesian computation", 2023).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
@@ -30,129 +29,88 @@ from holdfast.problems.attributes import (
     has_general_observations,
     sensing_labels,
 )
-from holdfast.tuning.contract_check import draw_observation, kolmogorov_p
-from holdfast.tuning.findings import CHECKS, CONTRACT, Finding, Inspection, spread_out
+from holdfast.tuning.contract_check import acted, draw_observation
+from holdfast.tuning.findings import CheckEndedError, Inspection, spread_out
 
-__all__ = ["Calibration", "calibrate", "check_likelihoods", "remedy_of"]
+__all__ = ["check_likelihoods", "remedy_of", "uniform_p"]
 
-_REPLICATES = 300
-"""Simulated observations of a sensing action from each kind of belief."""
-
+_REPLICATES = 300  # simulated observations of a sensing action from each kind of belief
 _PARTICLES = 200
-_CLOUDS = 10
-"""Beliefs that come of one state each."""
+_CLOUDS = 10  # beliefs that come of one state each
+_MOST_COORDINATES, _MOST_ACTIONS = 8, 64
+_INITIAL, _CLOUD, _WHICH, _SHOWN, _TIES = 16, 17, 18, 19, 20  # trial numbers of the streams here
+_GAINS = 0.1  # nats by which the true state's posterior must grow for a remedy to be named
 
-_MOST_COORDINATES = 8
-_MOST_ACTIONS = 64
-
-_INITIAL, _CLOUD, _WHICH, _SHOWN, _TIES = 16, 17, 18, 19, 20
-
-_GAINS = 0.1
-"""Nats by which the true state's posterior must grow for a remedy to be named."""
-
-
-class Calibration(NamedTuple):
-    """What simulated observations of one sensing action lead to.
-
-    Attributes
-    ----------
-    log_likelihoods : array of shape (r, n)
-        Of each simulated observation in each particle's state, up to a constant of the observation.
-    truths : array of shape (r,)
-        Which particle the observation was drawn in.
-    states : array of shape (r, n, state_size)
-    shown : array of shape (r, observation_size)
-    """
-
-    log_likelihoods: FloatArray
-    truths: IntArray
-    states: FloatArray
-    shown: FloatArray
+_Calibration = tuple[FloatArray, IntArray, FloatArray, FloatArray]
+"""Log-likelihoods of r observations in n particles each, (r, n), up to a constant of each
+observation; the true particles, (r,); all particles' states, (r, n, state_size); the observations,
+(r, observation_size)."""
 
 
 def check_likelihoods(inspection: Inspection) -> None:
     """Test for each sensing action whether its samples follow its likelihood."""
-    problem = inspection.problem
+    problem, late = inspection.problem, inspection.deadline(0.45, "likelihood")
     count = len(sensing_labels(problem))
-    late = inspection.deadline(0.45)
     function = "log_likelihood" if has_general_observations(problem) else "observation_mean"
-    untried = 0
-    beliefs_of = list(_beliefs(inspection))
+    kinds = list(_beliefs(inspection))
     for action in range(min(count, _MOST_ACTIONS)):
         if late():
-            untried = count - action
-            break
-        with inspection.part():
-            for kind, beliefs in beliefs_of:
+            return
+        with contextlib.suppress(CheckEndedError):
+            for kind, beliefs in kinds:
                 found = inspection.ask(
-                    function,
-                    lambda beliefs=beliefs, action=action: calibrate(  # type: ignore[misc]
-                        inspection, action, beliefs, late
-                    ),
-                    "likelihood",
+                    function, _calibrate, inspection, action, beliefs, late, check="likelihood"
                 )
-                _test(inspection, action, kind, found, function)
-    if untried:
-        inspection.add(
-            "information",
-            "likelihood",
-            f"the likelihoods of {untried} of {count} sensing actions were not tested: the time "
-            "for this check was over",
-            "Give it more (--budget).",
-        )
+                ties = inspection.random(_TIES, action).random((len(found[1]), 1))
+                about = f"{function}, {inspection.label(action)}"
+                _test(inspection, about, kind, found, ties)
 
 
 def _beliefs(inspection: Inspection) -> Iterator[tuple[str, list[FloatArray]]]:
     """Yield beliefs as wide as the initial one or the way, and as narrow as some moves."""
-    problem, ask = inspection.problem, inspection.ask
+    problem, ask, walk = inspection.problem, inspection.ask, inspection.walk
     own = inspection.random(_INITIAL)
-    states = ask("initial_states", lambda: checked.initial_states(problem, own, _PARTICLES))
-    yield "the initial belief", [states]
-    walk = inspection.walk
+    yield (
+        "the initial belief",
+        [ask("initial_states", checked.initial_states, problem, own, _PARTICLES)],
+    )
     if walk is None:
         return
-    rows = walk.states.reshape(-1, walk.states.shape[-1])
-    stages = walk.stages.reshape(-1)
-    yield "states along the way", [rows[spread_out(_PARTICLES, len(rows))]]
-    clouds = []
-    moves = min(inspection.settings.sensing_interval + 1, 5)
-    for number in range(_CLOUDS):
-        at = (number * len(rows)) // _CLOUDS
+    count = len(walk.states)
+    yield "states along the way", [walk.states[spread_out(_PARTICLES, count)]]
 
-        def spread(at: int = at, number: int = number) -> FloatArray:
-            cloud = np.repeat(rows[at : at + 1], _PARTICLES // 2, axis=0)
-            for step in range(moves):
-                commanded = checked.policy(problem, rows[at], int(stages[at]))
-                action = checked.executed_action(problem, commanded)
-                noise = inspection.random(_CLOUD, number * 100 + step)
-                cloud = checked.move(problem, cloud, action, noise)
-            return cloud
+    def spread(at: int, number: int) -> FloatArray:
+        cloud = np.tile(walk.states[at], (_PARTICLES // 2, 1))
+        action = acted(problem, walk.states[at], int(walk.stages[at]))
+        for step in range(min(inspection.settings.sensing_interval + 1, 5)):
+            own = inspection.random(_CLOUD, number * 100 + step)
+            cloud = checked.move(problem, cloud, action, own)
+        return cloud
 
-        clouds.append(ask("move", spread))
+    clouds = [ask("move", spread, each * count // _CLOUDS, each) for each in range(_CLOUDS)]
     yield "beliefs that come of one state", clouds
 
 
-def calibrate(
-    inspection: Inspection, action: int, beliefs: list[FloatArray], late: Any = lambda: False
-) -> Calibration:
+def _calibrate(
+    inspection: Inspection, action: int, beliefs: list[FloatArray], late: Callable[[], bool]
+) -> _Calibration:
     """Simulate observations of a sensing action in states of some beliefs, and weigh all states."""
     problem = inspection.problem
     which = inspection.random(_WHICH, action).random(_REPLICATES)
-    rows, truths, states, observations = [], [], [], []
+    found: list[tuple[Any, ...]] = []
     for number in range(_REPLICATES):
         if late() and number >= 50:
             break
         belief = beliefs[number % len(beliefs)]
         truth = int(which[number] * len(belief))
-        noise = inspection.random(_SHOWN + 2 * action, number)
-        shown = draw_observation(problem, belief[truth], action, noise)
-        rows.append(_log_likelihoods(problem, belief, action, shown))
-        truths.append(truth)
-        states.append(belief)
+        own = inspection.random(_SHOWN + 2 * action, number)
+        shown = draw_observation(problem, belief[truth], action, own)
         # An angle is what it is on the circle: a turn more would tell what no posterior knows.
         angles = circular_observation(problem, action, shown.size)
-        observations.append(differences(shown, np.zeros(shown.size), angles))
-    return Calibration(np.array(rows), np.array(truths), np.array(states), np.array(observations))
+        on_circle = differences(shown, np.zeros(shown.size), angles)
+        found.append((_log_likelihoods(problem, belief, action, shown), truth, belief, on_circle))
+    values, truths, states, shown = (np.array(part) for part in zip(*found, strict=True))
+    return values, truths, states, shown
 
 
 def _log_likelihoods(
@@ -161,64 +119,47 @@ def _log_likelihoods(
     if has_general_observations(problem):
         return checked.log_likelihood(problem, states, action, shown)
     belief = Belief(states, uniform_weights(len(states)))
-    weights = update(problem, belief, action, shown)[0].weights
     with np.errstate(divide="ignore"):
-        logarithms: FloatArray = np.log(weights)
-    return logarithms
+        return np.asarray(np.log(update(problem, belief, action, shown)[0].weights))
 
 
 def _test(
-    inspection: Inspection, action: int, kind: str, found: Calibration, function: str
+    inspection: Inspection, about: str, kind: str, found: _Calibration, ties: FloatArray
 ) -> None:
-    label = inspection.label(action)
-    values, truths = found.log_likelihoods, found.truths
-    own = values[np.arange(len(truths)), truths]
-    if (own == -np.inf).any():
-        inspection.add(
-            "error",
-            "likelihood",
-            f"{function}, {label}: {int((own == -np.inf).sum())} of {len(own)} simulated "
-            "observations are impossible (minus infinity) in the very state in which they were "
-            "drawn",
-            "sample_observation and log_likelihood must be of one distribution.",
-            CONTRACT,
-        )
+    (values, truths, states, shown), count = found, len(found[1])
+    if impossible := int((values[np.arange(count), truths] == -np.inf).sum()):
+        seen = f"{about}: {impossible} of {count} simulated observations are impossible (minus "
+        seen += "infinity) in the very state in which they were drawn"
+        advice = "sample_observation and log_likelihood must be of one distribution."
+        inspection.add("error", "likelihood", seen, advice)
         return
     weights = _posteriors(values)
-    ties = inspection.random(_TIES, action).random(len(truths))
     quantities: list[tuple[str, FloatArray]] = [("likelihood", values)]
-    away = found.shown - found.shown.mean(axis=0)
-    for at in range(min(found.states.shape[-1], _MOST_COORDINATES)):
-        own_states = found.states[..., at]
-        quantities.append((inspection.coordinate(at), own_states))
-        # The order turns with the observation, so that one which is ignored shows.
-        quantities.append(
-            (f"{inspection.coordinate(at)} times the observation", own_states * away[:, :1])
-        )
-    remedy: tuple[str, str] | None = None
+    away = shown - shown.mean(axis=0)
+    for at in range(min(states.shape[-1], _MOST_COORDINATES)):
+        name, own = inspection.coordinate(at), states[..., at]
+        # The second order turns with the observation, so that one which is ignored shows.
+        quantities += [(name, own), (f"{name} times the observation", own * away[:, :1])]
+    remedy = None
+    usual = "Compare sample_observation with log_likelihood (observation_mean and "
+    usual += "observation_variance of one state with those of many): of one distribution."
     for name, quantity in quantities:
-        places = _places(quantity, weights, truths, ties)
-        for shape, numbers in (("place", places), ("distance from the middle", _folded(places))):
-            p = _uniform_p(numbers)
+        # How much of each posterior lies below the true state; of what is equal, a share.
+        own = quantity[np.arange(count), truths][:, np.newaxis]
+        places = (weights * ((quantity < own) + ties * (quantity == own))).sum(axis=1)
+        # The distance from the middle is uniform, too, and shows a wrong width.
+        folded = np.abs(2.0 * places - 1.0)
+        for shape, numbers in (("place", places), ("distance from the middle", folded)):
+            p = uniform_p(numbers)
             if p < 1e-3 and remedy is None:
                 remedy = remedy_of(values, truths)
-            seen, advice = remedy or ("", "")
-            inspection.test(
-                p,
-                Finding(
-                    "error",
-                    "likelihood",
-                    f"{function}, {label}: does not fit what is sampled. In {len(truths)} "
-                    f"simulated observations from {kind}, the true state's {shape} among the "
-                    f"particles by {name} is not uniform: mean {numbers.mean():.2f} instead of "
-                    f"0.50{seen}",
-                    advice
-                    or "Compare log_likelihood with sample_observation (or observation_mean and "
-                    "observation_variance of one state with those of many): both must be of one "
-                    "distribution.",
-                    CHECKS,
-                ),
+            better, advice = remedy or ("", usual)
+            seen = (
+                f"{about}: does not fit what is sampled. In {count} simulated observations from "
+                f"{kind}, the true state's {shape} among the particles by {name} is not uniform: "
+                f"mean {numbers.mean():.2f} instead of 0.50{better}"
             )
+            inspection.test(p, "likelihood", seen, advice)
 
 
 def _posteriors(values: FloatArray) -> FloatArray:
@@ -228,28 +169,20 @@ def _posteriors(values: FloatArray) -> FloatArray:
     return normal
 
 
-def _places(
-    quantity: FloatArray, weights: FloatArray, truths: IntArray, ties: FloatArray
-) -> FloatArray:
-    """Return how much of each posterior lies below the true state; of equal ones, a share."""
-    own = quantity[np.arange(len(truths)), truths][:, np.newaxis]
-    below = np.where(quantity < own, weights, 0.0).sum(axis=1)
-    equal = np.where(quantity == own, weights, 0.0).sum(axis=1)
-    places: FloatArray = below + ties * equal
-    return places
+def uniform_p(numbers: FloatArray) -> float:
+    """Return the p-value of Kolmogorov's test that numbers are uniform between 0 and 1.
 
-
-def _folded(places: FloatArray) -> FloatArray:
-    """Return the distance from the middle, which is uniform, too, and shows a wrong width."""
-    return np.abs(2.0 * places - 1.0)
-
-
-def _uniform_p(numbers: FloatArray) -> float:
-    """Return the p-value of Kolmogorov's test that numbers are uniform between 0 and 1."""
-    ordered, count = np.sort(numbers), len(numbers)
-    above = np.arange(1, count + 1) / count - ordered
-    below = ordered - np.arange(count) / count
-    return kolmogorov_p(float(max(above.max(), below.max())), count)
+    The approximation is that of Stephens (1970), Journal of the Royal Statistical Society B 32.
+    """
+    count = len(numbers)
+    above = np.arange(1, count + 1) / count - np.sort(numbers)
+    distance = max(above.max(), (1.0 / count - above).max())
+    scaled = (np.sqrt(count) + 0.12 + 0.11 / np.sqrt(count)) * distance
+    if scaled < 0.3:
+        return 1.0
+    terms = np.arange(1, 101)
+    total = 2.0 * np.sum((-1.0) ** (terms - 1) * np.exp(-2.0 * terms**2 * scaled**2))
+    return float(min(1.0, max(0.0, total)))
 
 
 def remedy_of(values: FloatArray, truths: IntArray) -> tuple[str, str] | None:
@@ -262,39 +195,24 @@ def remedy_of(values: FloatArray, truths: IntArray) -> tuple[str, str] | None:
         own = _posteriors(changed)[np.arange(len(truths)), truths]
         return float(np.log(np.maximum(own, 1e-300)).mean())
 
-    as_it_is = fit(values)
     finite = np.where(np.isfinite(values), values, np.finfo(float).min)
-    found: list[tuple[float, str, str]] = []
+    negative = -finite / 1e3 if np.abs(finite).max() > 1e300 else -finite
+    advice = "The log-likelihood is greatest where the observation is likely: "
+    advice += "-0.5 * deviation * deviation."
+    found = [(fit(negative), ". It fits better with the other sign", advice)]
     if (values >= 0.0).all():
-        found.append(
-            (
-                fit(np.log(np.maximum(values, 1e-300))),
-                ". It fits better if the logarithm of the result is taken: log_likelihood seems to "
-                "return the likelihood",
-                "Return the logarithm: numerics.log(likelihood).",
-            )
-        )
-    found.append(
-        (
-            fit(-finite / 1e3 if np.abs(finite).max() > 1e300 else -finite),
-            ". It fits better with the other sign",
-            "The log-likelihood is greatest where the observation is likely: "
-            "-0.5 * deviation * deviation.",
-        )
-    )
+        seen = ". It fits better if the logarithm of the result is taken: log_likelihood seems to "
+        seen += "return the likelihood"
+        advice = "Return the logarithm: numerics.log(likelihood)."
+        found.append((fit(np.log(np.maximum(values, 1e-300))), seen, advice))
     powers = 2.0 ** np.arange(-12.0, 12.5, 0.5)
     fits = [fit(finite * power) if power < 1.0 else fit(values * power) for power in powers]
     best = int(np.argmax(fits))
     width = 1.0 / np.sqrt(powers[best])
     if not 0.8 < width < 1.25:
-        found.append(
-            (
-                fits[best] - 0.01,
-                f". It fits better if the noise is taken to be {width:.2g} times as wide",
-                "A variance in place of a standard deviation, or the reverse? In a Gaussian's "
-                "logarithm, -0.5 * (d / deviation)**2, and in stream.normal(loc, scale), the scale "
-                "is the standard deviation.",
-            )
-        )
+        seen = f". It fits better if the noise is taken to be {width:.2g} times as wide"
+        advice = "A variance in place of a standard deviation, or the reverse? Both in "
+        advice += "-0.5 * (d / deviation)**2 and in stream.normal(loc, scale) it is the deviation."
+        found.append((fits[best] - 0.01, seen, advice))
     gain, seen, advice = max(found)
-    return (seen, advice) if gain > as_it_is + _GAINS else None
+    return (seen, advice) if gain > fit(values) + _GAINS else None

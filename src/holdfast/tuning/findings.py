@@ -1,8 +1,8 @@
 """Findings about a problem, and the inspection that collects them.
 
 A problem is a user's own code and may do anything. So an inspection calls it through
-:meth:`Inspection.ask`: whatever the code raises becomes a finding with the user's own lines, that
-one check ends, and the next one begins.
+:meth:`Inspection.ask`: whatever it raises becomes a finding with the user's own lines, that one
+check ends, and the next one begins.
 
 A statistical test is wrong now and then. All tests of an inspection share one false-alarm rate:
 they are collected, and only at the end, when their number is known, each is compared with its share
@@ -11,11 +11,10 @@ they are collected, and only at the end, when their number is known, each is com
 
 from __future__ import annotations
 
-import contextlib
 import re
+import textwrap
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal, NamedTuple, TypeVar
 
@@ -25,16 +24,18 @@ from holdfast.config.user_code import account_of_user_error, in_words
 from holdfast.errors import HoldfastError
 from holdfast.numerics.arrays import FloatArray, IntArray
 from holdfast.numerics.randomness import Purpose, Stream, stream
+from holdfast.planning.planner import PlanningState
 from holdfast.planning.settings import PlanningSettings
 from holdfast.printable import one_line
-from holdfast.problems.attributes import name_of, sensing_labels, state_labels
+from holdfast.problems.attributes import sensing_labels, state_labels
 
 __all__ = [
+    "CONTRACT",
     "FALSE_ALARM_RATE",
+    "WHERE",
     "CheckEndedError",
     "Finding",
     "Inspection",
-    "Severity",
     "Walk",
     "spread_out",
 ]
@@ -43,12 +44,39 @@ FALSE_ALARM_RATE = 0.001
 """Probability that the statistical tests of a right problem, all together, find an error."""
 
 Severity = Literal["error", "warning", "information"]
-"""An error makes decisions wrong, a warning makes them worse, information is to be read."""
-
-_ORDER = ("error", "warning", "information")
 
 CONTRACT = "docs/problems.md#your-own"
-CHECKS = "docs/problems.md#check-it"
+WHERE = {
+    "depletion": "docs/settings.md",
+    "likelihood": "docs/problems.md#check-it",
+    "resolution": "docs/problems.md#a-sharp-sensor-beside-a-weak-one",
+    "sensors": "docs/problems.md#when-to-sense",
+    "time": "docs/settings.md",
+}
+"""What of the documentation says more, by check; of all others it is the contract."""
+
+_REMEDIES = (
+    ("read-only", "It changes the array that it is given. Take a copy: states = states.copy()."),
+    ("TimeoutError", "Look for a loop that need not end, such as one that draws until it fits."),
+    ("a stream is for", "Draw from the stream of this call alone, and do not keep it."),
+    (
+        "something else|global generator",
+        "Draw from the stream that the function is given, stream.normal(states.shape), not from "
+        "np.random, random or a generator of your own, and keep nothing that changes a result.",
+    ),
+    (
+        "another leading shape",
+        "Compute each state by itself: index coordinates as states[..., 0] and take no mean, "
+        "maximum or sum over states.",
+    ),
+    (
+        "ValueError|IndexError|TypeError|need ",
+        "Make it take states of any leading shape, (), (n,) or (t, n), with the coordinates last "
+        "(states[..., 0]), and return what the table there says, as float64.",
+    ),
+    ("raised", "These are the lines of your own code."),
+)
+"""Patterns of what is raised, and what to do; the first that fits counts."""
 
 ResultT = TypeVar("ResultT")
 
@@ -59,12 +87,13 @@ class Finding(NamedTuple):
     Attributes
     ----------
     severity : {"error", "warning", "information"}
+        An error makes decisions wrong, a warning makes them worse, information is to be read.
     check : str
         Which check found it: contract, purity, streams, goals, likelihood, ...
     seen : str
         What was seen, with numbers.
     advice : str
-        What to do; empty for information.
+        What to do; empty for most information.
     where : str
         The part of the documentation that says more.
     details : str
@@ -75,13 +104,14 @@ class Finding(NamedTuple):
     check: str
     seen: str
     advice: str = ""
-    where: str = CHECKS
+    where: str = CONTRACT
     details: str = ""
 
     def __str__(self) -> str:
-        lines = [f"{self.severity}: {self.check}: {self.seen}"]
-        lines += [self.details] if self.details else []
-        lines += [f"-> {self.advice} ({self.where})"] if self.advice else []
+        lines = [f"{self.severity:<11} {self.check}: {self.seen}"]
+        lines += [textwrap.indent(self.details, "    ")] if self.details else []
+        where = "" if self.severity == "information" else f" ({self.where})"
+        lines += [f"    -> {self.advice}{where}"] if self.advice else []
         return "\n".join(lines)
 
 
@@ -90,81 +120,31 @@ class CheckEndedError(Exception):
 
 
 class Walk(NamedTuple):
-    """Trials in which the state is known: the policy is followed from n initial states.
-
-    Attributes
-    ----------
-    states : array of shape (t, n, state_size)
-        At a few steps, the first of them 0.
-    stages : array of shape (t, n)
-    reached, failed : array of shape (n,)
-        The step at which a trial came to the goal, or failed; -1 if it did not.
-    steps : int
-        How many steps were taken.
-    """
+    """Trials with the state known: m states and stages of theirs, and when each was at the goal."""
 
     states: FloatArray
     stages: IntArray
     reached: IntArray
-    failed: IntArray
-    steps: int
-
-
-class _Test(NamedTuple):
-    p: float
-    finding: Finding
 
 
 class Inspection:
-    """What the checks of one problem share: its settings, random streams, time and findings.
-
-    Parameters
-    ----------
-    problem : Problem
-    settings : PlanningSettings
-    max_steps : int
-        Steps after which a simulated trial has failed.
-    seed : int
-        Names every random draw.
-    budget_s : float
-        Time after which no further work is begun. What is found does not depend on it unless it
-        runs out, which is a finding.
-
-    Attributes
-    ----------
-    findings : list of Finding
-    walk : Walk or None
-        Set by the check of goals.
-    rewards : list of float
-        Of simulated steps.
-    """
+    """What the checks of one problem share: its settings, random streams, time and findings."""
 
     def __init__(
-        self,
-        problem: Any,
-        settings: PlanningSettings,
-        max_steps: int,
-        seed: int,
-        budget_s: float,
+        self, problem: Any, settings: PlanningSettings, max_steps: int, seed: int, budget_s: float
     ) -> None:
         self.problem, self.settings, self.max_steps, self.seed = problem, settings, max_steps, seed
         self.findings: list[Finding] = []
         self.walk: Walk | None = None
+        self.beliefs: list[PlanningState] = []
         self.rewards: list[float] = []
         self.num_tests = 0
-        self._tests: list[_Test] = []
-        self._budget_s = budget_s
-        self._end = perf_counter() + budget_s
-        self._warned: set[str] = set()
+        self._tests: list[tuple[float, Finding]] = []
+        self._budget_s, self._end = budget_s, perf_counter() + budget_s
         self._blamed: set[str] = set()
 
-    @property
-    def name(self) -> str:
-        """What messages call the problem."""
-        return name_of(self.problem)
-
     def random(self, purpose: int, number: int = 0) -> Stream:
-        """Return a stream that no other check has."""
+        """Return a stream, by the number of what it is for."""
         return stream(self.seed, purpose, number, Purpose.INITIAL_BELIEF)
 
     def label(self, sensing_action: int) -> str:
@@ -176,127 +156,79 @@ class Inspection:
         labels = state_labels(self.problem)
         return labels[number] if labels else f"coordinate {number} of a state"
 
-    def deadline(self, share: float) -> Callable[[], bool]:
+    def deadline(self, share: float, check: str) -> Callable[[], bool]:
         """Return a function that tells whether a check has used up its share of the time."""
         end = min(self._end, perf_counter() + share * self._budget_s)
-        return lambda: perf_counter() > end
+
+        def late() -> bool:
+            if perf_counter() <= end:
+                return False
+            seen = "the time for this check was over before it had looked at all"
+            self.add("information", check, seen, "Give it more (--budget).")
+            return True
+
+        return late
 
     def add(
-        self,
-        severity: Severity,
-        check: str,
-        seen: str,
-        advice: str = "",
-        where: str = CHECKS,
-        details: str = "",
+        self, severity: Severity, check: str, seen: str, advice: str = "", details: str = ""
     ) -> None:
         """Add a finding, unless it is there."""
+        where = WHERE.get(check, CONTRACT)
         found = Finding(severity, check, one_line(seen), advice, where, details)
         if found not in self.findings:
             self.findings.append(found)
 
-    def test(self, p: float, finding: Finding) -> None:
-        """Add a finding if the p-value of a test is too small for chance, which shows later."""
+    def test(self, p: float, check: str, seen: str, advice: str) -> None:
+        """Add an error if the p-value of a test is too small for chance, which shows later."""
         self.num_tests += 1
-        self._tests.append(_Test(p, finding))
+        self._tests.append((p, Finding("error", check, seen, advice)))
 
     def judge_tests(self) -> None:
-        """Add the findings of the tests whose p-value is below their share of the false alarms.
-
-        Of several findings of one check about one function, the one with the least p-value counts.
-        """
-        least: dict[tuple[str, str], _Test] = {}
-        for test in sorted(self._tests, key=lambda test: test.p):
-            least.setdefault((test.finding.check, test.finding.seen.partition(":")[0]), test)
-        for test in least.values():
-            if test.p * self.num_tests < FALSE_ALARM_RATE:
-                seen = f"{test.finding.seen} (p = {test.p:.1g}, of {self.num_tests} tests)"
-                self.add(**test.finding._replace(seen=seen)._asdict())
+        """Add what has a p-value below its share of the false alarms, one for each function."""
+        if self.num_tests:
+            seen = f"{self.num_tests} statistical tests were made; of a right problem they find an "
+            seen += f"error, all together, with a probability of at most {FALSE_ALARM_RATE:g}"
+            self.add("information", "likelihood", seen)
+        judged = set()
+        for p, found in sorted(self._tests, key=lambda test: test[0]):
+            about = found.check, found.seen.partition(":")[0]
+            if p * self.num_tests < FALSE_ALARM_RATE and about not in judged:
+                judged.add(about)
+                seen = f"{found.seen} (p = {p:.1g}, of {self.num_tests} tests)"
+                self.add("error", found.check, seen, found.advice)
         self._tests.clear()
 
-    def sorted_findings(self) -> list[Finding]:
-        """Return the findings, errors first."""
-        return sorted(self.findings, key=lambda found: _ORDER.index(found.severity))
-
-    def part(self) -> contextlib.suppress:
-        """Return a context in which a check may end early without ending the inspection."""
-        return contextlib.suppress(CheckEndedError)
-
-    def ask(self, function: str, call: Callable[[], ResultT], check: str = "contract") -> ResultT:
-        """Return what a call of the problem's code returns.
-
-        Raises
-        ------
-        CheckEndedError
-            If it raises; that is a finding about ``function`` then. Ctrl-C passes.
-        """
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            try:
-                found = call()
-            except (KeyboardInterrupt, CheckEndedError):
-                raise
-            except BaseException as error:
-                self._add_error(function, check, error)
-                raise CheckEndedError from error
-        for warning in caught:
-            self._add_warning(function, warning)
-        return found
+    def ask(
+        self, function: str, call: Callable[..., ResultT], *arguments: Any, check: str = "contract"
+    ) -> ResultT:
+        """Return what a call of the problem's code returns; what it raises is a finding."""
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                return call(*arguments)
+        except (KeyboardInterrupt, CheckEndedError):
+            raise
+        except BaseException as error:
+            self._add_error(function, check, error)
+            raise CheckEndedError from error
 
     def _add_error(self, function: str, check: str, error: BaseException) -> None:
-        account = account_of_user_error(error, function)
-        words = in_words(error)
+        account, words = account_of_user_error(error, function), in_words(error)
+        seen, details = f"{function} raised {words}", ""
         if account is not None:
-            header = f"{function} raised {words}"
-            seen, details = header, account.removeprefix(header).strip("\n")
+            details = account.removeprefix(seen).strip("\n")
         else:
-            words = str(error) if isinstance(error, HoldfastError) else words
-            seen, details = words if function in words else f"{function}: {words}", ""
+            seen = str(error) if isinstance(error, HoldfastError) else words
+            seen = seen if function in seen else f"{function}: {seen}"
         # One finding for what is broken, whoever calls it and with whatever states.
-        to_blame = _to_blame(words, details) or f"{function} {type(error).__name__}"
+        frames = re.findall(r'^  File "(.+)", line \d+, in (.+)$', details, re.MULTILINE)
+        named = re.match(r"(\w+) of ", seen)
+        to_blame = " ".join(frames[-1]) if frames else named[1] if named else f"{function} {check}"
         if to_blame in self._blamed:
             return
         self._blamed.add(to_blame)
-        advice = "Look at what it returns there; the documentation says what is needed."
-        if details:
-            advice = "These are the lines of your own code."
-        if isinstance(error, ValueError | IndexError | TypeError) or "need" in words:
-            advice = (
-                "Make it take states of any leading shape, (), (n,) or (t, n), with the "
-                "coordinates last (states[..., 0]), and return what the table there says, as "
-                "float64."
-            )
-        if "read-only" in words:
-            advice = "It changes the array that it is given. Take a copy: states = states.copy()."
-        elif isinstance(error, TimeoutError):
-            advice = "Look for a loop that need not end, such as one that draws until it fits."
-        elif "a stream is for" in words:
-            advice = "Draw from the stream of this call alone, and do not keep it."
-        self.add("error", check, seen, advice, CONTRACT, details)
-
-    def _add_warning(self, function: str, warning: warnings.WarningMessage) -> None:
-        text = f"{warning.category.__name__}: {warning.message}"
-        key = f"{function} {text}"
-        if key in self._warned or len(self._warned) > 20:
-            return
-        self._warned.add(key)
-        place = f"{Path(warning.filename).name}, line {warning.lineno}"
-        self.add(
-            "information",
-            "contract",
-            f"{function} made NumPy or Python warn: {text} ({place})",
-            "Harmless where the value is not used, as a logarithm of 0 that means impossible.",
-            CONTRACT,
-        )
-
-
-def _to_blame(words: str, details: str) -> str | None:
-    """Return the function that an error is about: the innermost of the user's, or the named one."""
-    frames = re.findall(r'^  File "(.+)", line \d+, in (.+)$', details, re.MULTILINE)
-    if frames:
-        return " ".join(frames[-1])
-    named = re.match(r"(\w+) of ", words)
-    return named[1] if named else None
+        fits = (remedy for pattern, remedy in _REMEDIES if re.search(pattern, seen))
+        self.add("error", check, seen, next(fits, "Look at what it returns there."), details)
 
 
 def spread_out(count: int, total: int) -> IntArray:

@@ -1,63 +1,239 @@
-"""What a few simulated trials show: endings, beliefs that are worn out, and truths that are lost.
+"""Whether the task can be done, and what a few simulated trials show of the beliefs.
 
-The trials sense at random, which costs no time for choosing and favours no sensor. Their beliefs
-just before a sensing step are kept for the checks of the sensors.
+What sensing can gain is bounded by what the policy does in a state that is known. So first some
+trials are simulated all at once without any belief: if they do not come to the goal, no sensing
+will. They also show where the robot goes, for the checks that need states from along the way.
+
+Then a few trials sense at random, which costs no time for choosing and favours no sensor. Their
+beliefs before sensing are kept for the checks of the sensors and of the time of a decision.
 """
 
 from __future__ import annotations
 
+import contextlib
+import cProfile
 from collections.abc import Callable
-from typing import NamedTuple
+from time import thread_time
+from typing import Any
 
+import msgspec
 import numpy as np
 
 from holdfast.errors import HoldfastError
-from holdfast.numerics.arrays import BoolArray, FloatArray
+from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
 from holdfast.numerics.circular import differences
+from holdfast.numerics.randomness import NoiseFreeStream
 from holdfast.planning.belief import Belief
-from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
-from holdfast.problems.attributes import circular_states, sensing_labels
+from holdfast.problems import checked
+from holdfast.problems.attributes import (
+    PARAMETERS,
+    circular_actions,
+    circular_states,
+    sensing_labels,
+)
+from holdfast.problems.problem import ProblemBase
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
-from holdfast.tuning.contract_check import truths
-from holdfast.tuning.findings import CONTRACT, Inspection, spread_out
+from holdfast.tuning.contract_check import acted, check_contract, truths
+from holdfast.tuning.findings import Inspection, Severity, Walk, spread_out
 
-__all__ = ["SensedBelief", "check_trials"]
+__all__ = ["check_decision_time", "check_goals", "check_trials"]
 
-_TRIALS = 8
-_BELIEFS = 24
-"""Beliefs before sensing that are kept."""
-
-_MOST_STEPS = 1000
-
-_FEW_LEFT = 3.0
-"""Effective particles after an observation below which it leaves hardly any."""
-
-_OFTEN = 0.2
-"""Share of the observations from which on it is worth a warning."""
-
-_PARTICLES_KEPT = 400
+_WALKS = 64
+_KEPT, _CHOSEN = 24, 48  # steps whose states are kept, and states whose contract is checked
+_LONGER = 4  # times max_steps, to tell a limit that is too low from a trial that is lost
+_INITIAL, _WAY, _NOISE = 8, 9, 10  # trial numbers of the streams here
+_DRAWS, _STATES = 100, 12  # moves from each of some states, whose noise is compared
+_TRIALS, _MOST_STEPS, _DECISIONS = 8, 1000, 5
+_BELIEFS, _PARTICLES = 24, 400  # beliefs before sensing that are kept, and particles of each
+_ENOUGH = 0.5  # share of the trials that should reach the goal
+_OFTEN = 0.2  # share of the observations from which on it is worth a warning
+_FEW_LEFT = 3.0  # effective particles below which an observation leaves hardly any
 
 
-class SensedBelief(NamedTuple):
-    """A belief just before sensing, and the stage of the task."""
-
-    belief: Belief
-    stage: int
-
-
-class _Left(NamedTuple):
-    """What an observation leaves of a belief, and in which coordinates it had lost the truth."""
-
-    sensing_action: int
-    size: float
-    explained: bool
-    outside: BoolArray
+def check_goals(inspection: Inspection) -> None:
+    """Follow the policy with the state known, and check the contract again along the way."""
+    walk = _follow_policy(inspection)
+    chosen = spread_out(_CHOSEN, len(walk.states))
+    if len(chosen) == _CHOSEN:
+        check_contract(inspection, walk.states[chosen], walk.stages[chosen])
+    _check_motion(inspection, walk)
 
 
-class _TimeOverError(HoldfastError):
-    """The time for this check is over."""
+def _follow_policy(inspection: Inspection) -> Walk:
+    """Simulate trials in which the state is known, until all have ended or the steps are over."""
+    problem, ask = inspection.problem, inspection.ask
+    late = inspection.deadline(0.2, "goals")
+    own = inspection.random(_INITIAL)
+    states = ask("initial_states", checked.initial_states, problem, own, _WALKS)
+    stages = np.zeros(_WALKS, dtype=np.int64)
+    reached, failed = np.full((2, _WALKS), -1)
+    kept: list[tuple[FloatArray, IntArray]] = []
+    jumps = np.zeros((2, states.shape[1]), dtype=np.int64)
+    turns = np.zeros((2, problem.action_size), dtype=np.int64)
+    step = still = 0
+    stride = 1
+    while True:
+        done = ask("is_goal", truths, problem, "is_goal", states)
+        lost = ask("is_failure", truths, problem, "is_failure", states)
+        running = (reached < 0) & (failed < 0)
+        reached[running & done] = step
+        failed[running & lost & ~done] = step
+        if step % stride == 0:
+            kept.append((states, stages))
+        if len(kept) > 2 * _KEPT:  # so that a long trial takes no more memory
+            kept, stride = kept[::2], 2 * stride
+        if step == _LONGER * inspection.max_steps or not (running & ~done & ~lost).any() or late():
+            break
+        stages = ask("next_stage", checked.next_stages, problem, states, stages)
+        commanded = ask("policy", checked.policy, problem, states, stages)
+        actions = ask("execute", checked.executed_action, problem, commanded)
+        still += bool((actions == 0.0).all())
+        own = inspection.random(_WAY, step)
+        moved = ask("move", checked.move, problem, states, actions, own)
+        jumps += _large_changes(moved - states)
+        turns += _large_changes(ask("policy", checked.policy, problem, moved, stages) - commanded)
+        states = moved
+        step += 1
+    some = [kept[index] for index in spread_out(_KEPT, len(kept))]
+    at, their = (np.concatenate([each[part] for each in some]) for part in (0, 1))
+    inspection.walk = walk = Walk(at, np.asarray(their, dtype=np.int64), reached)
+    _report_angles(inspection, jumps, turns)
+    _report_walk(inspection, walk, failed, step, never_moves=0 < step == still)
+    if getattr(type(problem), "reward", None) not in (None, ProblemBase.reward):
+        actions = ask("policy", acted, problem, walk.states, walk.stages)
+        rewards = ask("reward", checked.rewards, problem, walk.states, actions)
+        inspection.rewards.extend(rewards.tolist())
+    return walk
+
+
+def _large_changes(change: FloatArray) -> IntArray:
+    """Count the large changes of each coordinate in a step, and those of about a whole turn."""
+    size = np.abs(change)
+    return np.array([(size > 0.5 * np.pi).sum(0), (np.abs(size - 2.0 * np.pi) < 0.5).sum(0)])
+
+
+def _report_angles(inspection: Inspection, jumps: IntArray, turns: IntArray) -> None:
+    """Warn of coordinates whose large changes are all whole turns, as if they were angles."""
+    problem = inspection.problem
+    for counts, attribute, declared, whose in (
+        (jumps, "circular", circular_states(problem), "a state"),
+        (turns, "circular_actions", circular_actions(problem), "the task action"),
+    ):
+        for at in np.flatnonzero((counts[1] >= 2) & (counts[1] == counts[0])).tolist():
+            if at in declared:
+                continue
+            seen = f"coordinate {at} of {whose} jumps by a whole turn (2 pi) in one step, and is "
+            seen += "not declared to be an angle: the mean of 3.1 and -3.1 is taken for 0"
+            advice = (
+                f"Give the problem {attribute} = ({at},), and circular_observations if a sensor "
+            )
+            advice += "shows it; in a policy take numerics.wrapped(goal - heading)."
+            inspection.add("warning", "units", seen, advice)
+
+
+def _report_walk(
+    inspection: Inspection, walk: Walk, failed: IntArray, steps: int, *, never_moves: bool
+) -> None:
+    limit, num_stages = inspection.max_steps, inspection.problem.num_stages
+    reached, in_time = walk.reached >= 0, (walk.reached >= 0) & (walk.reached <= limit)
+    if (walk.reached == 0).all():
+        seen = f"all of {_WALKS} initial states are goals: each trial ends before its first step"
+        inspection.add("error", "goals", seen, "Look at is_goal and initial_states.")
+        return
+    if never_moves and not reached.all():
+        seen = f"the policy never moves: its executed action is 0 in all of {_WALKS} trials of "
+        seen += f"{steps} steps, and {reached.sum()} of them reach the goal"
+        inspection.add("error", "goals", seen, "Look at policy and execute.")
+        return
+    seen = f"with the state known, the policy comes to the goal in {reached.sum()} of {_WALKS} "
+    seen += "trials"
+    if reached.any():
+        seen += f", after {np.median(walk.reached[reached]):.0f} steps (median)"
+    if lost := int((failed >= 0).sum()):
+        seen += f", and {lost} fail"
+    if running := _WALKS - int(reached.sum()) - lost:
+        seen += f"; {running} have not ended after {steps} steps"
+    if (reached & ~in_time).any():
+        seen += f"; within max_steps, {limit}, it is {in_time.sum()}"
+    cut = running > 0 and steps < limit
+    advice = (
+        "What is lost here no sensing can win. Look at is_goal and at the policy near the goal."
+    )
+    if reached.mean() >= _ENOUGH:
+        needed = int(np.quantile(walk.reached[reached], 0.9))
+        advice = f"Set simulator.max_steps to {2 * needed} or more."
+    if cut or in_time.mean() >= _ENOUGH:
+        inspection.add("information", "goals", seen)
+    else:
+        inspection.add("warning" if in_time.any() else "error", "goals", seen, advice)
+    if (greatest := int(walk.stages.max())) + 1 < num_stages and not cut:
+        seen = f"num_stages is {num_stages}, but no trial comes beyond stage {greatest}"
+        inspection.add("warning", "goals", seen, "Look at next_stage.")
+
+
+def _check_rewards(inspection: Inspection) -> None:
+    """Look at the rewards of all simulated steps: whether they tell anything."""
+    rewards, selector = np.array(inspection.rewards), inspection.settings.selector
+    if not rewards.size or np.ptp(rewards) > 0.0 or rewards[0] < 0.0:
+        return
+    seen = f"the reward is {rewards[0]:g} in all of {len(rewards)} simulated steps: "
+    severity: Severity = "information"
+    if rewards[0] > 0.0:
+        severity, why = "warning", "a trial that never reaches the goal has the greatest return"
+    else:
+        why = "expected_return has nothing to tell sensing actions by"
+    if selector.method == "expected_return" and selector.rollout_reward == "problem":
+        severity = "error"
+    advice = "With selector.rollout_reward: steps the return counts steps instead; so it does "
+    advice += "without a reward."
+    inspection.add(severity, "goals", seen + why, advice)
+
+
+def _check_motion(inspection: Inspection, walk: Walk) -> None:
+    """Compare the noise of ``move`` with what the problem says of it."""
+    problem, ask = inspection.problem, inspection.ask
+    declared = np.asarray(problem.motion_variance, dtype=np.float64)
+    circular = circular_states(problem)
+    ratios = []
+    for number, at in enumerate(spread_out(_STATES, len(walk.states))):
+        state, own = walk.states[at], inspection.random(_NOISE, number)
+        action = ask("execute", acted, problem, state, int(walk.stages[at]))
+        many = np.tile(state, (_DRAWS, 1))
+        moved = ask("move", checked.move, problem, many, action, own)
+        slopes = ask("move", _slopes, problem, state, action)
+        variance = differences(moved, moved[0], circular).var(axis=0)
+        predicted = (slopes**2 * declared).sum(axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratios.append(np.where(predicted > 0.0, variance / predicted, np.nan))
+    for at, values in enumerate(np.transpose(ratios)):
+        known = values[np.isfinite(values)]
+        ratio = float(np.median(known)) if 2 * len(known) >= len(values) else 1.0
+        if not 1.0 / 9.0 <= ratio <= 9.0:
+            seen = f"motion_variance says that a step blurs {inspection.coordinate(at)} with a "
+            seen += f"variance {'below' if ratio > 1.0 else 'above'} what move does: move's is "
+            seen += f"{ratio:.2g} times as large (median of {len(ratios)} states)"
+            advice = "motion_variance is the variance of the noise of one step, not its standard "
+            advice += "deviation. The mixture estimators depend on it."
+            inspection.add("warning", "motion", seen, advice)
+
+
+def _slopes(problem: Any, state: FloatArray, action: FloatArray) -> FloatArray:
+    """Return how a state after a move changes with the action, (state_size, action_size)."""
+
+    def led(by: FloatArray) -> FloatArray:
+        return checked.expected_move(problem, state, action + by, NoiseFreeStream(1000))
+
+    slopes = np.empty((state.size, action.size))
+    for at, step in enumerate(np.diag(1e-3 * np.maximum(1.0, np.abs(action)))):
+        change = differences(led(step), led(-step), circular_states(problem))
+        slopes[:, at] = change / (2.0 * step[at])
+    return slopes
+
+
+class _EndedError(HoldfastError):
+    """The time for this check is over, or the trial has failed."""
 
 
 class _Watcher(TrialObserver):
@@ -65,172 +241,155 @@ class _Watcher(TrialObserver):
 
     def __init__(self, inspection: Inspection, late: Callable[[], bool]) -> None:
         self.inspection, self.late = inspection, late
-        self.before: list[PlanningState] = []
-        self.left: list[_Left] = []
+        self.steps: list[SensingStep] = []
+        self.outside: list[BoolArray] = []
 
     def trial_began(self, environment: object, state: PlanningState) -> None:
         """Keep the world, to look at the true state."""
         del state
-        self.environment = environment
+        assert isinstance(environment, SimulatedEnvironment)
+        self.world = environment
 
     def sensed(self, step: SensingStep) -> None:
-        """Note the belief, and what the observation left of it."""
-        self.before.append(step.before)
-        info = step.observation_info
-        world = self.environment
-        assert isinstance(world, SimulatedEnvironment)
+        """Note the step, and in which coordinates the true state was beyond all particles."""
+        self.steps.append(step)
         angles = circular_states(self.inspection.problem)
-        apart = differences(step.before.belief.states, world.state, angles)
-        # The true state beyond all particles in some coordinate.
-        outside = (apart > 0.0).all(axis=0) | (apart < 0.0).all(axis=0)
-        size = info.effective_sample_size
-        self.left.append(_Left(step.sensing_action, size, info.explained, np.asarray(outside)))
+        apart = differences(step.before.belief.states, self.world.state, angles)
+        self.outside.append(np.asarray((apart > 0.0).all(axis=0) | (apart < 0.0).all(axis=0)))
 
     def acted(self, step: TaskStep) -> None:
         """End the trial if the time is over, or in a failure, which the world does not know."""
         if self.late():
-            raise _TimeOverError
+            raise _EndedError("late")
         if step.reward is not None:
             self.inspection.rewards.append(step.reward)
-        world = self.environment
-        assert isinstance(world, SimulatedEnvironment)
-        if truths(self.inspection.problem, "is_failure", world.state):
-            raise _TimeOverError("failed")
+        if truths(self.inspection.problem, "is_failure", self.world.state):
+            raise _EndedError("failed")
 
 
-def check_trials(inspection: Inspection) -> list[SensedBelief]:
-    """Run a few trials with random sensing; return beliefs from along the way."""
-    problem, settings = inspection.problem, inspection.settings
-    late = inspection.deadline(0.25)
-    import msgspec
-
+def check_trials(inspection: Inspection) -> None:
+    """Run a few trials with random sensing, and keep beliefs from before sensing."""
+    settings, late = inspection.settings, inspection.deadline(0.25, "trials")
     selector = msgspec.structs.replace(
         settings.selector, method="random", sensing_is_optional=False
     )
-    planner = Planner(problem, msgspec.structs.replace(settings, selector=selector))
+    planner = Planner(inspection.problem, msgspec.structs.replace(settings, selector=selector))
     steps = min(inspection.max_steps, _MOST_STEPS)
-    results: list[TrialResult] = []
-    failed = 0
-    states: list[PlanningState] = []
-    left: list[_Left] = []
-    shares: list[FloatArray] = []
-    for trial in range(_TRIALS):
-        if late():
-            break
-        watcher = _Watcher(inspection, late)
+    reached: list[int] = []
+    endings: list[str] = []
+    watchers: list[_Watcher] = []
 
-        def run(watcher: _Watcher = watcher, trial: int = trial) -> TrialResult | str:
-            try:
-                return run_trial(planner, inspection.seed, trial, max_steps=steps, observer=watcher)
-            except _TimeOverError as error:
-                return str(error)
+    def run(trial: int, watcher: _Watcher) -> str:
+        try:
+            result = run_trial(planner, inspection.seed, trial, max_steps=steps, observer=watcher)
+        except _EndedError as error:
+            return str(error)
+        reached.extend([result.steps] if result.success else [])
+        return "ended"
 
-        result = inspection.ask("a simulated trial", run, "trials")
-        states += watcher.before
-        left += watcher.left
-        if watcher.left:
-            shares.append(np.array([each.outside for each in watcher.left]))
-        if isinstance(result, TrialResult):
-            results.append(result)
-        else:
-            failed += result == "failed"
-    ended = len(results) + failed
-    if ended < _TRIALS:
-        inspection.add(
-            "information",
-            "trials",
-            f"{ended} of {_TRIALS} simulated trials came to their end in the time for this check",
-            "Give it more (--budget).",
-        )
-    _report_endings(inspection, results, failed, steps)
-    _report_depletion(inspection, left)
-    _report_lost_truths(inspection, left, shares)
+    while len(watchers) < _TRIALS and not late():
+        watchers.append(_Watcher(inspection, late))
+        endings.append(inspection.ask("a simulated trial", run, len(endings), watchers[-1]))
+    count, failed = len(endings) - endings.count("late"), endings.count("failed")
+    if count:
+        _report_endings(inspection, reached, count, failed, steps)
+    _report_depletion(inspection, [each for each in watchers if each.steps])
+    states = [step.before for watcher in watchers for step in watcher.steps]
     kept = [states[index] for index in spread_out(_BELIEFS, len(states))]
-    return [SensedBelief(_thinned(each.belief), each.stage) for each in kept]
-
-
-def _thinned(belief: Belief) -> Belief:
-    """Return a belief of at most so many particles, which is enough for the sensors' checks."""
-    count = len(belief.weights)
-    if count <= _PARTICLES_KEPT:
-        return belief
-    chosen = spread_out(_PARTICLES_KEPT, count)
-    weights: FloatArray = belief.weights[chosen] / belief.weights[chosen].sum()
-    return Belief(belief.states[chosen], weights)
+    for state in kept:
+        (points, weights), chosen = state.belief, spread_out(_PARTICLES, len(state.belief.weights))
+        thinned = Belief(points[chosen], weights[chosen] / weights[chosen].sum())
+        inspection.beliefs.append(state._replace(belief=thinned))
+    _check_rewards(inspection)
 
 
 def _report_endings(
-    inspection: Inspection, results: list[TrialResult], failed: int, steps: int
+    inspection: Inspection, reached: list[int], count: int, failed: int, steps: int
 ) -> None:
-    count = len(results) + failed
-    if not count:
-        return
-    successes = [result.steps for result in results if result.success]
-    seen = f"with random sensing, {len(successes)} of {count} trials reach the goal"
-    if successes:
-        seen += f", after {np.median(successes):.0f} steps (median)"
-    if failed:
-        seen += f", and {failed} fail"
+    seen = f"with random sensing, {len(reached)} of {count} trials reach the goal"
+    seen += f", after {np.median(reached):.0f} steps (median)" if reached else ""
+    seen += f", and {failed} fail" if failed else ""
     walk = inspection.walk
-    possible = walk is not None and (walk.reached >= 0).mean() >= 0.5
-    if not successes and possible:
-        inspection.add(
-            "warning",
-            "trials",
-            f"{seen}, within {steps} steps; with the state known most do",
-            "Random sensing may be too poor, or the estimate (the mean) lies where the robot is "
-            "not. Try particle_filter.estimate: heaviest_mode, sense more often "
-            "(simulator.sensing_intervals), and look at the warnings here.",
-            "docs/problems.md#your-own",
-        )
-    else:
+    if reached or walk is None or (walk.reached >= 0).mean() < 0.5:
         inspection.add("information", "trials", seen)
-
-
-def _report_depletion(inspection: Inspection, left: list[_Left]) -> None:
-    """Report what observations leave of the particles."""
-    if not left:
         return
+    seen += f", within {steps} steps; with the state known most do"
+    advice = "The estimate (the mean) may lie where the robot is not, or random sensing is too "
+    advice += "poor. Try particle_filter.estimate: heaviest_mode, and sense more often "
+    advice += "(simulator.sensing_intervals)."
+    inspection.add("warning", "trials", seen, advice)
+
+
+def _report_depletion(inspection: Inspection, trials: list[_Watcher]) -> None:
+    """Report what observations leave of the particles, and how often the truth is beyond them."""
+    if not trials:
+        return
+    left = [
+        (step.sensing_action, step.observation_info.effective_sample_size)
+        for trial in trials
+        for step in trial.steps
+    ]
     particles = inspection.settings.particle_filter.num_particles
     few = []
     for action in range(len(sensing_labels(inspection.problem))):
-        sizes = np.array([each.size for each in left if each.sensing_action == action])
+        sizes = np.array([size for own, size in left if own == action])
         if len(sizes) >= 5 and (share := (sizes < _FEW_LEFT).mean()) > _OFTEN:
             few.append(f"{inspection.label(action)} in {share:.0%} of {len(sizes)} observations")
     if few:
-        inspection.add(
-            "warning",
-            "depletion",
-            f"sensors are too sharp for {particles} particles: often fewer than {_FEW_LEFT:.0f} "
-            f"particles count afterwards (effective sample size), with {', '.join(few)}",
-            "Take more particles (particle_filter.num_particles), sense more often, or declare the "
-            "sensor a little less sharp than it is.",
-            "docs/settings.md",
-        )
-
-
-def _report_lost_truths(
-    inspection: Inspection, left: list[_Left], trials: list[FloatArray]
-) -> None:
-    """Report how often the true state lies beyond all particles; each trial counts the same."""
-    if not trials:
-        return
-    unexplained = sum(not each.explained for each in left)
-    particles = inspection.settings.particle_filter.num_particles
-    shares = np.mean([outside.mean(axis=0) for outside in trials], axis=0)
-    whole = float(np.mean([outside.any(axis=1).mean() for outside in trials]))
+        seen = f"sensors are too sharp for {particles} particles: often fewer than {_FEW_LEFT:.0f} "
+        seen += f"count afterwards (effective sample size), with {', '.join(few)}"
+        advice = "Take more particles (particle_filter.num_particles), sense more often, or "
+        advice += "declare the sensor a little less sharp than it is."
+        inspection.add("warning", "depletion", seen, advice)
+    # Each trial counts the same.
+    outside = [np.array(trial.outside) for trial in trials]
+    shares = np.mean([each.mean(axis=0) for each in outside], axis=0)
+    whole = float(np.mean([each.any(axis=1).mean() for each in outside]))
     # Beyond all of n particles of a right belief it is twice in n + 1.
-    if whole < _OFTEN + 2.0 * shares.size / (particles + 1):
-        return
-    at = int(shares.argmax())
-    inspection.add(
-        "warning",
-        "depletion",
-        f"in {whole:.0%} of the beliefs before sensing, over {len(trials)} trials with random "
-        f"sensing, the true state lies beyond all {particles} particles in some coordinate, most "
-        f"often in {inspection.coordinate(at)} ({shares[at]:.0%}); {unexplained} of {len(left)} "
-        "observations are further than any particle explains",
-        "An observation of one coordinate leaves few particles for the others: take more of them, "
-        "or sense more often. A coordinate that does not move needs a little noise in move.",
-        CONTRACT,
-    )
+    if whole > _OFTEN + 2.0 * shares.size / (particles + 1):
+        at = int(shares.argmax())
+        seen = f"in {whole:.0%} of the beliefs before sensing, over {len(trials)} trials with "
+        seen += f"random sensing, the true state lies beyond all {particles} particles in some "
+        seen += f"coordinate, most often in {inspection.coordinate(at)} ({shares[at]:.0%})"
+        advice = "An observation of one coordinate leaves few particles for the others: take more, "
+        advice += "or sense more often. What does not move needs a little noise in move."
+        inspection.add("warning", "depletion", seen, advice)
+
+
+def check_decision_time(inspection: Inspection) -> None:
+    """Say how many milliseconds of one thread a choice of what to sense takes, and in what."""
+    problem, settings = inspection.problem, inspection.settings
+    late = inspection.deadline(0.15, "time")
+    active = msgspec.structs.replace(settings.active_sensing, num_cores=1)
+    planner = Planner(problem, msgspec.structs.replace(settings, active_sensing=active))
+    initial = inspection.ask("a decision", planner.init, inspection.seed, 0, check="time")
+    taken: list[float] = []
+    profile = cProfile.Profile(thread_time)
+
+    def decide(state: PlanningState) -> None:
+        # The first one, which may load something, does not count.
+        planner.choose_sensing_action(state)
+        began = thread_time()
+        planner.choose_sensing_action(state)
+        taken.append(thread_time() - began)
+        with contextlib.suppress(ValueError):  # if a profiler runs already
+            profile.runcall(planner.choose_sensing_action, state)
+
+    some = spread_out(_DECISIONS, len(inspection.beliefs))
+    for state in [initial, *(inspection.beliefs[index] for index in some)]:
+        if not (taken and late()):
+            inspection.ask("a decision", decide, state, check="time")
+    codes = {getattr(getattr(problem, each, None), "__code__", None): each for each in PARAMETERS}
+    entries = sorted(profile.getstats(), key=lambda entry: -entry.totaltime)
+    parts = [
+        f"{entry.totaltime / entries[0].totaltime:.0%} in {codes[entry.code]} "
+        f"({entry.callcount} calls)"
+        for entry in entries
+        if entry.code in codes and entry.totaltime > 0.02 * entries[0].totaltime
+    ]
+    seen = f"a choice of what to sense takes {np.median(taken) * 1e3:.2g} ms of processor time "
+    seen += f"({settings.selector.method}, {settings.particle_filter.num_particles} particles)"
+    seen += f": {', '.join(parts)}" if parts else ""
+    advice = "Use whole arrays in what takes most, no loop over states, and look whether fewer "
+    advice += "active_sensing.num_observation_samples choose as well."
+    inspection.add("information", "time", seen, advice if np.median(taken) > 5e-3 else "")
