@@ -46,3 +46,8 @@ if not TYPE_CHECKING:
 
         value = globals()[name] = getattr(reproducible, name)
         return value
+
+
+def __dir__() -> list[str]:
+    """Return the functions, imported or not."""
+    return list(__all__)

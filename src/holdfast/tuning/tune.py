@@ -203,6 +203,14 @@ class _Tuner:
         if untried:
             what = "candidate was" if untried == 1 else "candidates were"
             sentence += f" {untried} slow {what} not tried: a larger budget does that."
+        open_ones = sum(
+            each.state == "in the race" and each.candidate not in judged for each in standings
+        )
+        if open_ones and fresh < most:
+            what = "candidate is" if open_ones == 1 else "candidates are"
+            sentence += (
+                f" {open_ones} more {what} not beaten yet: --resume with a larger budget goes on."
+            )
         return Tuning(
             sentence=sentence,
             choice=verdict.choice,
