@@ -83,7 +83,8 @@ def test_nothing_matters() -> None:
     # The same with few trials: what they would not have shown is said.
     few = {name: trials[name][:10] for name in trials}
     few["other"][3] = few["other"][3]._replace(success=False)
-    assert "would not have shown" in judge(few, "other", "steps", LIMIT).sentence
+    sentence = judge(few, "other", "steps", LIMIT).sentence
+    assert "would not have shown" in sentence and sentence.startswith("No difference showed in ")
     same = {AS_CONFIGURED: trials[AS_CONFIGURED], RANDOM: trials[AS_CONFIGURED]}
     assert judge(same, AS_CONFIGURED, "steps", LIMIT).comparisons[0].interval == (0.0, 0.0)
 

@@ -114,10 +114,9 @@ class Tuning(Table, msgspec.Struct, frozen=True, kw_only=True):
 
     def shown(self) -> list[tuple[str, ...]]:
         """Return a row for each candidate, for people."""
-        cost = {"steps": "steps", "success": "no success", "reward": "-reward"}[self.objective]
-        head = ("race", "trials", cost, "to as configured", "95 % interval")
+        head = ("race", "trials", self.objective, "to as configured", "95 % interval")
         more = ("success (%)", "decision (ms)", "trial (s)", "state")
-        return [(*head, *more), *map(_raced, self.candidates)]
+        return [(*head, *more), *(_raced(each, self.objective) for each in self.candidates)]
 
     def legend(self) -> str:
         """Return how to read the table."""
@@ -130,15 +129,23 @@ class Tuning(Table, msgspec.Struct, frozen=True, kw_only=True):
 _COLUMNS = CandidateRow.__struct_fields__
 
 
-def _raced(each: CandidateRow) -> tuple[str, ...]:
+def _in_its_unit(objective: Objective, *costs: float) -> list[float]:
+    """Return steps, success or reward of costs, in ascending order."""
+    return sorted(costs if objective == "steps" else (0.0 - cost for cost in costs))
+
+
+def _raced(each: CandidateRow, objective: Objective) -> tuple[str, ...]:
     if each.cost is None or each.difference is None or each.interval is None:
         return (each.candidate, str(each.trials), *6 * ("",), each.state)
-    low, high = each.interval
+    (value,), (difference,) = (
+        _in_its_unit(objective, cost) for cost in (each.cost, each.difference)
+    )
+    low, high = _in_its_unit(objective, *each.interval)
     return (
         each.candidate,
         str(each.trials),
-        f"{each.cost:.4g}",
-        f"{each.difference:+.3g}",
+        f"{value:.4g}",
+        f"{difference:+.3g}",
         f"[{low:+.3g}, {high:+.3g}]",
         f"{100.0 * (each.success or 0.0):.3g}",
         f"{each.decision_ms or 0.0:.3g}",
@@ -232,6 +239,7 @@ def tuning_figure(found: Tuning) -> bytes:
 
     rows = [each for each in found.candidates if each.interval is not None][::-1]
     judged = [each for each in found.comparisons if each.measure == found.objective][::-1]
+    side = "left" if found.objective == "steps" else "right"
     with mpl.rc_context(STYLE):
         height = 1.6 + 0.24 * (len(rows) + len(judged))
         figure = Figure(figsize=(8.0, height), layout="constrained")
@@ -242,13 +250,20 @@ def tuning_figure(found: Tuning) -> bytes:
             (
                 above,
                 f"{found.choice}, on {found.fresh_trials} fresh trials: {found.objective} less "
-                "that of",
+                f"that of ({side} is better)",
                 [(each.against, each.difference, each.interval) for each in judged],
             ),
             (
                 below,
-                "the race: cost less that of the configuration (left is better)",
-                [(each.candidate, each.difference, each.interval) for each in rows],
+                f"the race: {found.objective} less that of the configuration",
+                [
+                    (
+                        each.candidate,
+                        *_in_its_unit(found.objective, each.difference or 0.0),
+                        _in_its_unit(found.objective, *(each.interval or ())),
+                    )
+                    for each in rows
+                ],
             ),
         ):
             panel.set_title(title, loc="left")

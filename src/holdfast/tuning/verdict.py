@@ -204,13 +204,16 @@ def _sentence(
     effects = "; ".join(map(_effect, decisive))
     fresh = f"{trials:,} trials that had no part in the choice"
     if not matters:
+        reach = max((abs(end) for each in decisive for end in each.interval), default=0.0)
+        wide = bool(decisive) and reach > _WIDE * abs(decisive[0].value)
         text = f"What you sense does not matter here, as far as {fresh} tell"
+        if wide:
+            text = f"No difference showed in {fresh}"
         keep = "Keep your configuration" if choice == configured else f"Sense by {choice}"
         text += f": {effects}. {keep}." if effects else "."
-        reach = max((abs(end) for each in decisive for end in each.interval), default=0.0)
-        if decisive and reach > _WIDE * abs(decisive[0].value):
+        if wide:
             text += (
-                f" A difference of up to {_amount(reach, objective)} would not have shown: "
+                f" One of up to {_amount(reach, objective)} would not have shown: "
                 "a larger budget may find it."
             )
         return text
