@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import resource
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +111,44 @@ def test_intervals_are_judged_beside_random_sensing_at_the_same(run: Path) -> No
     if "simulator.sensing_intervals" in winner.changes:
         rivals = {each.against for each in found.comparisons} | {found.choice}
         assert any(each.startswith("random, every") for each in rivals)
+
+
+def test_damaged_files(run: Path) -> None:
+    out = run.parent / "tuned"
+    tuned(run, out=out)
+    trials, settings = out / "trials.csv", out / "tune.json"
+    whole, known = trials.read_bytes(), settings.read_bytes()
+    head, first, rest = whole.split(b"\n", 2)
+    odd = [b"", b"\xff\xfe", b"random,1,\x00", b'"always x', b"a" * 200_000, first[:-9] + b"inf"]
+    trials.write_bytes(b"\n".join([head, *odd, rest]) + first[:-9])
+    tuned(run, out=out)
+    again = trials.read_bytes()
+    assert again.startswith(b"\n".join([head, *odd, rest]))  # nothing was lost, nothing cut
+    assert len(again.splitlines()) == len(whole.splitlines()) + len(odd)  # one trial was run again
+    settings.write_bytes(b'{"objective": "\xff"}')
+    with pytest.raises(OutputError, match=r"tune\.json: cannot be read: "):
+        tuned(run, out=out)
+    settings.unlink()
+    with pytest.raises(OutputError, match=r"tune\.json: is gone, so nothing tells of which"):
+        tuned(run, out=out)
+    assert trials.read_bytes() == again
+    settings.write_bytes(known)
+    tuned(run, out=out)
+
+
+def test_a_full_disk_is_an_error_in_words(run: Path) -> None:
+    out = run.parent / "tuned"
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2_500, before[1]))
+    try:
+        with pytest.raises(OutputError, match=r"trials\.csv: cannot be written: "):
+            tuned(run, out=out, most=100)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    kept = (out / "trials.csv").read_bytes()
+    assert len(kept) == 2_500
+    tuned(run, out=out)
+    assert (out / "trials.csv").read_bytes().startswith(kept[: kept.rfind(b"\n") + 1])
 
 
 def test_what_is_refused(run: Path) -> None:

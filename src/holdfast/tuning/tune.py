@@ -11,6 +11,7 @@ tuning that goes on runs the same race again, with the trials that it has.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import fcntl
 import math
@@ -379,16 +380,18 @@ class _Trials:
         path = directory / TRIALS_NAME
         try:
             directory.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("a+", encoding="utf-8", newline="")
+            self._file = path.open("a", encoding="utf-8", newline="")
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            content = path.read_bytes()
+            whole = content[: content.rfind(b"\n") + 1]
+            lines = whole.decode(errors="replace").split("\n")
+            self.rows = {(row.candidate, row.trial): row for row in _rows_of(lines)}
             self._require_the_same(directory / SETTINGS_NAME)
-            self._file.seek(0)
-            self.rows = {(row.candidate, row.trial): row for row in _rows_of(self._file)}
-            # Whatever a kill has cut short goes.
-            self._file.truncate(0)
-            self._file.write(_line(TrialRow._fields))
-            self._file.writelines(map(_line, self.rows.values()))
-            self._file.flush()
+            # What a kill has cut short goes. The rest stays as it is: a disk may be full.
+            self._file.truncate(len(whole))
+            if not whole:
+                self._file.write(_line(TrialRow._fields))
+                self._file.flush()
         except BlockingIOError:
             raise OutputError(f"{shown_path(path)}: another process is writing it") from None
         except OSError as error:
@@ -396,17 +399,23 @@ class _Trials:
 
     def __exit__(self, *exception: object) -> None:
         if self._file is not None:
-            self._file.close()
+            with contextlib.suppress(OSError):  # what a full disk does not take was an error before
+                self._file.close()
 
     def _require_the_same(self, path: Path) -> None:
         settings = msgspec.to_builtins(self._settings)
         try:
             there = msgspec.json.decode(path.read_bytes())
         except FileNotFoundError:
+            if self.rows:
+                raise OutputError(
+                    f"{shown_path(path)}: is gone, so nothing tells of which tuning the trials of "
+                    f"{TRIALS_NAME} are; choose another directory"
+                ) from None
             content = msgspec.json.format(msgspec.json.encode(settings), indent=2)
             write_atomically(path, content)
             return
-        except (OSError, msgspec.DecodeError) as error:
+        except (OSError, UnicodeDecodeError, msgspec.DecodeError) as error:
             raise OutputError(f"{shown_path(path)}: cannot be read: {error}") from None
         found = first_difference(there, msgspec.json.decode(msgspec.json.encode(settings)))
         if found is not None:
@@ -425,8 +434,12 @@ class _Trials:
         """Keep a trial."""
         self.rows[row.candidate, row.trial] = row
         if self._file is not None:
-            self._file.write(_line(row))
-            self._file.flush()
+            try:
+                self._file.write(_line(row))
+                self._file.flush()
+            except OSError as error:
+                where = shown_path(Path(self._file.name))
+                raise OutputError(f"{where}: cannot be written: {error.strerror}") from error
 
 
 def _line(values: Iterable[Any]) -> str:
@@ -434,10 +447,14 @@ def _line(values: Iterable[Any]) -> str:
     return line
 
 
-def _rows_of(file: IO[str]) -> Iterator[TrialRow]:
-    for values in csv.reader(file):
+def _rows_of(lines: Iterable[str]) -> Iterator[TrialRow]:
+    """Yield the trials; each line is read by itself, so that a damaged one costs no other."""
+    for line in lines:
         try:
-            name, trial, success, failed, steps, reward, decision_ms, seconds = values
+            ((name, trial, success, failed, steps, reward, *times),) = csv.reader([line])
+            decision_ms, seconds = map(float, times)
+            if not 0.0 <= decision_ms + seconds < math.inf:
+                continue
             yield TrialRow(
                 name,
                 int(trial),
@@ -445,8 +462,8 @@ def _rows_of(file: IO[str]) -> Iterator[TrialRow]:
                 failed == "1",
                 int(steps),
                 float(reward) if reward else None,
-                float(decision_ms),
-                float(seconds),
+                decision_ms,
+                seconds,
             )
-        except ValueError:
-            continue  # the head, or a row that was cut short
+        except (ValueError, csv.Error):
+            continue  # the head, or a damaged row
