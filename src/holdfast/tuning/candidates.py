@@ -24,6 +24,7 @@ from holdfast.planning.settings import (
     PlanningSettings,
     estimator_of,
 )
+from holdfast.printable import one_line
 from holdfast.problems.attributes import resolution_of, sensing_labels
 from holdfast.problems.problem import ProblemBase
 
@@ -135,7 +136,10 @@ def _first(base: Configuration, variations: Sequence[Variation], objective: Obje
         if method in ENTROPY_METHODS:
             yield from _of_entropies(base, method, variations, objective)
     if "fixed" in variations:
-        for number, label in enumerate(sensing_labels(base.problem)):
+        labels = [one_line(label) for label in sensing_labels(base.problem)]
+        for number, label in enumerate(labels):
+            # A candidate is known by its name, here and in the table of its trials.
+            label += f" ({number})" * (labels.count(label) > 1)
             fixed = {"selector.method": "fixed", "selector.sensing_action": number}
             yield f"always {label}", fixed
 
