@@ -36,7 +36,7 @@ def tuned(path: Path, **more: Any) -> Any:
 
 def test_what_it_finds_and_writes(run: Path) -> None:
     out = run.parent / "tuned"
-    found = tuned(run, out=out)
+    found = tuned(run, out=str(out))
     names = {each.candidate for each in found.candidates}
     assert names == {AS_CONFIGURED, RANDOM, "always x", "always y", "always θ"}
     assert found.objective == "steps"
@@ -154,10 +154,18 @@ def test_a_full_disk_is_an_error_in_words(run: Path) -> None:
 def test_what_is_refused(run: Path) -> None:
     with pytest.raises(InvalidValueError, match=r"vary has 'method'; allowed are methods"):
         tuned(run, vary=["method"])
-    with pytest.raises(InvalidValueError, match=r"most is 1; "):
-        tuned(run, most=1)
-    with pytest.raises(InvalidValueError, match=r"budget_s is nan"):
-        tuned(run, budget_s=math.nan)
+    for name, value, words in (
+        ("most", 1, "most 1: allowed are whole numbers from 2 "),
+        ("most", 2.5, "most 2.5: allowed are whole numbers from 2 "),
+        ("jobs", 0, "jobs 0: allowed are whole numbers from 1 "),
+        ("jobs", 2.5, "jobs 2.5: allowed are whole numbers from 1 "),
+        ("budget_s", math.nan, "budget_s is nan; it must be a number above 0"),
+        ("budget_s", "600", "budget_s is '600'; it must be a number above 0"),
+        ("max_decision_ms", math.nan, "max_decision_ms is nan; it must be a number above 0"),
+        ("objective", "speed", "objective is 'speed'; allowed are reward, steps, success"),
+    ):
+        with pytest.raises(InvalidValueError, match=words):
+            tuned(run, **{name: value})
     (run.parent / "bare.py").write_text(BARE)
     run.write_text(RUN.replace("peg_in_hole_2d", "bare:Bare"))
     with pytest.raises(InvalidValueError, match=r"bare:Bare has neither rewards nor sensing_costs"):

@@ -43,6 +43,7 @@ from holdfast.errors import (
     TrialError,
     WorkerDiedError,
 )
+from holdfast.numerics.arrays import integer
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings, PlanningSettings
@@ -142,8 +143,8 @@ class TrialPool:
     def __init__(
         self, jobs: int, *, expected: int | None = None, observer: TrialObserver = NULL_OBSERVER
     ) -> None:
-        if not 1 <= jobs <= MAX_JOBS:
-            raise InvalidValueError(f"jobs is {jobs}; it must be from 1 to {MAX_JOBS}")
+        if integer(jobs) is None or not 1 <= jobs <= MAX_JOBS:
+            raise InvalidValueError(f"jobs is {jobs!r:.80}; it must be from 1 to {MAX_JOBS}")
         self._jobs = jobs
         self._expected = expected
         self._observer = observer

@@ -17,17 +17,19 @@ import fcntl
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any, NamedTuple, get_args
 
 import msgspec
 import numpy as np
 
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import InvalidValueError, OutputError, TrialError
+from holdfast.numerics.arrays import real_number, whole
 from holdfast.recording.fingerprint import fingerprint
 from holdfast.recording.run_directory import first_difference
 from holdfast.recording.table_formats import csv_rows
 from holdfast.robot.trial_pool import Arm, TrialPool, available_cores
+from holdfast.runtime.command_line import MAX_JOBS
 from holdfast.runtime.files import shown_path, write_atomically
 from holdfast.tuning.candidates import (
     AS_CONFIGURED,
@@ -76,7 +78,7 @@ def tune(
     most: int = 200,
     jobs: int | None = None,
     max_decision_ms: float = math.inf,
-    out: Path | None = None,
+    out: str | Path | None = None,
     on_progress: Callable[[Progress], None] = lambda _: None,
 ) -> Tuning:
     """Find what to sense on a problem, by simulating it; :func:`hf.check_problem` comes first.
@@ -99,7 +101,7 @@ def tune(
         Processes; None: one for each core.
     max_decision_ms : float
         A candidate whose median decision takes longer must not win.
-    out : Path, optional
+    out : path, optional
         A directory for the files; if it has trials of the same tuning, it goes on with these.
 
     Raises
@@ -116,10 +118,16 @@ def tune(
     unknown = [each for each in vary if each not in VARIATIONS]
     if unknown:
         raise InvalidValueError(f"vary has {unknown[0]!r}; allowed are {', '.join(VARIATIONS)}")
-    if not 2 <= most < FRESH:
-        raise InvalidValueError(f"most is {most}; it must be from 2 to {FRESH - 1}")
-    if not budget_s > 0.0:
-        raise InvalidValueError(f"budget_s is {budget_s}; it must be above 0")
+    most = whole("most", most, 2, FRESH - 1)
+    jobs = available_cores() if jobs is None else whole("jobs", jobs, 1, MAX_JOBS)
+    for name, value in (("budget_s", budget_s), ("max_decision_ms", max_decision_ms)):
+        number = real_number(value)
+        if number is None or not number > 0.0:
+            raise InvalidValueError(f"{name} is {value!r:.80}; it must be a number above 0")
+    if objective is not None and objective not in get_args(Objective):
+        allowed = ", ".join(get_args(Objective))
+        raise InvalidValueError(f"objective is {objective!r:.80}; allowed are {allowed}")
+    out = None if out is None else Path(out)
     if objective is None:
         priced = getattr(configuration.problem, "sensing_costs", None) is not None
         objective = "reward" if priced else "steps"
@@ -128,7 +136,6 @@ def tune(
             f"objective is 'reward', but {configuration.problem_name} has neither rewards nor "
             "sensing_costs; take 'steps' or 'success'"
         )
-    jobs = jobs or available_cores()
     settings = {
         "configuration": configuration.plain()["configuration"],
         "objective": objective,
