@@ -151,6 +151,32 @@ def test_a_full_disk_is_an_error_in_words(run: Path) -> None:
     assert (out / "trials.csv").read_bytes().startswith(kept[: kept.rfind(b"\n") + 1])
 
 
+def test_no_process_has_a_problem_for_each_candidate(run: Path) -> None:
+    """It may hold a large map: with one for each, a laptop's memory is soon full."""
+    (run.parent / "counted.py").write_text(COUNTED)
+    run.write_text(RUN.replace("peg_in_hole_2d", "counted:Counted"))
+    found = tuned(run, vary=["methods", "resolution"], most=2, jobs=2)
+    assert len(found.candidates) > 6
+    held = [int(each) for each in (run.parent / "held").read_text().split()]
+    # Beside the one of the process, one with which a candidate's settings are checked.
+    assert max(held) <= 2
+
+
+COUNTED = """
+import pathlib
+import weakref
+from tests.line_problem import Line
+
+HELD = weakref.WeakSet()
+
+class Counted(Line):
+    def __init__(self):
+        HELD.add(self)
+        with pathlib.Path(__file__).with_name("held").open("a") as file:
+            file.write(f"{len(HELD)}\\n")
+"""
+
+
 def test_what_is_refused(run: Path) -> None:
     with pytest.raises(InvalidValueError, match=r"vary has 'method'; allowed are methods"):
         tuned(run, vary=["method"])

@@ -7,6 +7,7 @@ particles to take are varied afterwards, of the method that won, so that there a
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
@@ -79,6 +80,8 @@ def has_rewards(problem: Any) -> bool:
 def changed(base: Configuration, changes: Mapping[str, Any]) -> Configuration:
     """Return a configuration with other values of some keys, checked as one from a file.
 
+    None of them is the problem's: the problem is that of ``base``, which may be large.
+
     Raises
     ------
     ConfigurationError
@@ -89,7 +92,7 @@ def changed(base: Configuration, changes: Mapping[str, Any]) -> Configuration:
     for key, value in changes.items():
         section, _, name = key.partition(".")
         sections[section] = {**sections[section], name: value}
-    return Configuration.from_plain(plain)
+    return dataclasses.replace(Configuration.from_plain(plain), problem=base.problem)
 
 
 def first_candidates(
