@@ -81,6 +81,30 @@ def test_a_configuration_that_is_random_is_not_tried_twice(tmp_path: Path) -> No
     assert by_name(candidates)["path_entropy"].changes == {"selector.method": "path_entropy"}
 
 
+def test_names_tell_sensing_actions_apart(tmp_path: Path) -> None:
+    (tmp_path / "alike.py").write_text(ALIKE)
+    base = written(tmp_path, "").plain()
+    base["configuration"] |= {"problem": "alike:Alike", "problem_directory": str(tmp_path)}
+    base["configuration"]["model"] = base["configuration"]["state_space_planner"] = {}
+    found = by_name(first_candidates(Configuration.from_plain(base), ["fixed"], "steps")[0])
+    actions = {name: each.changes.get("selector.sensing_action") for name, each in found.items()}
+    assert actions["always look (0)"] in (0, None)
+    assert actions["always look (2)"] == 2
+    # It goes into a comment of tuned.yaml, whose next line would be a key.
+    assert actions["always x seed: 1"] == 1
+
+
+ALIKE = """
+from tests.line_problem import Line
+
+class Alike(Line):
+    sensing_actions = ("look", "x\\nseed: 1", "look")
+
+    def observation_mean(self, states, sensing_action):
+        return states[..., :1]
+"""
+
+
 @pytest.mark.parametrize(("interval", "others"), [(8, [0, 4, 17]), (0, [1])])
 def test_intervals_and_particles_of_the_winner(
     tmp_path: Path, interval: int, others: list[int]

@@ -9,6 +9,7 @@ import pytest
 from tests.command_line import run_here
 from tests.unit.test_tuning_tune import RUN
 
+from holdfast.errors import WorkerDiedError
 from holdfast.tuning import tune as tuning
 
 WORDS = ("tune", "run.yaml", "--vary", "fixed", "--trials", "20", "-j", "1", "--no-check")
@@ -51,6 +52,20 @@ def test_an_interrupted_one_goes_on(
     command = "holdfast tune run.yaml --vary fixed --trials 20 --jobs 1 --no-check"
     command = command.replace("--trials", "--budget 1.5m --trials") + " --out mine --resume"
     assert said.stderr.endswith(f"Go on with: {command}\n")
+
+
+def test_after_a_killed_worker_it_can_go_on(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def killed(*arguments: Any, on_progress: Any, **more: Any) -> None:
+        on_progress(tuning.Progress(0.1, 1, "5 candidates race"))
+        raise WorkerDiedError("a worker process was killed")
+
+    monkeypatch.setattr(tuning, "tune", killed)
+    said = run_here(capsys, here, *WORDS, "--out", "mine")
+    assert said.code == 4
+    assert "holdfast: error: a worker process was killed\nGo on with: holdfast tune" in said.stderr
+    assert said.stderr.endswith(" --out mine --resume\n")
 
 
 @pytest.mark.parametrize(

@@ -122,6 +122,7 @@ def test_runs_on_the_disk_and_other_tasks(tmp_path: Path) -> None:
     [
         (lambda: trials_of("random", 0), "n 0: allowed"),
         (lambda: trials_of("random", jobs=0), "jobs is 0"),
+        (lambda: trials_of("random", jobs=1.5), "jobs is 1.5"),
         (lambda: trials_of("random", seed=-1), "seed -1"),
         (
             lambda: hf.run_trials(cast("Any", "peg.yaml"), 3),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import resource
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,7 @@ def tuned(path: Path, **more: Any) -> Any:
 
 def test_what_it_finds_and_writes(run: Path) -> None:
     out = run.parent / "tuned"
-    found = tuned(run, out=out)
+    found = tuned(run, out=str(out))
     names = {each.candidate for each in found.candidates}
     assert names == {AS_CONFIGURED, RANDOM, "always x", "always y", "always θ"}
     assert found.objective == "steps"
@@ -112,13 +113,85 @@ def test_intervals_are_judged_beside_random_sensing_at_the_same(run: Path) -> No
         assert any(each.startswith("random, every") for each in rivals)
 
 
+def test_damaged_files(run: Path) -> None:
+    out = run.parent / "tuned"
+    tuned(run, out=out)
+    trials, settings = out / "trials.csv", out / "tune.json"
+    whole, known = trials.read_bytes(), settings.read_bytes()
+    head, first, rest = whole.split(b"\n", 2)
+    odd = [b"", b"\xff\xfe", b"random,1,\x00", b'"always x', b"a" * 200_000, first[:-9] + b"inf"]
+    trials.write_bytes(b"\n".join([head, *odd, rest]) + first[:-9])
+    tuned(run, out=out)
+    again = trials.read_bytes()
+    assert again.startswith(b"\n".join([head, *odd, rest]))  # nothing was lost, nothing cut
+    assert len(again.splitlines()) == len(whole.splitlines()) + len(odd)  # one trial was run again
+    settings.write_bytes(b'{"objective": "\xff"}')
+    with pytest.raises(OutputError, match=r"tune\.json: cannot be read: "):
+        tuned(run, out=out)
+    settings.unlink()
+    with pytest.raises(OutputError, match=r"tune\.json: is gone, so nothing tells of which"):
+        tuned(run, out=out)
+    assert trials.read_bytes() == again
+    settings.write_bytes(known)
+    tuned(run, out=out)
+
+
+def test_a_full_disk_is_an_error_in_words(run: Path) -> None:
+    out = run.parent / "tuned"
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2_500, before[1]))
+    try:
+        with pytest.raises(OutputError, match=r"trials\.csv: cannot be written: "):
+            tuned(run, out=out, most=100)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    kept = (out / "trials.csv").read_bytes()
+    assert len(kept) == 2_500
+    tuned(run, out=out)
+    assert (out / "trials.csv").read_bytes().startswith(kept[: kept.rfind(b"\n") + 1])
+
+
+def test_no_process_has_a_problem_for_each_candidate(run: Path) -> None:
+    """It may hold a large map: with one for each, a laptop's memory is soon full."""
+    (run.parent / "counted.py").write_text(COUNTED)
+    run.write_text(RUN.replace("peg_in_hole_2d", "counted:Counted"))
+    found = tuned(run, vary=["methods", "resolution"], most=2, jobs=2)
+    assert len(found.candidates) > 6
+    held = [int(each) for each in (run.parent / "held").read_text().split()]
+    # Beside the one of the process, one with which a candidate's settings are checked.
+    assert max(held) <= 2
+
+
+COUNTED = """
+import pathlib
+import weakref
+from tests.line_problem import Line
+
+HELD = weakref.WeakSet()
+
+class Counted(Line):
+    def __init__(self):
+        HELD.add(self)
+        with pathlib.Path(__file__).with_name("held").open("a") as file:
+            file.write(f"{len(HELD)}\\n")
+"""
+
+
 def test_what_is_refused(run: Path) -> None:
     with pytest.raises(InvalidValueError, match=r"vary has 'method'; allowed are methods"):
         tuned(run, vary=["method"])
-    with pytest.raises(InvalidValueError, match=r"most is 1; "):
-        tuned(run, most=1)
-    with pytest.raises(InvalidValueError, match=r"budget_s is nan"):
-        tuned(run, budget_s=math.nan)
+    for name, value, words in (
+        ("most", 1, "most 1: allowed are whole numbers from 2 "),
+        ("most", 2.5, "most 2.5: allowed are whole numbers from 2 "),
+        ("jobs", 0, "jobs 0: allowed are whole numbers from 1 "),
+        ("jobs", 2.5, "jobs 2.5: allowed are whole numbers from 1 "),
+        ("budget_s", math.nan, "budget_s is nan; it must be a number above 0"),
+        ("budget_s", "600", "budget_s is '600'; it must be a number above 0"),
+        ("max_decision_ms", math.nan, "max_decision_ms is nan; it must be a number above 0"),
+        ("objective", "speed", "objective is 'speed'; allowed are reward, steps, success"),
+    ):
+        with pytest.raises(InvalidValueError, match=words):
+            tuned(run, **{name: value})
     (run.parent / "bare.py").write_text(BARE)
     run.write_text(RUN.replace("peg_in_hole_2d", "bare:Bare"))
     with pytest.raises(InvalidValueError, match=r"bare:Bare has neither rewards nor sensing_costs"):

@@ -115,6 +115,23 @@ def test_slower_decisions_need_a_reason() -> None:
     assert judge(slow, "slow", "steps", LIMIT).choice == AS_CONFIGURED
 
 
+def test_a_slow_one_does_not_hide_that_random_sensing_is_better() -> None:
+    trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 8.0), RANDOM: rows(RANDOM, 0.0)}
+    swings = [60 * (-1) ** n for n in range(len(WORLDS))]
+    trials["slow"] = [
+        row._replace(candidate="slow", steps=row.steps - 2 + swing, decision_ms=20.0)
+        for row, swing in zip(trials[RANDOM], swings, strict=True)
+    ]
+    found = judge(trials, "slow", "steps", LIMIT)
+    assert found.choice == RANDOM
+    assert found.sentence.startswith("Sense at random: ")
+
+
+def test_a_finalist_that_failed_afterwards_is_not_chosen() -> None:
+    trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 0.0), RANDOM: rows(RANDOM, 0.0)}
+    assert judge(trials, "gone", "steps", LIMIT, {AS_CONFIGURED}).choice == RANDOM
+
+
 def test_who_is_barred_is_not_chosen() -> None:
     trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 0.0), "other": rows("other", 0.0)}
     found = judge(trials, "other", "steps", LIMIT, {AS_CONFIGURED})

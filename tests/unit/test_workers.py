@@ -7,6 +7,7 @@ import signal
 import struct
 import subprocess
 import sys
+import threading
 from collections.abc import Iterable
 from multiprocessing.connection import Connection
 
@@ -75,3 +76,18 @@ if __name__ == "__main__":
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60.0
     )
     assert (done.returncode, done.stdout) == (0, "b'here'\n"), done.stderr
+
+
+def test_threads_that_start_workers_leave_the_process_as_it_was() -> None:
+    main, before = sys.modules["__main__"], dict(os.environ)
+    workers = [WorkerProcess(f"of-thread-{number}", wait, (), 1) for number in range(12)]
+    threads = [threading.Thread(target=worker.start) for worker in workers]
+    try:
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert sys.modules["__main__"] is main
+        assert dict(os.environ) == before
+    finally:
+        end_workers(workers)

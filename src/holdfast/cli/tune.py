@@ -10,10 +10,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from holdfast.cli.exit_codes import ended_by_signals, interrupted_by
+from holdfast.cli.exit_codes import EXIT_CAN_GO_ON, ended_by_signals, interrupted_by
 from holdfast.cli.overrides import combined, parse_assignment
 from holdfast.cli.terminal import counted, duration, progress_line
-from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.errors import (
+    InvalidValueError,
+    OutputError,
+    ProblemError,
+    RunError,
+    WorkerDiedError,
+)
 from holdfast.printable import printable
 from holdfast.runtime.command_line import (
     MAX_JOBS,
@@ -77,7 +83,7 @@ class TuneOptions(Options):
     """
 
     needs_arguments = True
-    exit_codes: ClassVar = {}
+    exit_codes: ClassVar = {4: None}
 
     configuration: Path = argument("CONFIG", "Configuration file (YAML).", location)
     vary: str = option(
@@ -146,6 +152,11 @@ class TuneOptions(Options):
     )
     quiet: bool = flag("-q", help="Show only the sentence.")
 
+    def resume_command(self, directory: Path) -> str:
+        """Return the command that goes on."""
+        words = [*self.words("out", "resume"), *self.table()["out"].words(directory)]
+        return shlex.join(["holdfast", "tune", *words, "--resume"])
+
 
 def main(arguments: Sequence[str]) -> int:
     """Tune and return the exit code."""
@@ -201,13 +212,15 @@ def _tune(options: TuneOptions) -> int:
         )
     except KeyboardInterrupt as interruption:
         line.stop()
-        words = [*options.words("out", "resume"), "--out", shown_path(out), "--resume"]
-        command = shlex.join(["holdfast", "tune", *words])
         sys.stderr.write(
             f"\n{interrupted_by(interruption)}. The finished trials are kept.\n"
-            f"Go on with: {command}\n"
+            f"Go on with: {options.resume_command(out)}\n"
         )
         raise
+    except (OutputError, WorkerDiedError) as error:
+        if not doing:
+            raise  # the directory is not ours
+        raise RunError(error, options.resume_command(out), EXIT_CAN_GO_ON) from error
     finally:
         line.stop()
     text = f"{found.sentence}\n" if options.quiet else tuning_tables(found)

@@ -43,6 +43,7 @@ from holdfast.errors import (
     TrialError,
     WorkerDiedError,
 )
+from holdfast.numerics.arrays import integer
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings, PlanningSettings
@@ -142,8 +143,8 @@ class TrialPool:
     def __init__(
         self, jobs: int, *, expected: int | None = None, observer: TrialObserver = NULL_OBSERVER
     ) -> None:
-        if not 1 <= jobs <= MAX_JOBS:
-            raise InvalidValueError(f"jobs is {jobs}; it must be from 1 to {MAX_JOBS}")
+        if integer(jobs) is None or not 1 <= jobs <= MAX_JOBS:
+            raise InvalidValueError(f"jobs is {jobs!r:.80}; it must be from 1 to {MAX_JOBS}")
         self._jobs = jobs
         self._expected = expected
         self._observer = observer
@@ -444,6 +445,9 @@ def _new_arm(arm: Arm) -> _NewArm:
     )
 
 
+_OF_THE_PROBLEM = ("problem", "problem_directory", "model", "state_space_planner")
+"""Sections of a configuration."""
+
 _NEEDS_CLOUDPICKLE = (
     "a problem that a notebook or a script defines needs cloudpickle: pip install "
     "'holdfast[tune]', or put its class into a module of its own, or use jobs=1"
@@ -472,6 +476,7 @@ def _pickled(problem: Problem) -> bytes:
 def _work(connection: Connection, threads: int) -> None:
     """Run trials until the parent closes the pipe."""
     arms: list[_NewArm | Arm] = []
+    problems: dict[bytes, Problem] = {}
     while True:
         request = _REQUESTS.decode(connection.recv_bytes())
         if isinstance(request, _NewArm):
@@ -482,7 +487,7 @@ def _work(connection: Connection, threads: int) -> None:
         try:
             arm = arms[request.arm]
             if isinstance(arm, _NewArm):
-                arms[request.arm] = arm = _arm_in_worker(arm, threads)
+                arms[request.arm] = arm = _arm_in_worker(arm, threads, problems)
             result = _run_one(arm, request.trial, NULL_OBSERVER)
             answer = _Finished(result, perf_counter() - started)
         except HoldfastError as error:
@@ -492,10 +497,17 @@ def _work(connection: Connection, threads: int) -> None:
         connection.send_bytes(_ENCODE(answer))
 
 
-def _arm_in_worker(sent: _NewArm, threads: int) -> Arm:
-    """Build an arm in a worker, which has as many threads as its share of the cores."""
+def _arm_in_worker(sent: _NewArm, threads: int, problems: dict[bytes, Problem]) -> Arm:
+    """Build an arm in a worker, which has as many threads as its share of the cores.
+
+    Arms that differ in their settings alone share a problem of ``problems``: it may be large.
+    """
     if sent.plain is not None:
-        problem = Configuration.from_plain(sent.plain).problem
+        sections = sent.plain["configuration"]
+        key = _ENCODE([sent.plain["path"], *map(sections.get, _OF_THE_PROBLEM)])
+        if key not in problems:
+            problems[key] = Configuration.from_plain(sent.plain).problem
+        problem = problems[key]
     else:
         import pickle
 

@@ -13,6 +13,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import threading
 import weakref
 from collections.abc import Callable, Iterable, Iterator
 from multiprocessing import resource_tracker
@@ -28,6 +29,8 @@ __all__ = ["WorkerProcess", "end_workers"]
 _ENDING_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
 
 _END_S = 10.0
+
+_STARTING = threading.Lock()
 
 _STARTED: weakref.WeakSet[WorkerProcess] = weakref.WeakSet()
 
@@ -77,7 +80,8 @@ class WorkerProcess:
         # Started first, because its start would undo the mask set below.
         resource_tracker.ensure_running()
         _STARTED.add(self)
-        with _inherited_by_children(self._threads):
+        # One at a time: two threads that run trials would restore what the other one has set.
+        with _STARTING, _inherited_by_children(self._threads):
             self._process.start()
         # Only the child must hold this end, else its death would not close the pipe.
         self._theirs.close()

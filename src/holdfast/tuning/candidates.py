@@ -7,6 +7,7 @@ particles to take are varied afterwards, of the method that won, so that there a
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
@@ -24,6 +25,7 @@ from holdfast.planning.settings import (
     PlanningSettings,
     estimator_of,
 )
+from holdfast.printable import one_line
 from holdfast.problems.attributes import resolution_of, sensing_labels
 from holdfast.problems.problem import ProblemBase
 
@@ -78,6 +80,8 @@ def has_rewards(problem: Any) -> bool:
 def changed(base: Configuration, changes: Mapping[str, Any]) -> Configuration:
     """Return a configuration with other values of some keys, checked as one from a file.
 
+    None of them is the problem's: the problem is that of ``base``, which may be large.
+
     Raises
     ------
     ConfigurationError
@@ -88,7 +92,7 @@ def changed(base: Configuration, changes: Mapping[str, Any]) -> Configuration:
     for key, value in changes.items():
         section, _, name = key.partition(".")
         sections[section] = {**sections[section], name: value}
-    return Configuration.from_plain(plain)
+    return dataclasses.replace(Configuration.from_plain(plain), problem=base.problem)
 
 
 def first_candidates(
@@ -135,7 +139,10 @@ def _first(base: Configuration, variations: Sequence[Variation], objective: Obje
         if method in ENTROPY_METHODS:
             yield from _of_entropies(base, method, variations, objective)
     if "fixed" in variations:
-        for number, label in enumerate(sensing_labels(base.problem)):
+        labels = [one_line(label) for label in sensing_labels(base.problem)]
+        for number, label in enumerate(labels):
+            # A candidate is known by its name, here and in the table of its trials.
+            label += f" ({number})" * (labels.count(label) > 1)
             fixed = {"selector.method": "fixed", "selector.sensing_action": number}
             yield f"always {label}", fixed
 

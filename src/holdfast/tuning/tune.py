@@ -11,22 +11,25 @@ tuning that goes on runs the same race again, with the trials that it has.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import fcntl
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any, NamedTuple, get_args
 
 import msgspec
 import numpy as np
 
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import InvalidValueError, OutputError, TrialError
+from holdfast.numerics.arrays import real_number, whole
 from holdfast.recording.fingerprint import fingerprint
 from holdfast.recording.run_directory import first_difference
 from holdfast.recording.table_formats import csv_rows
 from holdfast.robot.trial_pool import Arm, TrialPool, available_cores
+from holdfast.runtime.command_line import MAX_JOBS
 from holdfast.runtime.files import shown_path, write_atomically
 from holdfast.tuning.candidates import (
     AS_CONFIGURED,
@@ -75,7 +78,7 @@ def tune(
     most: int = 200,
     jobs: int | None = None,
     max_decision_ms: float = math.inf,
-    out: Path | None = None,
+    out: str | Path | None = None,
     on_progress: Callable[[Progress], None] = lambda _: None,
 ) -> Tuning:
     """Find what to sense on a problem, by simulating it; :func:`hf.check_problem` comes first.
@@ -98,7 +101,7 @@ def tune(
         Processes; None: one for each core.
     max_decision_ms : float
         A candidate whose median decision takes longer must not win.
-    out : Path, optional
+    out : path, optional
         A directory for the files; if it has trials of the same tuning, it goes on with these.
 
     Raises
@@ -115,10 +118,16 @@ def tune(
     unknown = [each for each in vary if each not in VARIATIONS]
     if unknown:
         raise InvalidValueError(f"vary has {unknown[0]!r}; allowed are {', '.join(VARIATIONS)}")
-    if not 2 <= most < FRESH:
-        raise InvalidValueError(f"most is {most}; it must be from 2 to {FRESH - 1}")
-    if not budget_s > 0.0:
-        raise InvalidValueError(f"budget_s is {budget_s}; it must be above 0")
+    most = whole("most", most, 2, FRESH - 1)
+    jobs = available_cores() if jobs is None else whole("jobs", jobs, 1, MAX_JOBS)
+    for name, value in (("budget_s", budget_s), ("max_decision_ms", max_decision_ms)):
+        number = real_number(value)
+        if number is None or not number > 0.0:
+            raise InvalidValueError(f"{name} is {value!r:.80}; it must be a number above 0")
+    if objective is not None and objective not in get_args(Objective):
+        allowed = ", ".join(get_args(Objective))
+        raise InvalidValueError(f"objective is {objective!r:.80}; allowed are {allowed}")
+    out = None if out is None else Path(out)
     if objective is None:
         priced = getattr(configuration.problem, "sensing_costs", None) is not None
         objective = "reward" if priced else "steps"
@@ -127,7 +136,6 @@ def tune(
             f"objective is 'reward', but {configuration.problem_name} has neither rewards nor "
             "sensing_costs; take 'steps' or 'success'"
         )
-    jobs = jobs or available_cores()
     settings = {
         "configuration": configuration.plain()["configuration"],
         "objective": objective,
@@ -387,16 +395,18 @@ class _Trials:
         path = directory / TRIALS_NAME
         try:
             directory.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("a+", encoding="utf-8", newline="")
+            self._file = path.open("a", encoding="utf-8", newline="")
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            content = path.read_bytes()
+            whole = content[: content.rfind(b"\n") + 1]
+            lines = whole.decode(errors="replace").split("\n")
+            self.rows = {(row.candidate, row.trial): row for row in _rows_of(lines)}
             self._require_the_same(directory / SETTINGS_NAME)
-            self._file.seek(0)
-            self.rows = {(row.candidate, row.trial): row for row in _rows_of(self._file)}
-            # Whatever a kill has cut short goes.
-            self._file.truncate(0)
-            self._file.write(_line(TrialRow._fields))
-            self._file.writelines(map(_line, self.rows.values()))
-            self._file.flush()
+            # What a kill has cut short goes. The rest stays as it is: a disk may be full.
+            self._file.truncate(len(whole))
+            if not whole:
+                self._file.write(_line(TrialRow._fields))
+                self._file.flush()
         except BlockingIOError:
             raise OutputError(f"{shown_path(path)}: another process is writing it") from None
         except OSError as error:
@@ -404,17 +414,23 @@ class _Trials:
 
     def __exit__(self, *exception: object) -> None:
         if self._file is not None:
-            self._file.close()
+            with contextlib.suppress(OSError):  # what a full disk does not take was an error before
+                self._file.close()
 
     def _require_the_same(self, path: Path) -> None:
         settings = msgspec.to_builtins(self._settings)
         try:
             there = msgspec.json.decode(path.read_bytes())
         except FileNotFoundError:
+            if self.rows:
+                raise OutputError(
+                    f"{shown_path(path)}: is gone, so nothing tells of which tuning the trials of "
+                    f"{TRIALS_NAME} are; choose another directory"
+                ) from None
             content = msgspec.json.format(msgspec.json.encode(settings), indent=2)
             write_atomically(path, content)
             return
-        except (OSError, msgspec.DecodeError) as error:
+        except (OSError, UnicodeDecodeError, msgspec.DecodeError) as error:
             raise OutputError(f"{shown_path(path)}: cannot be read: {error}") from None
         found = first_difference(there, msgspec.json.decode(msgspec.json.encode(settings)))
         if found is not None:
@@ -433,8 +449,12 @@ class _Trials:
         """Keep a trial."""
         self.rows[row.candidate, row.trial] = row
         if self._file is not None:
-            self._file.write(_line(row))
-            self._file.flush()
+            try:
+                self._file.write(_line(row))
+                self._file.flush()
+            except OSError as error:
+                where = shown_path(Path(self._file.name))
+                raise OutputError(f"{where}: cannot be written: {error.strerror}") from error
 
 
 def _line(values: Iterable[Any]) -> str:
@@ -442,10 +462,14 @@ def _line(values: Iterable[Any]) -> str:
     return line
 
 
-def _rows_of(file: IO[str]) -> Iterator[TrialRow]:
-    for values in csv.reader(file):
+def _rows_of(lines: Iterable[str]) -> Iterator[TrialRow]:
+    """Yield the trials; each line is read by itself, so that a damaged one costs no other."""
+    for line in lines:
         try:
-            name, trial, success, failed, steps, reward, decision_ms, seconds = values
+            ((name, trial, success, failed, steps, reward, *times),) = csv.reader([line])
+            decision_ms, seconds = map(float, times)
+            if not 0.0 <= decision_ms + seconds < math.inf:
+                continue
             yield TrialRow(
                 name,
                 int(trial),
@@ -453,8 +477,8 @@ def _rows_of(file: IO[str]) -> Iterator[TrialRow]:
                 failed == "1",
                 int(steps),
                 float(reward) if reward else None,
-                float(decision_ms),
-                float(seconds),
+                decision_ms,
+                seconds,
             )
-        except ValueError:
-            continue  # the head, or a row that was cut short
+        except (ValueError, csv.Error):
+            continue  # the head, or a damaged row

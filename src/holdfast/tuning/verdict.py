@@ -163,16 +163,18 @@ def judge(
     decisive = [found for pair in pairs if (found := compare(*pair, objective)) is not None]
     matters = any(each.finding for each in decisive)
     admitted = [name for name in names if name not in barred] or names
-    choice = configured if configured in admitted else finalist
+    choice = next(name for name in (configured, finalist, *admitted) if name in admitted)
     if matters:
         costs = {
             name: np.mean([cost_of(row, objective, limit) for row in rows[name]]) for name in names
         }
         choice = min(admitted, key=costs.__getitem__)
         found = compare(choice, configured, objective)
-        slower = _decision_ms(rows[choice]) > _MUCH_SLOWER * _decision_ms(rows[configured])
-        if configured in admitted and found is not None and found.finding < 1 and slower:
-            choice = configured
+        bound_ms = _MUCH_SLOWER * _decision_ms(rows[configured])
+        quick = [name for name in admitted if _decision_ms(rows[name]) <= bound_ms]
+        if configured in quick and found is not None and found.finding < 1:
+            # What is as quick may be better than the configuration beyond noise, as random sensing.
+            choice = min(quick, key=costs.__getitem__)
     against = [name for name in names if name != choice]
     comparisons = [
         found
