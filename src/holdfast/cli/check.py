@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
     from holdfast.tuning.findings import Finding
 
-__all__ = ["main"]
+__all__ = ["impatient", "main"]
 
 _COLORS = {"error": 31, "warning": 33, "information": 0}
 """Of a terminal: red, yellow; else its own."""
@@ -108,7 +108,7 @@ def _check(options: CheckOptions) -> int:
     line.start(f"checking {configuration.problem_name}", 0, "")
     try:
         # What the problem's code prints is no finding.
-        with contextlib.redirect_stdout(sys.stderr), _impatient(_PATIENCE * options.budget):
+        with contextlib.redirect_stdout(sys.stderr), impatient(_PATIENCE * options.budget):
             found = check_problem(
                 configuration.problem,
                 configuration.planning,
@@ -164,7 +164,7 @@ def _configuration(options: CheckOptions) -> Configuration:
 
 
 @contextlib.contextmanager
-def _impatient(seconds: float) -> Iterator[None]:
+def impatient(seconds: float) -> Iterator[None]:
     """Raise TimeoutError in the problem's code if it takes so long: a finding with its lines."""
     from holdfast.config.user_code import is_users_file
 
