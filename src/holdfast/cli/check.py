@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from holdfast.config.loader import Configuration
 
-__all__ = ["main"]
+__all__ = ["impatient", "main"]
 
 _WIDEST = 110
 
@@ -98,7 +98,7 @@ def _check(options: CheckOptions) -> int:
     line.start(f"checking {configuration.problem_name}", 0, "")
     try:
         # What the problem's code prints is no finding.
-        with contextlib.redirect_stdout(sys.stderr), _impatient(_PATIENCE * options.budget):
+        with contextlib.redirect_stdout(sys.stderr), impatient(_PATIENCE * options.budget):
             found = check_problem(
                 configuration.problem,
                 configuration.planning,
@@ -153,7 +153,7 @@ def _configuration(options: CheckOptions) -> Configuration:
 
 
 @contextlib.contextmanager
-def _impatient(seconds: float) -> Iterator[None]:
+def impatient(seconds: float) -> Iterator[None]:
     """Raise TimeoutError in the problem's code if it takes so long: a finding with its lines."""
     from holdfast.config.user_code import is_users_file
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 import shlex
@@ -44,6 +45,7 @@ __all__ = ["TuneOptions", "main"]
 
 _MOST_TRIALS = 100_000
 _LONGEST_CHECK_S = 20.0
+_PATIENCE_S = 60.0
 _LONGEST_S = 30 * 86_400.0
 _UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
@@ -232,14 +234,17 @@ def _tune(options: TuneOptions) -> int:
 
 def _check(configuration: Configuration, options: TuneOptions) -> None:
     """Show what is wrong with the problem; raise ProblemError if that is an error."""
+    from holdfast.cli.check import impatient
     from holdfast.tuning.problem_check import check_problem
 
-    found = check_problem(
-        configuration.problem,
-        configuration.planning,
-        max_steps=configuration.simulator.max_steps,
-        budget_s=min(_LONGEST_CHECK_S, 0.1 * _seconds(options.budget)),
-    )
+    # What the problem's code prints is no result, and it may hang.
+    with contextlib.redirect_stdout(sys.stderr), impatient(_PATIENCE_S):
+        found = check_problem(
+            configuration.problem,
+            configuration.planning,
+            max_steps=configuration.simulator.max_steps,
+            budget_s=min(_LONGEST_CHECK_S, 0.1 * _seconds(options.budget)),
+        )
     errors = [each for each in found if each.severity == "error"]
     for each in found:
         if each.severity == "warning" and not options.quiet:
