@@ -74,6 +74,14 @@ def test_random_where_it_is_best() -> None:
     assert judge(trials, "path", "steps", LIMIT).sentence.startswith("Sense at random: ")
 
 
+def test_no_trial_succeeds() -> None:
+    trials = {
+        name: [each._replace(success=False) for each in rows(name, 0.0)]
+        for name in (AS_CONFIGURED, "other", RANDOM)
+    }
+    assert "No trial succeeded" in judge(trials, "other", "steps", LIMIT).sentence
+
+
 def test_nothing_matters() -> None:
     trials = {name: rows(name, 0.0) for name in (AS_CONFIGURED, "other", RANDOM)}
     found = judge(trials, "other", "steps", LIMIT)

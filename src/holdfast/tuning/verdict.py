@@ -184,6 +184,8 @@ def judge(
     ]
     trials = len(rows[configured])
     sentence = _sentence(choice, configured, matters, objective, comparisons, trials)
+    if not any(row.success for each in rows.values() for row in each):
+        sentence += " No trial succeeded: ask holdfast check first whether the goal can be reached."
     return Verdict(choice, matters, sentence, tuple(comparisons))
 
 
