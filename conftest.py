@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import pytest
+from hypothesis import settings
 
 # Images for containers set it. The processes that tests start would compile all of holdfast each
 # time: half a second, in tests of how soon something is noticed or launched. And pytest would
@@ -27,6 +28,10 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
 ROOT = Path(__file__).parent
+
+# How long an example takes says how busy the machine is.
+settings.register_profile("no deadlines", deadline=None)
+settings.load_profile("no deadlines")
 
 DEPLOY = "deploy/"
 """The folder of what needs an engine of containers, tunnels or a machine of its own."""
