@@ -10,7 +10,7 @@ import sys
 import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from holdfast.cli.exit_codes import EXIT_DIFFERENT, ended_by_signals
 from holdfast.errors import ConfigurationError, InvalidValueError
@@ -30,8 +30,9 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from holdfast.config.loader import Configuration
+    from holdfast.tuning.findings import Finding
 
-__all__ = ["impatient", "main"]
+__all__ = ["inspected", "main"]
 
 _WIDEST = 110
 
@@ -90,23 +91,20 @@ def main(arguments: Sequence[str]) -> int:
 
 def _check(options: CheckOptions) -> int:
     from holdfast.cli.terminal import counted, progress_line
-    from holdfast.tuning.problem_check import CHECKS, check_problem
+    from holdfast.tuning.problem_check import CHECKS
 
     configuration = _configuration(options)
     line = progress_line(len(CHECKS), quiet=options.quiet or options.json, noun="check")
     names = list(CHECKS)
     line.start(f"checking {configuration.problem_name}", 0, "")
     try:
-        # What the problem's code prints is no finding.
-        with contextlib.redirect_stdout(sys.stderr), impatient(_PATIENCE * options.budget):
-            found = check_problem(
-                configuration.problem,
-                configuration.planning,
-                max_steps=configuration.simulator.max_steps,
-                seed=options.seed,
-                budget_s=options.budget,
-                on_check=lambda name: line.show(names.index(name), name),
-            )
+        found = inspected(
+            configuration,
+            _PATIENCE * options.budget,
+            seed=options.seed,
+            budget_s=options.budget,
+            on_check=lambda name: line.show(names.index(name), name),
+        )
     finally:
         line.stop()
     shown = [each for each in found if not options.quiet or each.severity != "information"]
@@ -119,6 +117,20 @@ def _check(options: CheckOptions) -> int:
     if not options.json:
         sys.stdout.write(f"{counted(errors, 'error')}, {counted(warnings, 'warning')}\n")
     return EXIT_DIFFERENT if errors else 0
+
+
+def inspected(configuration: Configuration, patience_s: float, **how: Any) -> list[Finding]:
+    """Check the problem of a configuration, which may print and hang; ``how`` as it is checked."""
+    from holdfast.tuning.problem_check import check_problem
+
+    # What the problem's code prints is no finding.
+    with contextlib.redirect_stdout(sys.stderr), _impatient(patience_s):
+        return check_problem(
+            configuration.problem,
+            configuration.planning,
+            max_steps=configuration.simulator.max_steps,
+            **how,
+        )
 
 
 def _configuration(options: CheckOptions) -> Configuration:
@@ -153,7 +165,7 @@ def _configuration(options: CheckOptions) -> Configuration:
 
 
 @contextlib.contextmanager
-def impatient(seconds: float) -> Iterator[None]:
+def _impatient(seconds: float) -> Iterator[None]:
     """Raise TimeoutError in the problem's code if it takes so long: a finding with its lines."""
     from holdfast.config.user_code import is_users_file
 

@@ -22,6 +22,7 @@ __all__ = [
     "ended_by_signals",
     "interrupted_by",
     "print_error",
+    "say_interrupted",
     "signal_of",
 ]
 
@@ -125,3 +126,8 @@ def interrupted_by(interruption: KeyboardInterrupt) -> str:
     """Return the words for a person: ``Interrupted`` after Ctrl-C, else ``Ended by SIGTERM``."""
     number = signal_of(interruption)
     return "Interrupted" if number == signal.SIGINT else f"Ended by {number.name}"
+
+
+def say_interrupted(how: str, kept: str, command: str) -> None:
+    """Print how a command was interrupted, what is kept, and the command that goes on."""
+    sys.stderr.write(printable(f"\n{how}. {kept}\nGo on with: {command}\n"))

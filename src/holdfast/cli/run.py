@@ -16,6 +16,7 @@ from holdfast.cli.exit_codes import (
     EXIT_WRONG_ANSWER,
     ended_by_signals,
     interrupted_by,
+    say_interrupted,
 )
 from holdfast.cli.run_figure import Remark, draw_figure
 from holdfast.cli.run_options import RunOptions
@@ -434,7 +435,7 @@ class _Notes:
         if self._as_json:
             self._event("interrupted", reason=f"{how}. {kept}", resume_command=command)
         else:
-            sys.stderr.write(printable(f"\n{how}. {kept}\nGo on with: {command}\n"))
+            say_interrupted(how, kept, command)
 
     @contextlib.contextmanager
     def while_it_lasts(self, text: str) -> Iterator[None]:

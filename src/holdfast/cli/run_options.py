@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -189,11 +188,11 @@ class RunOptions(Options):
 
     def resume_command(self, directory: Path) -> str:
         """Return the command that goes on."""
-        words = self.words(
-            *("out", "resume", "resume_if_begun", "after_reboot", "restart", "quiet", "view_file")
+        return self.command_to_resume(
+            "run",
+            directory,
+            *("resume_if_begun", "after_reboot", "restart", "quiet", "view_file"),
         )
-        out = self.table()["out"].words(directory)
-        return shlex.join(["holdfast", "run", *words, *out, "--resume"])
 
     def overrides(self) -> list[Override]:
         """Return the values that replace those of the file."""

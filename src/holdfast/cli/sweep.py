@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import shlex
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from holdfast.cli.exit_codes import EXIT_CAN_GO_ON, ended_by_signals, interrupted_by
+from holdfast.cli.exit_codes import (
+    EXIT_CAN_GO_ON,
+    ended_by_signals,
+    interrupted_by,
+    say_interrupted,
+)
 from holdfast.cli.overrides import combined, parse_assignment, parse_values
 from holdfast.cli.terminal import counted, progress_line
 from holdfast.errors import HoldfastError, InvalidValueError, RunError
@@ -97,8 +101,7 @@ class SweepOptions(Options):
 
     def resume_command(self, directory: Path) -> str:
         """Return the command that goes on."""
-        words = [*self.words("out", "resume"), *self.table()["out"].words(directory)]
-        return shlex.join(["holdfast", "sweep", *words, "--resume"])
+        return self.command_to_resume("sweep", directory)
 
     def arms(self) -> list[SweptArm]:
         """Return the combinations."""
@@ -168,8 +171,8 @@ def _sweep(options: SweepOptions) -> int:
             names = sweep.write_tables(comparison)
         except KeyboardInterrupt as interruption:
             kept = f"{finished:,} of {sweep.total:,} trials are finished and kept in {where}"
-            text = f"\n{interrupted_by(interruption)}. {kept}\nGo on with: "
-            sys.stderr.write(printable(f"{text}{options.resume_command(directory)}\n"))
+            how = interrupted_by(interruption)
+            say_interrupted(how, kept, options.resume_command(directory))
             raise
         except HoldfastError as error:
             raise RunError(error, options.resume_command(directory), EXIT_CAN_GO_ON) from error

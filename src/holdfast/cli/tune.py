@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import re
-import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from holdfast.cli.exit_codes import EXIT_CAN_GO_ON, ended_by_signals, interrupted_by
+from holdfast.cli.exit_codes import (
+    EXIT_CAN_GO_ON,
+    ended_by_signals,
+    interrupted_by,
+    say_interrupted,
+)
 from holdfast.cli.overrides import combined, parse_assignment
 from holdfast.cli.terminal import counted, duration, progress_line
 from holdfast.errors import (
@@ -156,8 +159,7 @@ class TuneOptions(Options):
 
     def resume_command(self, directory: Path) -> str:
         """Return the command that goes on."""
-        words = [*self.words("out", "resume"), *self.table()["out"].words(directory)]
-        return shlex.join(["holdfast", "tune", *words, "--resume"])
+        return self.command_to_resume("tune", directory)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -214,10 +216,8 @@ def _tune(options: TuneOptions) -> int:
         )
     except KeyboardInterrupt as interruption:
         line.stop()
-        sys.stderr.write(
-            f"\n{interrupted_by(interruption)}. The finished trials are kept.\n"
-            f"Go on with: {options.resume_command(out)}\n"
-        )
+        how = interrupted_by(interruption)
+        say_interrupted(how, "The finished trials are kept.", options.resume_command(out))
         raise
     except (OutputError, WorkerDiedError) as error:
         if not doing:
@@ -234,17 +234,10 @@ def _tune(options: TuneOptions) -> int:
 
 def _check(configuration: Configuration, options: TuneOptions) -> None:
     """Show what is wrong with the problem; raise ProblemError if that is an error."""
-    from holdfast.cli.check import impatient
-    from holdfast.tuning.problem_check import check_problem
+    from holdfast.cli.check import inspected
 
-    # What the problem's code prints is no result, and it may hang.
-    with contextlib.redirect_stdout(sys.stderr), impatient(_PATIENCE_S):
-        found = check_problem(
-            configuration.problem,
-            configuration.planning,
-            max_steps=configuration.simulator.max_steps,
-            budget_s=min(_LONGEST_CHECK_S, 0.1 * _seconds(options.budget)),
-        )
+    budget_s = min(_LONGEST_CHECK_S, 0.1 * _seconds(options.budget))
+    found = inspected(configuration, _PATIENCE_S, budget_s=budget_s)
     errors = [each for each in found if each.severity == "error"]
     for each in found:
         if each.severity == "warning" and not options.quiet:

@@ -30,7 +30,8 @@ from holdfast.recording.facts import (
     TrialBeginFact,
     TrialEndFact,
 )
-from holdfast.recording.tables import trial_cells
+from holdfast.recording.table_formats import cells
+from holdfast.recording.tables import trial_row
 
 __all__ = ["TABLES", "CsvSink"]
 
@@ -118,10 +119,10 @@ class CsvSink:
         self._write_belief(fact.trial, fact.steps, "end", fact.belief)
         if fact.result is None:
             known = {"trial": fact.trial, "outcome": "unfinished", "steps": fact.steps}
-            cells: list[object] = [known.get(column) for column in TRIAL_COLUMNS]
+            values: Sequence[object] = [known.get(column) for column in TRIAL_COLUMNS]
         else:
-            cells = trial_cells(fact.result)
-        trial, *others = cells
+            values = trial_row(fact.result)
+        trial, *others = cells(values)
         times = _seconds(self._began_ns), _seconds(fact.time_ns)
         self._trials.writerow([trial, *times, *others])
 

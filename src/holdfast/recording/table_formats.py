@@ -15,7 +15,7 @@ from holdfast.errors import HoldfastError
 from holdfast.printable import cell
 from holdfast.runtime.files import write_atomically
 
-__all__ = ["Table", "csv_rows"]
+__all__ = ["Table", "cells", "csv_rows"]
 
 _LATEX = {
     **{each: f"\\{each}" for each in "&%$#_{}"},
@@ -102,11 +102,13 @@ def csv_rows(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterat
     """
     yield ",".join(columns) + "\n"
     for row in rows:
-        texts = (
-            "" if value is None else str(int(value)) if isinstance(value, bool) else str(value)
-            for value in row
-        )
-        yield ",".join(map(_quoted, map(str, map(cell, texts)))) + "\n"
+        texts = ("" if value is None else str(value) for value in cells(row))
+        yield ",".join(map(_quoted, texts)) + "\n"
+
+
+def cells(row: Iterable[object]) -> list[object]:
+    """Return values as a CSV table has them: a truth value as 0 or 1, no text that is a formula."""
+    return [int(value) if isinstance(value, bool) else cell(value) for value in row]
 
 
 def _quoted(text: str) -> str:

@@ -16,12 +16,11 @@ import numpy as np
 
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
-from holdfast.printable import cell
 from holdfast.recording.fingerprint import EarlierCode
 from holdfast.recording.table_formats import csv_rows
 from holdfast.recording.timings import AnswerCounts, VerificationCounts
 
-__all__ = ["RunSummary", "SummaryBuilder", "csv_lines", "trial_cells", "wilson_interval"]
+__all__ = ["RunSummary", "SummaryBuilder", "csv_lines", "trial_row", "wilson_interval"]
 
 _NORMAL_QUANTILE_975 = 1.959963984540054
 
@@ -117,14 +116,12 @@ def csv_lines(results: Iterable[TrialResult]) -> Iterator[str]:
     Reading a number back gives the same number. None, such as the reward of a trial without one, is
     an empty cell.
     """
-    rows = (tuple(getattr(result, column) for column in TRIAL_COLUMNS) for result in results)
-    yield from csv_rows(TRIAL_COLUMNS, rows)
+    yield from csv_rows(TRIAL_COLUMNS, map(trial_row, results))
 
 
-def trial_cells(result: TrialResult) -> list[object]:
-    """Return the row of a trial, in the order of ``TRIAL_COLUMNS``."""
-    values = (getattr(result, column) for column in TRIAL_COLUMNS)
-    return [int(value) if isinstance(value, bool) else cell(value) for value in values]
+def trial_row(result: TrialResult) -> tuple[object, ...]:
+    """Return what a table has of a trial, in the order of ``TRIAL_COLUMNS``."""
+    return tuple(getattr(result, column) for column in TRIAL_COLUMNS)
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:

@@ -253,6 +253,14 @@ class Options:
         ]
         return list(itertools.chain.from_iterable(given))
 
+    def command_to_resume(self, command: str, directory: Path, *without: str) -> str:
+        """Return the command that goes on in a directory, but for the options named."""
+        import shlex  # for a command that has stopped
+
+        out = self.table()["out"].words(directory)
+        words = [command, *self.words("out", "resume", *without), *out, "--resume"]
+        return shlex.join(["holdfast", *words])
+
 
 class _Parser(argparse.ArgumentParser):
     """Raises what another parser prints."""

@@ -26,6 +26,7 @@ from holdfast.recording.outcome_comparison import (
 )
 from holdfast.recording.run_directory import RunDirectory
 from holdfast.recording.table_formats import csv_rows
+from holdfast.recording.tables import trial_row
 from holdfast.robot.trial_pool import Arm, TrialPool
 from holdfast.runtime.files import write_atomically
 from holdfast.tuning.simulated_trials import arm_of, table_of
@@ -215,4 +216,4 @@ class Sweep:
         for arm, run in zip(self.arms, self._runs, strict=True):
             chosen = tuple(_text(arm.values[key]) for key in keys)
             for result in run.journal.results():
-                yield (*chosen, *(getattr(result, name) for name in TRIAL_COLUMNS))
+                yield (*chosen, *trial_row(result))
