@@ -10,16 +10,16 @@ from holdfast.cli.overrides import Override, combined, parse_assignment
 from holdfast.errors import InvalidValueError
 from holdfast.recording.view_target import ViewTarget, viewer_url
 from holdfast.runtime.command_line import (
-    MAX_JOBS,
-    MAX_SEED,
     MAX_TRIALS,
     Options,
     argument,
     bad_value,
     flag,
+    jobs_option,
     location,
     number,
     option,
+    seed_option,
     whole_number,
 )
 from holdfast.runtime.files import shown_path
@@ -72,12 +72,7 @@ class RunOptions(Options):
         key="simulator.num_trials",
         help="Number of trials, instead of the file's.",
     )
-    seed: int | None = option(
-        metavar="S",
-        read=whole_number(0, MAX_SEED),
-        key="simulator.seed",
-        help="Seed of all random draws, instead of the file's.",
-    )
+    seed: int | None = seed_option()
     problem: str | None = option(
         metavar="NAME",
         help="Problem to run, instead of the file's: a registered name or module:Class.",
@@ -88,12 +83,7 @@ class RunOptions(Options):
         many=True,
         help="A value instead of the file's, as YAML: selector.method=random.",
     )
-    jobs: int | None = option(
-        "-j",
-        metavar="N",
-        read=whole_number(1, MAX_JOBS),
-        help="Largest number of processes (default: one for each core). Changes time only.",
-    )
+    jobs: int | None = jobs_option()
     out: Path | None = option(
         "-o",
         metavar="DIR",

@@ -20,14 +20,14 @@ from holdfast.cli.terminal import counted, progress_line
 from holdfast.errors import HoldfastError, InvalidValueError, RunError
 from holdfast.printable import printable
 from holdfast.runtime.command_line import (
-    MAX_JOBS,
-    MAX_SEED,
     MAX_TRIALS,
     Options,
     argument,
     flag,
+    jobs_option,
     location,
     option,
+    seed_option,
     whole_number,
 )
 from holdfast.runtime.files import shown_path
@@ -76,18 +76,8 @@ class SweepOptions(Options):
         key="simulator.num_trials",
         help="Number of trials of each combination, instead of the file's.",
     )
-    seed: int | None = option(
-        metavar="S",
-        read=whole_number(0, MAX_SEED),
-        key="simulator.seed",
-        help="Seed of all random draws, instead of the file's.",
-    )
-    jobs: int | None = option(
-        "-j",
-        metavar="N",
-        read=whole_number(1, MAX_JOBS),
-        help="Largest number of processes (default: one for each core). Changes time only.",
-    )
+    seed: int | None = seed_option()
+    jobs: int | None = jobs_option()
     out: Path | None = option(
         "-o",
         metavar="DIR",

@@ -26,16 +26,16 @@ from holdfast.errors import (
 )
 from holdfast.printable import printable
 from holdfast.runtime.command_line import (
-    MAX_JOBS,
-    MAX_SEED,
     Options,
     argument,
     bad_value,
     flag,
+    jobs_option,
     location,
     number,
     one_of,
     option,
+    seed_option,
     whole_number,
 )
 from holdfast.runtime.files import shown_path
@@ -123,18 +123,8 @@ class TuneOptions(Options):
         default=math.inf,
         help="No candidate may win whose median decision takes longer (default: no limit).",
     )
-    jobs: int | None = option(
-        "-j",
-        metavar="N",
-        read=whole_number(1, MAX_JOBS),
-        help="Largest number of processes (default: one for each core).",
-    )
-    seed: int | None = option(
-        metavar="S",
-        read=whole_number(0, MAX_SEED),
-        key="simulator.seed",
-        help="Seed of all random draws, instead of the file's.",
-    )
+    jobs: int | None = jobs_option(more="")
+    seed: int | None = seed_option()
     assignments: tuple[str, ...] = option(
         "--set",
         metavar="SECTION.KEY=VALUE",

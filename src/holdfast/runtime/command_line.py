@@ -27,10 +27,12 @@ __all__ = [
     "argument",
     "bad_value",
     "flag",
+    "jobs_option",
     "location",
     "number",
     "one_of",
     "option",
+    "seed_option",
     "wants_json",
     "whole_number",
 ]
@@ -159,6 +161,26 @@ def option(
 def flag(*names: str, help: str, default: bool = False) -> Any:  # noqa: A002
     """Declare an option without a value; one that is on by default is switched off by ``--no-``."""
     return Option(_with_long(names), help, "", str, default)
+
+
+def seed_option() -> Any:
+    """Declare the ``--seed`` of a command that runs trials."""
+    return option(
+        metavar="S",
+        read=whole_number(0, MAX_SEED),
+        key="simulator.seed",
+        help="Seed of all random draws, instead of the file's.",
+    )
+
+
+def jobs_option(more: str = " Changes time only.") -> Any:
+    """Declare the ``--jobs`` of a command that runs trials; ``more`` ends its help."""
+    return option(
+        "-j",
+        metavar="N",
+        read=whole_number(1, MAX_JOBS),
+        help=f"Largest number of processes (default: one for each core).{more}",
+    )
 
 
 def _with_long(names: tuple[str, ...]) -> tuple[str, ...]:
