@@ -49,7 +49,7 @@ def one_by_one(
                 belief = Belief(states, own_weights)
                 estimated = estimate(belief, settings.particle_filter.estimate)
                 own_stage = checked.next_stage(problem, estimated, own_stage)
-                action = problem.execute(problem.policy(estimated, own_stage))
+                action = problem.limit_action(problem.policy(estimated, own_stage))
                 states = problem.move(states, action, motion.substream(i).substream(step))
                 factor *= discount
                 points = points_of(states, own_stage)

@@ -67,7 +67,7 @@ class Target(ProblemBase):
         del stage
         return states[..., 2:] - states[..., :2]
 
-    def execute(self, actions: FloatArray) -> FloatArray:
+    def limit_action(self, actions: FloatArray) -> FloatArray:
         return np.clip(actions, -self.step, self.step)
 
     def is_goal(self, states: FloatArray) -> BoolArray:

@@ -56,7 +56,7 @@ class Carriage(hf.ProblemBase):
     def next_stage(self, estimates, stage):
         return np.where(np.abs(estimates[..., 0] - self.places[0]) < 0.05, 1, stage)
 
-    def execute(self, actions):
+    def limit_action(self, actions):
         return np.clip(actions, -0.1, 0.1)
 
     def is_goal(self, states):

@@ -68,7 +68,7 @@ class CorridorDoors(hf.ProblemBase):
     def policy(self, states, stage):
         return self.goal - states
 
-    def execute(self, actions):
+    def limit_action(self, actions):
         return np.clip(actions, -0.25, 0.25)
 
     def is_goal(self, states):

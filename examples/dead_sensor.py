@@ -45,7 +45,7 @@ class Warehouse(hf.ProblemBase):
     def policy(self, states, stage):
         return self.bay - states
 
-    def execute(self, actions):
+    def limit_action(self, actions):
         return np.clip(actions, -0.1, 0.1)
 
     def is_goal(self, states):

@@ -48,7 +48,7 @@ class Yard(hf.ProblemBase):
     def policy(self, states, stage):
         return self.dock - states
 
-    def execute(self, actions):
+    def limit_action(self, actions):
         return np.clip(actions, -0.15, 0.15)
 
     def is_goal(self, states):

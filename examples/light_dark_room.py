@@ -46,7 +46,7 @@ class LightDarkRoom(hf.ProblemBase):
         x, y = estimates[..., 0] - self.places[0, 0], estimates[..., 1] - self.places[0, 1]
         return np.where(x * x + y * y < 0.1, 1, stage)
 
-    def execute(self, actions):
+    def limit_action(self, actions):
         return np.clip(actions, -0.1, 0.1)
 
     def is_goal(self, states):

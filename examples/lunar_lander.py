@@ -101,7 +101,7 @@ class LunarLander(hf.ProblemBase):
         turn, climb = np.where(down, 0.0, turn), np.where(down, -0.5 * vy, climb)
         return np.stack([20.0 * climb - 1.0, -20.0 * turn], axis=-1)
 
-    def execute(self, actions):
+    def limit_action(self, actions):
         return np.clip(actions, -1.0, 1.0)
 
     def is_goal(self, states):

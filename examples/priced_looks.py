@@ -50,7 +50,7 @@ class PricedLooks(hf.ProblemBase):
     def policy(self, states, stage):
         return -states
 
-    def execute(self, actions):
+    def limit_action(self, actions):
         return np.clip(actions, -0.1, 0.1)
 
     def reward(self, states, actions):

@@ -35,7 +35,7 @@ class TwoEnds(hf.ProblemBase):
         moved[..., :2] += actions + 0.02 * stream.normal((*states.shape[:-1], 2))
         return moved
 
-    def execute(self, actions):
+    def limit_action(self, actions):
         return np.clip(actions, -0.1, 0.1)
 
     def rightly(self, states, sensing_action):

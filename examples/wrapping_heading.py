@@ -59,7 +59,7 @@ class WrappingHeading(hf.ProblemBase):
         ahead = np.where(np.abs(turn) < 0.5, np.sqrt(x * x + y * y), 0.0)
         return np.stack([turn, ahead], axis=-1)
 
-    def execute(self, actions):
+    def limit_action(self, actions):
         return np.clip(actions, [-0.3, 0.0], [0.3, 0.2])
 
     def is_goal(self, states):

@@ -100,9 +100,9 @@ class BusyRoom(ProblemBase):
         """Do what the peg alone asks for."""
         return self._peg.policy(states[..., :_PEG], stage)
 
-    def execute(self, actions: FloatArray) -> FloatArray:
+    def limit_action(self, actions: FloatArray) -> FloatArray:
         """Limit each component on its own."""
-        return self._peg.execute(actions)
+        return self._peg.limit_action(actions)
 
     def reward(self, states: FloatArray, actions: FloatArray) -> FloatArray:
         """Return minus the length of the way."""

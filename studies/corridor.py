@@ -74,7 +74,7 @@ class Corridor(ProblemBase):
         del stage
         return np.asarray(_GOAL - states)
 
-    def execute(self, actions: FloatArray) -> FloatArray:
+    def limit_action(self, actions: FloatArray) -> FloatArray:
         """Limit a step."""
         return np.clip(actions, -_STEP, _STEP)
 

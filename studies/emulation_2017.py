@@ -92,7 +92,7 @@ def run_emulation(first_trial: int, **series: Any) -> pd.DataFrame:
             particles = _sense(problem, world, particles, chosen, name, step)
         first = particles[:, 0]
         stages = np.asarray(problem.next_stage(first, stages))
-        actions = problem.execute(problem.policy(first, stages))
+        actions = problem.limit_action(problem.policy(first, stages))
         particles = problem.move(
             particles, actions[:, None, :], stream(*name, step, Purpose.PREDICTION)
         )

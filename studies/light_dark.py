@@ -76,7 +76,7 @@ class LightDark(ProblemBase):
         following = np.where(there, 1, stage)
         return following if following.ndim else int(following)
 
-    def execute(self, actions: FloatArray) -> FloatArray:
+    def limit_action(self, actions: FloatArray) -> FloatArray:
         """Limit each coordinate of a step on its own."""
         return np.clip(actions, -_STEP, _STEP)
 

@@ -68,7 +68,7 @@ class PasserBy(ProblemBase):
         del stage
         return -states[..., :2]
 
-    def execute(self, actions: FloatArray) -> FloatArray:
+    def limit_action(self, actions: FloatArray) -> FloatArray:
         """Limit each coordinate of a step on its own."""
         return np.clip(actions, -_STEP, _STEP)
 

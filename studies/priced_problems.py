@@ -57,7 +57,7 @@ class _Point(ProblemBase):
         del stage
         return -states
 
-    def execute(self, actions: FloatArray) -> FloatArray:
+    def limit_action(self, actions: FloatArray) -> FloatArray:
         return np.clip(actions, -self.step, self.step)
 
     def reward(self, states: FloatArray, actions: FloatArray) -> FloatArray:

@@ -292,7 +292,7 @@ class VdpTag(ProblemBase):
         del stages
         return value_of_plan(interception(states[:, :2], states[:, 2:])[1], chance_of_tag(1))
 
-    def execute(self, actions: FloatArray) -> FloatArray:
+    def limit_action(self, actions: FloatArray) -> FloatArray:
         """Make a step of every action: its direction is what counts."""
         return toward(actions)
 

@@ -65,7 +65,7 @@ class Westward(ProblemBase):
         ahead = np.where(np.abs(turn) < 0.5, np.sqrt(x * x + y * y), 0.0)
         return np.stack([turn, ahead], axis=-1)
 
-    def execute(self, actions: FloatArray) -> FloatArray:
+    def limit_action(self, actions: FloatArray) -> FloatArray:
         """Limit turn and way; there is no way back."""
         return np.clip(actions, [-0.3, 0.0], [0.3, 0.2])
 

@@ -83,7 +83,7 @@ def panel(axes: Any, title: str, limits: tuple[float, float, float, float]) -> N
 
 def draw_peg_in_hole(axes: Any) -> None:
     """Draw a peg, the hole and their lengths."""
-    scene: Any = hf.make("peg_in_hole_2d", hole_tolerance=0.25).scene()
+    scene: Any = hf.make_problem("peg_in_hole_2d", hole_tolerance=0.25).scene()
     panel(axes, "peg_in_hole_2d", (-3.6, -1.9, 6.4, 4.6))
     obstacles(axes, scene)
     peg(axes, scene, 3.4, 1.6, 0.5)
@@ -100,7 +100,7 @@ def draw_peg_in_hole(axes: Any) -> None:
 
 def draw_multitier(axes: Any) -> None:
     """Draw the plates, in the order in which the peg passes them."""
-    problem: Any = hf.make("multitier_peg_in_hole_2d")
+    problem: Any = hf.make_problem("multitier_peg_in_hole_2d")
     scene = problem.scene()
     panel(axes, "multitier_peg_in_hole_2d", (-12.0, -9.0, 12.0, 12.0))
     obstacles(axes, scene)
@@ -115,7 +115,7 @@ def draw_multitier(axes: Any) -> None:
 
 def draw_capsule(axes: Any) -> None:
     """Draw the maze and its via points, each with its axis."""
-    problem: Any = hf.make("capsule_robot")
+    problem: Any = hf.make_problem("capsule_robot")
     scene = problem.scene()
     panel(axes, "capsule_robot", (-0.9, -0.75, 5.6, 3.35))
     obstacles(axes, scene)

@@ -151,7 +151,7 @@ class _ContactPeg(hf.ProblemBase):
     def observation_variance(self, states, sensing_action):
         return self.look_variance[sensing_action : sensing_action + 1]
 
-    def execute(self, actions):
+    def limit_action(self, actions):
         return np.clip(actions, -self.step_size, self.step_size)
 
     def policy(self, states, stage):

@@ -10,9 +10,20 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from holdfast import errors, numerics
     from holdfast.config.loader import load as load_configuration
-    from holdfast.config.registry import make
-    from holdfast.errors import HoldfastError
+    from holdfast.config.registry import make_problem
+    from holdfast.config.registry import make_problem as make
+    from holdfast.errors import (
+        ConfigurationError,
+        EnvironmentFailedError,
+        HoldfastError,
+        InvalidValueError,
+        OutputError,
+        ProblemError,
+        TrialError,
+        UnknownProblemError,
+    )
     from holdfast.planning.belief import Belief
     from holdfast.planning.estimators import (
         GaussianMixture,
@@ -20,7 +31,7 @@ if TYPE_CHECKING:
         PriorNeighbors,
         entropy,
     )
-    from holdfast.planning.outcome import Ending, MoveResult
+    from holdfast.planning.outcome import Ending, MoveResult, TrialResult
     from holdfast.planning.planner import Planner, PlanningState
     from holdfast.planning.settings import (
         ActiveSensingSettings,
@@ -43,14 +54,18 @@ __all__ = [
     "LATER",
     "ActiveSensingSettings",
     "Belief",
+    "ConfigurationError",
     "Ending",
     "Environment",
+    "EnvironmentFailedError",
     "GaussianMixture",
     "GymnasiumEnvironment",
     "HoldfastError",
+    "InvalidValueError",
     "LostSettings",
     "MoveResult",
     "NearestNeighbor",
+    "OutputError",
     "ParticleFilterSettings",
     "Planner",
     "PlanningSettings",
@@ -58,15 +73,22 @@ __all__ = [
     "PriorNeighbors",
     "Problem",
     "ProblemBase",
+    "ProblemError",
     "Scene",
     "SelectorSettings",
     "SenseInBackground",
     "SimulatedEnvironment",
+    "TrialError",
+    "TrialResult",
+    "UnknownProblemError",
     "check_problem",
     "compare",
     "entropy",
+    "errors",
     "load_configuration",
     "make",
+    "make_problem",
+    "numerics",
     "open_run",
     "run_trial",
     "run_trials",
@@ -87,7 +109,14 @@ _PLACES = {
     "SenseInBackground": "robot.late_sensing.SenseInBackground",
     "GaussianMixture": "planning.estimators.GaussianMixture",
     "GymnasiumEnvironment": "robot.gymnasium_environment.GymnasiumEnvironment",
+    "ConfigurationError": "errors.ConfigurationError",
+    "EnvironmentFailedError": "errors.EnvironmentFailedError",
     "HoldfastError": "errors.HoldfastError",
+    "InvalidValueError": "errors.InvalidValueError",
+    "OutputError": "errors.OutputError",
+    "ProblemError": "errors.ProblemError",
+    "TrialError": "errors.TrialError",
+    "UnknownProblemError": "errors.UnknownProblemError",
     "NearestNeighbor": "planning.estimators.NearestNeighbor",
     "Planner": "planning.planner.Planner",
     "PlanningSettings": "planning.settings.PlanningSettings",
@@ -97,12 +126,14 @@ _PLACES = {
     "ProblemBase": "problems.problem.ProblemBase",
     "Scene": "problems.problem.Scene",
     "SimulatedEnvironment": "robot.environment.SimulatedEnvironment",
+    "TrialResult": "planning.outcome.TrialResult",
     "SelectorSettings": "planning.settings.SelectorSettings",
     "check_problem": "tuning.problem_check.check_problem",
     "compare": "tuning.simulated_trials.compare",
     "entropy": "planning.estimators.entropy",
     "load_configuration": "config.loader.load",
-    "make": "config.registry.make",
+    "make": "config.registry.make_problem",
+    "make_problem": "config.registry.make_problem",
     "open_run": "recording.reading.open_run",
     "run_trial": "robot.trial.run_trial",
     "run_trials": "tuning.simulated_trials.run_trials",
@@ -110,10 +141,14 @@ _PLACES = {
 }
 """The module of each name, and its name there; type checkers read the imports above."""
 
+_MODULES = ("errors", "numerics")
+
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> object:
         """Import a name of the public face (PEP 562)."""
+        if name in _MODULES:
+            return importlib.import_module(f"{__name__}.{name}")
         if name not in _PLACES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         module, _, own_name = _PLACES[name].rpartition(".")

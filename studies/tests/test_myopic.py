@@ -53,7 +53,7 @@ def test_a_robot_that_knows_its_state_succeeds(name: str) -> None:
     states = problem.initial_states(stream(1, 0, 0, Purpose.INITIAL_BELIEF), 50)
     done, failed = np.zeros((2, 50), bool)
     for step in range(case.max_steps):
-        actions = problem.execute(problem.policy(states, 0))
+        actions = problem.limit_action(problem.policy(states, 0))
         states = problem.move(states, actions, stream(1, 0, step, Purpose.WORLD_MOTION))
         ended, failures = checked.ends(problem, states)
         if failures is not None:

@@ -43,7 +43,7 @@ COPIES: dict[str, Callable[[Any], Any]] = {
 
 
 def planner_of(name: str) -> hf.Planner:
-    return hf.Planner(hf.make(name), particles=30)
+    return hf.Planner(hf.make_problem(name), particles=30)
 
 
 def advanced(planner: hf.Planner) -> hf.PlanningState:
@@ -80,7 +80,7 @@ def env() -> ProblemEnv:
 
 
 def moved_world() -> hf.SimulatedEnvironment:
-    world = hf.SimulatedEnvironment(hf.make("peg_in_hole_2d"), 3)
+    world = hf.SimulatedEnvironment(hf.make_problem("peg_in_hole_2d"), 3)
     world.perform(np.array([-0.1, 0.0, 0.0]))
     return world
 
@@ -105,7 +105,7 @@ POINTS = np.linspace(0.0, 1.0, 20).reshape(10, 2)
 OBJECTS: dict[str, Kept] = {
     **{
         f"problem {name}": Kept(
-            lambda name=name: hf.make(name),  # type: ignore[misc]
+            lambda name=name: hf.make_problem(name),  # type: ignore[misc]
             lambda problem: ended(hf.Planner(problem, particles=30)),
         )
         for name in BUILT_IN
@@ -159,7 +159,7 @@ OBJECTS: dict[str, Kept] = {
         lambda: hf.GaussianMixture(np.array([0.1, 0.2])),
         lambda each: hf.entropy(POINTS, None, each),
     ),
-    "scene": Kept(lambda: hf.make("peg_in_hole_2d").scene(), lambda each: repr(vars(each))),
+    "scene": Kept(lambda: hf.make_problem("peg_in_hole_2d").scene(), lambda each: repr(vars(each))),
 }
 
 

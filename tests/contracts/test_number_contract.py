@@ -21,7 +21,7 @@ from holdfast.planning.outcome import MoveResult, TrialResult
 
 gymnasium = pytest.importorskip("gymnasium")
 
-PEG = hf.make("peg_in_hole_2d")
+PEG = hf.make_problem("peg_in_hole_2d")
 PLANNER = hf.Planner(PEG, particles=30)
 STATE = PLANNER.init(1)
 AFTER = PLANNER.advance(STATE, np.zeros(3))
@@ -102,7 +102,7 @@ WHOLE: dict[str, tuple[Callable[[Any], Any], int]] = {
     "observe(sensing_action)": (lambda n: PLANNER.observe(STATE, n, [0.5]), 1),
     "plan_until_sensing": (lambda n: PLANNER.plan_until_sensing(AFTER, n), 2),
     "decide": (lambda n: PLANNER.decide(AFTER, n), 2),
-    "make": (lambda n: hf.make("peg_in_hole_2d", state_size=n).state_size, 3),
+    "make": (lambda n: hf.make_problem("peg_in_hole_2d", state_size=n).state_size, 3),
     "load(seed)": (lambda n: hf.load_configuration(CONFIGURATION, seed=n).to_yaml(), 3),
     "load(num_trials)": (lambda n: hf.load_configuration(CONFIGURATION, num_trials=n).to_yaml(), 3),
     "load(overrides)": (
@@ -189,7 +189,7 @@ REAL: dict[str, tuple[Callable[[Any], Any], Any]] = {
         [0.5, 0.25],
     ),
     "make": (
-        lambda x: hf.make("peg_in_hole_2d", init_mean=x).initial_states(INITIAL.anew(), 3),
+        lambda x: hf.make_problem("peg_in_hole_2d", init_mean=x).initial_states(INITIAL.anew(), 3),
         [4.0, 2.0, 0.0],
     ),
     "load(overrides)": (
@@ -259,9 +259,11 @@ def test_what_is_no_real_number(name: str, wrong: str) -> None:
 def test_one_real_number(number: Any) -> None:
     plain = float(number)
     for key in ("sensing_cov", "peg_width"):
-        made = hf.make("peg_in_hole_2d", **{key: number})
+        made = hf.make_problem("peg_in_hole_2d", **{key: number})
         assert leaf(made.observation_variance(np.zeros((1, 3)), 0)) == leaf(
-            hf.make("peg_in_hole_2d", **{key: plain}).observation_variance(np.zeros((1, 3)), 0)
+            hf.make_problem("peg_in_hole_2d", **{key: plain}).observation_variance(
+                np.zeros((1, 3)), 0
+            )
         )
     found = hf.entropy(POINTS, None, hf.NearestNeighbor(2, number))
     assert found == hf.entropy(POINTS, None, hf.NearestNeighbor(2, plain))
@@ -287,7 +289,7 @@ def test_the_error_names_value_and_limit() -> None:
     "function",
     [
         *("initial_states", "move", "observation_mean", "observation_variance", "policy"),
-        *("execute", "reward", "sample_observation", "log_likelihood"),
+        *("limit_action", "reward", "sample_observation", "log_likelihood"),
     ],
 )
 def test_what_a_problem_returns_with_a_mask(function: str) -> None:
@@ -306,7 +308,7 @@ def test_what_a_problem_returns_with_a_mask(function: str) -> None:
 class Gaussian(Line):
     """A line with a reward."""
 
-    def execute(self, actions: Any) -> Any:
+    def limit_action(self, actions: Any) -> Any:
         return 1.0 * actions
 
     def reward(self, states: Any, actions: Any) -> Any:

@@ -40,7 +40,7 @@ def some_states(problem: Problem, leading: tuple[int, ...]) -> FloatArray:
     count = int(np.prod(leading, dtype=int))
     states = problem.initial_states(initial(), count)
     for step in range(30):
-        actions = problem.execute(problem.policy(states, 0))
+        actions = problem.limit_action(problem.policy(states, 0))
         states = problem.move(states, actions, motion().substream(step))
     return states.reshape(*leading, problem.state_size)
 
@@ -83,7 +83,7 @@ def test_shapes_and_kinds(problem: Problem, leading: tuple[int, ...]) -> None:
     states = some_states(problem, leading)
     stages = some_stages(problem, leading)
     actions = problem.policy(states, stages)
-    executed = problem.execute(actions)
+    executed = problem.limit_action(actions)
     moved = problem.move(states, executed, motion())
     for array, size in (
         (actions, problem.action_size),
@@ -139,14 +139,14 @@ def test_a_batch_is_its_elements(problem: Problem) -> None:
     states = some_states(problem, (40,))
     stages = some_stages(problem, (40,))
     actions = problem.policy(states, stages)
-    executed = problem.execute(actions)
+    executed = problem.limit_action(actions)
     rewards = problem.reward(states, executed)
     goals = problem.is_goal(states)
     following = np.asarray(problem.next_stage(states, stages))
     for n, state in enumerate(states):
         stage = int(stages[n])
         assert problem.policy(state, stage).tobytes() == actions[n].tobytes()
-        assert problem.execute(actions[n]).tobytes() == executed[n].tobytes()
+        assert problem.limit_action(actions[n]).tobytes() == executed[n].tobytes()
         assert problem.reward(state, executed[n]) == rewards[n]
         assert problem.is_goal(state) == goals[n]
         assert problem.next_stage(state, stage) == following[n]
@@ -168,7 +168,7 @@ def test_one_stage_for_a_belief_each(problem: Problem) -> None:
 
 def test_motion_is_a_function_of_state_action_and_stream(problem: Problem) -> None:
     states = some_states(problem, (64,))
-    actions = problem.execute(problem.policy(states, 0))
+    actions = problem.limit_action(problem.policy(states, 0))
     moved = problem.move(states, actions, motion())
     assert problem.move(states, actions, motion()).tobytes() == moved.tobytes()
     assert problem.move(states, actions, motion().substream(7)).tobytes() != moved.tobytes()
@@ -195,9 +195,9 @@ def test_the_noise_has_the_stated_variance(problem: Problem) -> None:
 
 def test_limits_are_limits(problem: Problem) -> None:
     commanded = initial().normal((200, problem.action_size))
-    executed = problem.execute(commanded)
-    np.testing.assert_allclose(problem.execute(executed), executed, rtol=1e-15)
-    larger = np.abs(problem.execute(1e6 * commanded))
+    executed = problem.limit_action(commanded)
+    np.testing.assert_allclose(problem.limit_action(executed), executed, rtol=1e-15)
+    larger = np.abs(problem.limit_action(1e6 * commanded))
     assert (np.abs(executed) <= larger.max(axis=0) * (1.0 + 1e-15)).all()
     assert (executed * commanded >= 0.0).all()
 
@@ -216,11 +216,11 @@ def test_stages_advance_one_by_one_to_the_last(problem: Problem) -> None:
 def test_nothing_changes_its_arguments(problem: Problem) -> None:
     states = some_states(problem, (20,))
     stages = some_stages(problem, (20,))
-    actions = problem.execute(problem.policy(states, stages))
+    actions = problem.limit_action(problem.policy(states, stages))
     for array in (states, stages, actions):
         array.setflags(write=False)
     problem.policy(states, stages)
-    problem.execute(actions)
+    problem.limit_action(actions)
     problem.next_stage(states, stages)
     problem.reward(states, actions)
     problem.is_goal(states)
@@ -237,7 +237,7 @@ def test_the_task_can_be_done(problem: Problem) -> None:
     assert not problem.is_goal(states).any()
     for step in range(1500):
         stages = problem.next_stage(states, stages)
-        actions = problem.execute(problem.policy(states, stages))
+        actions = problem.limit_action(problem.policy(states, stages))
         states = problem.move(states, actions, motion().substream(step))
         done |= problem.is_goal(states)
         if done.all():

@@ -97,7 +97,7 @@ def belief_of(problem: Problem, count: int = COUNT) -> Belief:
     draws = stream(SEED, 0, 0, Purpose.INITIAL_BELIEF)
     states = problem.initial_states(draws, count)
     for step in range(40):
-        actions = problem.execute(problem.policy(states, 0))
+        actions = problem.limit_action(problem.policy(states, 0))
         states = problem.move(states, actions, draws.substream(2).substream(step))
     weights = draws.substream(1).uniform(count)
     weights[::7] = 0.0

@@ -56,7 +56,7 @@ class SonarRoom(ProblemBase):
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
         return -states
 
-    def execute(self, actions: FloatArray) -> FloatArray:
+    def limit_action(self, actions: FloatArray) -> FloatArray:
         return np.clip(actions, -0.1, 0.1)
 
     def is_goal(self, states: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:

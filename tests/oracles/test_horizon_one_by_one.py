@@ -59,7 +59,7 @@ def on_the_way(problem: Any, count: int) -> tuple[Belief, int]:
     for step in range(42):
         mean = states.mean(axis=0)
         stage = checked.next_stage(problem, mean, stage)
-        action = problem.execute(problem.policy(mean, stage))
+        action = problem.limit_action(problem.policy(mean, stage))
         states = problem.move(states, action, draws.substream(2).substream(step))
     weights = draws.substream(1).uniform(count)
     weights[::7] = 0.0
@@ -148,7 +148,7 @@ def test_beliefs_are_moved_as_one_after_the_other(name: str) -> None:
     problem = PROBLEMS[name]()
     beliefs = [on_the_way(problem, count)[0].states for count in (150, 150, 150)]
     states = np.stack(beliefs) + np.array([0.0, 0.01, 0.02])[:, np.newaxis, np.newaxis]
-    actions = problem.execute(problem.policy(states[:, 0], 0))
+    actions = problem.limit_action(problem.policy(states[:, 0], 0))
     streams = [stream(63, 0, step, Purpose.PREDICTION) for step in range(3)]
     alone = np.stack([problem.move(*each) for each in zip(states, actions, streams, strict=True)])
     for threads in (1, 2, 0):

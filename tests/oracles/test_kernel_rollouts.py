@@ -55,7 +55,7 @@ class Robot:
             if step > since and step % INTERVAL == 0:
                 value -= factor * price
             stage = self.problem.next_stage(state, stage)
-            action = self.problem.execute(self.problem.policy(state, stage))
+            action = self.problem.limit_action(self.problem.policy(state, stage))
             drawn = motion.substream(step).substream(0).normal((self.first + 1, len(state)))
             state = state + action + drawn[-1] * self.problem._motion_deviation
             value += factor * float(self.problem.reward(state, action))
@@ -79,7 +79,7 @@ class Robot:
                 break
             believed = self.mean() + offset
             stage = self.problem.next_stage(believed, stage)
-            action = self.problem.execute(self.problem.policy(believed, stage))
+            action = self.problem.limit_action(self.problem.policy(believed, stage))
             noise = motion.substream(step)
             for number, member in enumerate(self.cloud):
                 self.cloud[number] = self.moved(member, action, self.first + 1 + number, noise)

@@ -84,7 +84,7 @@ def ways(problem: Problem, states: FloatArray, steps: int) -> tuple[list[FloatAr
     stages = np.zeros(len(states), dtype=np.int64)
     found, passed = [states], [stages]
     for _ in range(steps):
-        states = states + problem.execute(problem.policy(states, stages))
+        states = states + problem.limit_action(problem.policy(states, stages))
         stages = np.asarray(problem.next_stage(states, stages))
         found.append(states)
         passed.append(stages)
@@ -166,7 +166,7 @@ def test_the_kernel_follows_as_numpy_does(name: str) -> None:
     for stage in range(problem.num_stages):
         states = some_belief(problem, 150, "uniform").states
         states_at, stages_at = problem.expected_path(states, stage, offsets, 1)
-        assert has_own(problem, "expected_path", ("policy", "execute", "next_stage"))
+        assert has_own(problem, "expected_path", ("policy", "limit_action", "next_stage"))
         expected_states, expected_stages = _followed(plain, states, stage, offsets, 1)
         np.testing.assert_array_equal(states_at, expected_states)
         np.testing.assert_array_equal(stages_at, np.broadcast_to(expected_stages, (6, 150)))
@@ -195,7 +195,7 @@ def test_an_inherited_path_is_none_of_a_new_policy() -> None:
     points, _ = path_points(problem, path((0, 3)), states, 0)
     moved = states
     for _ in range(3):
-        moved = problem.move(moved, problem.execute(problem.policy(moved, 0)), NOISE_FREE)
+        moved = problem.move(moved, problem.limit_action(problem.policy(moved, 0)), NOISE_FREE)
     np.testing.assert_array_equal(points[1], problem.policy(moved, 0))
 
 
@@ -213,7 +213,7 @@ def test_a_problem_may_say_where_its_actions_lead() -> None:
     problem = Drifting()
     states = np.array([[1.0, 2.0, 3.0], [0.1, 0.2, 0.3]])
     points, _ = path_points(problem, path((0, 1)), states, 0)
-    moved = states + problem.execute(problem.policy(states, 0)) + 0.1
+    moved = states + problem.limit_action(problem.policy(states, 0)) + 0.1
     stages = np.asarray(problem.next_stage(moved, np.zeros(2, dtype=np.int64)))
     np.testing.assert_array_equal(points[1], problem.policy(moved, stages))
 
@@ -284,10 +284,10 @@ class TestErrors:
     @pytest.mark.parametrize("found", [np.zeros((1, 3)), np.zeros(3), [[0.0] * 3]])
     def test_shape_of_what_is_executed(self, found: Any) -> None:
         class Wrong(Plane):
-            def execute(self, actions: FloatArray) -> FloatArray:
+            def limit_action(self, actions: FloatArray) -> FloatArray:
                 return found  # type: ignore[no-any-return]
 
-        with pytest.raises(ProblemError, match=r"execute of plane returned .*\(40, 3\)"):
+        with pytest.raises(ProblemError, match=r"limit_action of plane returned .*\(40, 3\)"):
             choose(Wrong(), path(), some_belief(Plane(), 40, "uniform"))
 
     def test_call_of_the_expected_move(self) -> None:
@@ -300,7 +300,7 @@ class TestErrors:
 
     def test_actions_that_grow_on_the_way(self) -> None:
         class Wrong(Plane):
-            def execute(self, actions: FloatArray) -> FloatArray:
+            def limit_action(self, actions: FloatArray) -> FloatArray:
                 return -1e60 * actions
 
         with pytest.raises(ProblemError, match=r"policy of plane.*in state .*, 3 steps on"):

@@ -76,7 +76,7 @@ class Plane(ProblemBase):
         following: IntArray = np.minimum(stage + arrived, 2)
         return following
 
-    def execute(self, actions: FloatArray) -> FloatArray:
+    def limit_action(self, actions: FloatArray) -> FloatArray:
         return np.clip(actions, -0.4, 0.4)
 
     def is_goal(self, states: FloatArray) -> npt.NDArray[np.bool_]:
@@ -137,7 +137,7 @@ def reference_points(
         if selector.method == "state_entropy":
             points.append(state)
         elif selector.actions == "executed":
-            points.append(problem.execute(problem.policy(state, stage)))
+            points.append(problem.limit_action(problem.policy(state, stage)))
         else:
             points.append(problem.policy(state, stage))
     return np.array(points)
@@ -161,11 +161,11 @@ def reference_sets(
         for start in states:
             state, own_stage = start, stage
             for _ in range(unit * offset):
-                state = state + problem.execute(problem.policy(state, own_stage))
+                state = state + problem.limit_action(problem.policy(state, own_stage))
                 own_stage = int(problem.next_stage(state, own_stage))
             points.append(problem.policy(state, own_stage))
             if selector.actions == "executed":
-                points[-1] = problem.execute(points[-1])
+                points[-1] = problem.limit_action(points[-1])
         sets.append((selector.path_discount**offset, np.array(points)))
     return sets
 
@@ -249,7 +249,7 @@ def algorithm_2(
                 if settings.particle_filter.estimate == "most_likely":
                     estimate = later_states[int(np.argmax(posterior))]
                 later_stage = int(problem.next_stage(estimate, later_stage))
-                action = problem.execute(problem.policy(estimate, later_stage))
+                action = problem.limit_action(problem.policy(estimate, later_stage))
                 motion = hypotheses.substream(2).substream(i).substream(step)
                 later_states = problem.move(later_states, action, motion)
                 points = reference_points(problem, settings, later_states, later_stage)

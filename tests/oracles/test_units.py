@@ -84,8 +84,8 @@ class Rescaled(ProblemBase):
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
         return np.asarray(self._own.policy(states / self._states, stage) * self._actions)
 
-    def execute(self, actions: FloatArray) -> FloatArray:
-        return np.asarray(self._own.execute(actions / self._actions) * self._actions)
+    def limit_action(self, actions: FloatArray) -> FloatArray:
+        return np.asarray(self._own.limit_action(actions / self._actions) * self._actions)
 
     def next_stage(self, estimates: FloatArray, stage: int | IntArray) -> int | IntArray:
         following: int | IntArray = self._own.next_stage(estimates / self._states, stage)

@@ -41,9 +41,9 @@ class LyingPeg(PegInHole2D):
             return np.asarray(actions * np.array([0.0, 0.0, 1.0]))  # as if the angle alone mattered
         return actions
 
-    def execute(self, actions: FloatArray) -> FloatArray:
+    def limit_action(self, actions: FloatArray) -> FloatArray:
         factor = {"far": 77.7, "half": 0.5}.get(os.environ.get(VARIABLE, ""), 1.0)
-        return np.asarray(factor * super().execute(actions))
+        return np.asarray(factor * super().limit_action(actions))
 
 
 def _is_verifying() -> bool:

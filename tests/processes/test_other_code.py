@@ -105,8 +105,8 @@ from holdfast.problems.peg_in_hole_2d import PegInHole2D
 class P(PegInHole2D):
     name = "p"
     GAIN = 1.0
-    def execute(self, actions):
-        return self.GAIN * super().execute(actions)
+    def limit_action(self, actions):
+        return self.GAIN * super().limit_action(actions)
 
 def make(gain):
     class Made(P):

@@ -64,7 +64,7 @@ class Absent(Lander):
     def is_done(self):
         num_moves = len(self.moves.read_text())
         if self.trial == 1 and num_moves == 5 and not Path("mended").exists():
-            return None
+            return "maybe"
         return self.ending.get(self.trial, False) if num_moves >= 6 else False
 """
 
@@ -162,14 +162,14 @@ def test_a_run_from_before_trials_could_fail_goes_on(tmp_path: Path) -> None:
     assert [event["step"] for event in events_of(out) if event["event"] == "resumed_trial"] == [21]
 
 
-def test_an_answer_that_is_none_after_a_move_is_mended_and_the_move_is_not_made_again(
+def test_a_wrong_answer_after_a_move_is_mended_and_the_move_is_not_made_again(
     tmp_path: Path,
 ) -> None:
     command = Command(tmp_path, "Absent")
     done = command.run()
     assert done.returncode == 4
     assert "trial 1, step 4, whose task action was performed" in done.stderr
-    assert 'is_done returned None; it must return True, False, "failed" or an Ending' in done.stderr
+    assert "is_done returned 'maybe'; it must return True, False, None" in done.stderr
     assert "--resume" in done.stderr
     (tmp_path / "mended").touch()
     done = command.run("--resume")

@@ -92,7 +92,7 @@ _defect(
 _defect(
     "late_not_written",
     "The journal does not get late observations.",
-    Edit(Robot, "_came_late", "self._unwritten.append(record)", "pass"),
+    Edit(Robot, "_take_late_observation", "self._unwritten.append(record)", "pass"),
 )
 _defect(
     "late_between_order_and_performance",
@@ -134,7 +134,12 @@ _defect(
 _defect(
     "new_belief_not_written",
     "The journal does not say that the belief of a lost robot was begun anew.",
-    Edit(Robot, "_reinitialise", "self._write(history.reinitialised())", "history.reinitialised()"),
+    Edit(
+        Robot,
+        "_reinitialise",
+        "self._write(history.fold_reinitialisation())",
+        "history.fold_reinitialisation()",
+    ),
 )
 _defect(
     "new_belief_not_folded_again",
@@ -169,7 +174,7 @@ _defect(
     "Services get the observation that came with a move, but not the measured motion.",
     Edit(
         TrialHistory,
-        "performed",
+        "fold_move",
         "Moved(record.step, motion, observation)",
         "Moved(record.step, b'', observation)",
     ),
@@ -178,7 +183,7 @@ _defect(
     "moves_planned_ahead",
     "The robot asks for all actions up to the next sensing step, although each move shows "
     "something.",
-    Edit(Question, "__init__", "elif planner.moves_show:", "elif False:"),
+    Edit(Question, "__init__", "elif planner.moves_give_observations:", "elif False:"),
 )
 _defect(
     "not_sensing_ordered",

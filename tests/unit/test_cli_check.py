@@ -26,7 +26,7 @@ class {name}(hf.ProblemBase):
         {move}
     def policy(self, states, stage):
         return -states
-    def execute(self, actions):
+    def limit_action(self, actions):
         return np.clip(actions, -0.3, 0.3)
     def is_goal(self, states):
         return np.abs(states[..., 0]) < self.width

@@ -28,7 +28,7 @@ def problem(request: pytest.FixtureRequest) -> Problem:
 
 
 def small_action(problem: Problem) -> FloatArray:
-    return problem.execute(np.full(problem.action_size, -0.05))
+    return problem.limit_action(np.full(problem.action_size, -0.05))
 
 
 def test_it_is_an_environment(problem: Problem) -> None:

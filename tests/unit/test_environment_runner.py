@@ -278,7 +278,7 @@ class TestEvents:
             np.testing.assert_array_equal(
                 np.asarray(sensed.observation), np.asarray(world.perform_sensing(sensing_action))
             )
-        action = problem.execute(np.full(problem.action_size, -0.05))
+        action = problem.limit_action(np.full(problem.action_size, -0.05))
         runner.perform(0, action)
         reward = world.perform(action)
         assert not isinstance(reward, MoveResult)
@@ -378,15 +378,22 @@ class TestFailures:
             ),
             ("perform", [1.0], "returned [1.0]; it must return a finite number"),
             ("perform", True, "returned True; it must return a finite number"),
-            ("is_done", None, 'returned None; it must return True, False, "failed" or an Ending'),
-            ("is_done", 1, 'returned 1; it must return True, False, "failed" or an Ending'),
-            ("is_done", "", """returned ''; it must return True, False, "failed" or an Ending"""),
+            ("is_done", 1, 'returned 1; it must return True, False, None, "failed" or an Ending'),
+            (
+                "is_done",
+                "",
+                """returned ''; it must return True, False, None, "failed" or an Ending""",
+            ),
             (
                 "is_done",
                 "done",
-                """returned 'done'; it must return True, False, "failed" or an Ending""",
+                """returned 'done'; it must return True, False, None, "failed" or an Ending""",
             ),
-            ("is_done", np.array([True]), 'it must return True, False, "failed" or an Ending'),
+            (
+                "is_done",
+                np.array([True]),
+                'it must return True, False, None, "failed" or an Ending',
+            ),
             ("steps_performed", -1, "returned -1; it must return a whole number >= 0"),
             ("steps_performed", 3.0, "returned 3.0; it must return a whole number >= 0"),
             ("steps_performed", True, "returned True; it must return a whole number >= 0"),

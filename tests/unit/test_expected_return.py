@@ -60,7 +60,7 @@ class Dock(ProblemBase):
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
         return -states
 
-    def execute(self, actions: FloatArray) -> FloatArray:
+    def limit_action(self, actions: FloatArray) -> FloatArray:
         return np.clip(actions, -0.2, 0.2)
 
     def reward(self, states: FloatArray, actions: FloatArray) -> FloatArray:
@@ -303,7 +303,7 @@ class TestRollouts:
             if step >= known_from:
                 estimate = state
             stage = problem.next_stage(estimate, stage)
-            action = problem.execute(problem.policy(estimate, stage))
+            action = problem.limit_action(problem.policy(estimate, stage))
             state, estimate = state + action, estimate + action
             reward = -1.0 if isinstance(problem, Free) else float(problem.reward(state, action))
             total += settings.active_sensing.discount**step * reward
@@ -460,7 +460,7 @@ class TestSensingCosts:
         history = TrialHistory(planner, 0, 0)
         observation = np.array([0.5])
         for sensing_action, total in ((0, -0.5), (1, -0.75), (2, -0.75)):
-            history.observed(sensing_action, observation, 0.0)
+            history.fold_observation(sensing_action, observation, 0.0)
             assert history.rewards.total == total
 
     def test_a_price_alone_is_a_reward(self) -> None:

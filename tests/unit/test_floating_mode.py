@@ -56,20 +56,20 @@ class TestNumPy:
     @pytest.mark.parametrize("method", METHODS)
     @pytest.mark.parametrize("name", ["peg_in_hole_2d", "capsule_robot", "peg_in_hole_3d"])
     def test_no_mode_stops_a_built_in_problem(self, name: str, method: str) -> None:
-        usual = trial_of(hf.make(name), method)
+        usual = trial_of(hf.make_problem(name), method)
         with np.errstate(all="raise"):
-            assert trial_of(hf.make(name), method) == usual
+            assert trial_of(hf.make_problem(name), method) == usual
             assert set(np.geterr().values()) == {"raise"}
 
     def test_nor_a_horizon(self) -> None:
-        usual = trial_of(hf.make("peg_in_hole_2d"), "action_entropy", horizon=2)
+        usual = trial_of(hf.make_problem("peg_in_hole_2d"), "action_entropy", horizon=2)
         with np.errstate(all="raise"):
-            found = trial_of(hf.make("peg_in_hole_2d"), "action_entropy", horizon=2)
+            found = trial_of(hf.make_problem("peg_in_hole_2d"), "action_entropy", horizon=2)
         assert found == usual
 
     def test_what_a_user_calls_by_itself(self) -> None:
         weights = np.append(np.full(9, TINY), 1.0)[::-1]
-        planner = hf.Planner(hf.make("peg_in_hole_2d"), particles=10)
+        planner = hf.Planner(hf.make_problem("peg_in_hole_2d"), particles=10)
         state = planner.init(1)
         sharp = state._replace(belief=hf.Belief.weighted(state.belief.states, weights))
         with np.errstate(all="raise"):
@@ -173,9 +173,9 @@ class TestProcessor:
     @pytest.mark.parametrize("method", ["path_entropy", "expected_return"])
     @pytest.mark.parametrize("mode", [0x400, 0x800], ids=["downward", "upward"])
     def test_rounding_changes_no_decision(self, mode: int, method: str) -> None:
-        usual = trial_of(hf.make("peg_in_hole_2d"), method)
+        usual = trial_of(hf.make_problem("peg_in_hole_2d"), method)
         with rounding(mode) as library:
-            found = trial_of(hf.make("peg_in_hole_2d"), method)
+            found = trial_of(hf.make_problem("peg_in_hole_2d"), method)
             kept = library.fegetround()
         assert found == usual
         assert kept == mode

@@ -328,7 +328,7 @@ class TestWhatIsRefused:
             hf.GymnasiumEnvironment(**{"env_id": CAR, "sensing": [[0], [1]], **arguments})
 
     def test_sensing_actions_and_actions_are_the_problems(self) -> None:
-        peg = hf.make("peg_in_hole_2d")
+        peg = hf.make_problem("peg_in_hole_2d")
         with pytest.raises(ConfigurationError, match="has 2 entries; peg_in_hole_2d has 3 sensing"):
             car(problem=peg)
         with pytest.raises(ConfigurationError, match="1 numbers, and a task action has 3"):

@@ -49,7 +49,7 @@ class OneOfFour(hf.ProblemBase):
     def policy(self, states: Any, stage: Any) -> Any:
         return -states
 
-    def execute(self, actions: Any) -> Any:
+    def limit_action(self, actions: Any) -> Any:
         return np.clip(actions, -0.5, 0.5)
 
     def is_goal(self, states: Any) -> Any:

@@ -82,14 +82,14 @@ def a_trial(configuration: Configuration, number: int) -> tuple[list[Record], Tr
         if planner.needs_sensing(state):
             sensing_action, _ = planner.choose_sensing_action(state)
             shown = np.asarray(world.perform_sensing(sensing_action), dtype=np.float64)
-            records.append(history.observed(sensing_action, shown, 0.0)[1])
+            records.append(history.fold_observation(sensing_action, shown, 0.0)[1])
         action, _ = planner.choose_task_action(history.state)
         reward = world.perform(action)
         assert reward is None or isinstance(reward, float)
         performed = PerformedRecord(state.step, reward)
         records += [ActingRecord(state.step, encode_floats(action)), performed]
         history.pending = action
-        history.performed(performed)
+        history.fold_move(performed)
     return records, history
 
 
@@ -193,12 +193,12 @@ def test_an_observation_that_comes_late(configuration: Configuration) -> None:
     history = TrialHistory(planner, seed, 0)
     world = SimulatedEnvironment(configuration.problem, seed, 0)
     shown = np.asarray(world.perform_sensing(1), dtype=np.float64)
-    _, observed = history.observed(1, None, 0.0)
+    _, observed = history.fold_observation(1, None, 0.0)
     action, _ = planner.choose_task_action(history.state)
     history.pending = action
     performed = PerformedRecord(0, None)
-    history.performed(performed)
-    came = history.came_late(LateObservation(0, shown))
+    history.fold_move(performed)
+    came = history.fold_late_observation(LateObservation(0, shown))
     assert came is not None
     late = came[1]
     assert isinstance(late, LateRecord)

@@ -48,7 +48,7 @@ def test_its_model_is_what_gymnasium_does(example: Configuration) -> None:
         while in_the_air(environment):
             before = environment._seen[:6].astype(np.float64)
             # The example's controller, disturbed.
-            action = problem.execute(problem.policy(before, 0)) + 0.3 * noise.normal(2)
+            action = problem.limit_action(problem.policy(before, 0)) + 0.3 * noise.normal(2)
             action = np.clip(action, -1.0, 1.0)
             noise = noise.substream(0)
             environment.perform(action)

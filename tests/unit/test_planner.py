@@ -226,7 +226,7 @@ class TestFunctions:
         assert info.estimate.tolist() == likely.tolist()
         assert not np.shares_memory(info.estimate, state.belief.states)
         stage = int(problem.next_stage(likely, state.stage))
-        assert action.tolist() == problem.execute(problem.policy(likely, stage)).tolist()
+        assert action.tolist() == problem.limit_action(problem.policy(likely, stage)).tolist()
         assert planner.advance(weighted, action).stage == stage
         # Of equals the first.
         _, info = planner.choose_task_action(state)

@@ -45,7 +45,7 @@ class Robot(hf.ProblemBase):
     def policy(self, states: Any, stage: Any) -> Any:
         return -states
 
-    def execute(self, actions: Any) -> Any:
+    def limit_action(self, actions: Any) -> Any:
         return np.clip(actions, -0.2, 0.2)
 
     def is_goal(self, states: Any) -> Any:
@@ -100,7 +100,7 @@ class Counts(Rover):
 
 
 class ChangesItsArgument(Rover):
-    def execute(self, actions: Any) -> Any:
+    def limit_action(self, actions: Any) -> Any:
         actions *= 0.5
         return actions
 
@@ -126,7 +126,7 @@ class KeepsItsStream(Rover):
 
 
 class Slow(Rover):
-    def execute(self, actions: Any) -> Any:
+    def limit_action(self, actions: Any) -> Any:
         return np.clip(actions, -0.0025, 0.0025)
 
     def move(self, states: Any, actions: Any, stream: Any) -> Any:
@@ -155,10 +155,10 @@ class GivesUp(Rover):
         raise SystemExit(3)
 
 
-class NoExecute:
+class NoLimits:
     """Derived from nothing."""
 
-    name = "no_execute"
+    name = "no_limits"
     state_size = action_size = num_stages = 1
     sensing_actions = ("x",)
     resolution = 0.1
@@ -216,7 +216,7 @@ class Millimetres(Gaussian):
     def move(self, states: Any, actions: Any, stream: Any) -> Any:
         return states + actions + 0.05 * self.scale * stream.normal(states.shape)
 
-    def execute(self, actions: Any) -> Any:
+    def limit_action(self, actions: Any) -> Any:
         return np.clip(actions, -0.2 * self.scale, 0.2 * self.scale)
 
     def is_goal(self, states: Any) -> Any:
@@ -267,7 +267,7 @@ OneGoalForAll(Rover).is_goal: (np.abs(states) < 0.2).all()
 Integers(Rover).reward: np.full(states.shape[:-1], -1)
 NeverAtTheGoal(Rover).is_goal: (np.abs(states - 9.0) < 0.2).all(axis=-1)
 AlwaysAtTheGoal(Rover).is_goal: (np.abs(states) < 99.0).all(axis=-1)
-NeverMoves(Rover).execute: 0.0 * actions
+NeverMoves(Rover).limit_action: 0.0 * actions
 AlwaysFails(Rover).is_failure: states[..., 0] > -5.0
 GoodReward(Rover).reward: np.ones(np.broadcast_shapes(states.shape[:-1], actions.shape[:-1]))
 NegativeVariance(Gaussian).observation_variance: states[..., :1] - 1.0
@@ -303,7 +303,7 @@ WRONG = {
     "SharedStart": (E, "streams", "initial_states gives all states of one call the same draw"),
     "GridStart": (E, "streams", "initial_states draws coordinate 0 .* of a belief at random, but"),
     "Counts": (E, "purity", "policy returned something else"),
-    "ChangesItsArgument": (E, "contract", "execute raised ValueError: .*read-only"),
+    "ChangesItsArgument": (E, "contract", "limit_action raised ValueError: .*read-only"),
     "ChangesStates": (E, "contract", "policy raised ValueError: .*read-only"),
     "OneStateOnly": (E, "contract", r"policy of rover returned .* of shape \(2, 2\)"),
     "Branches": (E, "contract", "policy raised ValueError: The truth value"),
@@ -322,7 +322,7 @@ WRONG = {
     "ZeroReward": (NOTE, "goals", "the reward is 0 in all"),
     "GoodReward": (W, "goals", "the reward is 1 in all"),
     "GivesUp": (E, "contract", "policy raised SystemExit: 3"),
-    "NoExecute": (E, "contract", "no_execute has no execute and no next_stage"),
+    "NoLimits": (E, "contract", "no_limits has no limit_action and no next_stage"),
     "Dominated": (W, "sensors", r"sensing action 2 \(x, blurred\) is dominated: .* \(x\)"),
     "Silent": (W, "sensors", r"sensing action 2 \(nothing\) tells nothing"),
     "TooSharp": (W, "depletion", "too sharp for 300 particles"),
@@ -383,7 +383,9 @@ WARNED = {"two_ends:TwoCues": {"sensors", "resolution"}, "two_ends:Sorting": {"r
 @pytest.mark.parametrize("name", RIGHT)
 def test_right_problems_have_no_error(name: str, examples: None) -> None:
     module, _, kind = name.partition(":")
-    problem = hf.make(name) if not kind else getattr(importlib.import_module(module), kind)()
+    problem = (
+        hf.make_problem(name) if not kind else getattr(importlib.import_module(module), kind)()
+    )
     found = check_problem(problem, max_steps=1500, budget_s=LONG_S)
     assert [each for each in found if each.severity == E] == []
     warned = {each.check for each in found if each.severity == W} - {"depletion"}

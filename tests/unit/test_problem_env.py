@@ -15,7 +15,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from holdfast.config.loader import load
-from holdfast.config.registry import BUILT_IN, make
+from holdfast.config.registry import BUILT_IN, make_problem
 from holdfast.errors import ConfigurationError, HoldfastError, InvalidValueError
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import PlanningSettings, SelectorSettings
@@ -116,7 +116,7 @@ class TestAnEpisodeIsATrial:
     def test_our_methods_as_agents_decide_as_in_run_trial(self, problem: str, method: Any) -> None:
         environment, inner = made(problem=problem)
         *_, last = episode(environment, lambda: inner.choose(method), seed=3, options={"trial": 2})
-        planner = Planner(make(problem), particles=40, method=method)
+        planner = Planner(make_problem(problem), particles=40, method=method)
         result = run_trial(planner, 3, 2, max_steps=60)
         assert last[4]["digest"] == result.digest
         assert last[4]["steps"] == result.steps

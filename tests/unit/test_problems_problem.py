@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from holdfast.config.registry import make
+from holdfast.config.registry import make_problem
 from holdfast.errors import ProblemError
 from holdfast.problems import checked
+from holdfast.problems import checked
+from holdfast.problems.attributes import know_earlier_names
 from holdfast.problems.problem import ProblemBase, Scene
 
 
@@ -35,7 +37,33 @@ class TestProblemBase:
         assert problem.reward(np.zeros((4, 3)), np.zeros((4, 2))).shape == (4,)
         assert problem.scene() is None
         actions = np.ones(2)
-        np.testing.assert_array_equal(problem.execute(actions), actions)
+        np.testing.assert_array_equal(problem.limit_action(actions), actions)
+
+    def test_the_earlier_name_of_limit_action(self) -> None:
+        """``execute`` is the same function, in a class, a subclass, a mixin and a plain class."""
+
+        class Halves(Minimal):
+            def execute(self, actions: Any) -> Any:
+                return super().execute(0.5 * actions)
+
+        class Quarters(Halves):
+            def limit_action(self, actions: Any) -> Any:
+                return super().limit_action(0.5 * actions)
+
+        class Limits:
+            def execute(self, actions: Any) -> Any:
+                return np.minimum(actions, 0.2)
+
+        class Mixed(Limits, Minimal):
+            """Takes its limits from a class that is no problem."""
+
+        for kind, limited in ((Halves, 0.5), (Quarters, 0.25), (Mixed, 0.2)):
+            problem: Any = kind()
+            assert problem.execute(np.ones(1)) == problem.limit_action(np.ones(1)) == limited
+            assert checked.executed_action(problem, np.ones(1)) == limited
+        plain: Any = Limits()
+        know_earlier_names(type(plain))
+        assert checked.executed_action(plain, np.ones(1)) == 0.2
 
 
 @pytest.mark.parametrize(
@@ -65,7 +93,7 @@ def test_a_scene_without_points_or_obstacles() -> None:
 def test_a_scene_of_coordinates_that_no_state_has(
     wrong: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    problem = make("peg_in_hole_2d")
+    problem = make_problem("peg_in_hole_2d")
     drawn = Scene(**{"axes": (0, 1), "limits": (0, 0, 1, 1)} | wrong)
     monkeypatch.setattr(problem, "scene", lambda: drawn, raising=False)
     with pytest.raises(ProblemError, match=r"scene of peg_in_hole_2d has axes .* from 0 to 2"):

@@ -138,7 +138,7 @@ def test_what_came_late_is_written_before_a_pending_action_is_ordered(on_lost: O
     """And a robot that is lost by it and holds still does not order it."""
     planner = Planner(PROBLEM, PLANNING)
     history = TrialHistory(planner, 11, 0, 1.0)
-    history.observed(0, None, 1.0)
+    history.fold_observation(0, None, 1.0)
     history.pending, _ = planner.choose_task_action(history.state)
     lost = LostSettings(false_alarm_rate=1.0, on_lost=on_lost)
     robot = Robot(planner, SimulatorSettings(), InProcessSource(), lost=lost)
@@ -168,7 +168,7 @@ def test_what_cannot_be_folded_in_is_not_written_down() -> None:
     """So the robot can go on once its environment is mended, which says again what it has shown."""
     planner = Planner(PROBLEM, PLANNING)
     history = TrialHistory(planner, 11, 0)
-    history.observed(0, np.array([0.0]), 1.0)
+    history.fold_observation(0, np.array([0.0]), 1.0)
     history.pending, _ = planner.choose_task_action(history.state)
 
     def begin(last: Acted) -> list[RobotEffect]:
@@ -197,10 +197,10 @@ def test_what_comes_with_a_move_is_written_before_a_lost_robot_holds_still(lost_
     lost = LostSettings(false_alarm_rate=0.1, on_lost="hold")
     history = TrialHistory(planner, 11, 0, lost.false_alarm_rate)
     for step in range(3):
-        history.observed(0, np.array([1e3]) if step == 1 else None, 1.0)
+        history.fold_observation(0, np.array([1e3]) if step == 1 else None, 1.0)
         history.pending, _ = planner.choose_task_action(history.state)
-        history.performed(PerformedRecord(step, None))
-    history.observed(0, np.array([0.0]), 1.0)
+        history.fold_move(PerformedRecord(step, None))
+    history.fold_observation(0, np.array([0.0]), 1.0)
     history.pending, _ = planner.choose_task_action(history.state)
     robot = Robot(planner, SimulatorSettings(), InProcessSource(), lost=lost)
     robot.begin_trial(0, history, EnvironmentReady(None, 3), 0.0, tail_is_certain=True)
@@ -212,7 +212,7 @@ def test_what_comes_with_a_move_is_written_before_a_lost_robot_holds_still(lost_
     assert [type(record) for record in written] == [PerformedRecord, LateRecord, LateRecord]
     assert history.awaited == ()
     assert history.is_lost
-    history.reinitialised()
+    history.fold_reinitialisation()
     assert not history.is_lost
 
 

@@ -110,13 +110,13 @@ def test_what_came_when_a_killed_robot_went_on_comes_there_again(again: tuple[st
     history, records = TrialHistory(planner, 3, 0), list[Record]()
 
     def late(taken: int) -> None:
-        found = history.came_late(LateObservation(taken, np.array([0.1 * taken])))
+        found = history.fold_late_observation(LateObservation(taken, np.array([0.1 * taken])))
         assert found is not None
         records.append(found[1])
 
     for step in range(4):
         sensing_action, _ = planner.choose_sensing_action(history.state)
-        records.append(history.observed(sensing_action, None, 0.0)[1])
+        records.append(history.fold_observation(sensing_action, None, 0.0)[1])
         if step == 2 and "chosen" in again:
             late(0)
         history.pending, _ = planner.choose_task_action(history.state)
@@ -125,7 +125,7 @@ def test_what_came_when_a_killed_robot_went_on_comes_there_again(again: tuple[st
             late(1)
         performed = PerformedRecord(step, None)
         records.append(performed)
-        history.performed(performed)
+        history.fold_move(performed)
         if step == 2:
             late(2)
     result = history.result(None)

@@ -84,13 +84,13 @@ def test_what_came_late_may_stand_between_an_action_and_its_performance() -> Non
     """A resumed robot is told of it before it performs the action that its journal ends with."""
     planner = Planner(PROBLEM, PLANNING)
     history = TrialHistory(planner, 11, 4)
-    sensed = history.observed(0, None, 1.0)[1]
+    sensed = history.fold_observation(0, None, 1.0)[1]
     action, _ = planner.choose_task_action(history.state)
     history.pending = action
-    found = history.came_late(LateObservation(0, np.array([3.5])))
+    found = history.fold_late_observation(LateObservation(0, np.array([3.5])))
     assert found is not None
     performed = PerformedRecord(0, -1.0)
-    history.performed(performed)
+    history.fold_move(performed)
     records: list[Record] = [sensed, ActingRecord(0, encode_floats(action)), found[1], performed]
     again = replay(planner, 11, 4, records)
     assert planner.digest(again.state) == planner.digest(history.state)
@@ -104,24 +104,24 @@ def test_a_lost_robot_stays_lost_when_an_explained_observation_comes_late() -> N
     """It held still, or was killed, before the new belief was written down."""
     history = TrialHistory(Planner(PROBLEM, PLANNING_EACH_STEP), 5, 0, 1.0)
     explained = history.planner.problem.observation_mean(history.state.belief.states[:1], 0)[0]
-    history.observed(0, None, 0.0)
+    history.fold_observation(0, None, 0.0)
     history.pending = np.zeros(3)
-    history.performed(PerformedRecord(0, None))
-    history.observed(0, np.full(1, 1e6), 0.0)
+    history.fold_move(PerformedRecord(0, None))
+    history.fold_observation(0, np.full(1, 1e6), 0.0)
     assert history.is_lost
-    found = history.came_late(LateObservation(0, explained))
+    found = history.fold_late_observation(LateObservation(0, explained))
     assert found is not None
     assert found[0].within_gate
     assert history.is_lost
-    history.reinitialised()
+    history.fold_reinitialisation()
     assert not history.is_lost
 
 
 def test_an_unexplained_observation_that_comes_late_can_find_it_lost() -> None:
     history = TrialHistory(Planner(PROBLEM, PLANNING_EACH_STEP), 5, 0, 1.0)
-    history.observed(0, None, 0.0)
+    history.fold_observation(0, None, 0.0)
     assert not history.is_lost
-    assert history.came_late(LateObservation(0, np.full(1, 1e6))) is not None
+    assert history.fold_late_observation(LateObservation(0, np.full(1, 1e6))) is not None
     assert history.is_lost
 
 
@@ -131,11 +131,11 @@ def test_a_suspect_sensor_is_no_lost_robot() -> None:
     kinds = []
     for action in (0, 1, 0):
         inside = history.planner.problem.observation_mean(history.state.belief.states, action)
-        history.observed(action, np.full(1, 1e6) if action == 0 else inside[0], 0.0)
+        history.fold_observation(action, np.full(1, 1e6) if action == 0 else inside[0], 0.0)
         kinds.append(None if history.alarm is None else history.alarm.kind)
         assert not history.is_lost
         history.pending = np.zeros(3)
-        history.performed(PerformedRecord(history.state.step, None))
+        history.fold_move(PerformedRecord(history.state.step, None))
     assert kinds == [None, None, "sensor_suspect"]
 
 
@@ -148,7 +148,7 @@ def test_what_has_begun() -> None:
     planner = Planner(PROBLEM, PLANNING)
     assert not begun(TrialHistory(planner, 1, 0))
     history = TrialHistory(planner, 1, 0)
-    history.observed(0, None, 0.0)
+    history.fold_observation(0, None, 0.0)
     assert begun(history)
     history = TrialHistory(planner, 1, 0)
     history.pending = np.zeros(3)

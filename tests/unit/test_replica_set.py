@@ -207,9 +207,9 @@ def test_a_wrong_service_stays_so_whatever_it_does() -> None:
         assert replica.refusal == replica.distrusted
         assert replica.refusal_code == "wrong_answer"
         assert not replica.usable(9.0)
-    assert services.hopeless()
+    assert services.all_refuse()
     assert not services.any_reliable()
-    assert services.why_nobody().endswith("other: wrong_answer: lied")
+    assert services.explain_no_service().endswith("other: wrong_answer: lied")
 
 
 def told(service: Replica) -> str | None:
@@ -391,11 +391,11 @@ class TestAllOfThem:
             assert services.local is not None
             for _ in range(5):
                 services.local.note_refusal(code, "no", 0.0, sensing=False)
-            assert services.hopeless() == at_once
+            assert services.all_refuse() == at_once
             for replica in services.cloud:
-                assert services.hopeless() == at_once
+                assert services.all_refuse() == at_once
                 replica.distrust("lied")
-            assert services.hopeless()
+            assert services.all_refuse()
 
     def test_a_local_service_is_usable_when_it_is_there(self) -> None:
         assert not ReplicaSet(["cloud"], None, 0.25).local_usable(0.0)
@@ -423,7 +423,7 @@ class TestAllOfThem:
             "failing failed: no such state",
             "wrong lied",
         ]
-        assert services.why_nobody().split("; ") == [
+        assert services.explain_no_service().split("; ") == [
             "absent: has not appeared",
             "gone: is not there",
             "busy: is busy",

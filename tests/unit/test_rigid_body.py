@@ -43,7 +43,7 @@ def test_translations_and_rotations_have_limits_of_their_own(
     problem = peg.from_settings({}, {"translation_step_size": 0.3, "rotation_step_size": 0.02})
     angles = problem.action_size - positions
     limits = np.array([0.3] * positions + [0.02] * angles)
-    np.testing.assert_array_equal(problem.execute(np.full(problem.action_size, 5.0)), limits)
-    np.testing.assert_array_equal(problem.execute(np.full(problem.action_size, -5.0)), -limits)
+    np.testing.assert_array_equal(problem.limit_action(np.full(problem.action_size, 5.0)), limits)
+    np.testing.assert_array_equal(problem.limit_action(np.full(problem.action_size, -5.0)), -limits)
     # What is within its own limit is left alone, also where the other one is smaller.
-    np.testing.assert_array_equal(problem.execute(0.9 * limits), 0.9 * limits)
+    np.testing.assert_array_equal(problem.limit_action(0.9 * limits), 0.9 * limits)

@@ -39,12 +39,12 @@ from holdfast.problems.peg_in_hole_2d import PegInHole2D
 class InThePolicy(PegInHole2D):
     actions = 0
 
-    def execute(self, actions):
+    def limit_action(self, actions):
         if actions.ndim == 1:
             InThePolicy.actions += 1
             if InThePolicy.actions > 45:  # in the second trial
                 sys.exit(0)
-        return super().execute(actions)
+        return super().limit_action(actions)
 
 
 class InTheWorld(PegInHole2D):
@@ -150,7 +150,7 @@ class TestWhateverItRaises:
     @pytest.mark.parametrize(
         ("name", "what", "where"),
         [
-            ("InThePolicy", "raised SystemExit: 0", "in execute"),
+            ("InThePolicy", "raised SystemExit: 0", "in limit_action"),
             ("InTheWorld", "raised SystemExit: 0", "in move"),
             ("InTheConstructor", "raised SystemExit: 0", "in __init__"),
             ("WithoutException", "raised GeneratorExit: enough", "in policy"),

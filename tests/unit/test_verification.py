@@ -214,7 +214,7 @@ def test_a_wrong_answer_that_was_obeyed_is_found_and_the_robot_goes_on_from_wher
     found_at = next(at for at, e in world.trace if is_report(e, "wrong_answer"))
     first = next(index for index, (at, e) in enumerate(world.trace) if at >= found_at)
     after = [e for _, e in world.trace[first:] if isinstance(e, Act)]
-    limits = PegInHole2D().execute
+    limits = PegInHole2D().limit_action
     assert after
     assert all(np.array_equal(e.action, limits(e.action)) for e in after)
     # Every task action since is the robot's own, in the state in which it is.
@@ -414,7 +414,7 @@ def test_a_rounding_error_is_no_excess() -> None:
     class Clipped(PegInHole2D):
         limit = 0.0
 
-        def execute(self, actions: FloatArray) -> FloatArray:
+        def limit_action(self, actions: FloatArray) -> FloatArray:
             return np.full_like(actions, self.limit)
 
     problem = Clipped()
@@ -433,8 +433,8 @@ def test_a_rounding_error_is_no_excess() -> None:
 class Geared(PegInHole2D):
     """What is executed is half of what is commanded."""
 
-    def execute(self, actions: FloatArray) -> FloatArray:
-        return np.asarray(0.5 * super().execute(actions))
+    def limit_action(self, actions: FloatArray) -> FloatArray:
+        return np.asarray(0.5 * super().limit_action(actions))
 
 
 def tasks_of(planner: Planner) -> Question:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["main"]
 
 _COLORS = {"ok": 32, "warns": 33, "fails": 31}
-"""Of a terminal: green, yellow, red; else its own."""
+"""Colours of a terminal: green, yellow, red; else its own."""
 
 _WIDEST = 110
 _ADVICE = f"{' ' * 19}-> "

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 __all__ = ["RobotFindings", "is_robot_run", "main"]
 
 _RUNS = Path("runs")
-_OF_SERVICES = ("recovery.launch", "offload.tls")
+_NEED_A_SERVICE = ("recovery.launch", "offload.tls")
 """Keys without effect where no service is named."""
 
 _ENVIRONMENT = "environment.object"
@@ -377,7 +377,7 @@ def _require_effect(options: RunOptions, configuration: Configuration, *, as_rob
             configuration, None if on_command_line else f"{shown_path(options.configuration)}: "
         )
     for given in options.overrides():
-        if given.key in _OF_SERVICES and given.value and not configuration.offload.services:
+        if given.key in _NEED_A_SERVICE and given.value and not configuration.offload.services:
             raise InvalidValueError(
                 f"{given.words} needs --service (or offload.services in "
                 f"{shown_path(options.configuration)}): without a service it would do nothing"

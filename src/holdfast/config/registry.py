@@ -19,7 +19,7 @@ from holdfast.numerics.arrays import plain
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.problems.problem import Problem
 
-__all__ = ["BUILT_IN", "BuiltIn", "make", "names", "problem_class", "problem_module"]
+__all__ = ["BUILT_IN", "BuiltIn", "make_problem", "names", "problem_class", "problem_module"]
 
 GROUP = "holdfast.problems"
 
@@ -60,7 +60,7 @@ def names() -> list[str]:
 
 
 @in_own_mode
-def make(name: str, **settings: Any) -> Problem:
+def make_problem(name: str, **settings: Any) -> Problem:
     """Build a problem by its registered name, or ``module:Class``.
 
     The settings are keys of the sections ``model`` and ``state_space_planner`` of a configuration

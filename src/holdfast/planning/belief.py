@@ -52,7 +52,7 @@ outside the validation gate; under a correct model in one dimension its probabil
 
 
 _DISCOUNT = 0.98
-"""Of Liu and West's kernel; they propose 0.95 to 0.99."""
+"""Discount factor of Liu and West's kernel; they propose 0.95 to 0.99."""
 
 _SHRINKAGE = (3.0 * _DISCOUNT - 1.0) / (2.0 * _DISCOUNT)
 _BANDWIDTH = float(np.sqrt(1.0 - _SHRINKAGE * _SHRINKAGE))

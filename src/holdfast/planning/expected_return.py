@@ -177,7 +177,7 @@ def _sampled_returns(
 def has_own_rollouts(problem: Problem) -> bool:
     """Tell whether the rollouts are those of the kernel, as for the built-in problems."""
     ends = ("reward", "is_goal", "is_failure", "known_state_return")
-    alike = ("policy", "execute", "move", "next_stage", *ends)
+    alike = ("policy", "limit_action", "move", "next_stage", *ends)
     return has_own(problem, "rollout_returns", alike) and not circular_states(problem)
 
 

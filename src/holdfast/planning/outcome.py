@@ -60,10 +60,10 @@ class Ending(NamedTuple):
     reason: str = ""
 
 
-Done: TypeAlias = bool | Literal["failed"] | Ending
-"""What ``is_done`` of an environment returns: False while the task goes on."""
+Done: TypeAlias = bool | Literal["failed"] | Ending | None
+"""What ``is_done`` of an environment returns: False or None while the task goes on."""
 
-DONE_VALUES = 'True, False, "failed" or an Ending'
+DONE_VALUES = 'True, False, None, "failed" or an Ending'
 """The same in words, for messages."""
 
 
@@ -75,7 +75,7 @@ def ending_of(done: object) -> Ending | None:
     InvalidValueError
         If it must not return that.
     """
-    if isinstance(done, bool | np.bool_):
+    if done is None or isinstance(done, bool | np.bool_):
         return Ending("succeeded") if done else None
     if isinstance(done, str) and done == "failed":
         return Ending("failed")

@@ -60,7 +60,7 @@ from holdfast.problems.attributes import (
     check_problem,
     check_sizes,
     circular_states,
-    moves_show,
+    moves_give_observations,
     sensing_action_of,
     static_parameters,
 )
@@ -222,9 +222,9 @@ class Planner:
         return self.no_sensing + self.settings.selector.sensing_is_optional
 
     @property
-    def moves_show(self) -> bool:
+    def moves_give_observations(self) -> bool:
         """Whether a move may show something, so that the next decision has to wait for it."""
-        return moves_show(self.problem)
+        return moves_give_observations(self.problem)
 
     def needs_sensing(self, state: PlanningState) -> bool:
         """Tell whether the next decision is a sensing action (else it is a task action)."""
@@ -411,7 +411,7 @@ class Planner:
         """
         actions: list[FloatArray] = []
         max_actions = whole("max_actions", max_actions, 0)
-        if self.moves_show:
+        if self.moves_give_observations:
             max_actions = min(max_actions, 1)
         while len(actions) < max_actions and not self.needs_sensing(state):
             interruption.check()
@@ -424,7 +424,7 @@ class Planner:
         """Make all decisions that no further observation can change."""
         actions, ahead = self.plan_until_sensing(state, max_actions)
         sensing_action = None
-        if self.needs_sensing(ahead) and not (actions and self.moves_show):
+        if self.needs_sensing(ahead) and not (actions and self.moves_give_observations):
             sensing_action, _ = self.choose_sensing_action(ahead)
         return Decision(tuple(actions), sensing_action, ahead)
 

@@ -25,7 +25,7 @@ from holdfast.problems.problem import Problem
 __all__ = ["PathPoints", "path_points"]
 
 
-_STEP = ("policy", "execute", "move", "expected_move", "next_stage")
+_STEP = ("policy", "limit_action", "move", "expected_move", "next_stage")
 """Functions that a step of the path calls."""
 
 
@@ -48,8 +48,8 @@ def path_points(
 ) -> PathPoints:
     """Follow every particle along its own noise-free path under the policy.
 
-    A step is the policy's action for the particle's state and stage, limited by ``execute``, the
-    motion without noise, and the next stage. All particles begin in one stage. Of the settings,
+    A step is the policy's action for the particle's state and stage, limited by ``limit_action``,
+    the motion without noise, and the next stage. All particles begin in one stage. Of the settings,
     ``selector.path_offsets``, ``path_unit``, ``path_discount`` and ``actions`` count.
 
     Raises
@@ -72,8 +72,8 @@ def path_points(
         row, particle = divmod(bad, states.shape[0])
         if not np.isfinite(states_at[row, particle]).all():
             raise ProblemError(
-                f"following the policy of {problem.name} without noise (policy, execute, move) led "
-                f"from the state {in_brief(states[particle])} in {offsets[row]} steps to "
+                f"following the policy of {problem.name} without noise (policy, limit_action, "
+                f"move) led from the state {in_brief(states[particle])} in {offsets[row]} steps to "
                 f"{in_brief(states_at[row, particle])}: every coordinate must be finite"
             )
         raise ProblemError(

@@ -30,13 +30,13 @@ from holdfast.numerics.circular import differences, mean_angles
 __all__ = ["OUTSIDE_PROBABILITY", "gate", "is_typical", "is_within"]
 
 OUTSIDE_PROBABILITY = 0.01
-"""Of an observation, if the belief and the model are right."""
+"""Probability that an observation is outside, if the belief and the model are right."""
 
 NUM_RANKED = 19
 """Drawn observations of a rank test: 1 / (19 + 1) is what :mod:`holdfast.planning.lost` allows."""
 
 _QUANTILE = 2.3263478740408408
-"""Of the standard normal distribution, at 1 - OUTSIDE_PROBABILITY."""
+"""Quantile of the standard normal distribution at 1 - OUTSIDE_PROBABILITY."""
 
 
 @functools.cache

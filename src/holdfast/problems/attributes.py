@@ -34,7 +34,8 @@ __all__ = [
     "has_circular_observations",
     "has_general_observations",
     "has_own",
-    "moves_show",
+    "know_earlier_names",
+    "moves_give_observations",
     "name_of",
     "resolution_of",
     "sensing_action_of",
@@ -58,7 +59,7 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "observation_variance": ("states", "sensing_action"),
     "policy": ("states", "stage"),
     "next_stage": ("estimates", "stage"),
-    "execute": ("actions",),
+    "limit_action": ("actions",),
     "reward": ("states", "actions"),
     "is_goal": ("states",),
     "is_failure": ("states",),
@@ -104,6 +105,7 @@ def check_problem(problem: Any) -> None:
         without them.
     """
     check_sizes(problem)
+    know_earlier_names(type(problem))
     name = problem.name
     observations = () if has_general_observations(problem) else GAUSSIAN_OBSERVATIONS
     missing = [each for each in (*NEEDED, *observations) if not hasattr(problem, each)]
@@ -471,9 +473,17 @@ def choice_labels(problem: Any) -> list[str]:
     return [*sensing_labels(problem), "no sensing"]
 
 
-def moves_show(problem: object) -> bool:
+def moves_give_observations(problem: object) -> bool:
     """Tell whether a problem can fold in what a move shows: a measured motion, an observation."""
     return hasattr(problem, "move_by_measurement") or hasattr(problem, "move_log_likelihood")
+
+
+def know_earlier_names(kind: type) -> None:
+    """Give the classes of a problem ``limit_action`` and ``execute``, its name until 0.1."""
+    for base in kind.__mro__:
+        for name, other in (("limit_action", "execute"), ("execute", "limit_action")):
+            if name in vars(base) and other not in vars(base):
+                setattr(base, other, vars(base)[name])
 
 
 def has_own(problem: Any, function: str, stands_for: tuple[str, ...]) -> bool:

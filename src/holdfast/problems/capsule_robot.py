@@ -174,7 +174,7 @@ class CapsuleRobot(RigidBodyProblem):
         following = np.minimum(stage + reached, self.num_stages - 1)
         return int(following) if np.ndim(following) == 0 else following
 
-    def execute(self, actions: FloatArray) -> FloatArray:
+    def limit_action(self, actions: FloatArray) -> FloatArray:
         """Limit the norm to the step size and keep the direction."""
         x, y = actions[..., 0:1], actions[..., 1:2]
         norm = np.sqrt(x * x + y * y)

@@ -285,7 +285,8 @@ def policy(problem: Any, states: FloatArray, stage: int | IntArray) -> FloatArra
 
 def executed_action(problem: Any, commanded: FloatArray) -> FloatArray:
     """Return the executed actions, of the shape of ``commanded``."""
-    return _array(problem, "execute", _ask(problem, "execute", commanded), commanded.shape)
+    limited = _ask(problem, "limit_action", commanded)
+    return _array(problem, "limit_action", limited, commanded.shape)
 
 
 def next_stage(problem: Any, estimate: FloatArray, stage: int) -> int:

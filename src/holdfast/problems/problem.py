@@ -40,6 +40,7 @@ import numpy.typing as npt
 from holdfast.errors import ProblemError
 from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray, real_numbers
 from holdfast.numerics.randomness import Stream
+from holdfast.problems.attributes import know_earlier_names
 
 __all__ = [
     "BatchedMotionProblem",
@@ -223,7 +224,7 @@ class Problem(Protocol):
         """Return the stage that follows from the state estimate, of the shape of ``stage``."""
         ...
 
-    def execute(self, actions: FloatArray) -> FloatArray:
+    def limit_action(self, actions: FloatArray) -> FloatArray:
         """Limit commanded actions to what one step can do."""
         ...
 
@@ -292,7 +293,7 @@ class ExpectedMotionProblem(Protocol):
     """Two more methods, for the selector ``path_entropy``, which follows particles without noise.
 
     Either, both or none. One that a class inherits is not used if the class itself replaces what it
-    speaks for: ``move``, and for the path ``policy``, ``execute`` and ``next_stage`` as well.
+    speaks for: ``move``, and for the path ``policy``, ``limit_action`` and ``next_stage`` as well.
     """
 
     def expected_move(self, states: FloatArray, actions: FloatArray) -> FloatArray:
@@ -312,7 +313,7 @@ class ExpectedMotionProblem(Protocol):
 
         Return the states after each number of steps of ``offsets`` (ascending), shape
         ``(len(offsets), n, state_size)``, and the stages there, shape ``(len(offsets), n)``. A step
-        is the policy's action for the state and its stage, limited by ``execute``, the motion
+        is the policy's action for the state and its stage, limited by ``limit_action``, the motion
         without noise, and ``next_stage`` of where that leads. ``threads`` may be used, or all cores
         if it is 0. What the path is without this method
         it must be with it: it is there to be faster.
@@ -451,6 +452,11 @@ class ProblemBase:
     up: str = "z"
     """Which axis of that pose points up: z, or y for a problem in a vertical plane."""
 
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        """Let a class define ``limit_action`` under its earlier name, ``execute``."""
+        super().__init_subclass__(**keywords)
+        know_earlier_names(cls)
+
     @classmethod
     def from_settings(
         cls, model: Mapping[str, Any], state_space_planner: Mapping[str, Any]
@@ -482,9 +488,11 @@ class ProblemBase:
         del estimates
         return stage
 
-    def execute(self, actions: FloatArray) -> FloatArray:
+    def limit_action(self, actions: FloatArray) -> FloatArray:
         """Do as commanded: actions have no limits."""
         return actions
+
+    execute = limit_action
 
     def reward(self, states: FloatArray, actions: FloatArray) -> FloatArray:
         """Return zero: the task is judged by success alone.

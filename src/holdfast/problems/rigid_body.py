@@ -273,7 +273,7 @@ class PegProblem(RigidBodyProblem):
         self._check_sensing_action(sensing_action)
         return self._observation_variance
 
-    def execute(self, actions: FloatArray) -> FloatArray:
+    def limit_action(self, actions: FloatArray) -> FloatArray:
         """Limit each component on its own to the step sizes."""
         return np.minimum(np.maximum(actions, self._lower_limits), self._upper_limits)
 

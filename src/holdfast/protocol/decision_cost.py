@@ -72,7 +72,7 @@ class ProblemCost(NamedTuple):
     initial: CallCost
     move: CallCost
     stage: CallCost
-    act: CallCost  # time of ``policy`` and ``execute`` together
+    act: CallCost  # time of ``policy`` and ``limit_action`` together
     # Time of the mean and variance of one sensing action's observation; with a general likelihood,
     # of drawing an observation and evaluating it.
     sense: CallCost
@@ -93,7 +93,7 @@ TYPICAL_PROBLEM = ProblemCost(
     known_return=None,
     observation_size=2,
 )
-"""Of a problem that was not measured."""
+"""Costs of a problem that was not measured."""
 
 
 class Cost(NamedTuple):
@@ -311,7 +311,7 @@ def cost_of_sensing(
 def _path_s(sizes: _Sizes, steps: float) -> float:
     """Return the seconds in which all particles follow their paths."""
     own = sizes.own
-    if has_own(sizes.problem, "expected_path", ("policy", "execute", "move", "next_stage")):
+    if has_own(sizes.problem, "expected_path", ("policy", "limit_action", "move", "next_stage")):
         return own.path_step.of(steps * sizes.particles)
     one = own.act.of(sizes.particles) + sizes.move_s(sizes.particles)
     return steps * (one + own.stage.of(sizes.particles) + 10e3 * sizes.unit_s)

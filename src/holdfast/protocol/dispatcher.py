@@ -402,12 +402,14 @@ class Dispatcher(DecisionSource):
                 self._calls.send(replica, question, now)
                 if replica.detector.trusted:
                     return
-        if services.hopeless():
-            self.stop(ServiceRefusedError(f"no service will decide: {services.why_nobody()}"))
+        if services.all_refuse():
+            self.stop(
+                ServiceRefusedError(f"no service will decide: {services.explain_no_service()}")
+            )
             return
         if question.needed_at is not None and self.holding_since is None:
             self.holding_since = now
-            reason = services.why_nobody()
+            reason = services.explain_no_service()
             self.effects.report("holding", step=question.state.step, reason=reason)
 
     def _try_others(self, question: Question, now: float) -> None:

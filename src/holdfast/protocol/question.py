@@ -105,7 +105,7 @@ class Question:
         if planner.needs_sensing(state):
             self.task_count = 0  # task actions in the answer
             self.sensing_step = state.step
-        elif planner.moves_show:
+        elif planner.moves_give_observations:
             self.task_count = 1
             self.sensing_step = None
         else:

@@ -143,7 +143,7 @@ class TrialHistory(Trial):
         """Whether anything has happened."""
         return self.num_inputs > 0 or self.state.step > 0 or self.pending is not None
 
-    def observed(
+    def fold_observation(
         self, sensing_action: int, observation: FloatArray | None, sensing_ms: float
     ) -> tuple[ObservationInfo, ObservedRecord]:
         """Fold in a sensing action; return what was found, and its record."""
@@ -154,7 +154,7 @@ class TrialHistory(Trial):
         self._add(Observed(step, sensing_action, shown))
         return info, ObservedRecord(step, sensing_action, shown, reached, sensing_ms)
 
-    def performed(self, record: PerformedRecord) -> ObservationInfo | None:
+    def fold_move(self, record: PerformedRecord) -> ObservationInfo | None:
         """Fold in that the pending task action was performed; return what was found, if any was."""
         assert self.pending is not None
         action, motion, observation = self.pending, record.motion, record.observation
@@ -165,7 +165,9 @@ class TrialHistory(Trial):
         self.pending = None
         return info
 
-    def came_late(self, late: LateObservation) -> tuple[ObservationInfo, LateRecord] | None:
+    def fold_late_observation(
+        self, late: LateObservation
+    ) -> tuple[ObservationInfo, LateRecord] | None:
         """Fold in a late observation; return what was found, and its record.
 
         None if none of its step is awaited.
@@ -179,7 +181,7 @@ class TrialHistory(Trial):
         shown = encode_floats(late.observation)
         return info, LateRecord(self.state.step, late.step, shown, reached)
 
-    def reinitialised(self) -> ReinitialisedRecord:
+    def fold_reinitialisation(self) -> ReinitialisedRecord:
         """Begin the belief anew; return the record."""
         reached = self.reinitialise()
         self.is_lost = False
@@ -248,15 +250,15 @@ def _replay_record(planner: Planner, history: TrialHistory, record: Record) -> N
         if not planner.needs_sensing(state):
             raise RecordError("is an observation where a task action is due")
         observation = numbers_of(record.observation)
-        _, again = history.observed(record.sensing_action, observation, record.sensing_ms)
+        _, again = history.fold_observation(record.sensing_action, observation, record.sensing_ms)
         _require_same_state(record.digest, again.digest)
     elif isinstance(record, LateRecord):
-        found = history.came_late(record.late())
+        found = history.fold_late_observation(record.late())
         if found is None:
             raise RecordError(f"is an observation of step {record.taken}, where none is awaited")
         _require_same_state(record.digest, found[1].digest)
     elif isinstance(record, ReinitialisedRecord):
-        _require_same_state(record.digest, history.reinitialised().digest)
+        _require_same_state(record.digest, history.fold_reinitialisation().digest)
     elif isinstance(record, ActingRecord):
         if planner.needs_sensing(state):
             raise RecordError("is a task action where an observation is due")
@@ -265,7 +267,7 @@ def _replay_record(planner: Planner, history: TrialHistory, record: Record) -> N
         raise RecordError("is of a performance of which no action was written down")
     else:
         history.actions.append(history.pending)
-        history.performed(record)
+        history.fold_move(record)
 
 
 def _require_same_state(recorded: bytes, reached: bytes) -> None:

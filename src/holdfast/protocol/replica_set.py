@@ -371,7 +371,7 @@ class ReplicaSet:
         ]
         return min(times, default=None)
 
-    def hopeless(self) -> bool:
+    def all_refuse(self) -> bool:
         """Return whether no service will ever answer."""
         if self.local is not None and self.local.refusal_code in _REFUSED_BY_ALL:
             return True
@@ -384,7 +384,7 @@ class ReplicaSet:
 
     # -- in words --------------------------------------------------------------------------------
 
-    def why_nobody(self) -> str:
+    def explain_no_service(self) -> str:
         """Explain why no service decides."""
         reasons = []
         for replica in self:

@@ -133,7 +133,7 @@ class Robot:
 
     @property
     def unexplained_observations(self) -> int:
-        """Of the current trial; 0 between trials."""
+        """Number of unexplained observations of the current trial; 0 between trials."""
         return 0 if self._history is None else self._history.num_unexplained
 
     @property
@@ -174,7 +174,7 @@ class Robot:
                 self._reinitialise()
             again = self._settle_pending_action(begun, resumed, tail_is_certain)
             for late in begun.late:
-                self._came_late(late)
+                self._take_late_observation(late)
             self._hold_if_lost()
         except HoldfastError as error:
             self._stop(error)
@@ -288,7 +288,9 @@ class Robot:
         history = self._current_history
         step, sensing_action = history.state.step, self._sensing_action
         try:
-            info, record = history.observed(sensing_action, event.observation, self._computed_ms)
+            info, record = history.fold_observation(
+                sensing_action, event.observation, self._computed_ms
+            )
         except HoldfastError as error:
             self._stop(error)
             return
@@ -319,7 +321,7 @@ class Robot:
     def _reinitialise(self) -> None:
         """Begin the belief anew, before anything else is decided."""
         history = self._current_history
-        self._write(history.reinitialised())
+        self._write(history.fold_reinitialisation())
         self.reports.reinitialised(history)
 
     def _performed(self, event: Acted) -> None:
@@ -327,7 +329,7 @@ class Robot:
         try:
             self._fold_move(event)
             for late in event.late:
-                self._came_late(late)
+                self._take_late_observation(late)
             for step in event.no_reading:
                 self.reports.no_reading(self._current_history, taken=step)
             self._hold_if_lost()
@@ -343,15 +345,15 @@ class Robot:
         record = PerformedRecord(event.step, event.reward, motion, shown)
         self.num_performed += 1
         # Before it is written: what cannot be folded in now can never be.
-        info = self._current_history.performed(record)
+        info = self._current_history.fold_move(record)
         self._unwritten.append(record)
         if info is not None:
             self._judge(event.step, info, of="move")
 
-    def _came_late(self, late: LateObservation) -> None:
+    def _take_late_observation(self, late: LateObservation) -> None:
         """Fold in an observation of an earlier step."""
         history = self._current_history
-        found = history.came_late(late)
+        found = history.fold_late_observation(late)
         if found is None:
             self.reports.late_unused(history, late.step)
             return
@@ -420,7 +422,7 @@ class Robot:
             assert question is not None
         answer = question.sensing
         if answer is None:
-            self._need(now)
+            self._await_answer(now)
             return
         if (
             question.state is not state
@@ -430,7 +432,7 @@ class Robot:
             self._effects.report("prefetch_unused", trial=self._trial, step=state.step)
             self._source.recompute()
             self._ask(self._planner.digest(state), now)
-            self._need(now)
+            self._await_answer(now)
             return
         provenance = question.sensing_provenance
         assert provenance is not None
@@ -454,7 +456,7 @@ class Robot:
             assert question is not None
             offset = 0
         if question.task_actions is None:
-            self._need(now)
+            self._await_answer(now)
             return
         provenance = question.task_provenance
         if offset == 0 and provenance is not None and provenance is not self._timed_provenance:
@@ -486,7 +488,7 @@ class Robot:
         )
         self._source.ask(question, now)
 
-    def _need(self, now: float) -> None:
+    def _await_answer(self, now: float) -> None:
         """Wait for the rest of the answer."""
         question = self._source.question
         if question is not None and question.needed_at is None:

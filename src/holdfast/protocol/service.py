@@ -68,7 +68,7 @@ from holdfast.protocol.service_sessions import (
 )
 
 _INERTIA_OF_ONE = 4.0
-"""Of the mean times of one session, whose decisions are alike."""
+"""Inertia of the mean times of one session, whose decisions are alike."""
 
 _NO_ROOM_RETRY_MS = 100.0
 """Shortest retry time for a robot that finds no free session."""

@@ -290,7 +290,7 @@ class Job:
             num_actions=len(actions),
             actions=encode_floats(actions),
         )
-        if planner.moves_show:
+        if planner.moves_give_observations:
             # The state ahead depends on what the move will show.
             return reached
         return reached._replace(ahead=ahead, ahead_digest=planner.digest(ahead)[:DIGEST_SIZE])

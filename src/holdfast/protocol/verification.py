@@ -2,8 +2,8 @@
 
 The robot holds the true state and has a planner. Two rules follow:
 
-- Task actions that the problem's ``execute`` would change are outside its limits. The own planner
-  computes the same actions before the robot acts, and the robot performs its own.
+- Task actions that the problem's ``limit_action`` would change are outside its limits. The own
+  planner computes the same actions before the robot acts, and the robot performs its own.
 - A random share of the questions, selected with the robot's secret so that no service can predict
   it, goes to the own planner as well, which computes while the robot moves. Recomputed are also a
   question to which two answers differ, and one whose sensing action was chosen for another state
@@ -142,14 +142,14 @@ class Verification:
             self._effects.report(
                 "limits_unknown",
                 step=question.state.step,
-                reason=f"{outside}; the robot's own planner comes to the same action, so execute "
-                "does not say which actions are possible; the robot computes each task action "
-                "itself, too, before it performs it",
+                reason=f"{outside}; the robot's own planner comes to the same action, so "
+                "limit_action does not say which actions are possible; the robot computes each "
+                "task action itself, too, before it performs it",
             )
         return actions, provenance
 
     def outside_limits(self, actions: FloatArray) -> str | None:
-        """Describe what of the task actions, one a row, the problem's ``execute`` would change."""
+        """Describe which task actions, one a row, the problem's ``limit_action`` would change."""
         limited = checked.executed_action(self._planner.problem, actions)
         # An action on a limit may be moved by a rounding error.
         slack = 1e-9 * np.maximum(1.0, np.abs(limited))
@@ -159,7 +159,7 @@ class Verification:
         first = int(np.argmax(outside))
         return (
             f"task action {_written(actions[first])} is outside the limits of the problem's "
-            f"execute, which makes {_written(limited[first])} of it"
+            f"limit_action, which makes {_written(limited[first])} of it"
         )
 
     # -- the own planner's answers ---------------------------------------------------------------

@@ -24,7 +24,7 @@ from holdfast.recording.recorder import TrialRecord
 __all__ = ["belief_remarks"]
 
 _SHARE = 0.2
-"""Of the beliefs after an observation, from which on it is worth a remark."""
+"""Share of the beliefs after an observation from which on a remark is made."""
 
 _FEW = 0.03
 """Share of its first values that a depleted coordinate still has, at most."""

@@ -69,7 +69,7 @@ _LATE_NS = 3_000_000_000
 _NICENESS = 10
 
 HEADER_BYTES = 4
-"""Of a message's length, little-endian."""
+"""Size of a message's length, little-endian."""
 
 
 class RecordsMessage(msgspec.Struct, array_like=True, frozen=True, tag=1):

@@ -49,7 +49,7 @@ TRUTH_FRAME = "truth"
 
 _NS_PER_S = 1_000_000_000
 _BAG_VERSION: Final = 8
-"""Of rosbag2's metadata: the last one whose qualities of service Humble's rosbag2 reads as well."""
+"""Version of rosbag2's metadata: the last one whose qualities of service Humble reads as well."""
 
 _LEVELS = {"DEBUG": 10, "INFO": 20, "WARN": 30, "ERROR": 40}
 

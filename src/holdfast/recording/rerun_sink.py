@@ -51,7 +51,7 @@ MAX_PARTICLES = 1000
 """Particles that are drawn of a belief: evenly spread ones, if it has more."""
 
 _BINS = 60
-"""Of a belief that is drawn as a histogram."""
+"""Bins of a belief that is drawn as a histogram."""
 
 _MAX_PATH = 2000
 """Places of a path that are kept; of a longer one every second, every fourth, ..."""
@@ -65,7 +65,7 @@ _TRUE = (240, 240, 240)
 _SENSED = (245, 178, 52)
 _ACTED = (255, 92, 92)
 _FAINT, _STRONG = np.array([30.0, 60.0, 110.0]), np.array([130.0, 190.0, 255.0])
-"""Of particles: without weight, and with the largest of the belief."""
+"""Colours of particles: without weight, and with the largest of the belief."""
 
 _SERIES = (
     (92, 164, 255), (245, 178, 52), (235, 98, 86), (84, 181, 166), (190, 130, 220), (176, 186, 104),
@@ -78,7 +78,7 @@ _STATUSES = {
 _OUTCOMES = {"succeeded": _GOAL, "failed": (235, 98, 86), "truncated": _SENSED}
 
 _MAX_DRAWS = 10_000
-"""Of a move without noise, as in :mod:`holdfast.planning.policy_path`."""
+"""Draws for a move without noise, as in :mod:`holdfast.planning.policy_path`."""
 
 
 class RerunSink:

@@ -88,7 +88,7 @@ OUTPUT_NAMES = (
 """The last three are there only if services decided."""
 
 _SECTIONS_WITHOUT_DECISIONS = ("offload", "recovery", "lost")
-"""Of what ``lost`` does to a belief, each time is in the journal."""
+"""Sections that change no decision: what ``lost`` does to a belief is in the journal."""
 
 _EARLIER_CODE = "earlier_code"
 """Key of the note about what other versions have decided."""

@@ -37,7 +37,7 @@ UNTIMED_STEP_S = 0.1
 """How long a step takes in a run that was recorded without times."""
 
 MOMENTS = 4
-"""Of a step: sensing action decided, observed, task action decided, and before the next step."""
+"""Sensing action decided, observed, task action decided, and before the next step."""
 
 _LEAST_GAP_NS = 1_000
 """Between two moments of a trial, so that their order shows."""

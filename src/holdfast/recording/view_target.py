@@ -13,7 +13,7 @@ __all__ = ["LOCAL_URL", "ViewTarget", "require_rerun", "viewer_url"]
 
 _PORT = 9876
 LOCAL_URL = f"rerun+http://127.0.0.1:{_PORT}/proxy"
-"""Of a viewer on this machine."""
+"""Address of a viewer on this machine."""
 
 _URL = re.compile(r"rerun(\+https?)?://\S+/proxy")
 _PLACE = re.compile(r"(\[[0-9a-fA-F:.%]+\]|[\w.-]+)(?::(\d{1,5}))?")

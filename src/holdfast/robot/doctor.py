@@ -56,7 +56,7 @@ _ALL_S: Final = 10.0
 _ECHOES: Final = 20
 _CLOCKS_APART_S: Final = 60.0
 _DATAGRAM_HEADERS_BYTES: Final = 48
-"""Of IPv6 and UDP."""
+"""Size of the IPv6 and UDP headers."""
 
 _IP_MTU: Final = {
     socket.AF_INET: (socket.IPPROTO_IP, 14),
@@ -76,7 +76,7 @@ _Look: TypeAlias = Callable[..., Awaitable["_Seen | None"]]
 State: TypeAlias = Literal["ok", "warns", "fails", "-"]
 
 _ECHO: Final = Request(PROTOCOL_VERSION, os.urandom(16), 1, 0, 0, 0, False, bytes(DIGEST_SIZE))
-"""Of an unknown session, so it is answered at once."""
+"""A request of an unknown session, which is answered at once."""
 
 _OTHERS_WORK_WITHOUT: Final = {"datagrams", "problem"}
 """Layers that those above do not need."""

@@ -75,8 +75,8 @@ class GymnasiumEnvironment:
         ``function(environment, task_action)`` returns gymnasium's action. Without it, for a Box
         the task action is clipped to its limits, and its coordinates fill the Box in order; for
         Discrete, MultiDiscrete and MultiBinary each coordinate becomes the nearest whole number
-        that is allowed. (The planner does not see that: let the problem's ``execute`` have the same
-        limits.)
+        that is allowed. (The planner does not see that: let the problem's ``limit_action``
+        have the same limits.)
     motion : coordinates or function, optional
         The measured motion: by how much these coordinates have changed, or
         ``function(environment, before, after)`` of the two observations. The problem's

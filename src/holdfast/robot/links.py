@@ -38,7 +38,7 @@ class Links(NamedTuple):
     transport: RobotTransport | None
     """Not started yet; None for a robot without services, which decides itself."""
     launcher: RecoveryLauncher | None = None
-    """Of the local service; None if there is none."""
+    """Launches the local service; None if there is none."""
     make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner
     """Joins the robot's problem and settings to the functions that lead from state to state."""
 

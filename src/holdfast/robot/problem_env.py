@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from holdfast.config.registry import make
+from holdfast.config.registry import make_problem
 from holdfast.errors import InvalidValueError
 from holdfast.numerics import reproducible as numerics
 from holdfast.numerics.arrays import FloatArray, floats_or_none, integer, whole
@@ -362,7 +362,7 @@ def _built(
             settings or configuration.planning,
             configuration.simulator.max_steps,
         )
-    built = make(problem, **(model or {})) if isinstance(problem, str) else problem
+    built = make_problem(problem, **(model or {})) if isinstance(problem, str) else problem
     return built, settings or PlanningSettings(), steps
 
 

@@ -65,7 +65,7 @@ from holdfast.runtime.events import EventSink
 _LAST_VERIFICATION_S = 10.0
 """Longest wait for unfinished verifications once all trials are finished."""
 
-_DEAF_S = 0.005
+_LOOP_STALL_S = 0.005
 """A longer stall of the loop is not counted against any service."""
 
 _TURN_S = 0.001
@@ -373,7 +373,7 @@ class RobotProcess:
             self._timer = self._on_loop().call_at(wake_at, self._wake)
 
     def _event_loop_stalled(self, seconds: float) -> None:
-        if seconds > _DEAF_S:
+        if seconds > _LOOP_STALL_S:
             self._robot.event_loop_stalled(seconds)
 
     @contextlib.contextmanager

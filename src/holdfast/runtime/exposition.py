@@ -27,7 +27,7 @@ BUCKETS_S = (
 """Upper bounds of the histograms' buckets."""
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-"""Of :func:`exposition`."""
+"""Media type of what :func:`exposition` returns."""
 
 
 class Durations(msgspec.Struct):

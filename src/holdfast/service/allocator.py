@@ -17,7 +17,7 @@ _ARENAS = 2
 """One for the thread that holds the interpreter, one for those that compute without it."""
 
 _M_ARENA_MAX = -8
-"""Of ``malloc.h``, the same on all platforms."""
+"""``M_ARENA_MAX`` of ``malloc.h``, the same on all platforms."""
 
 
 def limit_arenas() -> None:

@@ -104,15 +104,17 @@ def _measure(problem: Any, one_s: float, own: dict[str, Any]) -> None:
         except HoldfastError:
             # Some found no place, where a belief of few may: what it took to try counts.
             own["initial"] = CallCost(0.0, (thread_time() - began) / _FEW)
-    own["act"] = _measured(lambda states: problem.execute(problem.policy(states, 0)), few, many)
-    action = problem.execute(problem.policy(few[0], 0))
+    own["act"] = _measured(
+        lambda states: problem.limit_action(problem.policy(states, 0)), few, many
+    )
+    action = problem.limit_action(problem.policy(few[0], 0))
     own["move"] = _measured(lambda states: problem.move(states, action, random.anew()), few, many)
     own["stage"] = CallCost(0.0, 0.0)
     if problem.num_stages > 1:
         own["stage"] = _measured(
             lambda states: problem.next_stage(states, _stages(states)), few, many
         )
-    if has_own(problem, "expected_path", ("policy", "execute", "move", "next_stage")):
+    if has_own(problem, "expected_path", ("policy", "limit_action", "move", "next_stage")):
         path = _measured(lambda states: problem.expected_path(states, 0, (0, 8), 1), few, many)
         own["path_step"] = CallCost(path.call_s, path.state_s / 8.0)
     count = len(problem.sensing_actions)

@@ -65,7 +65,7 @@ class ServiceReport(msgspec.Struct):
     statistics: ServiceStatistics = msgspec.field(default_factory=ServiceStatistics)
     times: DecisionTimes = msgspec.field(default_factory=DecisionTimes)
     restarts: int = 0
-    """Of processes."""
+    """Worker processes that ended and were started again."""
     certificate_expires_s: float | None = None
     """The earliest end of a certificate in use, in seconds since 1970."""
     stale_credentials: int = 0

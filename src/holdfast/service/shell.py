@@ -53,7 +53,7 @@ _BRIEF_S = 0.001
 """Longer jobs run on threads, because a job blocks the loop."""
 
 _NICENESS = 5
-"""Of the threads for jobs that may take any time: a third of the processor time of the others.
+"""Niceness of the threads for jobs that may take any time: a third of the others' processor time.
 
 They also hold the interpreter for moments, which they must come to the end of.
 """
@@ -65,8 +65,8 @@ _MAX_UNDECODED = 4096
 """Large requests that wait to be decoded; further ones are rejected unread."""
 
 _MAX_UNDECODED_BYTES = 128 << 20
-"""Of these requests: two of the largest. One request is always admitted; when other robots have
-used up the bound, each robot may have one more, up to twice the bound in total."""
+"""Bytes of undecoded requests: two of the largest. One request is always admitted; when other
+robots have used up the bound, each robot may have one more, up to twice the bound in total."""
 
 _UNREAD_BUSY = [encode(Busy(0, retry_after_ms)) for retry_after_ms in range(100, 126)]
 """Used in rotation, so that robots that were rejected together do not retry together."""

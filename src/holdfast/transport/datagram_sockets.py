@@ -30,7 +30,8 @@ _ERROR: Final = struct.Struct("=I")
 _ERROR_BYTES: Final = 512
 
 QUOTED_BYTES: Final = 32
-"""Of a datagram: eight that can be guessed and 24 encrypted ones. None of ours is shorter."""
+"""Bytes of a datagram that an ICMP error quotes and that are compared: eight can be guessed, 24 are
+encrypted. None of ours is shorter."""
 
 
 def connected_socket(address: Any) -> socket.socket | None:

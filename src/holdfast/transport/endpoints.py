@@ -20,7 +20,7 @@ from holdfast.printable import did_you_mean
 from holdfast.runtime.addresses import host_and_port
 
 Role: TypeAlias = Literal["robot", "service"]
-"""Of an end of a link."""
+"""What an end of a link is."""
 
 MAX_SOCKET_PATH_BYTES = 107
 """Bound on the path of a local socket, from the system's ``sockaddr_un``."""

@@ -22,7 +22,7 @@ from holdfast.printable import one_line
 from holdfast.transport.endpoints import Role, check_name
 
 WIRE_VERSION: Final = 1
-"""Of the frames and the hello; the protocol's messages have another version."""
+"""Version of the frames and the hello; the protocol's messages have another version."""
 
 MAGIC: Final = b"holdfast"
 """The first bytes of either end."""
@@ -45,7 +45,7 @@ _LARGE_BYTES: Final = 1 << 20
 _HEADER: Final = struct.Struct("<IBI")  # bytes that follow it, kind, call
 
 HEADER_BYTES: Final = _HEADER.size
-"""Of each frame."""
+"""Size of the header of each frame."""
 
 
 class Frame(NamedTuple):

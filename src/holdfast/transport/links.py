@@ -60,7 +60,7 @@ _UNSENT_IN_SYSTEM_BYTES: Final = 128 * 1024
 """In the system's buffer: small, so that even a slow link shows progress every few seconds."""
 
 _DECODED_AT_ONCE_BYTES: Final = 16 * 1024
-"""Of received bytes: more can hold thousands of frames or TLS records."""
+"""Received bytes that are decoded at once: more can hold thousands of frames or TLS records."""
 
 _PINGS_IN_LEASE: Final = 3
 _CLOSE_TIMEOUT_S: Final = 1.0

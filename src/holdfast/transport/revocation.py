@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import ssl
 
 _MAX_LIST_BYTES = 16 << 20
-"""Of a list: about 400,000 certificates."""
+"""Size of a list: about 400,000 certificates."""
 
 _PEM_BLOCK = re.compile(rb"-----BEGIN ([A-Z0-9 ]+)-----(.*?)-----END \1-----", re.DOTALL)
 

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from holdfast.transport.tls import PeerCertificate
 
 MAX_LINKS: Final = 4096
-"""Of robots, at the same time. Above it the owner of the most links loses one."""
+"""Links of robots at the same time. Above it the owner of the most links loses one."""
 
 MAX_UNSENT_BYTES: Final = 32 << 20
 """Bound on all replies together that wait until robots read: the largest has 2 MiB."""

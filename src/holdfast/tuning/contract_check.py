@@ -99,7 +99,7 @@ def _calls(p: Any) -> Iterator[_Call]:
         _Call("initial_states", lambda s, _: c.initial_states(p, own, len(s))),
         _Call("policy", lambda s, k: c.policy(p, s, k), True),
         _Call("policy", lambda s, k: c.policy(p, s, int(k[0]))),
-        _Call("execute", do, True),
+        _Call("limit_action", do, True),
         _Call("move", lambda s, k: c.move(p, s, do(s, k), own)),
         _Call("move", lambda s, k: c.move(p, s, do(s, k)[0], own)),
         _Call("expected_move", lambda s, k: c.expected_move(p, s, do(s, k), still)),
@@ -223,7 +223,7 @@ def check_streams(inspection: Inspection) -> None:
     start.setflags(write=False)
     many = np.tile(start, (_DRAWS, 1))
     many.setflags(write=False)
-    action = ask("execute", acted, problem, start, 0)
+    action = ask("limit_action", acted, problem, start, 0)
 
     def moved(number: int, states: FloatArray = start) -> FloatArray:
         return ask("move", checked.move, problem, states, action, inspection.random(_MOVE, number))

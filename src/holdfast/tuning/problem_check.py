@@ -28,7 +28,7 @@ from holdfast.tuning.trial_check import check_decision_time, check_goals, check_
 __all__ = ["CHECKS", "check_problem"]
 
 _STATES = 48
-_NEEDED = ("execute", "next_stage", "reward", "scene", "resolution", "state_labels")
+_NEEDED = ("limit_action", "next_stage", "reward", "scene", "resolution", "state_labels")
 
 
 @in_own_mode

@@ -36,10 +36,10 @@ _BETS = np.array([1 / 64, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 9 / 10])
 """Shares of the capital: small ones find small differences, large ones soon find large ones."""
 
 PILOT_TRIALS = 2
-"""Of each candidate, which show how long a trial takes: the first one may be slower."""
+"""Trials of each candidate that show how long a trial takes: the first one may be slower."""
 
 _FIRST_TRIALS = 10
-"""Of each candidate, before any is set aside."""
+"""Trials of each candidate before any is set aside."""
 
 _SLOW = 3.0
 """Times the usual time of a trial."""

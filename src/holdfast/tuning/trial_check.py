@@ -88,7 +88,7 @@ def _follow_policy(inspection: Inspection) -> Walk:
             break
         stages = ask("next_stage", checked.next_stages, problem, states, stages)
         commanded = ask("policy", checked.policy, problem, states, stages)
-        actions = ask("execute", checked.executed_action, problem, commanded)
+        actions = ask("limit_action", checked.executed_action, problem, commanded)
         still += bool((actions == 0.0).all())
         own = inspection.random(_WAY, step)
         moved = ask("move", checked.move, problem, states, actions, own)
@@ -145,7 +145,7 @@ def _report_walk(
     if never_moves and not reached.all():
         seen = f"the policy never moves: its executed action is 0 in all of {_WALKS} trials of "
         seen += f"{steps} steps, and {reached.sum()} of them reach the goal"
-        inspection.add("error", "goals", seen, "Look at policy and execute.")
+        inspection.add("error", "goals", seen, "Look at policy and limit_action.")
         return
     seen = f"with the state known, the policy comes to the goal in {reached.sum()} of {_WALKS} "
     seen += "trials"
@@ -199,7 +199,7 @@ def _check_motion(inspection: Inspection, walk: Walk) -> None:
     ratios = []
     for number, at in enumerate(spread_out(_STATES, len(walk.states))):
         state, own = walk.states[at], inspection.random(_NOISE, number)
-        action = ask("execute", acted, problem, state, int(walk.stages[at]))
+        action = ask("limit_action", acted, problem, state, int(walk.stages[at]))
         many = np.tile(state, (_DRAWS, 1))
         moved = ask("move", checked.move, problem, many, action, own)
         slopes = ask("move", _slopes, problem, state, action)

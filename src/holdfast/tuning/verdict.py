@@ -31,7 +31,7 @@ __all__ = [
 ]
 
 FAMILY_LEVEL = 0.95
-"""Of all intervals of the objective together."""
+"""Confidence of all intervals of the objective together."""
 
 _WIDE = 0.1
 """An interval that reaches so far, as a share of the mean, says little."""

@@ -35,8 +35,8 @@ Row: TypeAlias = Literal["cloud", "local", "robot"]
 Activity: TypeAlias = Literal[
     "off", "starting", "ready", "deciding", "by_cloud", "by_local", "held"
 ]
-"""Of a service: off, starting, ready, deciding. Of the robot: off, starting, which service decides
-for it, held, or ready at the end."""
+"""States of a service: off, starting, ready, deciding. Of the robot: off, starting, which service
+decides for it, held, or ready at the end."""
 
 
 class Change(NamedTuple):

@@ -57,7 +57,7 @@ _PATIENCE_S = 30.0
 """For a reaction; on an idle machine it takes a hundredth of that."""
 
 _AROUND_S = 3.0
-"""Of the demo, before and after the robot's run."""
+"""Time shown before and after the robot's run."""
 
 
 class Findings(NamedTuple):

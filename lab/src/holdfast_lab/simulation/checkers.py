@@ -37,8 +37,8 @@ _REPLY_TAG_AT = 1
 
 _CHECKSUM_BYTES = 4
 _MAX_OPEN_CALLS = 8
-"""Of one robot to one service: four of which it awaits something, and others that were answered and
-whose end is on its way."""
+"""Open calls of one robot to one service: four of which it awaits something, and others that were
+answered and whose end is on its way."""
 
 _MAX_UNENDED = 64
 """Calls of one robot that a service has not ended; the robot has far fewer open."""
@@ -57,7 +57,7 @@ _TABLES = (dict, list, tuple, set, deque)
 _ATOMS = frozenset({int, float, bool, str, bytes, type(None)})
 
 _MAX_ITEMS = 512
-"""Of any one table of a machine; a trial has 40 steps, and a service remembers a hundred robots."""
+"""Items of any one table of a machine; a trial has 40 steps, a service has 100 robots."""
 
 
 def check_size(name: str, machine: object) -> None:

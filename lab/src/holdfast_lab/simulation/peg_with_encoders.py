@@ -16,7 +16,7 @@ from holdfast.problems.peg_in_hole_2d import PegInHole2D
 __all__ = ["PegWithEncoders"]
 
 _DEVIATION = 0.02
-"""Of a measured coordinate, in its unit."""
+"""Standard deviation of a measured coordinate, in its unit."""
 
 _IS_RIGHT = 0.9
 """How often the switch is."""

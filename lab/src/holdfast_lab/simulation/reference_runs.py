@@ -134,7 +134,7 @@ class _Moved(NamedTuple):
 
 
 _Entry: TypeAlias = _Sensed | _Moved | None
-"""Of the list of what was sensed and done; None: the belief was begun anew."""
+"""An entry of the list of what was sensed and done; None: the belief was begun anew."""
 
 
 class ReferenceRuns:

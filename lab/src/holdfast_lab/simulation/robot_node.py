@@ -64,7 +64,7 @@ if TYPE_CHECKING:
 __all__ = ["SESSION", "RobotNode"]
 
 SESSION = bytes(range(16))
-"""Of the robot that is looked at."""
+"""Session of the robot under test."""
 _PERFORMS_AFTER_S = 0.0002
 """From the order until the body moves: the process may die in between."""
 

@@ -34,7 +34,7 @@ _SPAN_S = 0.7
 """Faults begin within this time: a run without any takes about half a second."""
 
 _MESSAGES = 60
-"""Of each service and direction, among which some are struck; a run without faults has fewer."""
+"""Messages of each service and direction that may be struck; a run without faults has fewer."""
 
 _SHOW_OTHERWISE = 0.2
 """Share of the runs in which observations come late, moves show something, or sensing may be left
@@ -42,7 +42,7 @@ out."""
 
 _FEW_TRIALS = 4
 _PATTERNS = 16
-"""Of lateness. Each trial has one run without faults for each of these: few, so that they are
+"""Patterns of lateness. Each trial has one run without faults for each: few, so that they are
 remembered."""
 
 _SENSING_STEPS = range(0, 40, 9)

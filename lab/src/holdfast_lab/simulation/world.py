@@ -82,7 +82,7 @@ _NATS_PER_COST = 0.3
 """Where not to sense is a choice: it is the better one now and then."""
 
 _MAX_MESSAGES = 5_000
-"""Of a run; one without faults has about fifty."""
+"""Messages of a run; one without faults has about fifty."""
 
 _CROWD_IS_FELT_S = 1.0
 """So long after one of a crowd was served our robot may still wait: it was told to come back."""
@@ -91,7 +91,7 @@ _IS_ASKED_AGAIN_S = 1.0
 """So long after it has memory again a service may still be left alone."""
 
 _LAUNCH_TIMEOUT_S = 5.0
-"""Of the first launch that is never seen; the robot is more patient with each that follows."""
+"""Timeout of the first launch that is never seen; each that follows gets a longer one."""
 
 _EVENTS_PER_CHECK = 500
 """Events between two checks of the sizes of all tables."""
@@ -100,7 +100,7 @@ _MOMENTS = {WriteRecords: "journal", Send: "send", Sense: "sense", Act: "act"}
 """Effects before which a schedule can kill the robot's process, by their names there."""
 
 _MAX_EVENTS = 20_000
-"""Of a run; one without faults has about two hundred."""
+"""Events of a run; one without faults has about two hundred."""
 
 
 class Simulator:
