@@ -10,7 +10,6 @@ import pytest
 from holdfast.config.registry import make_problem
 from holdfast.errors import ProblemError
 from holdfast.problems import checked
-from holdfast.problems import checked
 from holdfast.problems.attributes import know_earlier_names
 from holdfast.problems.problem import ProblemBase, Scene
 
