@@ -12,6 +12,7 @@ INSTALLED_TOOLS := $(VENV)/.installed-tools
 INSTALLED_KERNEL := $(VENV)/.installed-kernel
 INSTALLED_FIGURES := $(VENV)/.installed-figures
 INSTALLED_DEV := $(VENV)/.installed-dev
+INSTALLED_DOCS := $(VENV)/.installed-docs
 INSTALLED_COMPILED := $(COMPILED)/.installed
 
 # The wheels of a real ROS 2, for tests alone.
@@ -30,7 +31,7 @@ PACKAGE_SOURCES := $(shell find cmake src lab/src -type f -not -name '*.pyc') la
 CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
 
 .DEFAULT_GOAL := help
-.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-ros test-ros1 test-compiled lint format simulate chaos fuzz soak bench results wheel sbom requirements clean
+.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-ros test-ros1 test-compiled lint format simulate chaos fuzz soak bench results docs wheel sbom requirements clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -115,6 +116,9 @@ results: $(INSTALLED_DEV) ## the experiments behind docs/results.md: hours, the 
 	    find runs/experiments/$$name -maxdepth 1 -type f -not -name '*_trials.csv' -exec cp {} docs/results/$$name/ \; ; \
 	done
 
+docs: $(INSTALLED_DOCS) ## the site, in build/site; its tutorials are run, and a warning is an error
+	$(BIN)/python -m sphinx -E -W --keep-going -q -b html -d build/site-doctrees docs build/site
+
 wheel: $(INSTALLED_DEV) ## dist/: the sources, and a wheel for machines of this kind, the same bytes each time; dist/lab/
 	rm -rf $(DIST)
 	SOURCE_DATE_EPOCH=$(RELEASED) $(BIN)/python -m build --outdir $(DIST)/unrepaired
@@ -137,7 +141,7 @@ requirements: $(INSTALLED_DEV) ## deploy/*requirements.txt anew: the versions an
 clean: ## remove what was built or run here, but keep .venv
 	rm -rf ros/*/build ros/*/*.egg-info
 	rm -rf build dist demo-run chaos-run .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
-	rm -f $(INSTALLED_KERNEL) $(INSTALLED_FIGURES) $(INSTALLED_DEV)
+	rm -f $(INSTALLED_KERNEL) $(INSTALLED_FIGURES) $(INSTALLED_DEV) $(INSTALLED_DOCS)
 	rm -rf $(COMPILED)
 
 # The interpreter is looked at first: without this, what is missing shows only as an error deep in
@@ -178,6 +182,10 @@ $(INSTALLED_DEV): $(INSTALLED_KERNEL) lab/pyproject.toml $(wildcard ros/*/setup.
 	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[dev]" -e ros/ros1_master_guard -e ros/holdfast_ros
 	$(INSTALL_LAB)
 	@touch $(INSTALLED_FIGURES) $@
+
+$(INSTALLED_DOCS): $(INSTALLED_FIGURES)
+	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[docs]"
+	@touch $@
 
 # The sources are copied into it, so whatever of them changes is installed again.
 $(INSTALLED_COMPILED): pyproject.toml $(NATIVE_SOURCES) $(PACKAGE_SOURCES) | $(BIN)/python
