@@ -49,6 +49,7 @@ html_theme = "pydata_sphinx_theme"
 html_title = "holdfast"
 html_theme_options = {
     "navigation_with_keys": False,
+    "collapse_navigation": True,
     "show_toc_level": 2,
     "header_links_before_dropdown": 6,
     "secondary_sidebar_items": ["page-toc"],
