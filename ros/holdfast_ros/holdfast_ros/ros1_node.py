@@ -34,7 +34,14 @@ from ros1_master_guard.headers import (
     encode_header,
     encode_message,
 )
-from ros1_master_guard.ros1_calls import Connection, HttpHead, decoded, message, offers_service
+from ros1_master_guard.ros1_calls import (
+    MAX_SHORT_BYTES,
+    Connection,
+    HttpHead,
+    decoded,
+    message,
+    offers_service,
+)
 
 __all__ = ["RosNode", "ServiceHandler", "Topic", "TopicType"]
 
@@ -61,9 +68,6 @@ _RETRY_S: Final = 0.1
 _MAX_CALL_BYTES: Final = 8 << 10
 """An XML-RPC call to a node has some hundred bytes. Parsing takes a microsecond for each of them,
 during which nobody else is served."""
-
-_MAX_ANSWER_BYTES: Final = 256 << 10
-"""The same of a master's answer, which names this node's services."""
 
 _MAX_UNREAD_BYTES: Final = 1 << 20
 _MAX_UNREAD_BYTES_OF_ALL: Final = 16 << 20
@@ -145,7 +149,7 @@ class RosNode:
         self._max_message_bytes = max_message_bytes
         self._services: dict[str, _Offer] = {}
         self._topics: dict[str, Topic] = {}
-        self._master = Connection(environment.master, self.name, _MAX_ANSWER_BYTES)
+        self._master = Connection(environment.master, self.name, MAX_SHORT_BYTES)
         self._parsing = asyncio.Lock()
         self._servers: list[asyncio.Server] = []
         self._uri = ""
