@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import struct
 import xmlrpc.client
 from collections.abc import Awaitable, Callable
 from contextlib import asynccontextmanager
@@ -20,7 +19,6 @@ from ros1_master_guard.ros1_calls import (
     Connection,
     call,
     decoded,
-    offers_service,
 )
 
 PATIENCE_S = 20.0
@@ -185,13 +183,11 @@ class TestCalls:
         uri = f"rosrpc://{'x' * 100}.y:1"
         with pytest.raises(CallError):
             await call(uri, "getPid", within_s=PATIENCE_S)
-        assert await offers_service(uri, "/x", within_s=PATIENCE_S) is None
 
     @pytest.mark.parametrize("uri", ["", "x", "http://", "http://x", "http://x:y/", "rosrpc://:1"])
     async def test_no_address(self, uri: str) -> None:
         with pytest.raises(CallError, match="names no host and port"):
             await call(uri, "getPid", within_s=PATIENCE_S)
-        assert await offers_service(uri, "/x", within_s=PATIENCE_S) is None
 
     async def test_what_cannot_be_said_is_an_error_too(self) -> None:
         async with listening(hanging) as (port, _):
@@ -238,46 +234,3 @@ class TestCostlyMessages:
         assert decoded(content) == xmlrpc.client.loads(content) == ((value, 5), "m")
         with pytest.raises(xmlrpc.client.Fault, match="no"):
             decoded(xmlrpc.client.dumps(xmlrpc.client.Fault(1, "no")).encode())
-
-
-def handshake(**fields: str) -> bytes:
-    data = b"".join(
-        struct.pack("<I", len(field)) + field
-        for field in (f"{name}={value}".encode() for name, value in fields.items())
-    )
-    return struct.pack("<I", len(data)) + data
-
-
-class TestServices:
-    @pytest.mark.parametrize(
-        ("answer", "offered"),
-        [
-            (handshake(md5sum="x", type="a/B", callerid="/error=x"), True),
-            (handshake(error="[/x] is not a provided service"), False),
-            (struct.pack("<I", 2**31), False),
-            (b"", False),
-        ],
-    )
-    async def test_what_it_says(self, answer: bytes, offered: bool) -> None:
-        asked = b""
-
-        async def handler(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            nonlocal asked
-            (size,) = struct.unpack("<I", await reader.readexactly(4))
-            asked = await reader.readexactly(size)
-            writer.write(answer)
-
-        async with listening(handler) as (port, _):
-            uri = f"rosrpc://127.0.0.1:{port}"
-            assert await offers_service(uri, "/x", within_s=PATIENCE_S) is offered
-        assert struct.pack("<I", 10) + b"service=/x" in asked
-        assert b"probe=1" in asked
-
-    async def test_nobody_listens(self) -> None:
-        uri = f"rosrpc://127.0.0.1:{free_port()}"
-        assert await offers_service(uri, "/x", within_s=PATIENCE_S) is False
-
-    async def test_it_hangs(self) -> None:
-        async with listening(hanging) as (port, _):
-            uri = f"rosrpc://127.0.0.1:{port}"
-            assert await offers_service(uri, "/x", within_s=SHORT_S) is None

@@ -18,10 +18,7 @@ from urllib.parse import urlsplit
 
 from ros1_master_guard.errors import CallError, GoneError, ProtocolError, SilentError
 from ros1_master_guard.headers import (
-    ANY_TYPE,
     MAX_HEADER_BYTES,
-    decode_header,
-    encode_header,
     host_and_port_of,
 )
 
@@ -34,7 +31,6 @@ __all__ = [
     "connect",
     "decoded",
     "message",
-    "offers_service",
 ]
 
 CALLER: Final = "/ros1_master_guard"
@@ -216,25 +212,3 @@ async def call(
     """Make one call with a short answer, on a new connection; see :meth:`Connection.call`."""
     with contextlib.closing(Connection(uri, caller, MAX_SHORT_BYTES)) as connection:
         return await connection.call(method, *arguments, within_s=within_s)
-
-
-async def offers_service(uri: str, service: str, *, within_s: float) -> bool | None:
-    """Return whether a service is offered at its URI, ``rosrpc://host:port``; None if unknown."""
-    # `rosservice` sends this header to learn a service's type; no call is made.
-    probe = {"probe": "1", "md5sum": ANY_TYPE, "callerid": CALLER, "service": service}
-    writer = None
-    try:
-        async with asyncio.timeout(within_s):
-            reader, writer = await connect(uri)
-            writer.write(encode_header(probe))
-            return "error" not in decode_header(await message(reader, MAX_HEADER_BYTES))
-    except GoneError:
-        return False
-    except (asyncio.IncompleteReadError, ProtocolError):
-        # Another service or another program listens there.
-        return False
-    except (CallError, OSError, ValueError):  # ValueError: a malformed host name
-        return None
-    finally:
-        if writer is not None:
-            writer.close()
