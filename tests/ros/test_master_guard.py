@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import socket
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -176,6 +177,24 @@ class TestItsOwnMaster:
         (event,) = graph.events(guard, "journal_failed")
         assert f"{journal}: is no journal of a ROS 1 master" in event["reason"]
         assert journal.read_bytes().startswith(b"ros1_master_guard")
+
+    def test_it_goes_on_when_nobody_reads_what_it_says(self, graph: Graph) -> None:
+        with subprocess.Popen(
+            (*GUARD, "--no-rosout"),
+            env=graph.environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        ) as guard:
+            assert guard.stdout is not None
+            assert guard.stderr is not None
+            guard.stdout.close()
+            guard.stderr.close()
+            wait_for(graph.master_pid)
+            graph.run("rosparam", "set", "/speed", "1")
+            replaced(graph, graph.kill_master())
+            assert graph.run("rosparam", "get", "/speed") == "1\n"
+            guard.terminate()
+            assert guard.wait(PATIENCE_S) == 0
 
     def test_the_spare_ends_quietly(self, graph: Graph) -> None:
         guard = graph.guard("--no-rosout")

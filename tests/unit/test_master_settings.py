@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import pytest
 from tests.ports import free_port
 
 from ros1_master_guard.errors import GuardError
-from ros1_master_guard.settings import MasterAddress, guard_lock
+from ros1_master_guard.settings import MasterAddress, directory_for, guard_lock
 
 
 def test_a_second_guard_is_kept_away() -> None:
@@ -19,6 +20,21 @@ def test_a_second_guard_is_kept_away() -> None:
             pass
     with guard_lock(port):
         pass
+
+
+class TestDirectory:
+    def test_one_of_this_user_alone(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+        directory = directory_for(None)
+        assert directory_for(tmp_path / "named") == tmp_path / "named"
+        assert directory.stat().st_mode & 0o777 == 0o700
+        directory.chmod(0o777)
+        with pytest.raises(GuardError, match="you alone can write to; name another one"):
+            directory_for(None)
+
+    def test_one_that_cannot_be_made(self, tmp_path: Path) -> None:
+        with pytest.raises(GuardError, match="cannot be made: No such file"):
+            directory_for(tmp_path / "missing" / "named")
 
 
 class TestAddress:

@@ -24,8 +24,9 @@ class Stock:
     uri = ""
 
     def getSystemState(self, caller: str) -> tuple[int, str, object]:  # noqa: N802
-        state = [[["/scan", ["/lidar"]]], [], [["/stop", ["/lidar"]]]]
-        return 1, "", state
+        scans = [["/scan", ["/lidar", "/ended"]]]
+        services = [["/stop", ["/lidar"]], ["/ended/stop", ["/ended"]]]
+        return 1, "", [scans, [["/left", ["/ended"]]], services]
 
     def getTopicTypes(self, caller: str) -> tuple[int, str, object]:  # noqa: N802
         return 1, "", [["/scan", "sensor_msgs/LaserScan"]]
@@ -34,7 +35,7 @@ class Stock:
         return 1, "", {"speed": 2}
 
     def lookupNode(self, caller: str, name: str) -> tuple[int, str, str]:  # noqa: N802
-        return 1, "", self.uri
+        return (-1, f"unknown node [{name}]", "") if name == "/ended" else (1, "", self.uri)
 
     def lookupService(self, caller: str, name: str) -> tuple[int, str, str]:  # noqa: N802
         return 1, "", "rosrpc://robot:1"
@@ -67,6 +68,7 @@ def test_a_stock_masters_state() -> None:
     with stock() as uri:
         state = asyncio.run(ask(uri))
         assert state.publishers == {"/scan": [("/lidar", uri)]}
+        assert state.subscribers == {}
         assert state.services == {"/stop": ("/lidar", uri, "rosrpc://robot:1")}
     assert state.types == {"/scan": "sensor_msgs/LaserScan"}
     assert state.parameters == {"speed": 2}

@@ -26,28 +26,20 @@ import uuid
 from collections.abc import Callable, Coroutine, Iterator
 from time import monotonic
 from typing import Any
-from urllib.parse import urlsplit
 
 from ros1_master_guard.errors import CallError, GoneError, GuardError, SilentError
-from ros1_master_guard.events import EventSink
+from ros1_master_guard.events import EventLog
 from ros1_master_guard.plan import gone_and_silent, process_of, snapshot, without
 from ros1_master_guard.process import MasterState
 from ros1_master_guard.ros1_calls import CALLER, Connection, call
-from ros1_master_guard.roscore import (
-    ROSOUT,
-    STEADY_S,
-    Rosout,
-    how_it_ended,
-    restart_delay_s,
-    set_versions,
-)
+from ros1_master_guard.roscore import ROSOUT, Rosout, how_it_ended, set_versions
 from ros1_master_guard.saved_state import read_journal, write_journal
-from ros1_master_guard.settings import GuardSettings, guard_lock, listens_at, own_directory
+from ros1_master_guard.settings import GuardSettings, directory_for, guard_lock, listens_at
 from ros1_master_guard.standby import MasterLink, MasterProcess
 
 __all__ = ["MasterGuard"]
 
-_PROBE_EVERY_S = 0.5
+_PROBE_EVERY_S = 0.2
 _PROBE_S = 1.0
 _POLL_EVERY_S = 0.25
 _POLL_SHARE = 0.1
@@ -56,6 +48,10 @@ _POLL_SHARE = 0.1
 _SPARE_DELAY_S = 0.5
 """The next master is loaded this long after a start, when the nodes have been served."""
 
+_RESTART_S = 0.5
+"""Pause before another start: after one that failed, or two masters that ended within _STEADY_S."""
+
+_STEADY_S = 1.0
 _LAST_WORDS_S = 1.0
 """For reading what a master told before it ended."""
 
@@ -65,7 +61,7 @@ _BACKLOG = 1024
 class MasterGuard:
     """Watches a master and replaces it when it dies."""
 
-    def __init__(self, settings: GuardSettings, events: EventSink) -> None:
+    def __init__(self, settings: GuardSettings, events: EventLog) -> None:
         self._settings = settings
         self._events = events
         self._uri = settings.address.own_uri
@@ -98,14 +94,13 @@ class MasterGuard:
         GuardError
             If nothing can be guarded.
         """
-        directory = self._settings.directory or own_directory()
+        directory = directory_for(self._settings.directory)
         self._journal = directory / f"master-{self._port}.journal"
         with guard_lock(self._port):
             try:
                 # Missing software is reported now, not when the master dies.
                 await self._next_master().warm()
                 how = await self._begin()
-                self._check_journal()
                 ready(how)
                 helpers = [self._keep_journal()]
                 if self._settings.rosout:
@@ -165,18 +160,17 @@ class MasterGuard:
             reason = await self._lost()
             noticed_at = monotonic()
             self._events.event("master_lost", reason=reason)
-            short_lives = short_lives + 1 if noticed_at - since < STEADY_S else 0
+            short_lives = short_lives + 1 if noticed_at - since < _STEADY_S else 0
             if short_lives > 1:
-                await asyncio.sleep(restart_delay_s(short_lives - 2))
+                await asyncio.sleep(_RESTART_S)
             await self._replace(noticed_at)
 
     async def _lost(self) -> str:
         """Wait for the master's end, and return the reason."""
-        ended = self._closed() if self._own is None else self._exited(self._own)
         helpers = map(self._help, (self._load_spare_later(), self._follow()))
-        with _running(ended, self._kill_silent()) as reasons, _running(*helpers):
+        with _running(self._unresponsive(), self._exited()) as reasons, _running(*helpers):
             await asyncio.wait(reasons, return_when=asyncio.FIRST_COMPLETED)
-            reason: str = next(task.result() for task in reversed(reasons) if task.done())
+            reason: str = next(task.result() for task in reasons if task.done())
         if self._own is not None:
             await self._own.end(signal.SIGKILL)
         if self._link is not None and self._link.following is not None:
@@ -185,48 +179,37 @@ class MasterGuard:
         self._own = self._link = self._pid = None
         return reason
 
-    async def _exited(self, master: MasterProcess) -> str:
-        return how_it_ended(await asyncio.shield(master.ended))
+    async def _exited(self) -> str:
+        """Wait for the end of the master that was started here."""
+        ended = asyncio.Future[int]() if self._own is None else self._own.ended
+        return how_it_ended(await asyncio.shield(ended))
 
-    async def _closed(self) -> str:
-        """Wait until the port of a master that was not started here is closed.
-
-        The system closes a killed process's connections, so one of them ends at once.
-        """
-        place = urlsplit(self._uri)
-        while True:
-            try:
-                reader, writer = await asyncio.open_connection(place.hostname, place.port)
-            except OSError:
-                return "nobody listens at its port"
-            try:
-                with contextlib.suppress(OSError):
-                    await reader.read(1)
-            finally:
-                writer.close()
-            # It may have closed this connection alone.
-            try:
-                await call(self._uri, "getPid", within_s=_PROBE_S)
-            except GoneError:
-                return "it ended"
-            except CallError:
-                await asyncio.sleep(_PROBE_EVERY_S)
-
-    async def _kill_silent(self) -> str:
-        """Kill a master that is silent for too long, and return the reason."""
-        told = False
-        while True:
-            # Stopped, or too busy to be of use.
-            reason = await self._silent()
-            if self._signal(signal.SIGKILL):
-                return reason
-            if not told:
-                self._events.event(
-                    "master_hangs",
-                    reason=f"{reason}; it is none of this user's processes on this machine, so it "
-                    "is left alone",
-                )
-                told = True
+    async def _unresponsive(self) -> str:
+        """Wait until the master answers no more, kill it if it is there, and return the reason."""
+        silent_s = self._settings.silent_s
+        failed, told = 0.0, False
+        with contextlib.closing(Connection(self._uri)) as connection:
+            while True:
+                asked_at = monotonic()
+                try:
+                    await connection.call("getPid", within_s=min(_PROBE_S, silent_s))
+                except GoneError:
+                    if self._own is None:
+                        return "nobody listens at its port"
+                except CallError:
+                    # Time actually waited counts, not the clock: this may have been stopped.
+                    failed += monotonic() - asked_at
+                else:
+                    failed = 0.0
+                reason = f"it did not answer for {silent_s:g} s"
+                # Stopped, or too busy to be of use.
+                if failed >= silent_s and self._signal(signal.SIGKILL):
+                    return reason
+                if failed >= silent_s and not told:
+                    told = True
+                    reason += "; it is none of this user's processes on this machine"
+                    self._events.event("master_hangs", reason=f"{reason}, so it is left alone")
+                await asyncio.sleep(0.01 if failed else _PROBE_EVERY_S)
 
     def _signal(self, number: signal.Signals) -> bool:
         """Signal the master, if it is a process of this user on this machine."""
@@ -300,11 +283,6 @@ class MasterGuard:
             self._save()
             await _pause(monotonic() - began)
 
-    def _check_journal(self) -> None:
-        self._save()
-        if self._unsaved:
-            raise GuardError(f"{self._unsaved}; name another --directory")
-
     def _save(self) -> None:
         now = self._known, self._known.changes
         is_saved = self._saved is not None and self._saved[0] is now[0] and self._saved[1] == now[1]
@@ -337,7 +315,6 @@ class MasterGuard:
 
     async def _replace(self, noticed_at: float) -> None:
         """Start a new master in place of one that has ended."""
-        failures = 0
         while True:
             try:
                 gone, silent = await gone_and_silent(self._known.nodes().values())
@@ -349,8 +326,7 @@ class MasterGuard:
             except (GuardError, OSError) as error:
                 self._events.event("master_failed", reason=str(error))
                 await self._drop_spare()
-                await asyncio.sleep(restart_delay_s(failures))
-                failures += 1
+                await asyncio.sleep(_RESTART_S)
             else:
                 return
 

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Collection, Mapping
-from typing import Any
+from collections.abc import Collection
 
 from ros1_master_guard.errors import CallError, GoneError, SilentError
 from ros1_master_guard.process import MasterState
 from ros1_master_guard.ros1_calls import CALLER, Connection, call
 
-__all__ = ["gone_and_silent", "process_of", "snapshot", "state_of_snapshot", "without"]
+__all__ = ["gone_and_silent", "process_of", "snapshot", "without"]
 
 _ANSWER_S = 0.3
 """Longest wait for a node while there is no master."""
@@ -73,30 +72,6 @@ def without(known: MasterState, gone: Collection[str]) -> MasterState:
 # -- a master that tells nothing of itself ---------------------------------------------------------
 
 
-def state_of_snapshot(
-    system_state: Any, types: Any, parameters: Mapping[str, Any], uris: Mapping[str, Any]
-) -> MasterState:
-    """Return a stock master's state, from its answers.
-
-    The arguments are the answers to ``getSystemState``, ``getTopicTypes`` and ``getParam("/")``,
-    and by name to ``lookupNode`` and ``lookupService``. Nodes and services without a URI ended
-    between two questions and are left out. No call returns the subscribers of parameters.
-    """
-    state = MasterState(parameters=dict(parameters), types=dict(types))
-    publishers, subscribers, services = system_state
-    for registrations, table in (
-        (state.publishers, publishers),
-        (state.subscribers, subscribers),
-    ):
-        for topic, nodes in table:
-            if registered := [(node, uris[node]) for node in nodes if uris.get(node)]:
-                registrations[topic] = registered
-    for service, nodes in services:
-        if nodes and uris.get(f"service {service}") and uris.get(nodes[0]):
-            state.services[service] = (nodes[0], uris[nodes[0]], uris[f"service {service}"])
-    return state
-
-
 async def process_of(connection: Connection, *, within_s: float) -> int:
     """Return a master's process id; raise CallError if it does not tell one."""
     pid = await connection.call("getPid", within_s=within_s)
@@ -106,29 +81,36 @@ async def process_of(connection: Connection, *, within_s: float) -> int:
 
 
 async def snapshot(connection: Connection) -> MasterState:
-    """Return a stock master's state; raise CallError if its answers cannot be understood."""
-    system_state, types, parameters = await connection.calls(
-        [
-            ("getSystemState", (CALLER,)),
-            ("getTopicTypes", (CALLER,)),
-            ("getParam", (CALLER, "/")),
-        ],
-        within_s=_SNAPSHOT_S,
-    )
+    """Return a stock master's state; raise CallError if its answers cannot be understood.
+
+    Nodes and services that ended between two questions are left out. No call returns the
+    subscribers of parameters.
+    """
+    asked = [
+        ("getSystemState", (CALLER,)),
+        ("getTopicTypes", (CALLER,)),
+        ("getParam", (CALLER, "/")),
+    ]
+    tables, types, parameters = await connection.calls(asked, within_s=_SNAPSHOT_S)
     try:
-        nodes = sorted({node for table in system_state for _, names in table for node in names})
-        services = [service for service, _ in system_state[2]]
-        found = await connection.calls(
-            [
-                *(("lookupNode", (CALLER, node)) for node in nodes),
-                *(("lookupService", (CALLER, service)) for service in services),
-            ],
-            within_s=_SNAPSHOT_S,
-        )
-        names = [*nodes, *(f"service {service}" for service in services)]
-        uris = dict(zip(names, found, strict=True))
-        return state_of_snapshot(system_state, types, parameters, uris)
+        state = MasterState(parameters=dict(parameters), types=dict(types))
+        publishers, subscribers, services = tables
+        names = sorted({node for table in tables for _, nodes in table for node in nodes})
+        asked = [
+            *(("lookupNode", (CALLER, node)) for node in names),
+            *(("lookupService", (CALLER, service)) for service, _ in services),
+        ]
+        found = await connection.calls(asked, within_s=_SNAPSHOT_S)
+        uris = dict(zip(names, found, strict=False))
+        for kept, table in ((state.publishers, publishers), (state.subscribers, subscribers)):
+            for topic, nodes in table:
+                if registered := [(node, uris[node]) for node in nodes if uris[node]]:
+                    kept[topic] = registered
+        for (service, nodes), uri in zip(services, found[len(names) :], strict=True):
+            if nodes and uri and uris[nodes[0]]:
+                state.services[service] = (nodes[0], uris[nodes[0]], uri)
     except CallError:
         raise
     except Exception as error:
         raise CallError(f"{connection.uri}: cannot be understood: {error}") from error
+    return state

@@ -38,8 +38,8 @@ Registrations = Dict[str, List[Tuple[str, str]]]  # noqa: UP006
 HEAD = struct.Struct("<Q")
 """The size in bytes that precedes each message."""
 
-_SEND_S = 1.0
-"""A guard that reads nothing for this long is told no more; it asks for the whole state again."""
+_SEND_S, _SEND_STATE_S = 1.0, 10.0
+"""A guard that takes longer to read a change, or the state, is told no more; it asks again."""
 
 _WORKERS = 8
 """Threads that tell nodes of changes. One that a stopped node blocks is lost to the others; stock
@@ -141,9 +141,9 @@ class _Guards:
 
     def add(self, guard: socket.socket, state: dict[str, Any]) -> None:
         """Tell a guard the whole state, and from now on every change."""
-        guard.settimeout(_SEND_S)
         with self._lock:
             self._sockets.append(guard)
+            guard.settimeout(_SEND_STATE_S)
             self._send(guard, encoded(state))
 
     def tell(self, *change: Any) -> None:
@@ -160,6 +160,7 @@ class _Guards:
     def _send(self, guard: socket.socket, message: bytes) -> None:
         try:
             guard.sendall(message)
+            guard.settimeout(_SEND_S)
         except OSError:
             self._sockets.remove(guard)
             guard.close()

@@ -11,17 +11,13 @@ import subprocess
 from time import monotonic
 
 from ros1_master_guard.errors import CallError, GoneError
-from ros1_master_guard.events import EventSink
+from ros1_master_guard.events import EventLog
 from ros1_master_guard.ros1_calls import call
 
-__all__ = ["ROSOUT", "STEADY_S", "Rosout", "how_it_ended", "restart_delay_s", "set_versions"]
+__all__ = ["ROSOUT", "Rosout", "how_it_ended", "set_versions"]
 
 ROSOUT = "/rosout"
 
-STEADY_S = 1.0
-"""A process that ends earlier than this may have failed at its start."""
-
-_FIRST_DELAY_S, _LAST_DELAY_S = 0.1, 1.0
 _CHECK_EVERY_S = 1.0
 _PROBE_S = 1.0
 _END_S = 2.0
@@ -33,7 +29,7 @@ class Rosout:
     Nodes reach the master at ``master_uri``, this process at ``own_uri``.
     """
 
-    def __init__(self, master_uri: str, own_uri: str, events: EventSink) -> None:
+    def __init__(self, master_uri: str, own_uri: str, events: EventLog) -> None:
         self._master_uri = master_uri
         self._own_uri = own_uri
         self._events = events
@@ -100,11 +96,6 @@ async def set_versions(master_uri: str) -> None:
             if output and process.returncode == 0:
                 value = output.decode(errors="replace")
                 await call(master_uri, "setParam", f"/{name}", value, within_s=_PROBE_S)
-
-
-def restart_delay_s(failures: int) -> float:
-    """Return the pause before the next start: 0.1 s, doubled with each failure, at most 1 s."""
-    return float(min(_LAST_DELAY_S, _FIRST_DELAY_S * 2 ** min(failures, 16)))
 
 
 def how_it_ended(code: int) -> str:

@@ -18,9 +18,9 @@ __all__ = [
     "DEFAULT_PORT",
     "GuardSettings",
     "MasterAddress",
+    "directory_for",
     "guard_lock",
     "listens_at",
-    "own_directory",
 ]
 
 DEFAULT_PORT = 11311
@@ -99,22 +99,28 @@ class GuardSettings(NamedTuple):
     rosout: bool = True
 
 
-def own_directory() -> Path:
-    """Return a directory of this user alone, which does not outlive the machine's uptime."""
+def directory_for(named: Path | None) -> Path:
+    """Return a directory that can be written to: the named one, or one of this user alone.
+
+    The latter does not outlive the machine's uptime. Raises GuardError if there is none.
+    """
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     name = "ros1_master_guard"
-    directory = Path(runtime) / name if runtime else Path(f"/tmp/{name}-{os.getuid()}")
+    own = Path(runtime) / name if runtime else Path(f"/tmp/{name}-{os.getuid()}")
+    directory = own if named is None else named
     try:
         directory.mkdir(mode=0o700, exist_ok=True)
         found = directory.lstat()
     except OSError as error:
         raise GuardError(f"{directory}: cannot be made: {error.strerror}") from error
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
-        raise GuardError(
-            f"{directory}: is not a directory that you alone can write to; name another one: "
-            "--directory"
-        )
-    return directory
+    is_own = found.st_uid == os.getuid() and not found.st_mode & 0o022
+    if named is None and not (stat.S_ISDIR(found.st_mode) and is_own):
+        problem = "is not a directory that you alone can write to"
+    elif not os.access(directory, os.W_OK):
+        problem = "cannot be written to"
+    else:
+        return directory
+    raise GuardError(f"{directory}: {problem}; name another one: --directory")
 
 
 @contextlib.contextmanager
@@ -129,10 +135,11 @@ def guard_lock(port: int) -> Iterator[None]:
             lock.bind(name)
             lock.listen()
         except OSError:
-            with socket.socket(socket.AF_UNIX) as asking:
+            pid = "unknown"
+            with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as asking:
                 asking.connect(name)
                 who = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 4)
-            pid = int.from_bytes(who, sys.byteorder)
+                pid = str(int.from_bytes(who, sys.byteorder))
             raise GuardError(
                 f"the master at port {port} has a guard already: process {pid}"
             ) from None
