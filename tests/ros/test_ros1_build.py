@@ -13,8 +13,9 @@ from tests.ros.conftest import ROOT, left_out
 from tests.ros.ros1_processes import SYSTEM_PYTHON, Ros1, ros1_in
 
 from holdfast_ros.active_sensing import DecisionRequest, RequestKind
+from holdfast_ros.loop_thread import LoopThread
 from holdfast_ros.ros1_client import Ros1Service
-from holdfast_ros.tcpros import RosEnvironment
+from holdfast_ros.ros1_environment import RosEnvironment
 
 EXAMPLE = ROOT / "examples" / "peg_in_hole_2d.yaml"
 CLOUD = "cloud_active_sensing"
@@ -83,10 +84,14 @@ def test_catkin_builds_it_and_roscpp_calls_it(around: Ros1, tmp_path: Path) -> N
         directory=tmp_path,
     )
     around.serve(CLOUD, EXAMPLE)
-    service = Ros1Service(CLOUD, RosEnvironment.of(around.environment))
-    state = service.ask(DecisionRequest(RequestKind.INITIALIZE, seed=4), 30.0).state
-    answer = service.ask(DecisionRequest(RequestKind.CHOOSE_SENSING_ACTION, state=state), 30.0)
-    service.close()
+    thread = LoopThread("test")
+    service = Ros1Service(CLOUD, RosEnvironment.of(around.environment), "robot")
+    begin = DecisionRequest(RequestKind.INITIALIZE, seed=4)
+    state = thread.run(service.ask(begin, 30.0)).state
+    choose = DecisionRequest(RequestKind.CHOOSE_SENSING_ACTION, state=state)
+    answer = thread.run(service.ask(choose, 30.0))
+    thread.call(service.disconnect)
+    thread.close(30.0)
     for way in ((), ("persistent",)):
         said = around.run(str(tmp_path / "stock"), CLOUD, *way).split()
         assert said == ["0", answer.configuration, str(answer.sensing_action)]

@@ -5,17 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from holdfast.config.loader import Configuration, load
-from holdfast.errors import CheckpointError
-from holdfast.planning.planner import Planner, digest
+from holdfast.planning.planner import Planner
 from holdfast_ros.active_sensing import (
     ActiveSensing,
     DecisionRequest,
     ErrorCode,
     RequestKind,
-    checked_state,
 )
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
@@ -87,29 +84,3 @@ def test_another_configuration_is_told_by_its_digest_but_not_by_its_seed() -> No
     assert answer.error is ErrorCode.OTHER_CONFIGURATION
     assert theirs.configuration in answer.message
     assert ours.configuration in answer.message
-
-
-def test_a_state_of_a_message_is_checked_as_a_checkpoint_is() -> None:
-    state = (
-        ActiveSensing(configuration())
-        .answer(DecisionRequest(RequestKind.INITIALIZE, seed=5, trial=0))
-        .state
-    )
-    assert state is not None
-    belief = state.belief
-
-    def taken(states: np.ndarray, weights: np.ndarray) -> object:
-        return checked_state(5, 0, 0, 0, False, belief.states.shape[1], states, weights)
-
-    again = checked_state(
-        5, 0, 0, 0, False, belief.states.shape[1], belief.states.ravel(), belief.weights
-    )
-    assert again is not None
-    assert digest(again) == digest(state)
-    assert taken(np.empty(0), np.empty(0)) is None
-    with pytest.raises(CheckpointError, match="state_size"):
-        taken(belief.states.ravel()[1:], belief.weights)
-    with pytest.raises(CheckpointError, match="weights"):
-        taken(belief.states.ravel(), belief.weights * 2)
-    with pytest.raises(CheckpointError, match="finite"):
-        taken(belief.states.ravel() * np.nan, belief.weights)

@@ -29,11 +29,3 @@ def test_a_header_has_the_bytes_that_ros_documents() -> None:
 def test_what_is_no_header_is_refused(data: bytes) -> None:
     with pytest.raises(ProtocolError, match=r"has sent .* connection header"):
         decode_header(data)
-
-
-def test_a_header_has_a_bounded_number_of_fields() -> None:
-    fields = {f"f{number}": "" for number in range(65)}
-    with pytest.raises(ProtocolError, match="more than 64 fields"):
-        decode_header(encode_header(fields)[4:])
-    del fields["f64"]
-    assert decode_header(encode_header(fields)[4:]) == fields

@@ -43,8 +43,25 @@ def test_a_coroutine_that_takes_too_long_is_cancelled() -> None:
     thread.close(PATIENCE_S)
 
 
-def test_after_the_end_calls_do_nothing() -> None:
+def test_after_the_end_calls_do_nothing_and_waits_have_ended() -> None:
     thread = LoopThread("the-loop")
+    begun = threading.Event()
+    told: list[str] = []
+
+    async def wait() -> None:
+        begun.set()
+        await asyncio.Event().wait()
+
+    def run() -> None:
+        with pytest.raises(TransportError, match="it is closed") as raised:
+            thread.run(wait(), PATIENCE_S)
+        told.append(str(raised.value))
+
+    waiting = threading.Thread(target=run)
+    waiting.start()
+    assert begun.wait(PATIENCE_S)
     thread.close(PATIENCE_S)
+    waiting.join(PATIENCE_S)
+    assert told
     thread.close(PATIENCE_S)
     thread.call(pytest.fail, "it was called")

@@ -6,28 +6,35 @@ import os
 from pathlib import Path
 
 import pytest
+from tests.ports import free_port
 
 from ros1_master_guard.errors import GuardError
-from ros1_master_guard.settings import GuardLock, MasterAddress
+from ros1_master_guard.settings import MasterAddress, directory_for, guard_lock
 
 
-class TestLock:
-    def test_a_second_guard_is_kept_away_even_if_the_file_is_removed(self, tmp_path: Path) -> None:
-        path = tmp_path / "lock"
-        with GuardLock(path, 11311) as lock:
-            path.unlink()
-            lock.keep()
-            with pytest.raises(GuardError, match=f"has a guard already: process {os.getpid()}"):
-                GuardLock(path, 11311)
-        with GuardLock(path, 11311):
+def test_a_second_guard_is_kept_away() -> None:
+    port = free_port()
+    with guard_lock(port):
+        refused = pytest.raises(GuardError, match=f"has a guard already: process {os.getpid()}")
+        with refused, guard_lock(port):
             pass
+    with guard_lock(port):
+        pass
 
-    def test_it_is_kept_young(self, tmp_path: Path) -> None:
-        path = tmp_path / "lock"
-        with GuardLock(path, 11311) as lock:
-            os.utime(path, (0, 0))
-            lock.keep()
-            assert path.stat().st_mtime > 0
+
+class TestDirectory:
+    def test_one_of_this_user_alone(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+        directory = directory_for(None)
+        assert directory_for(tmp_path / "named") == tmp_path / "named"
+        assert directory.stat().st_mode & 0o777 == 0o700
+        directory.chmod(0o777)
+        with pytest.raises(GuardError, match="you alone can write to; name another one"):
+            directory_for(None)
+
+    def test_one_that_cannot_be_made(self, tmp_path: Path) -> None:
+        with pytest.raises(GuardError, match="cannot be made: No such file"):
+            directory_for(tmp_path / "missing" / "named")
 
 
 class TestAddress:

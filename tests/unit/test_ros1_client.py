@@ -14,8 +14,8 @@ from tests.ports import free_port
 from holdfast.errors import TransportError
 from holdfast.protocol.status import Status
 from holdfast_ros.active_sensing import DecisionRequest, RequestKind
-from holdfast_ros.ros1_client import STATUS_WORDS, Ros1Service, service_type
-from holdfast_ros.tcpros import RosEnvironment
+from holdfast_ros.ros1_client import STATUS_WORDS, Ros1Client, Ros1Service, service_type
+from holdfast_ros.ros1_environment import RosEnvironment
 from ros1_master_guard.headers import decode_header, encode_header
 
 BEGIN = DecisionRequest(RequestKind.INITIALIZE, seed=1)
@@ -42,23 +42,28 @@ def master(service_uri: str) -> Iterator[int]:
             thread.join()
 
 
-def test_without_a_master() -> None:
-    service = Ros1Service("cloud", ros_environment(free_port()))
+async def ask(service: Ros1Service) -> None:
+    try:
+        await service.ask(BEGIN, PATIENCE_S)
+    finally:
+        service.disconnect()
+
+
+async def test_without_a_master() -> None:
+    service = Ros1Service("cloud", ros_environment(free_port()), "robot")
     with pytest.raises(TransportError, match="there is no master at"):
-        service.ask(BEGIN, PATIENCE_S)
-    service.close()
+        await ask(service)
 
 
-def test_a_refused_connection_means_a_dead_service() -> None:
+async def test_a_refused_connection_means_a_dead_service() -> None:
     port = free_port()
     with master(f"rosrpc://127.0.0.1:{port}") as at:
-        service = Ros1Service("cloud", ros_environment(at))
+        service = Ros1Service("cloud", ros_environment(at), "robot")
         with pytest.raises(TransportError, match=rf"nobody listens at .*{port}, .* it is dead"):
-            service.ask(BEGIN, PATIENCE_S)
-        service.close()
+            await ask(service)
 
 
-def test_a_service_of_another_type_refuses() -> None:
+async def test_a_service_of_another_type_refuses() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         fields: dict[str, str] = {}
 
@@ -69,28 +74,29 @@ def test_a_service_of_another_type_refuses() -> None:
                 fields.update(decode_header(sent.read(size)))
                 stream.sendall(encode_header({"error": "another type"}))
 
-        thread = threading.Thread(target=refuse)
-        thread.start()
+        refusing = threading.Thread(target=refuse)
+        refusing.start()
         with master(f"rosrpc://127.0.0.1:{listening.getsockname()[1]}") as at:
             service = Ros1Service("cloud", ros_environment(at), "robot")
             with pytest.raises(TransportError, match="it refuses: another type"):
-                service.ask(BEGIN, PATIENCE_S)
-            service.close()
-        thread.join()
+                await ask(service)
+        refusing.join()
     assert fields["service"] == "/cloud"
     assert fields["callerid"] == "/robot"
     assert fields["md5sum"] == service_type()[1]
 
 
-def test_a_closed_client_asks_nothing() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        port = listening.getsockname()[1]
-        with master(f"rosrpc://127.0.0.1:{port}") as at:
-            service = Ros1Service("cloud", ros_environment(at))
-            service.close()
-            with pytest.raises(TransportError, match="not asked any more"):
-                service.ask(BEGIN, PATIENCE_S)
-
-
 def test_every_status_has_its_words() -> None:
     assert set(STATUS_WORDS) == set(Status)
+
+
+def test_what_it_waits_for_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    with (
+        Ros1Client(ros_environment=ros_environment(free_port()), deadline_s=0.01) as client,
+        pytest.raises(TransportError, match="nobody has answered"),
+    ):
+        client.decide(BEGIN, give_up_s=0.2)
+    assert [record.getMessage().partition(":")[0] for record in caplog.records] == [
+        "status",
+        "holding",
+    ]

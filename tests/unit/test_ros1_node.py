@@ -17,8 +17,8 @@ import pytest
 from tests.ports import free_port
 
 from holdfast_ros import ros1_node
+from holdfast_ros.ros1_environment import RosEnvironment, ServiceType
 from holdfast_ros.ros1_node import RosNode
-from holdfast_ros.tcpros import RosEnvironment, ServiceType
 from ros1_master_guard.headers import encode_header
 from ros1_master_guard.ros1_calls import Connection, HttpHead
 
@@ -324,15 +324,13 @@ class Deaf:
         self.waiting += len(data)
 
 
-def test_what_waits_for_the_subscribers_of_a_topic_has_a_bound() -> None:
-    topic = ros1_node.Topic("/topic", ros1_node.TopicType("a/B", "0" * 32, ""), latched=False)
-    deaf = [Deaf() for _ in range(200)]
-    for each in deaf:
-        topic.add(cast(asyncio.StreamWriter, each))
+def test_what_waits_for_a_subscriber_has_a_bound() -> None:
+    topic = ros1_node.Topic("/topic", ros1_node.TopicType("a/B", "0" * 32, ""))
+    deaf = Deaf()
+    topic.add(cast(asyncio.StreamWriter, deaf))
     for _ in range(300):
         topic.send(bytes(10_000))
-    assert sum(each.waiting for each in deaf) <= 16 << 20
-    assert all(each.waiting > 70_000 for each in deaf)
+    assert 64 << 10 <= deaf.waiting <= (64 << 10) + 10_004
 
 
 def address_of(node: RosNode) -> tuple[str, int]:
@@ -366,41 +364,3 @@ async def test_half_a_request_holds_no_place_for_ever(
         assert await reader.readexactly(7) == b"\1" + struct.pack("<I", 2) + b"ab"
     writer.close()
     await node.close()
-
-
-class TestAnotherHasTheName:
-    async def test_who_is_dead_is_replaced(self, master: Master) -> None:
-        node = RosNode("cloud", around(master))
-        node.offer("cloud", TYPE, echo)
-        assert await node.start(PATIENCE_S)
-        own = master.services["/cloud"]
-        master.services["/cloud"] = f"rosrpc://127.0.0.1:{free_port()}"
-        await until(lambda: master.services["/cloud"] == own)
-        await node.close()
-
-    async def test_who_lives_is_left_alone(
-        self, master: Master, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(ros1_node, "_CHECK_INTERVAL_S", 0.01)
-        nodes = [RosNode(name, around(master)) for name in ("first", "second")]
-        for node in nodes:
-            node.offer("cloud", TYPE, echo)
-            assert await node.start(PATIENCE_S)
-            if node is nodes[0]:
-                first = master.services["/cloud"]
-        second = master.services["/cloud"]
-        looks = master.asked.count("system.multicall")
-        await until(lambda: master.asked.count("system.multicall") > looks + 10)
-        assert master.services["/cloud"] == second
-        await nodes[1].close()
-        await until(lambda: master.services["/cloud"] == first)
-        with socket.socket() as hanging:
-            hanging.bind(("127.0.0.1", 0))
-            hanging.listen()
-            silent = f"rosrpc://127.0.0.1:{hanging.getsockname()[1]}"
-            monkeypatch.setattr(ros1_node, "_MASTER_S", 0.2)
-            master.services["/cloud"] = silent
-            looks = master.asked.count("system.multicall")
-            await until(lambda: master.asked.count("system.multicall") > looks + 3)
-            assert master.services["/cloud"] == silent
-        await nodes[0].close()

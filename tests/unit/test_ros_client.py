@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from holdfast_ros.active_sensing import (
     RequestKind,
 )
 from holdfast_ros.client import ActiveSensingClient
+from holdfast_ros.loop_thread import LoopThread
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
 
@@ -40,14 +43,15 @@ class Direct:
         self.fails = False
         self.asked = 0
 
-    def ask(self, request: DecisionRequest, deadline_s: float) -> DecisionAnswer:
+    async def ask(self, request: DecisionRequest, deadline_s: float) -> DecisionAnswer:
         self.asked += 1
         if self.fails:
             raise TransportError("connection refused")
         return self._answers.answer(request)
 
-    def close(self) -> None:
-        pass
+
+def client_of(cloud: Direct, recovery: Direct, *more: Any) -> ActiveSensingClient:
+    return ActiveSensingClient(cloud, recovery, LoopThread("test"), *more)
 
 
 def decisions(
@@ -111,7 +115,7 @@ def test_a_trial_decides_as_in_process_whoever_is_lost(interval: int) -> None:
             cloud.fails = self.step // 5 % 2 == 1
             return super().perform_sensing(sensing_action)
 
-    with ActiveSensingClient(
+    with client_of(
         cloud, recovery, 5.0, lambda _, **fields: statuses.append(fields.get("status"))
     ) as client:
         world = Failing(settings.problem, simulator.seed, 2)
@@ -125,20 +129,18 @@ def test_a_trial_decides_as_in_process_whoever_is_lost(interval: int) -> None:
 
 def test_a_service_that_never_answers_holds_nobody_longer_than_the_deadline() -> None:
     settings = configuration()
-    stopped = threading.Event()
 
     class Stopped(Direct):
-        def ask(self, request: DecisionRequest, deadline_s: float) -> DecisionAnswer:
-            stopped.wait(60.0)
-            raise TransportError("stopped")
+        async def ask(self, request: DecisionRequest, deadline_s: float) -> DecisionAnswer:
+            await asyncio.Event().wait()
+            raise AssertionError
 
     cloud = Stopped("cloud", ActiveSensing(settings))
-    client = ActiveSensingClient(cloud, Direct("recovery", ActiveSensing(settings)), 0.01)
+    client = client_of(cloud, Direct("recovery", ActiveSensing(settings)), 0.01)
     answer = client.decide(DecisionRequest(RequestKind.INITIALIZE, seed=1, trial=0))
     assert answer.error is ErrorCode.OK
     assert client.decided_by == "recovery"
     assert client.status is Status.LOCAL_RECOVERY
-    stopped.set()
     client.close()
 
 
@@ -148,7 +150,7 @@ def test_nobody_answers() -> None:
     cloud.fails = recovery.fails = True
     told: list[str] = []
     with (
-        ActiveSensingClient(cloud, recovery, 0.01, lambda name, **_: told.append(name)) as client,
+        client_of(cloud, recovery, 0.01, lambda name, **_: told.append(name)) as client,
         pytest.raises(TransportError, match=r"0\.2 s: cloud: connection refused; recovery: conn"),
     ):
         client.decide(DecisionRequest(RequestKind.INITIALIZE), give_up_s=0.2)
@@ -159,7 +161,7 @@ def test_an_error_of_the_request_is_raised_and_not_asked_again_elsewhere() -> No
     settings = configuration()
     cloud, recovery = (Direct(name, ActiveSensing(settings)) for name in ("cloud", "recovery"))
     with (
-        ActiveSensingClient(cloud, recovery) as client,
+        client_of(cloud, recovery) as client,
         pytest.raises(InvalidValueError, match="cloud: BAD_REQUEST: kind 9"),
     ):
         client.decide(DecisionRequest(9))
@@ -171,10 +173,10 @@ class Slow(Direct):
 
     takes_s = 0.0
 
-    def ask(self, request: DecisionRequest, deadline_s: float) -> DecisionAnswer:
+    async def ask(self, request: DecisionRequest, deadline_s: float) -> DecisionAnswer:
         self.asked += 1
         if self.takes_s > deadline_s:
-            threading.Event().wait(deadline_s)
+            await asyncio.sleep(deadline_s)
             raise TransportError("no answer in time")
         return self._answers.answer(request)
 
@@ -183,7 +185,7 @@ def test_a_recovery_service_that_is_slower_than_the_deadline_gets_more_time() ->
     settings = configuration()
     cloud, recovery = (Slow(name, ActiveSensing(settings)) for name in ("cloud", "recovery"))
     cloud.fails, cloud.takes_s, recovery.takes_s = True, 60.0, 0.05
-    with ActiveSensingClient(cloud, recovery, 0.01) as client:
+    with client_of(cloud, recovery, 0.01) as client:
         for _ in range(2):
             assert client.decide(DecisionRequest(RequestKind.INITIALIZE)).error is ErrorCode.OK
             assert client.decided_by == "recovery"
@@ -195,7 +197,7 @@ def test_who_waits_for_a_client_that_is_closed_is_told_so() -> None:
     cloud, recovery = (Direct(name, ActiveSensing(settings)) for name in ("cloud", "recovery"))
     cloud.fails = recovery.fails = True
     holding = threading.Event()
-    client = ActiveSensingClient(cloud, recovery, 0.01, lambda *_, **__: holding.set())
+    client = client_of(cloud, recovery, 0.01, lambda *_, **__: holding.set())
     told: list[str] = []
 
     def wait() -> None:
@@ -216,5 +218,7 @@ def test_who_waits_for_a_client_that_is_closed_is_told_so() -> None:
 @pytest.mark.parametrize("deadline_s", [0.0, -1.0, float("nan"), float("inf"), 1e12])
 def test_a_deadline_out_of_bounds_is_refused(deadline_s: float) -> None:
     service = Direct("cloud", ActiveSensing(configuration()))
+    thread = LoopThread("test")
     with pytest.raises(InvalidValueError, match="deadline_s"):
-        ActiveSensingClient(service, service, deadline_s)
+        ActiveSensingClient(service, service, thread, deadline_s)
+    thread.close(60.0)

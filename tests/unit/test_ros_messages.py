@@ -167,3 +167,18 @@ def test_a_state_that_is_none() -> None:
     broken = STATE._replace(belief=Belief(STATE.belief.states, np.array([0.5, 0.75])))
     with pytest.raises(CheckpointError, match="1"):
         decode_request(encode_request(DecisionRequest(1, state=broken)))
+
+
+@pytest.mark.parametrize(
+    ("states", "weights", "said"),
+    [(1.0, 2.0, "weights"), (np.nan, 1.0, "finite"), (1.0, None, "state_size 3 need 3")],
+)
+def test_a_state_is_checked_as_a_checkpoint_is(
+    states: float, weights: float | None, said: str
+) -> None:
+    before = STATE.belief
+    changed = before.weights[:1] if weights is None else weights * before.weights
+    state = STATE._replace(belief=Belief(states * before.states, changed))
+    asked = encode_request(DecisionRequest(RequestKind.CHOOSE_SENSING_ACTION, state=state))
+    with pytest.raises(CheckpointError, match=said):
+        decode_request(asked)

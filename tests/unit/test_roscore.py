@@ -1,15 +1,10 @@
-"""What belongs to a master: pauses between starts, and how processes end."""
+"""What belongs to a master: how processes end."""
 
 from __future__ import annotations
 
 import pytest
 
-from ros1_master_guard.roscore import how_it_ended, restart_delay_s
-
-
-def test_the_pause_doubles_up_to_a_second() -> None:
-    assert [restart_delay_s(failures) for failures in range(6)] == [0.1, 0.2, 0.4, 0.8, 1.0, 1.0]
-    assert restart_delay_s(10_000) == 1.0
+from ros1_master_guard.roscore import how_it_ended
 
 
 @pytest.mark.parametrize(

@@ -9,29 +9,60 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.master_state import known
 
+from ros1_master_guard import process as master_process
 from ros1_master_guard.errors import GuardError
+from ros1_master_guard.process import MasterState
 from ros1_master_guard.settings import GuardSettings, MasterAddress
-from ros1_master_guard.standby import DetachedProcess, MasterProcess
+from ros1_master_guard.standby import MasterProcess
 
 
-def test_an_exit_code_is_known_and_an_end_may_be_repeated() -> None:
-    async def run() -> int:
-        process = DetachedProcess([sys.executable, "-c", "raise SystemExit(3)"], {})
-        code = await process.wait()
-        await process.end(signal.SIGTERM)
-        return code
-
-    assert asyncio.run(run()) == 3
+def settings(directory: Path, program: str) -> GuardSettings:
+    """Return settings with a Python that runs a program of ours instead of a master."""
+    python = directory / "python"
+    python.write_text(f'#!/bin/sh\nshift\nexec {sys.executable} -c "{program}" "$@"\n')
+    python.chmod(0o755)
+    return GuardSettings(MasterAddress("localhost", 11311, "127.0.0.1"), str(python))
 
 
-def test_a_process_that_ignores_the_signal_is_killed() -> None:
+def test_what_a_master_told_is_known_when_it_has_ended(tmp_path: Path) -> None:
+    program = f"""
+import os, socket, sys
+sys.path.insert(0, {str(Path(master_process.__file__).parent)!r})
+from process import *
+guard = socket.socket(fileno=int(sys.argv[2]))
+guard.sendall(encoded('warm'))
+read = lambda size: guard.recv(size, socket.MSG_WAITALL)
+state = decoded(read(*HEAD.unpack(read(HEAD.size))))
+guard.sendall(encoded(state))
+for number in range(2000): guard.sendall(encoded(('parameters', '/a', [number] * 100)))
+os.kill(os.getpid(), 9)
+"""
+
+    async def run() -> tuple[int, MasterState]:
+        with socket.socket() as listening:
+            process = MasterProcess(settings(tmp_path, program), listening)
+            await process.serve(known())
+            code = await process.ended
+            assert process.link.following is not None
+            await process.link.following
+            await process.end()
+            return code, process.link.state
+
+    expected = known()
+    expected.parameters["a"] = [1999] * 100
+    assert asyncio.run(run()) == (-signal.SIGKILL, expected)
+
+
+def test_a_process_that_ignores_the_signal_is_killed(tmp_path: Path) -> None:
     program = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); signal.pause()"
 
     async def run() -> int:
-        process = DetachedProcess([sys.executable, "-c", program], {})
-        await process.end(signal.SIGSTOP)
-        return await process.wait()
+        with socket.socket() as listening:
+            process = MasterProcess(settings(tmp_path, program), listening)
+            await process.end(signal.SIGSTOP)
+            return await process.ended
 
     assert asyncio.run(run()) == -signal.SIGKILL
 
@@ -45,11 +76,11 @@ def test_a_python_without_ros_is_named(tmp_path: Path) -> None:
 
     async def run() -> None:
         with socket.socket() as listening:
-            process = MasterProcess(settings, listening, tmp_path / "journal")
+            process = MasterProcess(settings, listening)
             try:
                 await process.warm()
             finally:
-                await process.end(at_once=True)
+                await process.end()
 
     with pytest.raises(GuardError, match=r"cannot run a ROS 1 master .*rosmaster"):
         asyncio.run(run())
@@ -61,7 +92,7 @@ def test_a_python_that_is_not_there_is_named(tmp_path: Path) -> None:
 
     async def run() -> None:
         with socket.socket() as listening:
-            MasterProcess(settings, listening, tmp_path / "journal")
+            MasterProcess(settings, listening)
 
     with pytest.raises(GuardError, match="cannot be run: No such file"):
         asyncio.run(run())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 import threading
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
@@ -12,7 +13,7 @@ import pytest
 from tests.ports import free_port
 
 from ros1_master_guard.errors import CallError
-from ros1_master_guard.plan import NodeReport, ask_everyone, process_of, snapshot
+from ros1_master_guard.plan import gone_and_silent, process_of, snapshot
 from ros1_master_guard.process import MasterState
 from ros1_master_guard.ros1_calls import Connection
 
@@ -23,8 +24,9 @@ class Stock:
     uri = ""
 
     def getSystemState(self, caller: str) -> tuple[int, str, object]:  # noqa: N802
-        state = [[["/scan", ["/lidar"]]], [], [["/stop", ["/lidar"]]]]
-        return 1, "", state
+        scans = [["/scan", ["/lidar", "/ended"]]]
+        services = [["/stop", ["/lidar"]], ["/ended/stop", ["/ended"]]]
+        return 1, "", [scans, [["/left", ["/ended"]]], services]
 
     def getTopicTypes(self, caller: str) -> tuple[int, str, object]:  # noqa: N802
         return 1, "", [["/scan", "sensor_msgs/LaserScan"]]
@@ -33,16 +35,10 @@ class Stock:
         return 1, "", {"speed": 2}
 
     def lookupNode(self, caller: str, name: str) -> tuple[int, str, str]:  # noqa: N802
-        return 1, "", self.uri
+        return (-1, f"unknown node [{name}]", "") if name == "/ended" else (1, "", self.uri)
 
     def lookupService(self, caller: str, name: str) -> tuple[int, str, str]:  # noqa: N802
         return 1, "", "rosrpc://robot:1"
-
-    def getPublications(self, caller: str) -> tuple[int, str, object]:  # noqa: N802
-        return 1, "", [["/scan", "sensor_msgs/LaserScan"]]
-
-    def getSubscriptions(self, caller: str) -> tuple[int, str, object]:  # noqa: N802
-        return 1, "", []
 
 
 @contextmanager
@@ -72,6 +68,7 @@ def test_a_stock_masters_state() -> None:
     with stock() as uri:
         state = asyncio.run(ask(uri))
         assert state.publishers == {"/scan": [("/lidar", uri)]}
+        assert state.subscribers == {}
         assert state.services == {"/stop": ("/lidar", uri, "rosrpc://robot:1")}
     assert state.types == {"/scan": "sensor_msgs/LaserScan"}
     assert state.parameters == {"speed": 2}
@@ -105,7 +102,6 @@ def test_a_master_that_tells_no_process_id(pid: object, monkeypatch: pytest.Monk
         ("getSystemState", [[[1, 2, 3]], [], []]),
         ("getSystemState", [[["/scan", [["/lidar"]]]], [], []]),
         ("getSystemState", [[["/scan", ["/lidar", 5]]], [], []]),
-        ("getSystemState", [[[7, ["/lidar"]]], [], []]),
         ("getTopicTypes", 5),
         ("getTopicTypes", ["ab", "c"]),
         ("getParam", "a text"),
@@ -119,20 +115,9 @@ def test_a_master_whose_answers_have_another_form(
         asyncio.run(asked(uri, snapshot))
 
 
-def test_a_place_that_is_no_text_is_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Stock, "lookupNode", lambda *_: (1, "", [5]))
-    with stock() as uri:
-        state = asyncio.run(asked(uri, snapshot))
-    assert isinstance(state, MasterState)
-    assert state.publishers == {}
-
-
-def test_a_node_reports_its_topics_and_a_dead_one_is_gone() -> None:
+def test_a_node_that_answers_lives_and_a_dead_one_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Stock, "getPid", lambda *_: (1, "", 5), raising=False)
     dead = f"http://127.0.0.1:{free_port()}/"
-    known = MasterState()
-    with stock() as uri:
-        known.publishers = {"/scan": [("/lidar", uri), ("/dead", dead)]}
-        known.services = {"/stop": ("/dead", dead, f"rosrpc://127.0.0.1:{free_port()}")}
-        nodes, services = asyncio.run(ask_everyone(known))
-    assert nodes == {uri: NodeReport({"/scan": "sensor_msgs/LaserScan"}, {}), dead: "gone"}
-    assert services == {"/stop": False}
+    with stock() as uri, socket.create_server(("127.0.0.1", 0)) as stopped:
+        silent = f"http://127.0.0.1:{stopped.getsockname()[1]}/"
+        assert asyncio.run(gone_and_silent([uri, dead, silent])) == ({dead}, {silent})

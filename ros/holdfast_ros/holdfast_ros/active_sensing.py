@@ -20,10 +20,8 @@ import numpy as np
 
 from holdfast.config.loader import Configuration
 from holdfast.config.user_code import account_of_user_error
-from holdfast.errors import CheckpointError, HoldfastError, InvalidValueError, ProblemError
+from holdfast.errors import HoldfastError, InvalidValueError, ProblemError
 from holdfast.numerics.arrays import FloatArray
-from holdfast.planning import planner as planning
-from holdfast.planning.belief import Belief
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.robot.environment import is_no_reading
 from holdfast.robot.session_configuration import session_configuration_of
@@ -35,9 +33,7 @@ __all__ = [
     "DecisionRequest",
     "ErrorCode",
     "RequestKind",
-    "checked_state",
     "configuration_digest",
-    "no_state",
 ]
 
 
@@ -128,11 +124,6 @@ class DecisionAnswer(NamedTuple):
     task_actions: FloatArray = np.empty((0, 0))
 
 
-def no_state() -> PlanningState:
-    """Return a state without particles, which messages use for none."""
-    return PlanningState(0, 0, 0, 0, False, Belief(np.empty((0, 0)), np.empty(0)))
-
-
 def configuration_digest(configuration: Configuration) -> str:
     """Return 16 digits of a digest over the problem, its code, the settings and the version.
 
@@ -216,35 +207,3 @@ class ActiveSensing:
             ahead,
             task_actions=np.reshape(actions, (len(actions), planner.problem.action_size)),
         )
-
-
-def checked_state(
-    seed: int,
-    trial: int,
-    step: int,
-    stage: int,
-    sensed: bool,
-    state_size: int,
-    states: FloatArray,
-    weights: FloatArray,
-) -> PlanningState | None:
-    """Return the state that a message has, or None if it has no particles.
-
-    ``states`` has shape ``(num_particles * state_size,)``, particle after particle, and ``weights``
-    ``(num_particles,)``.
-
-    Raises CheckpointError if this is no state: numbers that are missing or not finite, weights that
-    are negative or do not sum to 1, a negative seed.
-    """
-    if not weights.size and not states.size:
-        return None
-    if states.size != weights.size * state_size:
-        raise CheckpointError(
-            f"state.belief.states has {states.size} numbers: {weights.size} weights and "
-            f"state_size {state_size} need {weights.size * state_size}"
-        )
-    belief = Belief(states.reshape(weights.size, state_size), weights)
-    # A state from outside must pass the checks of a checkpoint.
-    return planning.decode_checkpoint(
-        planning.encode_checkpoint(PlanningState(seed, trial, step, stage, sensed, belief))
-    )

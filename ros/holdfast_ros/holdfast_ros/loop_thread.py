@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import threading
 from collections.abc import Callable, Coroutine
+from concurrent.futures import CancelledError
 from typing import Any, TypeVar
 
 from holdfast.errors import TransportError
@@ -23,17 +24,23 @@ class LoopThread:
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
-    def run(self, coroutine: Coroutine[Any, Any, _T], within_s: float) -> _T:
+    def run(self, coroutine: Coroutine[Any, Any, _T], within_s: float | None = None) -> _T:
         """Run a coroutine there, and wait at most ``within_s`` for its result.
 
-        Raises TransportError if it takes longer.
+        Raises TransportError if it takes longer, or this is closed before.
         """
+        if self._loop.is_closed():
+            coroutine.close()
+            raise TransportError("it is closed")
         future = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
         try:
             return future.result(within_s)
         except TimeoutError:
-            future.cancel()
             raise TransportError(f"it took longer than {within_s:g} s") from None
+        except CancelledError:
+            raise TransportError("it is closed") from None
+        finally:
+            future.cancel()
 
     def call(self, function: Callable[..., object], *arguments: object) -> None:
         """Call a function there; after the end nothing happens."""
@@ -49,7 +56,10 @@ class LoopThread:
         asyncio.set_event_loop(self._loop)
         try:
             self._loop.run_forever()
-            # Tasks that were just cancelled get their exception.
-            self._loop.run_until_complete(asyncio.sleep(0))
+            tasks = asyncio.all_tasks(self._loop)
+            for task in tasks:
+                task.cancel()
+            for waits in (asyncio.gather(*tasks, return_exceptions=True), asyncio.sleep(0)):
+                self._loop.run_until_complete(waits)  # the last is for connections that just closed
         finally:
             self._loop.close()

@@ -15,21 +15,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.errors import HoldfastError, InvalidValueError
+from holdfast.errors import CheckpointError, HoldfastError, InvalidValueError
 from holdfast.numerics.arrays import FloatArray
-from holdfast_ros.active_sensing import (
-    DecisionAnswer,
-    DecisionRequest,
-    ErrorCode,
-    checked_state,
-    no_state,
-)
+from holdfast.planning.belief import Belief
+from holdfast.planning.planner import PlanningState, decode_checkpoint, encode_checkpoint
+from holdfast_ros.active_sensing import DecisionAnswer, DecisionRequest, ErrorCode
 
 if TYPE_CHECKING:
     from rosbags.interfaces.typing import Typesdict
     from rosbags.typesys.store import Typestore
 
-    from holdfast.planning.planner import PlanningState
     from holdfast_ros.active_sensing import ActiveSensing
 
 __all__ = [
@@ -202,7 +197,8 @@ def answer_message(service: ActiveSensing, request: bytes) -> bytes:
 
 def _state_message(state: PlanningState | None) -> Any:
     types = typestore().types
-    seed, trial, step, stage, sensed, (states, weights) = no_state() if state is None else state
+    none = PlanningState(0, 0, 0, 0, False, Belief(np.empty((0, 0)), np.empty(0)))
+    seed, trial, step, stage, sensed, (states, weights) = none if state is None else state
     return types[f"{_PACKAGE}/msg/PlanningState"](
         seed=_whole("state.seed", seed, 63, 63),
         trial=_whole("state.trial", trial, 0, 32),
@@ -216,17 +212,24 @@ def _state_message(state: PlanningState | None) -> Any:
 
 
 def _state(message: Any) -> PlanningState | None:
+    """Return the state that a message has, or None if it has no particles.
+
+    Raises CheckpointError if this is no state: numbers that are missing or not finite, weights that
+    are negative or do not sum to 1, a negative seed.
+    """
     belief = message.belief
-    return checked_state(
-        message.seed,
-        message.trial,
-        message.step,
-        message.stage,
-        bool(message.sensed),
-        belief.state_size,
-        _array(belief.states),
-        _array(belief.weights),
-    )
+    states, weights, size = _array(belief.states), _array(belief.weights), belief.state_size
+    if not weights.size and not states.size:
+        return None
+    if states.size != weights.size * size:
+        raise CheckpointError(
+            f"state.belief.states has {states.size} numbers: {weights.size} weights and "
+            f"state_size {size} need {weights.size * size}"
+        )
+    head = message.seed, message.trial, message.step, message.stage, bool(message.sensed)
+    state = PlanningState(*head, Belief(states.reshape(weights.size, size), weights))
+    # A state from outside must pass the checks of a checkpoint.
+    return decode_checkpoint(encode_checkpoint(state))
 
 
 def _encode(message: Any, part: str) -> bytes:

@@ -12,28 +12,18 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ipaddress
-import queue
-import socket
-import struct
-import threading
 from collections.abc import Callable
-from time import monotonic
-from typing import TYPE_CHECKING, Any, Final
-from urllib.parse import urlsplit
-
-import numpy as np
+from typing import Final
 
 from holdfast.errors import TransportError
-from holdfast.numerics.arrays import FloatArray
 from holdfast.protocol.status import Status
-from holdfast.runtime.addresses import host_and_port, system_words
-from holdfast_ros.active_sensing import DecisionAnswer, DecisionRequest, ErrorCode, RequestKind
-from holdfast_ros.client import ActiveSensingClient
+from holdfast.runtime.addresses import system_words
+from holdfast_ros.active_sensing import DecisionAnswer, DecisionRequest
+from holdfast_ros.client import ActiveSensingClient, log_event
 from holdfast_ros.loop_thread import LoopThread
 from holdfast_ros.messages import MAX_BYTES, decode_answer, encode_request, md5_sum
-from holdfast_ros.ros1_node import RosNode, Topic, TopicType
-from holdfast_ros.tcpros import RosEnvironment, ServiceType, place_of_service
+from holdfast_ros.ros1_environment import RosEnvironment, ServiceType
+from holdfast_ros.ros1_node import RosNode, TopicType
 from ros1_master_guard.errors import CallError, GoneError, ProtocolError
 from ros1_master_guard.headers import (
     MAX_HEADER_BYTES,
@@ -41,10 +31,7 @@ from ros1_master_guard.headers import (
     encode_header,
     encode_message,
 )
-from ros1_master_guard.ros1_calls import call
-
-if TYPE_CHECKING:
-    from rosbags.typesys.store import Typestore
+from ros1_master_guard.ros1_calls import call, connect, message
 
 __all__ = ["SERVICE_TYPE", "STATUS_WORDS", "Ros1Client", "Ros1Service", "service_type"]
 
@@ -63,16 +50,15 @@ _LOOKUP_S: Final = 1.0
 
 _START_S: Final = 5.0
 _CLOSE_S: Final = 1.0
-_MAX_WAITING: Final = 256
+
+STATUS_TYPE: Final = TopicType(
+    "std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n"
+)
 
 
 def service_type() -> ServiceType:
     """Return the typed service's name and digest in ROS 1."""
     return ServiceType(SERVICE_TYPE, md5_sum())
-
-
-class _LostError(TransportError):
-    """The connection has ended."""
 
 
 class Ros1Service:
@@ -82,8 +68,8 @@ class Ros1Service:
     ----------
     name : str
         Of the service, such as ``cloud_active_sensing``.
-    ros_environment : RosEnvironment or None
-        None reads ROS's variables.
+    ros_environment : RosEnvironment
+        Where the master is.
     caller : str
         Name of the asking node.
 
@@ -93,22 +79,15 @@ class Ros1Service:
         If the name is none.
     """
 
-    def __init__(
-        self,
-        name: str,
-        ros_environment: RosEnvironment | None = None,
-        caller: str = "holdfast_robot",
-    ) -> None:
-        self._ros_environment = ros_environment or RosEnvironment.of()
-        self.name = self._ros_environment.resolved(name)
-        self._caller = self._ros_environment.resolved(caller)
+    def __init__(self, name: str, ros_environment: RosEnvironment, caller: str) -> None:
+        self.name = ros_environment.resolved(name)
+        self._master = ros_environment.master
+        self._caller = ros_environment.resolved(caller)
         self._digest = md5_sum()
-        self._last_place: tuple[str, int] | None = None
-        self._socket: socket.socket | None = None
-        self._is_closed = False
-        self._lock = threading.Lock()
+        self._last_uri: str | None = None
+        self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
-    def ask(self, request: DecisionRequest, deadline_s: float) -> DecisionAnswer:
+    async def ask(self, request: DecisionRequest, deadline_s: float) -> DecisionAnswer:
         """Ask, and wait at most ``deadline_s`` for the answer.
 
         Raises
@@ -116,179 +95,96 @@ class Ros1Service:
         TransportError
             If there is no answer; the message gives the reason.
         """
-        until = monotonic() + deadline_s
-        message = encode_message(encode_request(request))
+        asked = encode_message(encode_request(request))
         try:
-            return decode_answer(self._exchange(message, until))
-        except TimeoutError:
-            self._disconnect()
-            raise TransportError(f"no answer in {deadline_s:g} s") from None
-        except TransportError:
-            self._disconnect()
-            raise
-        except OSError as error:
-            self._disconnect()
-            raise TransportError(system_words(error.errno)) from error
+            async with asyncio.timeout(deadline_s):
+                return decode_answer(await self._exchange(asked, deadline_s))
+        except BaseException as error:
+            self.disconnect()
+            match error:
+                case TimeoutError():
+                    reason = f"no answer in {deadline_s:g} s"
+                case asyncio.IncompleteReadError():
+                    reason = "it has ended the connection"
+                case ProtocolError():
+                    reason = f"it {error}"
+                case OSError():
+                    reason = system_words(error.errno)
+                case CallError():
+                    reason = str(error)
+                case _:
+                    raise
+            raise TransportError(reason) from error
 
-    def close(self) -> None:
-        """End all requests; may be called from another thread, and repeated."""
-        self._is_closed = True
-        self._disconnect()
+    def disconnect(self) -> None:
+        """End the connection; the next request opens another."""
+        if self._streams is not None:
+            self._streams[1].close()
+            self._streams = None
 
-    def _exchange(self, message: bytes, until: float) -> bytes:
-        if self._socket is not None:
+    async def _exchange(self, asked: bytes, deadline_s: float) -> bytes:
+        if self._streams is not None:
             # The service may have been restarted since. Requests change nothing there, so they can
             # be repeated.
-            with contextlib.suppress(_LostError, ConnectionError):
-                return self._exchange_over(self._socket, message, until)
-            self._disconnect()
-        return self._exchange_over(self._connected(until), message, until)
+            with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
+                return await self._exchange_over(*self._streams, asked)
+            self.disconnect()
+        return await self._exchange_over(*await self._connected(deadline_s), asked)
 
-    def _exchange_over(self, stream: socket.socket, message: bytes, until: float) -> bytes:
-        _send(stream, message, until)
-        is_done = _receive(stream, 1, until) == b"\x01"
-        answer = _receive_message(stream, MAX_BYTES, until)
+    async def _exchange_over(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, asked: bytes
+    ) -> bytes:
+        writer.write(asked)
+        is_done = await reader.readexactly(1) == b"\x01"
+        answer = await message(reader, MAX_BYTES)
         if not is_done:
             raise TransportError(f"it answers: {answer[:500].decode(errors='replace')}")
         return answer
 
-    # -- the connection ----------------------------------------------------------------------------
-
-    def _connected(self, until: float) -> socket.socket:
-        place, where = self._found(until)
+    async def _connected(
+        self, deadline_s: float
+    ) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        uri, where = await self._found(deadline_s)
         try:
-            stream = socket.create_connection(place, _left(until))
-        except ConnectionRefusedError:
-            raise TransportError(
-                f"nobody listens at {host_and_port(*place)}, where {where}: it is dead"
-            ) from None
-        try:
-            stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._take(stream)
-            fields = {
-                "callerid": self._caller,
-                "service": self.name,
-                "md5sum": self._digest,
-                "type": SERVICE_TYPE,
-                "persistent": "1",
-            }
-            _send(stream, encode_header(fields), until)
-            header = decode_header(_receive_message(stream, MAX_HEADER_BYTES, until))
-        except ProtocolError as error:
-            stream.close()
-            raise TransportError(f"it {error}") from error
-        except BaseException:
-            stream.close()
-            raise
+            reader, writer = await connect(uri)
+        except GoneError:
+            raise TransportError(f"nobody listens at {uri}, where {where}: it is dead") from None
+        self._streams = reader, writer
+        fields = {
+            "callerid": self._caller,
+            "service": self.name,
+            "md5sum": self._digest,
+            "type": SERVICE_TYPE,
+            "persistent": "1",
+        }
+        writer.write(encode_header(fields))
+        header = decode_header(await message(reader, MAX_HEADER_BYTES))
         if "error" in header:
             raise TransportError(f"it refuses: {header['error']:.500}")
-        self._last_place = place
-        return stream
+        self._last_uri = uri
+        return reader, writer
 
-    def _take(self, stream: socket.socket) -> None:
-        """Have a connection that :meth:`close` ends."""
-        with self._lock:
-            if self._is_closed:
-                raise TransportError("it is not asked any more")
-            self._socket = stream
-
-    def _found(self, until: float) -> tuple[tuple[str, int], str]:
+    async def _found(self, deadline_s: float) -> tuple[str, str]:
         """Return where the service is, and who says so."""
-        last = self._last_place
-        within_s = _left(until)
-        if last is not None:
-            within_s = min(within_s / 2, _LOOKUP_S)
+        within_s = deadline_s if self._last_uri is None else min(deadline_s / 2, _LOOKUP_S)
         try:
-            host, port = place_of_service(self._looked_up(within_s))
+            asked = call(
+                *(self._master, "lookupService", self.name), within_s=within_s, caller=self._caller
+            )
+            return str(await asked), "the master says it is"
         except GoneError:
-            reason = f"there is no master at {self._ros_environment.master}"
+            reason = f"there is no master at {self._master}"
         except CallError as error:
             reason = str(error)
-        else:
-            return (_address(host, until), port), "the master says it is"
-        if last is None:
+        if self._last_uri is None:
             raise TransportError(reason)
-        return last, f"it was last ({reason})"
-
-    def _looked_up(self, within_s: float) -> str:
-        ros_environment = self._ros_environment
-        parts = urlsplit(ros_environment.master)
-        until = monotonic() + within_s
-        assert parts.hostname is not None and parts.port is not None
-        master = f"http://{host_and_port(_address(parts.hostname, until), parts.port)}/"
-        asked = call(master, "lookupService", self.name, within_s=_left(until), caller=self._caller)
-        return str(asyncio.run(asked))
-
-    def _disconnect(self) -> None:
-        with self._lock:
-            stream, self._socket = self._socket, None
-        if stream is not None:
-            with contextlib.suppress(OSError):
-                stream.shutdown(socket.SHUT_RDWR)  # wakes a waiting thread
-            stream.close()
-
-
-def _left(until: float) -> float:
-    left = until - monotonic()
-    if left <= 0:
-        raise TimeoutError
-    return left
-
-
-def _address(host: str, until: float) -> str:
-    """Return the address of a host; its look-up, which nothing can break off, is left behind."""
-    with contextlib.suppress(ValueError):
-        return str(ipaddress.ip_address(host))
-    found: queue.SimpleQueue[str] = queue.SimpleQueue()
-
-    def look_up() -> None:
-        try:
-            # ROS 1 uses IPv4 by default.
-            found.put(socket.getaddrinfo(host, None, socket.AF_INET)[0][4][0])  # type: ignore[arg-type]
-        except (OSError, UnicodeError):
-            found.put("")
-
-    threading.Thread(target=look_up, name="holdfast-resolve", daemon=True).start()
-    try:
-        address = found.get(timeout=_left(until))
-    except queue.Empty:
-        raise TimeoutError from None
-    if not address:
-        raise TransportError(f"host name not found: {host}")
-    return address
-
-
-def _send(stream: socket.socket, data: bytes, until: float) -> None:
-    stream.settimeout(_left(until))
-    stream.sendall(data)
-
-
-def _receive(stream: socket.socket, size: int, until: float) -> bytes:
-    data = bytearray(size)
-    view = memoryview(data)
-    place = 0
-    while place < size:
-        stream.settimeout(_left(until))
-        received = stream.recv_into(view[place:])
-        if not received:
-            raise _LostError("it has ended the connection")
-        place += received
-    return bytes(data)
-
-
-def _receive_message(stream: socket.socket, max_bytes: int, until: float) -> bytes:
-    (size,) = struct.unpack("<I", _receive(stream, 4, until))
-    if size > max_bytes:
-        raise TransportError(f"it answers with {size} bytes; {max_bytes} are allowed")
-    return _receive(stream, size, until)
+        return self._last_uri, f"it was last ({reason})"
 
 
 class Ros1Client(ActiveSensingClient):
     """The thesis's client: asks the cloud, and the recovery service if the cloud fails.
 
-    It is a node that publishes ``status`` and ``decided_by`` (``std_msgs/String``),
-    ``sensing_action`` (``std_msgs/UInt32``) and ``task_actions`` (``std_msgs/Float64MultiArray``,
-    one action after another), each under the node's name.
+    It is a node that publishes its status (``std_msgs/String``) as ``status`` under its name.
 
     Parameters
     ----------
@@ -313,92 +209,36 @@ class Ros1Client(ActiveSensingClient):
         ros_environment: RosEnvironment | None = None,
         on_event: Callable[..., None] | None = None,
     ) -> None:
-        from rosbags.typesys import Stores, get_typestore
-
         ros_environment = ros_environment or RosEnvironment.of()
         first, second = (Ros1Service(each, ros_environment, name) for each in (cloud, recovery))
-        self._store: Typestore = get_typestore(Stores.ROS1_NOETIC)
-        self._node = RosNode(name, ros_environment)
-        self._waiting = 0
+        super().__init__(first, second, LoopThread("holdfast-ros1"), deadline_s, self._tell)
+        self._services = first, second
+        self._own_on_event = on_event or log_event
         self._is_unregistered = False
-        self._topics: dict[str, tuple[Topic, str]] = {}
-        for topic, kind, latched in (
-            ("status", "std_msgs/msg/String", True),
-            ("decided_by", "std_msgs/msg/String", True),
-            ("sensing_action", "std_msgs/msg/UInt32", False),
-            ("task_actions", "std_msgs/msg/Float64MultiArray", False),
-        ):
-            definition, digest = self._store.generate_msgdef(kind)
-            type_ = TopicType(kind.replace("/msg/", "/"), digest, definition)
-            published = self._node.publish(f"{name}/{topic}", type_, latched=latched)
-            self._topics[topic] = published, kind
-        self._thread = LoopThread("holdfast-ros1")
+        self._node = RosNode(name, ros_environment)
+        self._status_topic = self._node.publish(f"{name}/status", STATUS_TYPE)
+        self._publish(Status.STANDARD)
         try:
             self._thread.run(self._node.start(), _START_S)
         except BaseException:
             self._thread.close(_START_S)
             raise
-        self._send("status", data=STATUS_WORDS[Status.STANDARD])
-        self._published_decider = ""
-        self._own_on_event = on_event
-        super().__init__(first, second, deadline_s, self._tell)
 
     def close(self) -> None:
         """End all requests, and unregister the node, within a second; may be repeated."""
-        super().close()
         if not self._is_unregistered:
             self._is_unregistered = True
             with contextlib.suppress(TransportError):
                 self._thread.run(self._node.close(_CLOSE_S), 2 * _CLOSE_S)
-            self._thread.close(_CLOSE_S)
-
-    def topic(self, name: str) -> Topic:
-        """Return one of the topics that are published, by the last part of its name."""
-        return self._topics[name][0]
-
-    def decide(self, request: DecisionRequest, give_up_s: float | None = None) -> DecisionAnswer:
-        """Return a service's answer; see :meth:`ActiveSensingClient.decide`."""
-        answer = super().decide(request, give_up_s)
-        if self.decided_by != self._published_decider:
-            self._published_decider = self.decided_by
-            self._send("decided_by", data=self.decided_by)
-        if answer.error is ErrorCode.OK and request.kind == RequestKind.CHOOSE_SENSING_ACTION:
-            self._send("sensing_action", data=answer.sensing_action)
-        elif len(answer.task_actions):
-            self._send("task_actions", **self._array(answer.task_actions))
-        return answer
+            for service in self._services:
+                self._thread.call(service.disconnect)
+        super().close()
 
     def _tell(self, name: str, **fields: object) -> None:
         if name == "status":
-            self._send("status", data=STATUS_WORDS[Status(fields["status"])])
-        if self._own_on_event is not None:
-            self._own_on_event(name, **fields)
+            self._publish(Status(fields["status"]))
+        self._own_on_event(name, **fields)
 
-    def _send(self, topic: str, **fields: Any) -> None:
-        """Publish without waiting; messages beyond a limit are dropped."""
-        to, kind = self._topics[topic]
-        message = self._store.types[kind](**fields)
-        data = bytes(self._store.serialize_ros1(message, kind))
-        if self._waiting >= _MAX_WAITING:
-            return
-        self._waiting += 1
-
-        def send() -> None:
-            self._waiting -= 1
-            to.send(data)
-
-        self._thread.call(send)
-
-    def _array(self, numbers: FloatArray) -> dict[str, Any]:
-        """Return the fields of a Float64MultiArray."""
-        types = self._store.types
-        dimension = types["std_msgs/msg/MultiArrayDimension"]
-        rows, columns = numbers.shape
-        layout = types["std_msgs/msg/MultiArrayLayout"](
-            dim=[
-                dimension(label="action", size=rows, stride=rows * columns),
-                dimension(label="coordinate", size=columns, stride=columns),
-            ],
-            data_offset=0,
-        )
-        return {"layout": layout, "data": np.ascontiguousarray(numbers, np.float64).ravel()}
+    def _publish(self, status: Status) -> None:
+        text = STATUS_WORDS[status].encode()
+        self._thread.call(self._status_topic.send, encode_message(text))

@@ -19,13 +19,7 @@ from typing import Any, Final, NamedTuple
 from holdfast.errors import DEFECT, TransportError, defect_fields
 from holdfast.runtime.addresses import host_and_port, why_not_bound
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
-from holdfast_ros.tcpros import (
-    RosEnvironment,
-    ServiceType,
-    encode_answer,
-    encode_refusal,
-    header_of_service,
-)
+from holdfast_ros.ros1_environment import RosEnvironment, ServiceType
 from ros1_master_guard.errors import CallError
 from ros1_master_guard.headers import (
     ANY_TYPE,
@@ -34,7 +28,13 @@ from ros1_master_guard.headers import (
     encode_header,
     encode_message,
 )
-from ros1_master_guard.ros1_calls import Connection, HttpHead, decoded, message, offers_service
+from ros1_master_guard.ros1_calls import (
+    MAX_SHORT_BYTES,
+    Connection,
+    HttpHead,
+    decoded,
+    message,
+)
 
 __all__ = ["RosNode", "ServiceHandler", "Topic", "TopicType"]
 
@@ -62,12 +62,8 @@ _MAX_CALL_BYTES: Final = 8 << 10
 """An XML-RPC call to a node has some hundred bytes. Parsing takes a microsecond for each of them,
 during which nobody else is served."""
 
-_MAX_ANSWER_BYTES: Final = 256 << 10
-"""The same of a master's answer, which names this node's services."""
-
-_MAX_UNREAD_BYTES: Final = 1 << 20
-_MAX_UNREAD_BYTES_OF_ALL: Final = 16 << 20
-"""Bounds on what waits for one subscriber, and for all of a topic; further messages are dropped."""
+_MAX_UNREAD_BYTES: Final = 64 << 10
+"""Bound on what waits for a subscriber; further messages are dropped."""
 
 _TURNS_TO_BEGIN: Final = 4
 """Turns of the loop until asyncio serves a connection that it has accepted. Before that it is in no
@@ -91,34 +87,28 @@ class _Offer(NamedTuple):
 
 
 class Topic:
-    """A topic that this node publishes; made by :meth:`RosNode.publish`."""
+    """A latched topic that this node publishes; made by :meth:`RosNode.publish`."""
 
-    def __init__(self, name: str, type_: TopicType, latched: bool) -> None:
+    def __init__(self, name: str, type_: TopicType) -> None:
         self.name = name
         self.type = type_
-        self.latched = latched
         self._last: bytes | None = None
         self.subscribers: set[asyncio.StreamWriter] = set()
 
     def send(self, payload: bytes) -> None:
         """Send a message to all subscribers; never waits."""
-        message = encode_message(payload)
-        if self.latched:
-            self._last = message
+        self._last = encode_message(payload)
         for writer in list(self.subscribers):
-            self._write(writer, message)
+            self._write(writer)
 
     def add(self, writer: asyncio.StreamWriter) -> None:
-        """Add a subscriber; it gets the last message of a latched topic."""
+        """Add a subscriber; it gets the last message."""
         self.subscribers.add(writer)
-        if self._last is not None:
-            self._write(writer, self._last)
+        self._write(writer)
 
-    def _write(self, writer: asyncio.StreamWriter, message: bytes) -> None:
-        waiting = writer.transport.get_write_buffer_size()
-        bound = min(_MAX_UNREAD_BYTES, _MAX_UNREAD_BYTES_OF_ALL // len(self.subscribers))
-        if waiting == 0 or waiting + len(message) <= bound:
-            writer.write(message)
+    def _write(self, writer: asyncio.StreamWriter) -> None:
+        if self._last and writer.transport.get_write_buffer_size() < _MAX_UNREAD_BYTES:
+            writer.write(self._last)
 
 
 class RosNode:
@@ -145,7 +135,7 @@ class RosNode:
         self._max_message_bytes = max_message_bytes
         self._services: dict[str, _Offer] = {}
         self._topics: dict[str, Topic] = {}
-        self._master = Connection(environment.master, self.name, _MAX_ANSWER_BYTES)
+        self._master = Connection(environment.master, self.name, MAX_SHORT_BYTES)
         self._parsing = asyncio.Lock()
         self._servers: list[asyncio.Server] = []
         self._uri = ""
@@ -159,9 +149,9 @@ class RosNode:
         """Offer a service, before the start; the caller and the log get the handler's errors."""
         self._services[self._environment.resolved(name)] = _Offer(type_, handler)
 
-    def publish(self, name: str, type_: TopicType, *, latched: bool = False) -> Topic:
-        """Add a topic, before the start; new subscribers of a latched one get its last message."""
-        topic = Topic(self._environment.resolved(name), type_, latched)
+    def publish(self, name: str, type_: TopicType) -> Topic:
+        """Add a topic, before the start; new subscribers get its last message."""
+        topic = Topic(self._environment.resolved(name), type_)
         self._topics[topic.name] = topic
         return topic
 
@@ -251,16 +241,7 @@ class RosNode:
             ("lookupNode", (self.name, self.name)),
             *(("lookupService", (self.name, name)) for name in services),
         ]
-        node, *found = await self._master.calls(lookups, within_s=_MASTER_S)
-        if node is None or None in found:
-            return False
-        # Another node may keep a name that it has taken over, as long as it offers the service.
-        others = [
-            offers_service(str(uri), name, within_s=_MASTER_S)
-            for (name, own), uri in zip(services.items(), found, strict=True)
-            if uri != own
-        ]
-        return False not in await asyncio.gather(*others)
+        return None not in await self._master.calls(lookups, within_s=_MASTER_S)
 
     async def _register(self) -> None:
         calls: list[tuple[str, tuple[object, ...]]] = [
@@ -380,7 +361,15 @@ class RosNode:
             return
         if _refuse_other_type(header, offer.type, f"service [{header['service']}]", writer):
             return
-        writer.write(encode_header(header_of_service(self.name, header["service"], offer.type)))
+        fields = {
+            "callerid": self.name,
+            "service": header["service"],
+            "type": offer.type.name,
+            "md5sum": offer.type.digest,
+            "request_type": f"{offer.type.name}Request",
+            "response_type": f"{offer.type.name}Response",
+        }
+        writer.write(encode_header(fields))
         if header.get("probe") == "1":
             await writer.drain()
             return
@@ -390,12 +379,14 @@ class RosNode:
             async with asyncio.timeout(_REQUEST_S):
                 request = await message(reader, self._max_message_bytes, first)
             try:
-                answer = encode_answer(await offer.handler(request))
+                # A byte for success, and the message or an error text.
+                answer = b"\1" + encode_message(await offer.handler(request))
             except Exception as error:  # noqa: BLE001 - only this request fails
                 reason = f"{type(error).__name__}: {error}"
                 if self._on_event is not None:
                     self._on_event("ros_request_failed", service=header["service"], reason=reason)
-                answer = encode_refusal(f"the service has failed: {reason:.500}")
+                text = f"the service has failed: {reason:.500}"
+                answer = b"\0" + encode_message(text.encode())
             writer.write(answer)
             await writer.drain()
             if header.get("persistent") != "1":
@@ -418,7 +409,7 @@ class RosNode:
                     "type": topic.type.name,
                     "md5sum": topic.type.digest,
                     "message_definition": topic.type.definition,
-                    "latching": "1" if topic.latched else "0",
+                    "latching": "1",
                 }
             )
         )

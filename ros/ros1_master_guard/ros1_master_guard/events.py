@@ -8,20 +8,13 @@ import json
 import queue
 import threading
 from collections.abc import Mapping
-from typing import Protocol, TextIO
+from typing import TextIO
 
-__all__ = ["EventLog", "EventSink", "json_line"]
+__all__ = ["EventLog", "json_line"]
 
 _MAX_QUEUED_LINES = 1000
 _MAX_LINE = 4000
 _FLUSH_TIMEOUT_S = 0.5
-
-
-class EventSink(Protocol):
-    """Takes events: a name, and fields in plain data or with a text of their own."""
-
-    def event(self, name: str, /, **fields: object) -> None:
-        """Take an event; never raises."""
 
 
 class EventLog:
@@ -39,7 +32,7 @@ class EventLog:
         self._thread.start()
 
     def event(self, name: str, /, **fields: object) -> None:
-        """Write an event."""
+        """Write an event: a name, and fields in plain data or with a text of their own."""
         with contextlib.suppress(queue.Full):
             self._lines.put_nowait((json_line if self._as_json else _text)(name, fields))
 

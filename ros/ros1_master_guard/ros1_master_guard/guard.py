@@ -6,12 +6,12 @@ nodes do not register again.
 
 The guard owns the listening socket, and each master inherits it. So calls to a master that has just
 died are not refused: they wait in the kernel for the next one, which is already running and has
-loaded all code. It reads what its predecessor had confirmed (:mod:`ros1_master_guard.process`),
-drops what has died meanwhile (:mod:`ros1_master_guard.plan`), and answers. For a node this is one
-slow call.
+loaded all code. It is given what its predecessor had told the guard
+(:mod:`ros1_master_guard.process`), without the nodes that have died meanwhile
+(:mod:`ros1_master_guard.plan`), and answers. For a node this is one slow call.
 
 A master survives its guard, and the next guard watches it. The guard also watches a foreign master,
-such as ``roscore``'s. That one keeps no journal, so the guard polls it a few times a second.
+such as ``roscore``'s. That one tells nothing by itself, so the guard asks it a few times a second.
 """
 
 from __future__ import annotations
@@ -26,79 +26,62 @@ import uuid
 from collections.abc import Callable, Coroutine, Iterator
 from time import monotonic
 from typing import Any
-from urllib.parse import urlsplit
 
 from ros1_master_guard.errors import CallError, GoneError, GuardError, SilentError
-from ros1_master_guard.events import EventSink
-from ros1_master_guard.plan import (
-    NodeReport,
-    Reconciled,
-    ask_everyone,
-    process_of,
-    reconcile,
-    snapshot,
-    unregistrations,
-)
-from ros1_master_guard.process import (
-    MasterState,
-    parameter_names,
-    read_journal,
-    touch,
-    write_journal,
-)
+from ros1_master_guard.events import EventLog
+from ros1_master_guard.plan import gone_and_silent, process_of, snapshot, without
+from ros1_master_guard.process import MasterState
 from ros1_master_guard.ros1_calls import CALLER, Connection, call
-from ros1_master_guard.roscore import (
-    ROSOUT,
-    STEADY_S,
-    Rosout,
-    how_it_ended,
-    restart_delay_s,
-    set_versions,
-)
-from ros1_master_guard.settings import GuardLock, GuardSettings, listens_at, own_directory
-from ros1_master_guard.standby import MasterProcess
+from ros1_master_guard.roscore import ROSOUT, Rosout, how_it_ended, set_versions
+from ros1_master_guard.saved_state import read_journal, write_journal
+from ros1_master_guard.settings import GuardSettings, directory_for, guard_lock, listens_at
+from ros1_master_guard.standby import MasterLink, MasterProcess
 
 __all__ = ["MasterGuard"]
 
-_PROBE_EVERY_S = 0.5
+_PROBE_EVERY_S = 0.2
 _PROBE_S = 1.0
 _POLL_EVERY_S = 0.25
 _POLL_SHARE = 0.1
-"""Largest share of a stock master's time spent on the guard's polling."""
+"""Largest share of the time for what is done again and again."""
 
 _SPARE_DELAY_S = 0.5
 """The next master is loaded this long after a start, when the nodes have been served."""
 
-_SECOND_LOOK_S = 1.0
-_KEPT_S = 5.0
-"""Longest time that calls wait for a master; after it they are refused."""
+_RESTART_S = 0.5
+"""Pause before another start: after one that failed, or two masters that ended within _STEADY_S."""
 
-_LOCKED_EVERY_S = 1.0
+_STEADY_S = 1.0
+_LAST_WORDS_S = 1.0
+"""For reading what a master told before it ended."""
+
 _BACKLOG = 1024
 
 
 class MasterGuard:
     """Watches a master and replaces it when it dies."""
 
-    def __init__(self, settings: GuardSettings, events: EventSink) -> None:
+    def __init__(self, settings: GuardSettings, events: EventLog) -> None:
         self._settings = settings
         self._events = events
         self._uri = settings.address.own_uri
-        self._listening: socket.socket | None = None
-        self._is_bound = False
+        self._port = settings.address.port
+        self._listening = socket.socket(
+            socket.AF_INET6 if ":" in settings.address.bind else socket.AF_INET
+        )
+        self._listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self._spare: MasterProcess | None = None
         self._own: MasterProcess | None = None
-        self._other_pid: int | None = None
-        self._is_inherited = False
-        """Whether an earlier guard started the other master."""
-        self._followed: MasterState | None = None
-        """The last known state of a master without a journal."""
-        self._unwritten: str | None = None
-        """Why that state is not in the journal."""
-        self._held = -1
-        """An open descriptor of a master's journal; readable even if the file is removed."""
-        self._doubtful = MasterState()
-        """Registrations of nodes that did not answer at the master's start."""
+        """The master, if this guard has started it."""
+        self._pid: int | None = None
+        """The master's process; None while there is none, or it has never answered."""
+        self._link: MasterLink | None = None
+        """Where the master tells what changes; None for a stock master."""
+        self._known = MasterState()
+        """What the master knows."""
+        self._saved: tuple[MasterState, int] | None = None
+        self._unsaved = ""
+        """Why the journal is not up to date."""
         self._rosout = Rosout(settings.address.uri, self._uri, events)
 
     async def run(self, ready: Callable[[str], None]) -> None:
@@ -111,34 +94,31 @@ class MasterGuard:
         GuardError
             If nothing can be guarded.
         """
-        directory = self._settings.directory or own_directory()
-        port = self._settings.address.port
-        self._journal = directory / f"master-{port}.journal"
-        with (
-            GuardLock(directory / f"master-{port}.lock", port) as lock,
-            _running(_keep_lock(lock)),
-        ):
+        directory = directory_for(self._settings.directory)
+        self._journal = directory / f"master-{self._port}.journal"
+        with guard_lock(self._port):
             try:
-                self._new_socket(0.0)
                 # Missing software is reported now, not when the master dies.
                 await self._next_master().warm()
                 how = await self._begin()
                 ready(how)
-                helpers = [self._rosout.keep()] if self._settings.rosout else []
+                helpers = [self._keep_journal()]
+                if self._settings.rosout:
+                    helpers.append(self._rosout.keep())
                 if how == "started":
                     helpers.append(set_versions(self._uri))
                 with _running(*map(self._help, helpers)):
                     await self._watch()
             except Exception:
                 # They continue without a guard, and the next one finds them.
-                self._own = None
+                self._own = self._link = None
                 self._rosout.release()
                 raise
             finally:
                 await self._close()
 
     async def _help(self, work: Coroutine[None, None, None]) -> None:
-        """Do optional work: its failure is logged and changes nothing else."""
+        """Do work besides watching: its failure is logged and changes nothing else."""
         try:
             await work
         except Exception as error:  # noqa: BLE001 (whatever it is, the master comes first)
@@ -148,29 +128,27 @@ class MasterGuard:
         """Find a master, or start one."""
         try:
             with contextlib.closing(Connection(self._uri)) as connection:
-                await connection.call("getPid", within_s=self._settings.silent_s)
-                await self._recognise(connection)
+                await self._attach(connection, self._settings.silent_s)
         except GoneError:
             pass
         except SilentError as error:
             self._events.event("note", reason=str(error))
+            self._known = self._read_journal()
             return "found"
         except CallError as error:
             raise GuardError(f"what is there is no ROS 1 master: {error}") from error
         else:
-            if self._unwritten is not None:
-                raise GuardError(f"{self._unwritten}; name another --directory")
             return "found"
-        known = self._known()
-        nodes, services = await ask_everyone(known)
-        others = {uri for node, uri in known.nodes().items() if node != ROSOUT}
-        resumes = any(isinstance(nodes[uri], NodeReport) for uri in others)
+        known = self._read_journal()
+        uris = known.nodes()
+        gone, silent = await gone_and_silent(uris.values())
+        others = {uri for node, uri in uris.items() if node != ROSOUT}
+        resumes = bool(others - gone - silent)
         if not resumes:
             # No node of the old graph is left, so its parameters are obsolete.
             known.parameters = {"run_id": str(uuid.uuid1())}
-            nodes = {uri: answer or "gone" for uri, answer in nodes.items()}
-            services = {service: bool(offered) for service, offered in services.items()}
-        await self._start(reconcile(known, nodes, services))
+            gone |= silent
+        await self._start(known, gone, silent - gone)
         return "resumed" if resumes else "started"
 
     # -- watching ----------------------------------------------------------------------------------
@@ -179,96 +157,69 @@ class MasterGuard:
         short_lives = 0
         while True:
             since = monotonic()
-            if self._own is not None:
-                reason = await self._watch_own(self._own)
-            else:
-                reason = await self._watch_other()
+            reason = await self._lost()
             noticed_at = monotonic()
             self._events.event("master_lost", reason=reason)
-            short_lives = short_lives + 1 if noticed_at - since < STEADY_S else 0
+            short_lives = short_lives + 1 if noticed_at - since < _STEADY_S else 0
             if short_lives > 1:
-                await asyncio.sleep(restart_delay_s(short_lives - 2))
+                await asyncio.sleep(_RESTART_S)
             await self._replace(noticed_at)
 
-    async def _watch_own(self, master: MasterProcess) -> str:
-        """Wait for the end of the master that was started here, and return the reason."""
-        looking = self._help(self._look_again())
-        watching = (master.process.wait(), self._silent())
-        with _running(self._load_spare_later(), looking), _running(*watching) as (ended, silent):
-            await asyncio.wait((ended, silent), return_when=asyncio.FIRST_COMPLETED)
-            if ended.done():
-                reason = how_it_ended(ended.result())
-            else:
-                reason = silent.result()
-                await master.end(at_once=True)
-            self._own = None
-            return reason
+    async def _lost(self) -> str:
+        """Wait for the master's end, and return the reason."""
+        helpers = map(self._help, (self._load_spare_later(), self._follow()))
+        with _running(self._unresponsive(), self._exited()) as reasons, _running(*helpers):
+            await asyncio.wait(reasons, return_when=asyncio.FIRST_COMPLETED)
+            reason: str = next(task.result() for task in reasons if task.done())
+        if self._own is not None:
+            await self._own.end(signal.SIGKILL)
+        if self._link is not None and self._link.following is not None:
+            await asyncio.wait((self._link.following,), timeout=_LAST_WORDS_S)
+            self._link.close()
+        self._own = self._link = self._pid = None
+        return reason
 
-    async def _watch_other(self) -> str:
-        """Wait for the end of a foreign master, and return the reason."""
-        with _running(self._closed(), self._kill_silent(), self._follow()) as tasks:
-            closed, killed, following = tasks
-            while not closed.done():
-                await asyncio.wait(
-                    [task for task in tasks if not task.done()],
-                    return_when=asyncio.FIRST_COMPLETED,
-                )
-                if following.done():
-                    following.result()
-            self._other_pid, self._is_inherited = None, False
-            reason: str = (killed if killed.done() else closed).result()
-            return reason
+    async def _exited(self) -> str:
+        """Wait for the end of the master that was started here."""
+        ended = asyncio.Future[int]() if self._own is None else self._own.ended
+        return how_it_ended(await asyncio.shield(ended))
 
-    async def _kill_silent(self) -> str:
-        """Kill a foreign master that is silent for too long, and return the reason."""
-        told = False
-        while True:
-            # Stopped, or too busy to be of use.
-            reason = await self._silent()
-            if self._signal_other(signal.SIGKILL):
-                return reason
-            if not told:
-                self._events.event(
-                    "master_hangs",
-                    reason=f"{reason}; it is none of this user's processes on this machine, so it "
-                    "is left alone",
-                )
-                told = True
+    async def _unresponsive(self) -> str:
+        """Wait until the master answers no more, kill it if it is there, and return the reason."""
+        silent_s = self._settings.silent_s
+        failed, told = 0.0, False
+        with contextlib.closing(Connection(self._uri)) as connection:
+            while True:
+                asked_at = monotonic()
+                try:
+                    await connection.call("getPid", within_s=min(_PROBE_S, silent_s))
+                except GoneError:
+                    if self._own is None:
+                        return "nobody listens at its port"
+                except CallError:
+                    # Time actually waited counts, not the clock: this may have been stopped.
+                    failed += monotonic() - asked_at
+                else:
+                    failed = 0.0
+                reason = f"it did not answer for {silent_s:g} s"
+                # Stopped, or too busy to be of use.
+                if failed >= silent_s and self._signal(signal.SIGKILL):
+                    return reason
+                if failed >= silent_s and not told:
+                    told = True
+                    reason += "; it is none of this user's processes on this machine"
+                    self._events.event("master_hangs", reason=f"{reason}, so it is left alone")
+                await asyncio.sleep(0.01 if failed else _PROBE_EVERY_S)
 
-    def _signal_other(self, number: signal.Signals) -> bool:
-        """Signal a foreign master, if it is a process of this user on this machine."""
-        pid = self._other_pid
-        if pid is None or not listens_at(pid, self._settings.address.port):
+    def _signal(self, number: signal.Signals) -> bool:
+        """Signal the master, if it is a process of this user on this machine."""
+        if self._pid is None or not listens_at(self._pid, self._port):
             return False
         try:
-            os.kill(pid, number)
+            os.kill(self._pid, number)
         except OSError:
             return False
         return True
-
-    async def _closed(self) -> str:
-        """Wait until the master's port is closed.
-
-        The system closes a killed process's connections, so one of them ends at once.
-        """
-        place = urlsplit(self._uri)
-        while True:
-            try:
-                reader, writer = await asyncio.open_connection(place.hostname, place.port)
-            except OSError:
-                return "nobody listens at its port"
-            try:
-                with contextlib.suppress(OSError):
-                    await reader.read(1)
-            finally:
-                writer.close()
-            # It may have closed this connection alone.
-            try:
-                await call(self._uri, "getPid", within_s=_PROBE_S)
-            except GoneError:
-                return "it ended"
-            except CallError:
-                await asyncio.sleep(_PROBE_EVERY_S)
 
     async def _silent(self) -> str:
         """Wait until the master has been silent for too long."""
@@ -277,7 +228,6 @@ class MasterGuard:
         with contextlib.closing(Connection(self._uri)) as connection:
             # Time actually waited counts, not the clock: the guard itself may have been stopped.
             while failed < self._settings.silent_s:
-                self._hold_journal()
                 asked_at = monotonic()
                 try:
                     await connection.call("getPid", within_s=probe_s)
@@ -290,126 +240,85 @@ class MasterGuard:
                 await asyncio.sleep(_PROBE_EVERY_S if not failed else 0.01)
         return f"it did not answer for {self._settings.silent_s:g} s"
 
+    # -- what the master knows ---------------------------------------------------------------------
+
+    async def _attach(self, connection: Connection, within_s: float = _PROBE_S) -> None:
+        """Learn what a master that was not started by this guard knows."""
+        pid = await process_of(connection, within_s=within_s)
+        # A stock master has no such call and answers so at once.
+        (name,) = await connection.calls([("getGuardSocket", (CALLER,))], within_s=_PROBE_S)
+        try:
+            self._link = await MasterLink.to(name) if name else None
+        except OSError as error:
+            raise CallError(f"{self._uri}: {error}") from error
+        self._known = await snapshot(connection) if self._link is None else self._link.state
+        is_new, self._pid = self._pid != pid, pid
+        if is_new:
+            self._events.event(
+                "guarding",
+                service=self._settings.address.uri,
+                pid=pid,
+                started_by="somebody else" if self._link is None else "an earlier guard",
+            )
+
     async def _follow(self) -> None:
-        """Journal the state of a master that keeps no journal itself."""
+        """Keep up with what the master knows, until cancelled."""
         with contextlib.closing(Connection(self._uri)) as connection:
-            while self._other_pid is None:
-                with contextlib.suppress(CallError):
-                    await self._recognise(connection)
-                await asyncio.sleep(_PROBE_EVERY_S)
-            while not self._is_inherited:
+            while True:
+                if self._link is not None and self._link.following is not None:
+                    await asyncio.wait((self._link.following,))
                 asked_at = monotonic()
                 with contextlib.suppress(CallError):
-                    await self._write_down(connection)
-                took = monotonic() - asked_at
-                await asyncio.sleep(max(_POLL_EVERY_S, took / _POLL_SHARE))
+                    # One that was silent until now, or tells this guard no more.
+                    if self._pid is None or self._link is not None:
+                        await self._attach(connection)
+                    elif (state := await snapshot(connection)) != self._known:
+                        self._known = state
+                await _pause(monotonic() - asked_at)
 
-    async def _recognise(self, connection: Connection) -> None:
-        """Identify a foreign master."""
-        pid = await process_of(connection, within_s=_PROBE_S)
-        # A stock master has no such call and answers so at once.
-        (journal,) = await connection.calls([("getJournal", (CALLER,))], within_s=_PROBE_S)
-        inherited = journal == str(self._journal)
-        self._followed = None
-        if not inherited:
-            # An existing journal belongs to another master.
-            self._forget_journal()
-            await self._write_down(connection)
-        self._other_pid, self._is_inherited = pid, inherited
-        self._events.event(
-            "guarding",
-            service=self._settings.address.uri,
-            pid=pid,
-            started_by="an earlier guard" if inherited else "somebody else",
-        )
+    async def _keep_journal(self) -> None:
+        """Write what the master knows to the directory, whenever it has changed."""
+        while True:
+            began = monotonic()
+            self._save()
+            await _pause(monotonic() - began)
 
-    async def _write_down(self, connection: Connection) -> None:
-        """Journal a stock master's state, if it has changed."""
-        state = await snapshot(connection)
-        changed, self._followed = state != self._followed, state
-        try:
-            if changed or self._unwritten is not None or not self._has_journal():
-                write_journal(self._journal, state)
-        except Exception as error:  # noqa: BLE001 - a parameter may have any type
-            before, self._unwritten = (
-                self._unwritten,
-                f"{self._journal}: what the master knows cannot be written down: "
-                f"{_words_of(error)}",
-            )
-            if before is None:
-                self._events.event("journal_failed", reason=self._unwritten)
-        else:
-            if self._unwritten is not None:
-                self._events.event("journal_written", reason=f"{self._journal}: is whole again")
-            self._unwritten = None
-
-    def _has_journal(self) -> bool:
-        try:
-            touch(self._journal, self._journal.stat())
-        except OSError:
-            return False
-        return True
-
-    # -- the journal -------------------------------------------------------------------------------
-
-    def _hold_journal(self) -> None:
-        """Keep the master's journal open, so that it stays readable if it is removed."""
-        if self._followed is not None:
+    def _save(self) -> None:
+        now = self._known, self._known.changes
+        is_saved = self._saved is not None and self._saved[0] is now[0] and self._saved[1] == now[1]
+        if is_saved and self._journal.exists():
             return
-        with contextlib.suppress(OSError):
-            if self._held < 0 or not os.path.samestat(self._journal.stat(), os.fstat(self._held)):
-                held = os.open(self._journal, os.O_RDONLY | os.O_CLOEXEC)
-                self._let_go()
-                self._held = held
-
-    def _let_go(self) -> None:
-        if self._held >= 0:
-            os.close(self._held)
-            self._held = -1
-
-    def _forget_journal(self) -> None:
-        self._let_go()
-        # It is written anew in a moment, and errors are reported then.
-        with contextlib.suppress(OSError):
-            self._journal.unlink(missing_ok=True)
-
-    def _known(self) -> MasterState:
-        """Return the last master's state."""
-        if self._followed is not None:
-            return self._followed
-        wrong: Exception = FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+        before = self._unsaved
         try:
-            known = read_journal(self._journal)
-            if known is not None or self._held < 0:
-                return known or MasterState()
+            write_journal(self._journal, self._known)
+        except Exception as error:  # noqa: BLE001 - a parameter may have any type
+            self._unsaved = (
+                f"{self._journal}: what the master knows cannot be written down: {_words_of(error)}"
+            )
+            if not before:
+                self._events.event("journal_failed", reason=self._unsaved)
+        else:
+            self._saved, self._unsaved = now, ""
+            if before:
+                self._events.event("journal_written", reason=f"{self._journal}: is whole again")
+
+    def _read_journal(self) -> MasterState:
+        """Return what a master knew that ended with its guard."""
+        try:
+            return read_journal(self._journal) or MasterState()
         except (OSError, ValueError) as error:
-            known, wrong = None, error
-        reason = f"{self._journal}: {_words_of(wrong)}"
-        try:
-            known = read_journal(self._held)
-            reason += "; it was still open here, and nothing is lost"
-        except (OSError, ValueError):
-            # The next master writes its own journal at this path.
-            aside = self._journal.with_name(f"{self._journal.name}.unread")
-            try:
-                self._journal.replace(aside)
-                reason += f"; it is kept as {aside}"
-            except OSError as error:
-                reason += f"; it cannot be put aside: {_words_of(error)}"
-            reason += ", and the new master knows nothing of the last one"
-        self._events.event("journal_failed", reason=reason)
-        return known or MasterState()
+            reason = f"{self._journal}: {_words_of(error)}; nothing is known of an earlier master"
+            self._events.event("journal_failed", reason=reason)
+            return MasterState()
 
     # -- replacing ---------------------------------------------------------------------------------
 
     async def _replace(self, noticed_at: float) -> None:
         """Start a new master in place of one that has ended."""
-        failures = 0
         while True:
             try:
-                known = self._known()
-                reconciled = reconcile(known, *await ask_everyone(known))
-                await self._start(reconciled, noticed_at)
+                gone, silent = await gone_and_silent(self._known.nodes().values())
+                await self._start(self._known, gone, silent, noticed_at)
             except _TakenError as error:
                 # Another program was faster, such as a unit that restarts roscore.
                 self._events.event("note", reason=str(error))
@@ -417,49 +326,43 @@ class MasterGuard:
             except (GuardError, OSError) as error:
                 self._events.event("master_failed", reason=str(error))
                 await self._drop_spare()
-                self._new_socket(_KEPT_S - (monotonic() - noticed_at))
-                await asyncio.sleep(restart_delay_s(failures))
-                failures += 1
+                await asyncio.sleep(_RESTART_S)
             else:
                 return
 
-    async def _start(self, reconciled: Reconciled, noticed_at: float | None = None) -> None:
+    async def _start(
+        self, known: MasterState, gone: set[str], silent: set[str], noticed_at: float | None = None
+    ) -> None:
         begun_at = monotonic() if noticed_at is None else noticed_at
         self._bind()
-        state = reconciled.state
+        state = without(known, gone)
         master = self._next_master()
         self._spare = None
         try:
             await master.serve(state)
         except BaseException:
-            await master.end(at_once=True)
+            await master.end(signal.SIGKILL)
             raise
-        self._followed = self._unwritten = None
-        self._let_go()
-        self._hold_journal()
-        self._own = master
-        self._doubtful = reconciled.doubtful
+        self._own, self._pid, self._link = master, master.pid, master.link
+        self._known = master.link.state
         # Without nodes a master begins anew, and nothing is lost.
-        begins_anew = not state.nodes()
+        lost = known.nodes().items() if state.nodes() else ()
         self._events.event(
             "master_started",
             service=self._settings.address.uri,
-            pid=master.process.pid,
+            pid=master.pid,
             nodes=len(state.nodes()),
             services=len(state.services),
             topics=len(state.publishers.keys() | state.subscribers.keys()),
-            parameters=len(parameter_names(state.parameters)),
-            gone=None if begins_anew else list(reconciled.gone) or None,
-            silent=list(reconciled.silent) or None,
-            lost_services=None if begins_anew else list(reconciled.lost_services) or None,
+            gone=[node for node, uri in lost if uri in gone] or None,
+            silent=[node for node, uri in known.nodes().items() if uri in silent] or None,
             duration_ms=(monotonic() - begun_at) * 1e3,
         )
 
     def _next_master(self) -> MasterProcess:
         """Return the process that waits to be the master, or a new one."""
-        if self._spare is None or self._spare.process.ended.done():
-            assert self._listening is not None
-            self._spare = MasterProcess(self._settings, self._listening, self._journal)
+        if self._spare is None or self._spare.ended.done():
+            self._spare = MasterProcess(self._settings, self._listening)
         return self._spare
 
     async def _load_spare_later(self) -> None:
@@ -468,66 +371,37 @@ class MasterGuard:
         with contextlib.suppress(GuardError):
             self._next_master()
 
-    async def _look_again(self) -> None:
-        """Ask the silent nodes once more: one that died with the master may have seemed slow."""
-        await asyncio.sleep(_SECOND_LOOK_S)
-        before = self._doubtful
-        found = reconcile(before, *await ask_everyone(before))
-        if calls := unregistrations(before, found.state):
-            with contextlib.closing(Connection(self._uri)) as connection:
-                await connection.calls(calls, within_s=_PROBE_S)
-            self._events.event(
-                "nodes_gone",
-                gone=list(found.gone) or None,
-                lost_services=list(found.lost_services) or None,
-            )
-
     async def _drop_spare(self) -> None:
         spare, self._spare = self._spare, None
         if spare is not None:
-            await spare.end(at_once=True)
-
-    def _new_socket(self, keep_s: float) -> None:
-        """Replace the listening socket, unless calls may still wait at it."""
-        if self._listening is not None:
-            if keep_s > 0.0:
-                return
-            self._listening.close()
-        family = socket.AF_INET6 if ":" in self._settings.address.bind else socket.AF_INET
-        self._listening = socket.socket(family)
-        self._listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        self._is_bound = False
+            await spare.end(signal.SIGKILL)
 
     def _bind(self) -> None:
         """Bind the master's port; connections wait for a master from now on."""
-        if self._is_bound:
+        if self._listening.getsockname()[1]:
             return
-        assert self._listening is not None
         address = self._settings.address
         try:
             self._listening.bind((address.bind, address.port))
             self._listening.listen(_BACKLOG)
         except OSError as error:
             text = f"port {address.port} of {address.bind}: {error.strerror}"
-            if error.errno == errno.EADDRINUSE:
-                raise _TakenError(text) from error
-            raise GuardError(text) from error
-        self._is_bound = True
+            raise (_TakenError if error.errno == errno.EADDRINUSE else GuardError)(text) from error
 
     async def _close(self) -> None:
         await self._rosout.end()
-        if self._is_inherited:
-            # As the guard that started both would do.
-            with contextlib.suppress(CallError):
-                uri = await call(self._uri, "lookupNode", ROSOUT, within_s=_PROBE_S)
-                await call(uri, "shutdown", "the guard ends", within_s=_PROBE_S)
-            self._signal_other(signal.SIGTERM)
-        if self._own is not None:
-            await self._own.end()
+        if self._link is not None:
+            if self._own is None:
+                # As the guard that started both would do.
+                with contextlib.suppress(CallError):
+                    uri = await call(self._uri, "lookupNode", ROSOUT, within_s=_PROBE_S)
+                    await call(uri, "shutdown", "the guard ends", within_s=_PROBE_S)
+                self._signal(signal.SIGTERM)
+            else:
+                await self._own.end()
+            self._link.close()
         await self._drop_spare()
-        self._let_go()
-        if self._listening is not None:
-            self._listening.close()
+        self._listening.close()
 
 
 @contextlib.contextmanager
@@ -541,10 +415,9 @@ def _running(*works: Coroutine[Any, Any, Any]) -> Iterator[list[asyncio.Task[Any
             task.cancel()
 
 
-async def _keep_lock(lock: GuardLock) -> None:
-    while True:
-        lock.keep()
-        await asyncio.sleep(_LOCKED_EVERY_S)
+async def _pause(took_s: float) -> None:
+    """Wait before something is done again that took so long."""
+    await asyncio.sleep(max(_POLL_EVERY_S, took_s / _POLL_SHARE))
 
 
 def _words_of(error: Exception) -> str:

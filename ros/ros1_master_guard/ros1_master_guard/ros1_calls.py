@@ -15,25 +15,22 @@ import xmlrpc.client
 from collections.abc import Iterable, Sequence
 from typing import Any, Final, NamedTuple, Self
 from urllib.parse import urlsplit
-from xml.parsers import expat
 
 from ros1_master_guard.errors import CallError, GoneError, ProtocolError, SilentError
 from ros1_master_guard.headers import (
-    ANY_TYPE,
     MAX_HEADER_BYTES,
-    decode_header,
-    encode_header,
     host_and_port_of,
 )
 
 __all__ = [
     "CALLER",
+    "MAX_SHORT_BYTES",
     "Connection",
     "HttpHead",
     "call",
+    "connect",
     "decoded",
     "message",
-    "offers_service",
 ]
 
 CALLER: Final = "/ros1_master_guard"
@@ -41,8 +38,9 @@ CALLER: Final = "/ros1_master_guard"
 
 _MAX_RESPONSE_BYTES: Final = 256 * 1024 * 1024
 
-_MAX_LEVELS: Final = 100
-"""Bound on lists and mappings within each other in a message."""
+MAX_SHORT_BYTES: Final = 16 * 1024
+"""Of what a node answers, or a master about one name. A malformed message may cost a square of its
+bytes: texts that are copied, mappings whose names have one hash."""
 
 
 class HttpHead(NamedTuple):
@@ -80,51 +78,24 @@ async def message(reader: asyncio.StreamReader, max_bytes: int, begun: bytes = b
     return await reader.readexactly(size)
 
 
-class _Unmarshaller(xmlrpc.client.Unmarshaller):
-    """The library's, but what it builds, and the time for it, are in proportion to what it reads.
-
-    The library repeats a text for each element that ends after it, takes any value for a name (a
-    peer can choose thousands of integers of one hash) and nests lists as deeply as it is told,
-    deeper than they can be printed.
-    """
-
-    def start(self, tag: str, attrs: dict[str, str]) -> None:
-        super().start(tag, attrs)
-        if len(self._marks) > _MAX_LEVELS:
-            raise xmlrpc.client.ResponseError(f"more than {_MAX_LEVELS} levels")
-
-    def end(self, tag: str) -> None:
-        if tag.split(":")[-1] == "struct":
-            for name in self._stack[self._marks[-1] :: 2]:
-                if not isinstance(name, str):
-                    raise xmlrpc.client.ResponseError(f"a member has the name {name!r:.100}")
-        super().end(tag)
-        self._data = []
-
-
-def _refuse_doctype(*_: object) -> None:
-    raise xmlrpc.client.ResponseError("a document type, which ROS never sends")
-
-
 def decoded(content: bytes) -> tuple[tuple[Any, ...], str | None]:
     """Decode an XML-RPC message of a peer; return its values, and the method if it is a call.
 
     A document type is refused: from a few hundred bytes of nested entities millions of elements
-    are made. Raises Fault if the message says so, and anything else if it is malformed.
+    are made. ROS sends none, and no other encoding than UTF-8, which could hide it. Raises Fault if
+    the message says so, and anything else if it is malformed.
     """
-    unmarshaller = _Unmarshaller()
-    parser = expat.ParserCreate()
-    parser.StartDoctypeDeclHandler = _refuse_doctype
-    parser.StartElementHandler = unmarshaller.start
-    parser.EndElementHandler = unmarshaller.end
-    parser.CharacterDataHandler = unmarshaller.data
-    unmarshaller.xml("", None)  # what expat hands over is text already
-    parser.Parse(content, True)
-    return unmarshaller.close(), unmarshaller.getmethodname()
+    if b"<!DOCTYPE" in content or b"\0" in content:
+        raise xmlrpc.client.ResponseError("a document type, which ROS never sends")
+    return xmlrpc.client.loads(content)
 
 
-async def _connect(uri: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    host, port = _place_of(uri)
+async def connect(uri: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """Connect to the host and port that a URI names; raise GoneError if nobody listens there."""
+    place = host_and_port_of(uri)
+    if place is None:
+        raise CallError(f"{uri!r:.200} names no host and port")
+    host, port = place
     # As in ROS 1: IPv4 unless the host is an IPv6 address, and the first address of a name.
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
@@ -133,13 +104,6 @@ async def _connect(uri: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter
         raise GoneError(f"{uri}: nobody listens there") from error
     except OSError as error:
         raise CallError(f"{uri}: {error.strerror or error}") from error
-
-
-def _place_of(uri: str) -> tuple[str, int]:
-    place = host_and_port_of(uri)
-    if place is None:
-        raise CallError(f"{uri!r:.200} names no host and port")
-    return place
 
 
 class Connection:
@@ -204,7 +168,7 @@ class Connection:
 
     async def _exchange(self, body: bytes) -> Any:
         if self._streams is None:
-            self._streams = await _connect(self.uri)
+            self._streams = await connect(self.uri)
         reader, writer = self._streams
         place = urlsplit(self.uri)
         head_lines = (
@@ -245,31 +209,6 @@ def _value_of(answer: object, method: str) -> Any:
 async def call(
     uri: str, method: str, *arguments: object, within_s: float, caller: str = CALLER
 ) -> Any:
-    """Make one call on a new connection; see :meth:`Connection.call`."""
-    connection = Connection(uri, caller)
-    try:
+    """Make one call with a short answer, on a new connection; see :meth:`Connection.call`."""
+    with contextlib.closing(Connection(uri, caller, MAX_SHORT_BYTES)) as connection:
         return await connection.call(method, *arguments, within_s=within_s)
-    finally:
-        connection.close()
-
-
-async def offers_service(uri: str, service: str, *, within_s: float) -> bool | None:
-    """Return whether a service is offered at its URI, ``rosrpc://host:port``; None if unknown."""
-    # `rosservice` sends this header to learn a service's type; no call is made.
-    probe = {"probe": "1", "md5sum": ANY_TYPE, "callerid": CALLER, "service": service}
-    writer = None
-    try:
-        async with asyncio.timeout(within_s):
-            reader, writer = await _connect(uri)
-            writer.write(encode_header(probe))
-            return "error" not in decode_header(await message(reader, MAX_HEADER_BYTES))
-    except GoneError:
-        return False
-    except (asyncio.IncompleteReadError, ProtocolError):
-        # Another service or another program listens there.
-        return False
-    except (CallError, OSError, ValueError):  # ValueError: a malformed host name
-        return None
-    finally:
-        if writer is not None:
-            writer.close()

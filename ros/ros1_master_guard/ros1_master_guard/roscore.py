@@ -4,27 +4,23 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import shutil
 import signal
 import subprocess
 from time import monotonic
 
 from ros1_master_guard.errors import CallError, GoneError
-from ros1_master_guard.events import EventSink
+from ros1_master_guard.events import EventLog
 from ros1_master_guard.ros1_calls import call
-from ros1_master_guard.standby import DetachedProcess
 
-__all__ = ["ROSOUT", "STEADY_S", "Rosout", "how_it_ended", "restart_delay_s", "set_versions"]
+__all__ = ["ROSOUT", "Rosout", "how_it_ended", "set_versions"]
 
 ROSOUT = "/rosout"
 
-STEADY_S = 1.0
-"""A process that ends earlier than this may have failed at its start."""
-
-_FIRST_DELAY_S, _LAST_DELAY_S = 0.1, 1.0
 _CHECK_EVERY_S = 1.0
 _PROBE_S = 1.0
-_VERSION_S = 30.0
+_END_S = 2.0
 
 
 class Rosout:
@@ -33,32 +29,34 @@ class Rosout:
     Nodes reach the master at ``master_uri``, this process at ``own_uri``.
     """
 
-    def __init__(self, master_uri: str, own_uri: str, events: EventSink) -> None:
+    def __init__(self, master_uri: str, own_uri: str, events: EventLog) -> None:
         self._master_uri = master_uri
         self._own_uri = own_uri
         self._events = events
-        self._process: DetachedProcess | None = None
+        self._process: subprocess.Popen[bytes] | None = None
 
     async def keep(self) -> None:
         """Start ``/rosout`` whenever there is none, until cancelled."""
-        failures = 0
+        # Where catkin installs it, and Debian.
+        prefixes = [*os.environ.get("CMAKE_PREFIX_PATH", "").split(os.pathsep), "/usr"]
+        program = shutil.which("rosout", path=os.pathsep.join(f"{p}/lib/rosout" for p in prefixes))
+        if program is None:
+            self._events.event("note", reason=f"no rosout in {prefixes}, so no /rosout")
+            return
         while True:
-            if self._process is None and not await self._exists():
-                rosrun = shutil.which("rosrun")
-                if rosrun is None:
-                    self._events.event("note", reason="no rosrun here, so no /rosout")
-                    return
-                begun_at = monotonic()
-                self._process = DetachedProcess(
-                    (rosrun, "rosout", "rosout", "__name:=rosout"),
-                    {"ROS_MASTER_URI": self._master_uri, "ROS_NAMESPACE": "/"},
-                    errors=subprocess.DEVNULL,
-                )
-                code = await self._process.wait()
+            if self._process is not None and (code := self._process.poll()) is not None:
                 self._process = None
                 self._events.event("rosout_ended", reason=how_it_ended(code))
-                failures = failures + 1 if monotonic() - begun_at < STEADY_S else 0
-                await asyncio.sleep(restart_delay_s(failures))
+            if self._process is None and not await self._exists():
+                self._process = subprocess.Popen(
+                    (program, "__name:=rosout"),
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                    # Ctrl-C is for the guard alone.
+                    start_new_session=True,
+                    env={**os.environ, "ROS_MASTER_URI": self._master_uri, "ROS_NAMESPACE": "/"},
+                )
             await asyncio.sleep(_CHECK_EVERY_S)
 
     def release(self) -> None:
@@ -66,9 +64,14 @@ class Rosout:
         self._process = None
 
     async def end(self) -> None:
-        """End the process that was started here."""
-        if self._process is not None:
-            await self._process.end(signal.SIGINT)
+        """End the process that was started here, by SIGKILL if need be."""
+        process = self._process
+        for number in (signal.SIGINT, signal.SIGKILL):
+            until = monotonic() + _END_S
+            if process is not None:
+                process.send_signal(number)
+            while process is not None and process.poll() is None and monotonic() < until:
+                await asyncio.sleep(0.01)
 
     async def _exists(self) -> bool:
         """Return whether it is there; True as well while its master is away."""
@@ -84,27 +87,15 @@ class Rosout:
 
 async def set_versions(master_uri: str) -> None:
     """Set the parameters ``/rosversion`` and ``/rosdistro``, as far as they are known."""
-    for name, words in (("rosversion", ("roslaunch",)), ("rosdistro", ("-d",))):
-        with contextlib.suppress(OSError, CallError, TimeoutError):
+    for name, word in (("rosversion", "roslaunch"), ("rosdistro", "-d")):
+        with contextlib.suppress(OSError, CallError):
             process = await asyncio.create_subprocess_exec(
-                *("rosversion", *words),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
+                *("rosversion", word), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
             )
-            try:
-                output, _ = await asyncio.wait_for(process.communicate(), _VERSION_S)
-            finally:
-                if process.returncode is None:
-                    process.kill()
+            output, _ = await process.communicate()
             if output and process.returncode == 0:
                 value = output.decode(errors="replace")
                 await call(master_uri, "setParam", f"/{name}", value, within_s=_PROBE_S)
-
-
-def restart_delay_s(failures: int) -> float:
-    """Return the pause before the next start: 0.1 s, doubled with each failure, at most 1 s."""
-    return float(min(_LAST_DELAY_S, _FIRST_DELAY_S * 2 ** min(failures, 16)))
 
 
 def how_it_ended(code: int) -> str:

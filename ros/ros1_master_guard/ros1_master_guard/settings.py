@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import socket
 import stat
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple, Self
 from urllib.parse import urlsplit
 
 from ros1_master_guard.errors import GuardError
-from ros1_master_guard.process import touch
 
 __all__ = [
     "DEFAULT_PORT",
-    "GuardLock",
     "GuardSettings",
     "MasterAddress",
+    "directory_for",
+    "guard_lock",
     "listens_at",
-    "own_directory",
 ]
 
 DEFAULT_PORT = 11311
@@ -100,80 +99,51 @@ class GuardSettings(NamedTuple):
     rosout: bool = True
 
 
-def own_directory() -> Path:
-    """Return a directory of this user alone, which does not outlive the machine's uptime."""
+def directory_for(named: Path | None) -> Path:
+    """Return a directory that can be written to: the named one, or one of this user alone.
+
+    The latter does not outlive the machine's uptime. Raises GuardError if there is none.
+    """
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     name = "ros1_master_guard"
-    directory = Path(runtime) / name if runtime else Path(f"/tmp/{name}-{os.getuid()}")
+    own = Path(runtime) / name if runtime else Path(f"/tmp/{name}-{os.getuid()}")
+    directory = own if named is None else named
     try:
         directory.mkdir(mode=0o700, exist_ok=True)
         found = directory.lstat()
     except OSError as error:
         raise GuardError(f"{directory}: cannot be made: {error.strerror}") from error
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
-        raise GuardError(
-            f"{directory}: is not a directory that you alone can write to; name another one: "
-            "--directory"
-        )
-    return directory
+    is_own = found.st_uid == os.getuid() and not found.st_mode & 0o022
+    if named is None and not (stat.S_ISDIR(found.st_mode) and is_own):
+        problem = "is not a directory that you alone can write to"
+    elif not os.access(directory, os.W_OK):
+        problem = "cannot be written to"
+    else:
+        return directory
+    raise GuardError(f"{directory}: {problem}; name another one: --directory")
 
 
-class GuardLock:
-    """Keeps a second guard of the same master, with the same directory, away.
+@contextlib.contextmanager
+def guard_lock(port: int) -> Iterator[None]:
+    """Keep other guards of a master away, by a name in the kernel that ends with the process.
 
-    Raises
-    ------
-    GuardError
-        If there is one already.
+    Raises GuardError if there is one already.
     """
-
-    def __init__(self, path: Path, port: int) -> None:
-        self._path = path
+    name = f"\0ros1_master_guard/{port}"
+    with socket.socket(socket.AF_UNIX) as lock:
         try:
-            self._descriptor = self._open()
-        except OSError as error:
-            raise GuardError(f"{path}: cannot be written: {error.strerror}") from error
-        if not self._take(self._descriptor):
-            who = os.pread(self._descriptor, 20, 0).decode(errors="replace").strip()
-            os.close(self._descriptor)
+            lock.bind(name)
+            lock.listen()
+        except OSError:
+            pid = "unknown"
+            with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as asking:
+                asking.connect(name)
+                who = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 4)
+                pid = str(int.from_bytes(who, sys.byteorder))
             raise GuardError(
-                f"the master at port {port} has a guard already: process {who or 'unknown'}"
-            )
-
-    def _open(self) -> int:
-        return os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-
-    def _take(self, descriptor: int) -> bool:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            return False
-        # The lock is on the file; its content is optional, as the disk may be full.
-        with contextlib.suppress(OSError):
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
-        return True
-
-    def keep(self) -> None:
-        """Keep the file young for cleaners of old files, and lock a new one if it is gone."""
-        try:
-            found = self._path.lstat()
-            if os.path.samestat(found, os.fstat(self._descriptor)):
-                touch(self._path, found)
-                return
-        except OSError:
-            pass
-        with contextlib.suppress(OSError):
-            descriptor = self._open()
-            if self._take(descriptor):
-                descriptor, self._descriptor = self._descriptor, descriptor
-            os.close(descriptor)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        os.close(self._descriptor)
+                f"the master at port {port} has a guard already: process {pid}"
+            ) from None
+        yield
 
 
 def listens_at(pid: int, port: int) -> bool:

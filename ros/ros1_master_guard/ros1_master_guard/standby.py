@@ -1,4 +1,4 @@
-"""Processes that survive this one: masters, and processes that wait to become one."""
+"""Masters as their guard sees them: a process that waits to be one, and all that one tells."""
 
 from __future__ import annotations
 
@@ -9,27 +9,107 @@ import signal
 import socket
 import subprocess
 import threading
-from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, Self
 
 from ros1_master_guard import process as master_process
 from ros1_master_guard.errors import GuardError
-from ros1_master_guard.process import MasterState
+from ros1_master_guard.process import HEAD, MasterState, decoded, encoded
 from ros1_master_guard.settings import GuardSettings
 
-__all__ = ["DetachedProcess", "MasterProcess"]
+__all__ = ["MasterLink", "MasterProcess"]
 
 _START_S = 30.0
 _END_S = 2.0
+_READ_BYTES = 1 << 20
 
 
-class DetachedProcess:
-    """A process whose end is noticed at once, and which survives the event loop.
+class MasterLink:
+    """A connection to a master of :mod:`ros1_master_guard.process`.
 
-    The standard library's subprocess coroutines would end it with the loop.
+    Attributes
+    ----------
+    state : MasterState
+        What the master has told so far.
+    following : asyncio.Task or None
+        Ends with the connection, when all that was told is in the state.
+    """
 
-    ``environment`` is added to this process's. Without ``errors`` its standard error is this
-    process's.
+    def __init__(self, stream: socket.socket) -> None:
+        stream.setblocking(False)
+        self._stream = stream
+        self._loop = asyncio.get_running_loop()
+        self._received = bytearray()
+        self.state = MasterState()
+        self.following: asyncio.Task[None] | None = None
+
+    @classmethod
+    async def to(cls, name: str) -> Self:
+        """Connect to a running master by the name of its socket; raise OSError if it has ended."""
+        stream = socket.socket(socket.AF_UNIX)
+        try:
+            stream.connect(f"\0{name}")
+            link = cls(stream)
+            await link.begin()
+        except BaseException:
+            stream.close()
+            raise
+        return link
+
+    async def begin(self) -> None:
+        """Take the whole state, and follow it from now on; raise OSError if none comes."""
+        told = await self.hear()
+        if not isinstance(told, dict):
+            raise ConnectionError(f"the master has not begun ({told or 'it ended'})")
+        self.state = MasterState(**told)
+        self.following = asyncio.create_task(self._follow())
+
+    async def _follow(self) -> None:
+        while change := await self._next():
+            self.state.apply(*change)
+
+    async def hear(self) -> Any:
+        """Return the next message; a text of its own if none comes."""
+        try:
+            async with asyncio.timeout(_START_S):
+                return await self._next()
+        except TimeoutError:
+            return f"it said nothing for {_START_S:g} s"
+
+    async def say(self, message: Any) -> None:
+        """Send a message."""
+        with contextlib.suppress(OSError):
+            await self._loop.sock_sendall(self._stream, encoded(message))
+
+    def close(self) -> None:
+        """End the connection."""
+        if self.following is not None:
+            self.following.cancel()
+        self._stream.close()
+
+    async def _next(self) -> Any:
+        """Return the next message; None at the end."""
+        received = self._received
+        while True:
+            end = HEAD.size + HEAD.unpack_from(received)[0] if len(received) >= HEAD.size else None
+            if end is not None and len(received) >= end:
+                message = decoded(bytes(received[HEAD.size : end]))
+                del received[:end]
+                return message
+            try:
+                data = await self._loop.sock_recv(self._stream, _READ_BYTES)
+            except OSError:
+                data = b""
+            if not data:
+                return None
+            received += data
+
+
+class MasterProcess:
+    """A process that is a master, or waits to become one; it survives this one.
+
+    It inherits ``listening``, which need not be bound yet. The standard library's subprocess
+    coroutines would end it with the loop.
 
     Attributes
     ----------
@@ -38,30 +118,36 @@ class DetachedProcess:
 
     Raises
     ------
-    OSError
+    GuardError
         If it cannot be started.
     """
 
-    def __init__(
-        self,
-        words: Sequence[str],
-        environment: Mapping[str, str],
-        *,
-        pass_fds: Sequence[int] = (),
-        errors: int | None = None,
-    ) -> None:
+    def __init__(self, settings: GuardSettings, listening: socket.socket) -> None:
+        self._python = settings.python
         self._loop = asyncio.get_running_loop()
         self.ended: asyncio.Future[int] = self._loop.create_future()
-        self._process = subprocess.Popen(
-            words,
-            pass_fds=pass_fds,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=errors,
-            # Ctrl-C is for the guard alone.
-            start_new_session=True,
-            env={**os.environ, **environment},
-        )
+        self._warm = False
+        mine, its = socket.socketpair()
+        script = str(Path(master_process.__file__).resolve())
+        descriptors = (listening.fileno(), its.fileno())
+        try:
+            self._process = subprocess.Popen(
+                (settings.python, script, *map(str, descriptors)),
+                pass_fds=descriptors,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                # Ctrl-C is for the guard alone.
+                start_new_session=True,
+                env={**os.environ, "ROS_MASTER_URI": settings.address.uri},
+            )
+        except OSError as error:
+            mine.close()
+            raise GuardError(
+                f"--python {settings.python}: cannot be run: {error.strerror}"
+            ) from error
+        finally:
+            its.close()
+        self.link = MasterLink(mine)
         self.pid = self._process.pid
         threading.Thread(target=self._wait, daemon=True).start()
 
@@ -69,67 +155,12 @@ class DetachedProcess:
         code = self._process.wait()
         # The loop may be closed by then.
         with contextlib.suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(self._tell, code)
-
-    def _tell(self, code: int) -> None:
-        if not self.ended.done():
-            self.ended.set_result(code)
-
-    async def wait(self) -> int:
-        """Wait for its end; may be cancelled."""
-        return await asyncio.shield(self.ended)
-
-    async def end(self, number: signal.Signals) -> None:
-        """End it by a signal, and by SIGKILL if that does not help; may be repeated."""
-        for each in (number, signal.SIGKILL):
-            if not self.ended.done():
-                with contextlib.suppress(ProcessLookupError):
-                    self._process.send_signal(each)
-                await asyncio.wait((self.ended,), timeout=_END_S)
-
-
-class MasterProcess:
-    """A process that is a master, or waits to become one.
-
-    It inherits ``listening``, which need not be bound yet.
-
-    Raises GuardError if it cannot be started.
-    """
-
-    def __init__(self, settings: GuardSettings, listening: socket.socket, journal: Path) -> None:
-        self._python = settings.python
-        self._warm = False
-        self._control, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._control.setblocking(False)
-        script = str(Path(master_process.__file__).resolve())
-        # In memory, because the disk may be full.
-        self._state = open(os.memfd_create("master-state"), "wb", buffering=0)  # noqa: PTH123, SIM115
-        descriptors = (listening.fileno(), its.fileno(), self._state.fileno())
-        try:
-            self.process = DetachedProcess(
-                (settings.python, script, *map(str, descriptors), str(journal)),
-                {"ROS_MASTER_URI": settings.address.uri},
-                pass_fds=descriptors,
-            )
-        except OSError as error:
-            self._control.close()
-            self._state.close()
-            raise GuardError(
-                f"--python {settings.python}: cannot be run: {error.strerror}"
-            ) from error
-        finally:
-            its.close()
+            self._loop.call_soon_threadsafe(self.ended.set_result, code)
 
     async def warm(self) -> None:
-        """Wait until it has loaded what it needs.
-
-        Raises GuardError if it cannot.
-        """
-        if self._warm:
-            return
-        said = await self._hear()
-        if said != "warm":
-            missing = said.removeprefix("missing ") or "it ended at once"
+        """Wait until it has loaded what it needs; raise GuardError if it cannot."""
+        if not self._warm and (said := await self.link.hear()) != "warm":
+            missing = str(said or "it ended at once").removeprefix("missing ")
             raise GuardError(
                 f"{self._python} cannot run a ROS 1 master ({missing}); install ROS 1 (on Debian: "
                 "apt-get install python3-rosmaster rosout), or name ROS's Python with --python"
@@ -137,36 +168,18 @@ class MasterProcess:
         self._warm = True
 
     async def serve(self, state: MasterState) -> None:
-        """Make it the master, with this state.
-
-        Raises GuardError if it does not begin, or if there is no room for the state.
-        """
+        """Make it the master, with this state; raise GuardError if it does not begin."""
         await self.warm()
-        content = memoryview(master_process.journal_of(state))
+        await self.link.say(vars(state))
         try:
-            while content:
-                content = content[self._state.write(content) :]
+            await self.link.begin()
         except OSError as error:
-            raise GuardError(f"the new master's state: {error.strerror}") from error
-        with contextlib.suppress(OSError):
-            await asyncio.get_running_loop().sock_sendall(self._control, b"go")
-        if (said := await self._hear()) != "serving":
-            raise GuardError(f"the new master has not begun ({said or 'it ended'})")
-        self._control.close()
-        self._state.close()
+            raise GuardError(f"the next master: {error}") from error
 
-    async def _hear(self) -> str:
-        loop = asyncio.get_running_loop()
-        try:
-            async with asyncio.timeout(_START_S):
-                return (await loop.sock_recv(self._control, 4096)).decode(errors="replace")
-        except TimeoutError:
-            return f"it said nothing for {_START_S:g} s"
-        except OSError:
-            return ""
-
-    async def end(self, *, at_once: bool = False) -> None:
-        """End it; may be repeated."""
-        self._control.close()
-        self._state.close()
-        await self.process.end(signal.SIGKILL if at_once else signal.SIGTERM)
+    async def end(self, number: signal.Signals = signal.SIGTERM) -> None:
+        """End it by a signal, and by SIGKILL if that does not help; may be repeated."""
+        for each in (number, signal.SIGKILL):
+            if not self.ended.done():
+                self._process.send_signal(each)
+                await asyncio.wait((self.ended,), timeout=_END_S)
+        self.link.close()

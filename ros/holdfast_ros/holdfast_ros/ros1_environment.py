@@ -1,9 +1,4 @@
-"""TCPROS, the protocol of ROS 1 over TCP, as bytes: no socket here.
-
-A connection begins with a header from each end (:mod:`ros1_master_guard.headers`). Then a caller
-sends requests, each after its length, and receives a response to each in the same order: a byte for
-success, then a message or an error text. A topic's connection carries messages only.
-"""
+"""What a node of ROS 1 is told by its surroundings: the master, its own address, names."""
 
 from __future__ import annotations
 
@@ -14,15 +9,11 @@ from collections.abc import Mapping
 from typing import NamedTuple, Self
 
 from holdfast.errors import TransportError
-from ros1_master_guard.headers import encode_message, host_and_port_of
+from ros1_master_guard.headers import host_and_port_of
 
 __all__ = [
     "RosEnvironment",
     "ServiceType",
-    "encode_answer",
-    "encode_refusal",
-    "header_of_service",
-    "place_of_service",
 ]
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
@@ -34,42 +25,6 @@ class ServiceType(NamedTuple):
 
     name: str
     digest: str
-
-
-def header_of_service(node: str, service: str, type_: ServiceType) -> dict[str, str]:
-    """Return the fields with which a service answers a caller's header."""
-    return {
-        "callerid": node,
-        "service": service,
-        "type": type_.name,
-        "md5sum": type_.digest,
-        "request_type": f"{type_.name}Request",
-        "response_type": f"{type_.name}Response",
-    }
-
-
-def encode_answer(payload: bytes) -> bytes:
-    """Encode a response."""
-    return b"\x01" + encode_message(payload)
-
-
-def encode_refusal(reason: str) -> bytes:
-    """Encode a response that reports an error."""
-    return b"\x00" + encode_message(reason.encode())
-
-
-def place_of_service(uri: object) -> tuple[str, int]:
-    """Return host and port of a service's URI, ``rosrpc://HOST:PORT``.
-
-    Raises
-    ------
-    TransportError
-        If it has another form.
-    """
-    place = host_and_port_of(str(uri), "rosrpc")
-    if place is None:
-        raise TransportError(f"the master says that it is at {uri!r:.200}, which is no place")
-    return place
 
 
 class RosEnvironment(NamedTuple):

@@ -5,25 +5,9 @@ from __future__ import annotations
 import pytest
 
 from holdfast.errors import TransportError
-from holdfast_ros.tcpros import RosEnvironment, encode_answer, encode_refusal, place_of_service
+from holdfast_ros.ros1_environment import RosEnvironment
 
 HERE = RosEnvironment("http://localhost:11311", "localhost", "127.0.0.1", "/")
-
-
-def test_requests_and_answers() -> None:
-    assert encode_answer(b"abc") == b"\1\3\0\0\0abc"
-    assert encode_refusal("no") == b"\0\2\0\0\0no"
-
-
-def test_where_a_service_is() -> None:
-    assert place_of_service("rosrpc://robot.local:40001") == ("robot.local", 40001)
-    assert place_of_service("rosrpc://[::1]:40001") == ("::1", 40001)
-
-
-@pytest.mark.parametrize("uri", ["", "http://a:1", "rosrpc://a", "rosrpc://:1", "rosrpc://a:x", 7])
-def test_what_is_no_place_is_refused(uri: object) -> None:
-    with pytest.raises(TransportError, match="which is no place"):
-        place_of_service(uri)
 
 
 @pytest.mark.parametrize(

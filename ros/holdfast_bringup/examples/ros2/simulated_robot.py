@@ -1,1 +1,0 @@
-../../../../examples/ros2/simulated_robot.py
