@@ -14,7 +14,8 @@ it, so an iterator of ten million trials is never queued anywhere, and one that 
 results so far (a race) has seen all but the trials of :attr:`TrialPool.waiting`. Where the next
 trials follow from results, submit them in the loop: :meth:`TrialPool.submit`, and
 :meth:`TrialPool.drop` takes back what no worker has begun. Leaving the ``with`` ends the workers at
-once, also on Ctrl-C.
+once, also on Ctrl-C. A worker that dies costs the trial that it ran: its other trials go to another
+one, and a further call of :meth:`TrialPool.run` goes on.
 
 The first trials are run in this process, until the time that a trial takes shows that workers would
 pay for their own start. Each worker holds trials for a tenth of a second, at most 16, and answers
@@ -26,7 +27,7 @@ from __future__ import annotations
 import os
 import traceback
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from time import perf_counter
@@ -67,6 +68,12 @@ _LOOKAHEAD_S = 0.1
 """A worker is sent trials for about this long, so that it never waits for the next one."""
 
 _MAX_LOOKAHEAD = 16
+
+_TICK_S = 0.25
+"""Between two looks at trials that may be overdue."""
+
+_BUILD_S = 60.0
+"""A worker may need it to start and to build a problem: no time of a trial."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +140,9 @@ class TrialPool:
     observer : TrialObserver
         Observes the trials that are run in this process because no worker could help: all of them
         if ``jobs`` is 1, else the last one at most.
+    overdue : callable, optional
+        Asked of each trial that runs, with its arm and the seconds so far: whether its worker is to
+        be ended. If it is given, no trial is run in this process, which none can end or hold up.
 
     Attributes
     ----------
@@ -141,18 +151,25 @@ class TrialPool:
     """
 
     def __init__(
-        self, jobs: int, *, expected: int | None = None, observer: TrialObserver = NULL_OBSERVER
+        self,
+        jobs: int,
+        *,
+        expected: int | None = None,
+        observer: TrialObserver = NULL_OBSERVER,
+        overdue: Callable[[Arm, float], bool] | None = None,
     ) -> None:
         if integer(jobs) is None or not 1 <= jobs <= MAX_JOBS:
             raise InvalidValueError(f"jobs is {jobs!r:.80}; it must be from 1 to {MAX_JOBS}")
         self._jobs = jobs
         self._expected = expected
         self._observer = observer
+        self._overdue = overdue
         self._queue: deque[tuple[Arm, int]] = deque()
         self._workers: list[_Worker] = []
         self._times: dict[Arm, _Times] = {}
         self._all_times = _Times()
         self._a_trial_is_long = False
+        self._wanted = 0
 
     def __enter__(self) -> TrialPool:
         return self
@@ -174,15 +191,16 @@ class TrialPool:
     @property
     def has_room(self) -> bool:
         """Whether further trials could keep a worker from waiting."""
-        return len(self._queue) < (1 if self._jobs == 1 else self._jobs * _MAX_LOOKAHEAD)
+        here = self._jobs == 1 and self._overdue is None
+        return len(self._queue) < (1 if here else self._jobs * _MAX_LOOKAHEAD)
 
     def submit(self, arm: Arm, trial: int) -> None:
         """Add a trial, which :meth:`run` yields when it is finished."""
         self._queue.append((arm, trial))
 
-    def drop(self, arm: Arm) -> None:
-        """Take back an arm's trials that no worker has; the others are still yielded."""
-        self._queue = deque(job for job in self._queue if job[0] is not arm)
+    def drop(self, arm: Arm | None = None) -> None:
+        """Take back trials, an arm's or all, that no worker has; the others are still yielded."""
+        self._queue = deque(job for job in self._queue if arm not in (None, job[0]))
 
     def run(self, trials: Iterable[tuple[Arm, int]] = ()) -> Iterator[FinishedTrial]:
         """Yield trials as they are finished, in any order, until none is left.
@@ -199,7 +217,8 @@ class TrialPool:
             returned, or if such a function raises; the message then has the frames of that
             function. Its ``arm`` is the trial's; the others can go on in another call.
         WorkerDiedError
-            If a worker process was killed; the message names the trial that it was running.
+            If a worker process ended or was overdue; the message names the trial that it was
+            running. The others can go on in another call.
         TrialCrashError
             If anything else went wrong in a worker process. In this process that error is raised
             as it is, with a note that names the trial.
@@ -228,6 +247,8 @@ class TrialPool:
 
     def _workers_pay(self) -> bool:
         remaining = self._remaining()
+        if self._overdue is not None:
+            return True
         if self._jobs == 1 or remaining <= 1:
             return False
         if self._a_trial_is_long or self._expected is None:
@@ -258,15 +279,18 @@ class TrialPool:
 
     def _start_workers(self) -> None:
         """Start workers one by one, each noted first, so that they can always be ended."""
-        count = min(self._jobs, self._remaining())
-        threads = max(1, available_cores() // count)
+        self._wanted = self._wanted or min(self._jobs, self._remaining())
+        threads = max(1, available_cores() // self._wanted)
         limit = self._queue[0][0].planning.active_sensing.num_cores
-        for number in range(count):
+        while len(self._workers) < self._wanted:
+            number = len(self._workers)
             self._workers.append(_Worker(number, threads, min(threads, limit or threads)))
             self._workers[-1].start()
 
     def _feed(self) -> None:
         """Send trials, each to the worker with the least to do."""
+        if self._queue:
+            self._start_workers()  # in place of those that died
         while self._queue:
             worker = min(self._workers, key=_Worker.load)
             arm, trial = self._queue[0]
@@ -283,17 +307,47 @@ class TrialPool:
 
     def _receive(self) -> Iterator[FinishedTrial]:
         by_connection = {worker.connection: worker for worker in self._workers}
-        for connection in wait(list(by_connection)):
+        ready = wait(list(by_connection), None if self._overdue is None else _TICK_S)
+        for connection in ready:
             assert isinstance(connection, Connection)
             worker = by_connection[connection]
             answer = worker.receive()
             if answer is None:
-                raise _worker_died(worker)
+                self._lose(worker, *worker.how_it_ended())
+                continue
             message = _ANSWERS.decode(answer)
+            if isinstance(message, _Built):
+                worker.began_s = perf_counter()
+                continue
             arm, trial = worker.take_finished()
             if isinstance(message, _Failed):
                 raise _error_of(arm, message)
             yield self._finished(arm, trial, message.result, message.elapsed_s)
+        for connection, worker in by_connection.items():
+            if self._overdue is not None and connection not in ready and worker.outstanding:
+                ran_s = perf_counter() - worker.began_s
+                if self._overdue(worker.outstanding[0][0], ran_s):
+                    self._lose(worker, f"was ended after {max(0.0, ran_s):.1f} s", overdue=True)
+
+    def _lose(
+        self, worker: _Worker, how: str, killed: bool = False, *, overdue: bool = False
+    ) -> None:
+        """Take leave of a worker; raise WorkerDiedError if it had a trial."""
+        self._workers.remove(worker)
+        end_workers([worker])
+        if not worker.outstanding:
+            return
+        (arm, trial, _), *others = worker.outstanding
+        self._queue.extendleft((arm, trial) for arm, trial, _ in reversed(others))
+        advice = " (often the machine is out of memory: use fewer jobs or fewer particles)"
+        error = WorkerDiedError(
+            f"a worker process {how} while it ran trial {trial}"
+            f"{f' of {arm.label}' if arm.label else ''}{advice if killed else ''}; finished trials "
+            "are kept"
+        )
+        error.arm, error.trial = arm, trial
+        error.how, error.killed, error.overdue = how, killed, overdue
+        raise error
 
 
 def available_cores() -> int:
@@ -393,13 +447,17 @@ class _Finished(msgspec.Struct, tag="finished"):
     elapsed_s: float
 
 
+class _Built(msgspec.Struct, tag="built"):
+    """The arm of a trial is built; its first trial there begins."""
+
+
 class _Failed(msgspec.Struct, tag="failed"):
     text: str
     expected: bool
 
 
 _REQUESTS = msgspec.msgpack.Decoder(_NewArm | _Trial)
-_ANSWERS = msgspec.msgpack.Decoder(_Finished | _Failed)
+_ANSWERS = msgspec.msgpack.Decoder(_Finished | _Built | _Failed)
 _ENCODE = msgspec.msgpack.Encoder().encode
 
 
@@ -410,6 +468,7 @@ class _Worker(WorkerProcess):
         super().__init__(f"holdfast-worker-{number}", _work, (threads,), blas_threads)
         self.outstanding: deque[tuple[Arm, int, float]] = deque()
         self.expected_s = 0.0
+        self.began_s = 0.0
         self._arms: dict[Arm, int] = {}
 
     def load(self) -> float:
@@ -418,6 +477,8 @@ class _Worker(WorkerProcess):
 
     def send_trial(self, arm: Arm, trial: int, expected_s: float) -> None:
         # If it is dead, its pipe tells when it is read, where we know which trial it had.
+        if not self.outstanding:
+            self.began_s = perf_counter() + (_BUILD_S if arm not in self._arms else 0.0)
         if arm not in self._arms:
             self.send(_ENCODE(_new_arm(arm)))
             self._arms[arm] = len(self._arms)
@@ -429,6 +490,7 @@ class _Worker(WorkerProcess):
         """Return the trial that an answer was about: they come in order."""
         arm, trial, expected_s = self.outstanding.popleft()
         self.expected_s = self.expected_s - expected_s if self.outstanding else 0.0
+        self.began_s = perf_counter()
         return arm, trial
 
 
@@ -488,6 +550,7 @@ def _work(connection: Connection, threads: int) -> None:
             arm = arms[request.arm]
             if isinstance(arm, _NewArm):
                 arms[request.arm] = arm = _arm_in_worker(arm, threads, problems)
+                connection.send_bytes(_ENCODE(_Built()))
             result = _run_one(arm, request.trial, NULL_OBSERVER)
             answer = _Finished(result, perf_counter() - started)
         except HoldfastError as error:
@@ -531,16 +594,6 @@ def _arm_in_worker(sent: _NewArm, threads: int, problems: dict[bytes, Problem]) 
 def _error_of(arm: Arm, failed: _Failed) -> Exception:
     if failed.expected:
         return _trial_error(arm, failed.text)
-    return TrialCrashError(f"in a worker process:\n{failed.text}")
-
-
-def _worker_died(worker: _Worker) -> WorkerDiedError:
-    how, killed = worker.how_it_ended()
-    advice = " (often the machine is out of memory: use fewer jobs or fewer particles)"
-    what = "before it had a trial to run"
-    if worker.outstanding:
-        arm, trial, _ = worker.outstanding[0]
-        what = f"while it ran trial {trial}{f' of {arm.label}' if arm.label else ''}"
-    return WorkerDiedError(
-        f"a worker process {how} {what}{advice if killed else ''}; finished trials are kept"
-    )
+    error = TrialCrashError(f"in a worker process:\n{failed.text}")
+    error.arm = arm
+    return error
