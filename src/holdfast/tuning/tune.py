@@ -7,6 +7,8 @@ it was and random sensing (:mod:`holdfast.tuning.verdict`).
 
 A trial depends on its candidate and number alone, and each is kept as soon as it is finished. So a
 tuning that goes on runs the same race again, with the trials that it has.
+
+Trials run in processes of their own: a candidate that ends its process, or hangs, leaves the race.
 """
 
 from __future__ import annotations
@@ -17,14 +19,21 @@ import fcntl
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from time import monotonic
 from typing import IO, Any, NamedTuple, get_args
 
 import msgspec
 import numpy as np
 
 from holdfast.config.loader import Configuration, load
-from holdfast.errors import InvalidValueError, OutputError, TrialError
-from holdfast.numerics.arrays import real_number, whole
+from holdfast.errors import (
+    InvalidValueError,
+    OutputError,
+    TrialCrashError,
+    TrialError,
+    WorkerDiedError,
+)
+from holdfast.numerics.arrays import FloatArray, real_number, whole
 from holdfast.recording.fingerprint import fingerprint
 from holdfast.recording.run_directory import first_difference
 from holdfast.recording.table_formats import csv_rows
@@ -47,7 +56,7 @@ from holdfast.tuning.candidates import (
 )
 from holdfast.tuning.race import PILOT_TRIALS, MeasuredTrial, Standing, race
 from holdfast.tuning.tuning_report import CandidateRow, Tuning, write_report
-from holdfast.tuning.verdict import TrialRow, cost_of, judge, mean_difference
+from holdfast.tuning.verdict import MUCH_SLOWER, TrialRow, cost_of, judge, mean_difference
 
 __all__ = ["Progress", "tune"]
 
@@ -59,10 +68,23 @@ SETTINGS_NAME = "tune.json"
 
 _SHARE_OF_THE_RACE = 0.6
 _LEAST_FRESH = 20
+_REPORT_S = 3.0
+
+_PATIENCE_S = 10.0
+"""No trial is ended sooner while there is time."""
+
+_FAR_LONGER = 10.0
+"""Times what the longest possible trial would take, by the seconds per step seen so far."""
+
+_FIRST_SHARE = 0.1
+"""Of the budget: a first trial that takes longer leaves no time for ten."""
+
+_MOST_REFUSED = 4
+"""Of those that could not be tried, the sentence names so many."""
 
 
 class Progress(NamedTuple):
-    """How far a tuning is: seconds of work over the processes, trials, and what it does."""
+    """How far a tuning is: seconds of its budget, trials, and what it does."""
 
     spent_s: float
     trials: int
@@ -94,9 +116,9 @@ def tune(
     objective : {"reward", "steps", "success"}, optional
         None: ``reward`` if sensing has prices, else ``steps``.
     budget_s : float
-        About how long it may take. The race has three fifths of it.
+        How long it may take, but for the trials that run at its end. The race has three fifths.
     most : int
-        Trials of a candidate in the race, and as many to judge.
+        Trials of a candidate in the race, and up to twice as many to judge.
     jobs : int, optional
         Processes; None: one for each core.
     max_decision_ms : float
@@ -110,8 +132,8 @@ def tune(
         If a value does not fit.
     OutputError
         If ``out`` belongs to something else, or cannot be written.
-    TrialError
-        If the trials of the configuration itself fail.
+    TrialError, WorkerDiedError, TrialCrashError
+        If trials of the configuration itself fail, end their process, or do not end.
     """
     if not isinstance(configuration, Configuration):
         configuration = load(configuration)
@@ -142,9 +164,10 @@ def tune(
         "max_decision_ms": None if math.isinf(max_decision_ms) else max_decision_ms,
         "code": fingerprint(configuration),
     }
-    with _Trials(out, settings) as kept, TrialPool(jobs) as pool:
-        tuner = _Tuner(configuration, objective, kept, pool, max_decision_ms, on_progress)
-        found = tuner.run(vary, most, budget_s * jobs)
+    with _Trials(out, settings) as kept:
+        tuner = _Tuner(configuration, objective, kept, jobs, max_decision_ms, on_progress)
+        with TrialPool(jobs, overdue=tuner.is_overdue) as tuner.pool:
+            found = tuner.run(vary, most, max(0.5 * budget_s, budget_s - _REPORT_S))
     if out is not None:
         write_report(out, configuration, found)
     return found
@@ -153,32 +176,41 @@ def tune(
 class _Tuner:
     """One tuning: its candidates, and the trials that are asked for of them."""
 
+    pool: TrialPool
+
     def __init__(
         self,
         base: Configuration,
         objective: Objective,
         kept: _Trials,
-        pool: TrialPool,
+        jobs: int,
         max_decision_ms: float,
         on_progress: Callable[[Progress], None],
     ) -> None:
         self._base = base
         self._objective = objective
         self._kept = kept
-        self._pool = pool
+        self._jobs = jobs
         self._max_decision_ms = max_decision_ms
         self._on_progress = on_progress
         self._limit = base.simulator.max_steps
         self._candidates: dict[str, Candidate] = {}
         self._arms: dict[str, Arm] = {}
         self._failed: dict[str, str] = {}
+        self._killed: set[tuple[str, int]] = set()
         self._counted: set[tuple[str, int]] = set()
-        self._spent_s = 0.0
+        self._longest_s: dict[str, float] = {}
         self._doing = ""
+        self._began_s = monotonic()
+        self._budget_s = self._until_s = math.inf
 
     def run(self, vary: Sequence[Variation], most: int, budget_s: float) -> Tuning:
-        """Race and judge; ``budget_s`` is of a processor."""
+        """Race and judge, within ``budget_s``."""
+        self._budget_s = budget_s
+        # What was run before has had its part of the budget.
+        self._began_s -= self._seconds(key for key in self._kept.rows if key[1] < FRESH)
         candidates, refused = first_candidates(self._base, vary, self._objective)
+        left_out = dict(refused)
         later = [each for each in vary if each in ("interval", "particles")]
         for_first = _SHARE_OF_THE_RACE * budget_s * (0.6 if later else 1.0)
         standings = self._race(candidates, refused, most, for_first)
@@ -187,27 +219,39 @@ class _Tuner:
             others, refused = later_candidates(self._base, winner, later)
             more = self._race(others, refused, most, _SHARE_OF_THE_RACE * budget_s)
             standings = [*more, *(each for each in standings if each.candidate != winner.name)]
-        finalist = self._candidates[standings[0].candidate]
-        judged = self._judged(finalist)
-        self._doing = f"{finalist.name} is judged on fresh trials"
-        fresh = 0
+        finalists = self._finalists(standings)
+        judged = self._judged(finalists)
+        self._doing = f"{', '.join(finalists)}: judged on fresh trials"
+        self._until_s = budget_s
+        most_fresh = 2 * most
+        wanted = [(name, FRESH + trial) for trial in range(most_fresh) for name in judged]
+        self._began_s -= self._seconds(key for key in wanted if key in self._kept.rows)
         # Whether to go on depends on the time alone, never on what has come out.
-        while fresh < most and (fresh < _LEAST_FRESH or self._spent_s < budget_s):
-            block = range(fresh, min(fresh + _LEAST_FRESH, most))
-            for _ in self._measured([(name, FRESH + n) for n in block for name in judged]):
-                pass
-            fresh = block.stop
+        for _ in self._measured(wanted):
+            pass
+        judged = [name for name in judged if name not in self._failed]
+        fresh = next(
+            trial
+            for trial in range(most_fresh + 1)
+            if any((name, FRESH + trial) not in self._kept.rows for name in judged)
+        )
         rows = {
             name: [self._kept.rows[name, FRESH + trial] for trial in range(fresh)]
             for name in judged
-            if name not in self._failed
         }
         barred = {name for name in rows if self._refusal(name) is not None}
-        verdict = judge(rows, finalist.name, self._objective, self._limit, barred)
+        verdict = judge(
+            rows, finalists, self._objective, self._limit, barred, min(most, _LEAST_FRESH)
+        )
+        sentence = verdict.sentence
+        left_out |= self._failed
+        for name, reason in list(left_out.items())[:_MOST_REFUSED]:
+            sentence += f" {name} was left out: {reason.splitlines()[0]}."
+        if len(left_out) > _MOST_REFUSED:
+            sentence += f" So were {len(left_out) - _MOST_REFUSED} more (the table says why)."
         untried = sum(
             each.state == "set aside" and each.trials <= PILOT_TRIALS for each in standings
         )
-        sentence = verdict.sentence
         if untried:
             what = "candidate was" if untried == 1 else "candidates were"
             sentence += f" {untried} slow {what} not tried: a larger budget does that."
@@ -230,6 +274,13 @@ class _Tuner:
             candidates=tuple(map(self._row, standings)),
         )
 
+    def _spent_s(self) -> float:
+        return monotonic() - self._began_s
+
+    def _seconds(self, keys: Iterable[tuple[str, int]]) -> float:
+        """Return how long kept trials took, over all processes."""
+        return sum(self._kept.rows[key].seconds for key in keys) / self._jobs
+
     def _race(
         self,
         candidates: Sequence[Candidate],
@@ -240,17 +291,24 @@ class _Tuner:
         for each in candidates:
             self._add(each)
         names = [each.name for each in candidates]
-        of_them = {key for key in self._counted if key[0] in names}
-        before_s = sum(self._kept.rows[key].seconds for key in of_them)
         self._doing = f"{len(names)} candidates race"
+        self._until_s = until_s
+        before_s = self._seconds(
+            key for key in self._kept.rows if key[0] in names and key[1] < FRESH
+        )
         standings = race(
             names,
             self._measured,
             limit={"steps": float(self._limit), "success": 1.0}.get(self._objective),
             most=most,
-            budget_s=until_s - self._spent_s + before_s,
+            budget_s=self._jobs * (until_s - self._spent_s() + before_s),
             refuse=self._refusal,
         )
+        if not self._kept.of(AS_CONFIGURED):
+            raise TrialError(
+                f"{AS_CONFIGURED}: no trial ended within {until_s:.3g} s: a larger budget is "
+                "needed, or it hangs"
+            )
         if standings[0].state == "refused":
             raise InvalidValueError(
                 f"no candidate is admitted: {standings[0].candidate}: {standings[0].reason}"
@@ -260,35 +318,60 @@ class _Tuner:
             nothing._replace(candidate=name, reason=reason) for name, reason in refused.items()
         ]
 
+    def _finalists(self, standings: Sequence[Standing]) -> list[str]:
+        """Return whom to judge: the winner, and one that may be as good, best a quicker one."""
+        winner = standings[0].candidate
+        costs, bound_ms = self._costs(winner), self._decision_ms(winner) / MUCH_SLOWER
+        equals = []
+        for each in standings[1:]:
+            own = self._costs(each.candidate)
+            common = min(len(own), len(costs))
+            if each.state != "in the race" or each.candidate == AS_CONFIGURED or common < 2:
+                continue
+            differences = own[:common] - costs[:common]
+            if np.mean(differences) <= 2.0 * np.std(differences, ddof=1) / math.sqrt(common):
+                equals.append(each.candidate)
+        equals.sort(key=lambda name: self._decision_ms(name) > bound_ms)  # of alike, as they were
+        for second in equals:
+            each_s = {each.candidate: each.seconds for each in standings}
+            judged = self._judged([winner, second])
+            needed_s = 3 * _LEAST_FRESH * sum(each_s.get(name, 0.0) for name in judged)
+            if second != RANDOM and needed_s <= self._jobs * (self._budget_s - self._spent_s()):
+                return [winner, second]
+        return [winner]
+
     def _add(self, candidate: Candidate) -> None:
         if candidate.name not in self._candidates:
             self._candidates[candidate.name] = candidate
             self._arms[candidate.name] = Arm.of(candidate.configuration, candidate.name)
 
-    def _judged(self, finalist: Candidate) -> list[str]:
+    def _judged(self, finalists: Sequence[str]) -> list[str]:
         """Return whom the fresh trials judge, the configuration first."""
-        rivals = {AS_CONFIGURED: None, finalist.name: None}
+        rivals = dict.fromkeys((AS_CONFIGURED, *finalists))
         own = self._base.planning.selector.method
         if own != "random":
             rivals[RANDOM] = None
         if own not in ("random", DEFAULT) and DEFAULT in self._candidates:
             rivals[DEFAULT] = None
-        others = {
-            key: value for key, value in finalist.changes.items() if not key.startswith("selector.")
-        }
-        if others:
-            # It must not be that the particles or the interval do it, and not what is sensed.
-            changes = others | {"selector.method": "random"}
-            name = f"random,{finalist.name.rpartition(',')[2]}"
-            self._add(Candidate(name, changed(self._base, changes), changes))
-            rivals[name] = None
+        for finalist in finalists:
+            others = {
+                key: value
+                for key, value in self._candidates[finalist].changes.items()
+                if not key.startswith("selector.")
+            }
+            if others:
+                # It must not be that the particles or the interval do it, and not what is sensed.
+                changes = others | {"selector.method": "random"}
+                name = f"random,{finalist.rpartition(',')[2]}"
+                self._add(Candidate(name, changed(self._base, changes), changes))
+                rivals[name] = None
         return [name for name in rivals if name not in self._failed]
 
     def _refusal(self, name: str) -> str | None:
         """Return why a candidate must not win."""
         rows = self._kept.of(name)
         if rows and name not in self._failed:
-            decision_ms = float(np.median([row.decision_ms for row in rows]))
+            decision_ms = self._decision_ms(name)
             if decision_ms > self._max_decision_ms:
                 return (
                     f"a decision takes {decision_ms:.3g} ms, and at most "
@@ -296,8 +379,21 @@ class _Tuner:
                 )
         return self._failed.get(name)
 
+    def is_overdue(self, arm: Arm, ran_s: float) -> bool:
+        """Return whether a trial that has run so long is to be ended."""
+        longest_s = self._longest_s.get(arm.label)
+        if arm.label in self._failed or (
+            self._spent_s() > self._until_s and max(0.0, ran_s) >= (longest_s or 0.0)
+        ):
+            return True
+        first_s = _FIRST_SHARE * self._budget_s
+        return ran_s > max(_PATIENCE_S, first_s if longest_s is None else _FAR_LONGER * longest_s)
+
     def _measured(self, jobs: Sequence[tuple[str, int]]) -> Iterator[MeasuredTrial]:
-        """Run trials, or take those that are kept; leave out those of a candidate that fails."""
+        """Run trials while there is time, or take those that are kept.
+
+        Those of a candidate that fails are left out.
+        """
         missing = []
         for name, trial in jobs:
             row = self._kept.rows.get((name, trial))
@@ -305,10 +401,14 @@ class _Tuner:
                 missing.append((name, trial))
             else:
                 yield self._count(row)
-        more = ((self._arms[name], trial) for name, trial in missing if name not in self._failed)
+        more = (
+            (self._arms[name], trial)
+            for name, trial in missing
+            if name not in self._failed and self._spent_s() < self._until_s
+        )
         while True:
             try:
-                for finished in self._pool.run(more):
+                for finished in self.pool.run(more):
                     result = finished.result
                     row = TrialRow(
                         finished.arm.label,
@@ -322,23 +422,55 @@ class _Tuner:
                     )
                     self._kept.add(row)
                     yield self._count(row)
-            except TrialError as error:
-                arm = error.arm
-                if not isinstance(arm, Arm) or arm.label == AS_CONFIGURED:
-                    raise
-                self._failed[arm.label] = f"it fails: {error}"
-                self._pool.drop(arm)
+                    if self._spent_s() >= self._until_s:
+                        self.pool.drop()
+            except (TrialError, TrialCrashError, WorkerDiedError) as error:
+                self._leave_out(error)
             else:
                 return
+
+    def _leave_out(self, error: TrialError | TrialCrashError | WorkerDiedError) -> None:
+        """Take a candidate out of the race; raise the error if it is the configuration itself."""
+        arm = error.arm
+        assert isinstance(arm, Arm)
+        name, reason = arm.label, f"it fails: {error}"
+        if isinstance(error, TrialCrashError):
+            reason = f"it fails: {str(error).splitlines()[-1]}"
+        if isinstance(error, WorkerDiedError):
+            reason = f"it died: its process {error.how} in trial {error.trial % FRESH}"
+            if error.overdue and self._spent_s() > self._until_s:
+                self.pool.drop()  # time is up, and nobody's fault
+                return
+            if error.overdue:
+                reason = f"it hangs, or is too slow: trial {error.trial % FRESH} {error.how}"
+            elif error.killed and (name, error.trial) not in self._killed:
+                # Whoever killed it may have meant another one, if memory was short.
+                self._killed.add((name, error.trial))
+                self.pool.submit(arm, error.trial)
+                return
+        if name == AS_CONFIGURED and isinstance(error, WorkerDiedError):
+            raise WorkerDiedError(f"your configuration: {reason}") from error
+        if name == AS_CONFIGURED:
+            raise error
+        self._failed.setdefault(name, reason)
+        self.pool.drop(arm)
 
     def _count(self, row: TrialRow) -> MeasuredTrial:
         key = row.candidate, row.trial
         if key not in self._counted:
             self._counted.add(key)
-            self._spent_s += row.seconds
-        self._on_progress(Progress(self._spent_s, len(self._counted), self._doing))
+            possible_s = row.seconds * self._limit / max(1, row.steps)
+            self._longest_s[key[0]] = max(self._longest_s.get(key[0], 0.0), possible_s)
+        self._on_progress(Progress(self._spent_s(), len(self._counted), self._doing))
         cost = cost_of(row, self._objective, self._limit)
         return MeasuredTrial(row.candidate, row.trial, cost, row.seconds)
+
+    def _costs(self, name: str) -> FloatArray:
+        """Return what the trials of the race cost, in order."""
+        return np.array([cost_of(row, self._objective, self._limit) for row in self._kept.of(name)])
+
+    def _decision_ms(self, name: str) -> float:
+        return float(np.median([row.decision_ms for row in self._kept.of(name)]))
 
     def _row(self, standing: Standing) -> CandidateRow:
         name = standing.candidate
@@ -347,10 +479,7 @@ class _Tuner:
         rows = self._kept.of(name)[: standing.trials]
         if len(rows) <= PILOT_TRIALS:
             return CandidateRow(candidate=name, changes=changes, trials=len(rows), state=state)
-        costs, base = (
-            np.array([cost_of(row, self._objective, self._limit) for row in each[: len(rows)]])
-            for each in (rows, self._kept.of(AS_CONFIGURED))
-        )
+        costs, base = self._costs(name)[: len(rows)], self._costs(AS_CONFIGURED)
         common = min(len(costs), len(base))
         difference, interval = mean_difference(costs[:common] - base[:common])
         return CandidateRow(
@@ -361,7 +490,7 @@ class _Tuner:
             difference=difference,
             interval=interval,
             success=float(np.mean([row.success for row in rows])),
-            decision_ms=float(np.median([row.decision_ms for row in rows])),
+            decision_ms=self._decision_ms(name),
             trial_s=standing.seconds,
             state=state,
         )
