@@ -125,6 +125,11 @@ class TuneOptions(Options):
         help="No candidate may win whose median decision takes longer (default: no limit).",
     )
     jobs: int | None = jobs_option(more="")
+    ray: str | None = option(
+        metavar="ADDRESS",
+        help="Run the trials on a Ray cluster: auto (of this machine), HOST:PORT or "
+        "ray://HOST:PORT; on all of its cores unless --jobs says otherwise.",
+    )
     seed: int | None = seed_option()
     assignments: tuple[str, ...] = option(
         "--set",
@@ -201,6 +206,7 @@ def _tune(options: TuneOptions) -> int:
             budget_s=left_s,
             most=options.trials,
             jobs=options.jobs,
+            ray=options.ray,
             max_decision_ms=options.max_decision_ms,
             out=out,
             on_progress=show,

@@ -57,6 +57,7 @@ from holdfast.robot.trial import (
     run_trial,
 )
 from holdfast.runtime.command_line import MAX_JOBS
+from holdfast.runtime.ray_workers import RayCluster
 from holdfast.runtime.workers import WorkerProcess, end_workers
 
 __all__ = ["Arm", "FinishedTrial", "TrialPool", "available_cores"]
@@ -143,6 +144,8 @@ class TrialPool:
     overdue : callable, optional
         Asked of each trial that runs, with its arm and the seconds so far: whether its worker is to
         be ended. If it is given, no trial is run in this process, which none can end or hold up.
+    cluster : RayCluster, optional
+        Where the workers are, in place of this machine; it takes ``overdue``.
 
     Attributes
     ----------
@@ -157,6 +160,7 @@ class TrialPool:
         expected: int | None = None,
         observer: TrialObserver = NULL_OBSERVER,
         overdue: Callable[[Arm, float], bool] | None = None,
+        cluster: RayCluster | None = None,
     ) -> None:
         if integer(jobs) is None or not 1 <= jobs <= MAX_JOBS:
             raise InvalidValueError(f"jobs is {jobs!r:.80}; it must be from 1 to {MAX_JOBS}")
@@ -164,6 +168,7 @@ class TrialPool:
         self._expected = expected
         self._observer = observer
         self._overdue = overdue
+        self._cluster = cluster
         self._queue: deque[tuple[Arm, int]] = deque()
         self._workers: list[_Worker] = []
         self._times: dict[Arm, _Times] = {}
@@ -280,11 +285,12 @@ class TrialPool:
     def _start_workers(self) -> None:
         """Start workers one by one, each noted first, so that they can always be ended."""
         self._wanted = self._wanted or min(self._jobs, self._remaining())
-        threads = max(1, available_cores() // self._wanted)
+        threads = max(1, available_cores() // self._wanted) if self._cluster is None else 1
         limit = self._queue[0][0].planning.active_sensing.num_cores
         while len(self._workers) < self._wanted:
             number = len(self._workers)
-            self._workers.append(_Worker(number, threads, min(threads, limit or threads)))
+            blas_threads = min(threads, limit or threads)
+            self._workers.append(_Worker(number, threads, blas_threads, self._cluster))
             self._workers[-1].start()
 
     def _feed(self) -> None:
@@ -464,8 +470,12 @@ _ENCODE = msgspec.msgpack.Encoder().encode
 class _Worker(WorkerProcess):
     """A worker, and the trials that it has been sent."""
 
-    def __init__(self, number: int, threads: int, blas_threads: int) -> None:
+    def __init__(
+        self, number: int, threads: int, blas_threads: int, cluster: RayCluster | None
+    ) -> None:
         super().__init__(f"holdfast-worker-{number}", _work, (threads,), blas_threads)
+        if cluster is not None:
+            self._process = cluster.process(_Runner, self._theirs, threads)
         self.outstanding: deque[tuple[Arm, int, float]] = deque()
         self.expected_s = 0.0
         self.began_s = 0.0
@@ -537,31 +547,47 @@ def _pickled(problem: Problem) -> bytes:
 
 def _work(connection: Connection, threads: int) -> None:
     """Run trials until the parent closes the pipe."""
-    arms: list[_NewArm | Arm] = []
-    problems: dict[bytes, Problem] = {}
+    runner = _Runner(threads)
     while True:
-        request = _REQUESTS.decode(connection.recv_bytes())
+        for answer in runner.answers(connection.recv_bytes()):
+            connection.send_bytes(answer)
+
+
+class _Runner:
+    """What runs the trials in a worker, which has as many threads as its share of the cores."""
+
+    def __init__(self, threads: int) -> None:
+        self._threads = threads
+        self._arms: list[_NewArm | Arm] = []
+        self._problems: dict[bytes, Problem] = {}
+
+    def answer(self, message: bytes) -> list[bytes]:
+        """Return all that there is to answer."""
+        return list(self.answers(message))
+
+    def answers(self, message: bytes) -> Iterator[bytes]:
+        """Yield what there is to answer, as soon as it is known."""
+        request = _REQUESTS.decode(message)
         if isinstance(request, _NewArm):
-            arms.append(request)
-            continue
+            self._arms.append(request)
+            return
         started = perf_counter()
-        answer: _Finished | _Failed
         try:
-            arm = arms[request.arm]
+            arm = self._arms[request.arm]
             if isinstance(arm, _NewArm):
-                arms[request.arm] = arm = _arm_in_worker(arm, threads, problems)
-                connection.send_bytes(_ENCODE(_Built()))
+                self._arms[request.arm] = arm = _arm_in_worker(arm, self._threads, self._problems)
+                yield _ENCODE(_Built())
             result = _run_one(arm, request.trial, NULL_OBSERVER)
-            answer = _Finished(result, perf_counter() - started)
+            answer = _ENCODE(_Finished(result, perf_counter() - started))
         except HoldfastError as error:
-            answer = _Failed(str(error), True)
+            answer = _ENCODE(_Failed(str(error), True))
         except Exception:  # noqa: BLE001 - whatever it is, the parent raises it again
-            answer = _Failed(traceback.format_exc(), False)
-        connection.send_bytes(_ENCODE(answer))
+            answer = _ENCODE(_Failed(traceback.format_exc(), False))
+        yield answer
 
 
 def _arm_in_worker(sent: _NewArm, threads: int, problems: dict[bytes, Problem]) -> Arm:
-    """Build an arm in a worker, which has as many threads as its share of the cores.
+    """Build an arm in a worker.
 
     Arms that differ in their settings alone share a problem of ``problems``: it may be large.
     """

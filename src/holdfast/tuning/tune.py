@@ -40,6 +40,7 @@ from holdfast.recording.table_formats import csv_rows
 from holdfast.robot.trial_pool import Arm, TrialPool, available_cores
 from holdfast.runtime.command_line import MAX_JOBS
 from holdfast.runtime.files import shown_path, write_atomically
+from holdfast.runtime.ray_workers import RayCluster
 from holdfast.tuning.candidates import (
     AS_CONFIGURED,
     BY_DEFAULT,
@@ -99,6 +100,7 @@ def tune(
     budget_s: float = 600.0,
     most: int = 200,
     jobs: int | None = None,
+    ray: str | None = None,
     max_decision_ms: float = math.inf,
     out: str | Path | None = None,
     on_progress: Callable[[Progress], None] = lambda _: None,
@@ -121,6 +123,9 @@ def tune(
         Trials of a candidate in the race, and up to twice as many to judge.
     jobs : int, optional
         Processes; None: one for each core.
+    ray : str, optional
+        A Ray cluster whose cores run the trials: ``auto`` (of this machine), ``HOST:PORT`` or
+        ``ray://HOST:PORT``. Nodes need the same holdfast, and the problem at the same path.
     max_decision_ms : float
         A candidate whose median decision takes longer must not win.
     out : path, optional
@@ -141,7 +146,7 @@ def tune(
     if unknown:
         raise InvalidValueError(f"vary has {unknown[0]!r}; allowed are {', '.join(VARIATIONS)}")
     most = whole("most", most, 2, FRESH - 1)
-    jobs = available_cores() if jobs is None else whole("jobs", jobs, 1, MAX_JOBS)
+    jobs = None if jobs is None else whole("jobs", jobs, 1, MAX_JOBS)
     for name, value in (("budget_s", budget_s), ("max_decision_ms", max_decision_ms)):
         number = real_number(value)
         if number is None or not number > 0.0:
@@ -164,9 +169,13 @@ def tune(
         "max_decision_ms": None if math.isinf(max_decision_ms) else max_decision_ms,
         "code": fingerprint(configuration),
     }
-    with _Trials(out, settings) as kept:
+    with contextlib.ExitStack() as stack:
+        kept = stack.enter_context(_Trials(out, settings))
+        cluster = None if ray is None else stack.enter_context(RayCluster(ray))
+        cores = available_cores() if cluster is None else min(cluster.cores, MAX_JOBS)
+        jobs = jobs or cores
         tuner = _Tuner(configuration, objective, kept, jobs, max_decision_ms, on_progress)
-        with TrialPool(jobs, overdue=tuner.is_overdue) as tuner.pool:
+        with TrialPool(jobs, overdue=tuner.is_overdue, cluster=cluster) as tuner.pool:
             found = tuner.run(vary, most, max(0.5 * budget_s, budget_s - _REPORT_S))
     if out is not None:
         write_report(out, configuration, found)
