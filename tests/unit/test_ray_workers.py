@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import secrets
 import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from studies.tests.ray_cluster import RayCluster as StartedCluster
-from tests.command_line import run_here
-from tests.unit.test_tuning_tune import MEAN, OF_MEAN
 
 from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.runtime.ray_workers import RayCluster

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import resource
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,10 @@ import pytest
 
 import holdfast as hf
 from holdfast.config.loader import load
-from holdfast.errors import InvalidValueError, OutputError, WorkerDiedError
+from holdfast.errors import InvalidValueError, WorkerDiedError
 from holdfast.tuning.candidates import AS_CONFIGURED, RANDOM
-from holdfast.tuning.tune import FRESH, Progress
+from holdfast.tuning.kept_trials import FRESH
+from holdfast.tuning.tune import Progress
 
 RUN = """
 problem: peg_in_hole_2d
@@ -56,28 +56,6 @@ def test_what_it_finds_and_writes(run: Path) -> None:
         hf.Planner(load(run).problem, load(run).planning), seed=3, trial=0, max_steps=25
     )
     assert rows[1].startswith(f"as configured,0,{int(result.success)},0,{result.steps},")
-
-
-def test_it_goes_on_where_it_was_interrupted(run: Path) -> None:
-    out, whole = run.parent / "tuned", run.parent / "whole"
-
-    def interrupt(progress: Progress) -> None:
-        if progress.trials == 17:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        tuned(run, out=out, on_progress=interrupt)
-    trials = out / "trials.csv"
-    kept = trials.read_text()
-    assert len(kept.splitlines()) == 1 + 17
-    trials.write_text(kept + "as configured,9,1")  # a kill has cut it short
-    found = tuned(run, out=out)
-    assert trials.read_text().startswith(kept)
-    again = tuned(run, out=whole)
-    assert (found.sentence, found.choice) == (again.sentence, again.choice)
-    assert found.comparisons == again.comparisons
-    with pytest.raises(OutputError, match=r"objective was 'steps' and is 'success'"):
-        tuned(run, out=out, objective="success")
 
 
 def test_candidates_that_die_hang_or_fail_leave_the_race(
@@ -171,44 +149,6 @@ def test_intervals_are_judged_beside_random_sensing_at_the_same(run: Path) -> No
     if "simulator.sensing_intervals" in winner.changes:
         rivals = {each.against for each in found.comparisons} | {found.choice}
         assert any(each.startswith("random, every") for each in rivals)
-
-
-def test_damaged_files(run: Path) -> None:
-    out = run.parent / "tuned"
-    tuned(run, out=out)
-    trials, settings = out / "trials.csv", out / "tune.json"
-    whole, known = trials.read_bytes(), settings.read_bytes()
-    head, first, rest = whole.split(b"\n", 2)
-    odd = [b"", b"\xff\xfe", b"random,1,\x00", b'"always x', b"a" * 200_000, first[:-9] + b"inf"]
-    trials.write_bytes(b"\n".join([head, *odd, rest]) + first[:-9])
-    tuned(run, out=out)
-    again = trials.read_bytes()
-    assert again.startswith(b"\n".join([head, *odd, rest]))  # nothing was lost, nothing cut
-    assert len(again.splitlines()) == len(whole.splitlines()) + len(odd)  # one trial was run again
-    settings.write_bytes(b'{"objective": "\xff"}')
-    with pytest.raises(OutputError, match=r"tune\.json: cannot be read: "):
-        tuned(run, out=out)
-    settings.unlink()
-    with pytest.raises(OutputError, match=r"tune\.json: is gone, so nothing tells of which"):
-        tuned(run, out=out)
-    assert trials.read_bytes() == again
-    settings.write_bytes(known)
-    tuned(run, out=out)
-
-
-def test_a_full_disk_is_an_error_in_words(run: Path) -> None:
-    out = run.parent / "tuned"
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2_500, before[1]))
-    try:
-        with pytest.raises(OutputError, match=r"trials\.csv: cannot be written: "):
-            tuned(run, out=out, most=100)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    kept = (out / "trials.csv").read_bytes()
-    assert len(kept) == 2_500
-    tuned(run, out=out)
-    assert (out / "trials.csv").read_bytes().startswith(kept[: kept.rfind(b"\n") + 1])
 
 
 def test_no_process_has_a_problem_for_each_candidate(run: Path) -> None:

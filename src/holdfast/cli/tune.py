@@ -167,7 +167,8 @@ def main(arguments: Sequence[str]) -> int:
 
 def _tune(options: TuneOptions) -> int:
     from holdfast.config.loader import load
-    from holdfast.tuning.tune import TRIALS_NAME, Progress, tune
+    from holdfast.tuning.kept_trials import TRIALS_NAME
+    from holdfast.tuning.tune import Progress, tune
     from holdfast.tuning.tuning_report import CONFIGURATION_NAME, tuning_tables
 
     runs, began_s = Path("runs").absolute(), monotonic()

@@ -18,8 +18,7 @@ once, also on Ctrl-C. A worker that dies costs the trial that it ran: its other 
 one, and a further call of :meth:`TrialPool.run` goes on.
 
 The first trials are run in this process, until the time that a trial takes shows that workers would
-pay for their own start. Each worker holds trials for a tenth of a second, at most 16, and answers
-with one message for each.
+pay for their own start. Each worker holds trials for a tenth of a second, at most 16.
 """
 
 from __future__ import annotations
@@ -51,8 +50,6 @@ from holdfast.planning.settings import LostSettings, PlanningSettings
 from holdfast.problems.problem import Problem
 from holdfast.robot.trial import (
     NULL_OBSERVER,
-    SensingStep,
-    TaskStep,
     TrialObserver,
     run_trial,
 )
@@ -74,7 +71,7 @@ _TICK_S = 0.25
 """Between two looks at trials that may be overdue."""
 
 _BUILD_S = 60.0
-"""A worker may need it to start and to build a problem: no time of a trial."""
+"""For a worker to start and to build a problem, before the time of a trial begins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,10 +217,9 @@ class TrialPool:
         TrialError
             If holdfast refuses something in a trial, for example what a problem's function
             returned, or if such a function raises; the message then has the frames of that
-            function. Its ``arm`` is the trial's; the others can go on in another call.
+            function. Its ``arm`` is the trial's, as of the others. Another call can go on.
         WorkerDiedError
-            If a worker process ended or was overdue; the message names the trial that it was
-            running. The others can go on in another call.
+            If a worker process ended or was overdue; the message names the trial.
         TrialCrashError
             If anything else went wrong in a worker process. In this process that error is raised
             as it is, with a note that names the trial.
@@ -251,9 +247,9 @@ class TrialPool:
         return max(self._expected - self._all_times.count, len(self._queue))
 
     def _workers_pay(self) -> bool:
-        remaining = self._remaining()
         if self._overdue is not None:
             return True
+        remaining = self._remaining()
         if self._jobs == 1 or remaining <= 1:
             return False
         if self._a_trial_is_long or self._expected is None:
@@ -286,11 +282,9 @@ class TrialPool:
         """Start workers one by one, each noted first, so that they can always be ended."""
         self._wanted = self._wanted or min(self._jobs, self._remaining())
         threads = max(1, available_cores() // self._wanted) if self._cluster is None else 1
-        limit = self._queue[0][0].planning.active_sensing.num_cores
-        while len(self._workers) < self._wanted:
-            number = len(self._workers)
-            blas_threads = min(threads, limit or threads)
-            self._workers.append(_Worker(number, threads, blas_threads, self._cluster))
+        limit = self._queue[0][0].planning.active_sensing.num_cores or threads
+        while (number := len(self._workers)) < self._wanted:
+            self._workers.append(_Worker(number, threads, min(threads, limit), self._cluster))
             self._workers[-1].start()
 
     def _feed(self) -> None:
@@ -333,11 +327,9 @@ class TrialPool:
             if self._overdue is not None and connection not in ready and worker.outstanding:
                 ran_s = perf_counter() - worker.began_s
                 if self._overdue(worker.outstanding[0][0], ran_s):
-                    self._lose(worker, f"was ended after {max(0.0, ran_s):.1f} s", overdue=True)
+                    self._lose(worker, f"was ended after {max(0.0, ran_s):.1f} s", False, True)
 
-    def _lose(
-        self, worker: _Worker, how: str, killed: bool = False, *, overdue: bool = False
-    ) -> None:
+    def _lose(self, worker: _Worker, how: str, killed: bool, overdue: bool = False) -> None:
         """Take leave of a worker; raise WorkerDiedError if it had a trial."""
         self._workers.remove(worker)
         end_workers([worker])
@@ -345,11 +337,11 @@ class TrialPool:
             return
         (arm, trial, _), *others = worker.outstanding
         self._queue.extendleft((arm, trial) for arm, trial, _ in reversed(others))
-        advice = " (often the machine is out of memory: use fewer jobs or fewer particles)"
+        what = f"trial {trial}{f' of {arm.label}' if arm.label else ''}"
+        if killed:
+            what += " (often the machine is out of memory: use fewer jobs or fewer particles)"
         error = WorkerDiedError(
-            f"a worker process {how} while it ran trial {trial}"
-            f"{f' of {arm.label}' if arm.label else ''}{advice if killed else ''}; finished trials "
-            "are kept"
+            f"a worker process {how} while it ran {what}; finished trials are kept"
         )
         error.arm, error.trial = arm, trial
         error.how, error.killed, error.overdue = how, killed, overdue
@@ -383,19 +375,13 @@ class _Watch(TrialObserver):
     def __init__(self) -> None:
         self._deadline = perf_counter() + _WORKER_START_S
 
-    def sensed(self, step: SensingStep) -> None:
+    def sensed(self, step: object) -> None:
         """Look at the clock."""
         del step
-        self._check()
-
-    def acted(self, step: TaskStep) -> None:
-        """Look at the clock."""
-        del step
-        self._check()
-
-    def _check(self) -> None:
         if perf_counter() > self._deadline:
             raise _TrialIsLongError
+
+    acted = sensed
 
 
 def _run_one(arm: Arm, trial: int, observer: TrialObserver) -> TrialResult:
@@ -411,18 +397,16 @@ def _run_one(arm: Arm, trial: int, observer: TrialObserver) -> TrialResult:
         )
     except (_TrialIsLongError, KeyboardInterrupt):
         raise
-    except HoldfastError as error:
-        raise _trial_error(arm, f"{where}: {error}") from error
     except BaseException as error:
-        account = account_of_user_error(error, arm.problem_name)
-        if account is not None:
-            raise _trial_error(arm, f"{where}: {account}") from error
+        ours = isinstance(error, HoldfastError)
+        text = str(error) if ours else account_of_user_error(error, arm.problem_name)
+        if text is not None:
+            raise _with_arm(TrialError(f"{where}: {text}"), arm) from error
         error.add_note(f"in {where}")
         raise
 
 
-def _trial_error(arm: Arm, text: str) -> TrialError:
-    error = TrialError(text)
+def _with_arm(error: TrialError | TrialCrashError, arm: Arm) -> Exception:
     error.arm = arm
     return error
 
@@ -470,10 +454,8 @@ _ENCODE = msgspec.msgpack.Encoder().encode
 class _Worker(WorkerProcess):
     """A worker, and the trials that it has been sent."""
 
-    def __init__(
-        self, number: int, threads: int, blas_threads: int, cluster: RayCluster | None
-    ) -> None:
-        super().__init__(f"holdfast-worker-{number}", _work, (threads,), blas_threads)
+    def __init__(self, number: int, threads: int, blas: int, cluster: RayCluster | None) -> None:
+        super().__init__(f"holdfast-worker-{number}", _work, (threads,), blas)
         if cluster is not None:
             self._process = cluster.process(_Runner, self._theirs, threads)
         self.outstanding: deque[tuple[Arm, int, float]] = deque()
@@ -561,10 +543,6 @@ class _Runner:
         self._arms: list[_NewArm | Arm] = []
         self._problems: dict[bytes, Problem] = {}
 
-    def answer(self, message: bytes) -> list[bytes]:
-        """Return all that there is to answer."""
-        return list(self.answers(message))
-
     def answers(self, message: bytes) -> Iterator[bytes]:
         """Yield what there is to answer, as soon as it is known."""
         request = _REQUESTS.decode(message)
@@ -618,8 +596,5 @@ def _arm_in_worker(sent: _NewArm, threads: int, problems: dict[bytes, Problem]) 
 
 
 def _error_of(arm: Arm, failed: _Failed) -> Exception:
-    if failed.expected:
-        return _trial_error(arm, failed.text)
-    error = TrialCrashError(f"in a worker process:\n{failed.text}")
-    error.arm = arm
-    return error
+    crash = TrialCrashError(f"in a worker process:\n{failed.text}")
+    return _with_arm(TrialError(failed.text) if failed.expected else crash, arm)

@@ -14,32 +14,25 @@ Trials run in processes of their own: a candidate that ends its process, or hang
 from __future__ import annotations
 
 import contextlib
-import csv
-import fcntl
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from time import monotonic
-from typing import IO, Any, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
-import msgspec
 import numpy as np
 
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import (
     InvalidValueError,
-    OutputError,
     TrialCrashError,
     TrialError,
     WorkerDiedError,
 )
 from holdfast.numerics.arrays import FloatArray, real_number, whole
 from holdfast.recording.fingerprint import fingerprint
-from holdfast.recording.run_directory import first_difference
-from holdfast.recording.table_formats import csv_rows
 from holdfast.robot.trial_pool import Arm, TrialPool, available_cores
 from holdfast.runtime.command_line import MAX_JOBS
-from holdfast.runtime.files import shown_path, write_atomically
 from holdfast.runtime.ray_workers import RayCluster
 from holdfast.tuning.candidates import (
     AS_CONFIGURED,
@@ -55,21 +48,20 @@ from holdfast.tuning.candidates import (
     has_rewards,
     later_candidates,
 )
+from holdfast.tuning.kept_trials import FRESH, KeptTrials
 from holdfast.tuning.race import PILOT_TRIALS, MeasuredTrial, Standing, race
 from holdfast.tuning.tuning_report import CandidateRow, Tuning, write_report
 from holdfast.tuning.verdict import MUCH_SLOWER, TrialRow, cost_of, judge, mean_difference
 
 __all__ = ["Progress", "tune"]
 
-FRESH = 1_000_000
-"""Number of the first trial that judges; those of the race are below it."""
-
-TRIALS_NAME = "trials.csv"
-SETTINGS_NAME = "tune.json"
-
 _SHARE_OF_THE_RACE = 0.6
 _LEAST_FRESH = 20
+_AT_MOST_OF_THE_RACE = 0.75
+"""Where trials take longer than those before."""
+
 _REPORT_S = 3.0
+_JUDGED_ANYWAY = (AS_CONFIGURED, RANDOM)
 
 _PATIENCE_S = 10.0
 """No trial is ended sooner while there is time."""
@@ -170,7 +162,7 @@ def tune(
         "code": fingerprint(configuration),
     }
     with contextlib.ExitStack() as stack:
-        kept = stack.enter_context(_Trials(out, settings))
+        kept = stack.enter_context(KeptTrials(out, settings))
         cluster = None if ray is None else stack.enter_context(RayCluster(ray))
         cores = available_cores() if cluster is None else min(cluster.cores, MAX_JOBS)
         jobs = jobs or cores
@@ -191,7 +183,7 @@ class _Tuner:
         self,
         base: Configuration,
         objective: Objective,
-        kept: _Trials,
+        kept: KeptTrials,
         jobs: int,
         max_decision_ms: float,
         on_progress: Callable[[Progress], None],
@@ -261,17 +253,13 @@ class _Tuner:
         untried = sum(
             each.state == "set aside" and each.trials <= PILOT_TRIALS for each in standings
         )
-        if untried:
-            what = "candidate was" if untried == 1 else "candidates were"
-            sentence += f" {untried} slow {what} not tried: a larger budget does that."
+        sentence += _note(untried, "slow", "not tried: a larger budget does that")
         open_ones = sum(
             each.state == "in the race" and each.candidate not in judged for each in standings
         )
-        if open_ones and fresh < most:
-            what = "candidate is" if open_ones == 1 else "candidates are"
-            sentence += (
-                f" {open_ones} more {what} not beaten yet: --resume with a larger budget goes on."
-            )
+        if fresh < most:
+            rest = "not beaten: --resume with a larger budget goes on"
+            sentence += _note(open_ones, "more", rest)
         return Tuning(
             sentence=sentence,
             choice=verdict.choice,
@@ -301,7 +289,7 @@ class _Tuner:
             self._add(each)
         names = [each.name for each in candidates]
         self._doing = f"{len(names)} candidates race"
-        self._until_s = until_s
+        self._until_s = until_s * _AT_MOST_OF_THE_RACE / _SHARE_OF_THE_RACE
         before_s = self._seconds(
             key for key in self._kept.rows if key[0] in names and key[1] < FRESH
         )
@@ -328,26 +316,28 @@ class _Tuner:
         ]
 
     def _finalists(self, standings: Sequence[Standing]) -> list[str]:
-        """Return whom to judge: the winner, and one that may be as good, best a quicker one."""
+        """Return the winner, and one that may be as good, two if the winner is judged anyway."""
         winner = standings[0].candidate
-        costs, bound_ms = self._costs(winner), self._decision_ms(winner) / MUCH_SLOWER
-        equals = []
+        costs, equals = self._costs(winner), []
         for each in standings[1:]:
             own = self._costs(each.candidate)
             common = min(len(own), len(costs))
-            if each.state != "in the race" or each.candidate == AS_CONFIGURED or common < 2:
+            if each.state != "in the race" or each.candidate in _JUDGED_ANYWAY or common < 2:
                 continue
             differences = own[:common] - costs[:common]
             if np.mean(differences) <= 2.0 * np.std(differences, ddof=1) / math.sqrt(common):
                 equals.append(each.candidate)
-        equals.sort(key=lambda name: self._decision_ms(name) > bound_ms)  # of alike, as they were
-        for second in equals:
-            each_s = {each.candidate: each.seconds for each in standings}
-            judged = self._judged([winner, second])
-            needed_s = 3 * _LEAST_FRESH * sum(each_s.get(name, 0.0) for name in judged)
-            if second != RANDOM and needed_s <= self._jobs * (self._budget_s - self._spent_s()):
-                return [winner, second]
-        return [winner]
+        bound_ms = self._decision_ms(winner) / MUCH_SLOWER
+        quick = [name for name in equals if self._decision_ms(name) <= bound_ms]
+        each_s = {each.candidate: each.seconds for each in standings}
+        found = [winner]
+        for name in dict.fromkeys([*quick[:1], *equals]):
+            judged = self._judged([*found, name])
+            needed_s = 3 * _LEAST_FRESH * sum(each_s.get(each, 0.0) for each in judged)
+            has_room = len(found) < 2 + (winner in _JUDGED_ANYWAY)
+            if has_room and needed_s <= self._jobs * (self._budget_s - self._spent_s()):
+                found.append(name)
+        return found
 
     def _add(self, candidate: Candidate) -> None:
         if candidate.name not in self._candidates:
@@ -505,118 +495,6 @@ class _Tuner:
         )
 
 
-class _Trials:
-    """The trials that are finished, in memory and, if there is a directory, in its file.
-
-    Attributes
-    ----------
-    rows : dict
-        By candidate and number.
-    """
-
-    def __init__(self, directory: Path | None, settings: Mapping[str, Any]) -> None:
-        self.rows: dict[tuple[str, int], TrialRow] = {}
-        self._directory = directory
-        self._settings = settings
-        self._file: IO[str] | None = None
-
-    def __enter__(self) -> _Trials:
-        if self._directory is not None:
-            try:
-                self._open(self._directory)
-            except BaseException:
-                self.__exit__()
-                raise
-        return self
-
-    def _open(self, directory: Path) -> None:
-        path = directory / TRIALS_NAME
-        try:
-            directory.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("a", encoding="utf-8", newline="")
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            content = path.read_bytes()
-            whole = content[: content.rfind(b"\n") + 1]
-            lines = whole.decode(errors="replace").split("\n")
-            self.rows = {(row.candidate, row.trial): row for row in _rows_of(lines)}
-            self._require_the_same(directory / SETTINGS_NAME)
-            # What a kill has cut short goes. The rest stays as it is: a disk may be full.
-            self._file.truncate(len(whole))
-            if not whole:
-                self._file.write(_line(TrialRow._fields))
-                self._file.flush()
-        except BlockingIOError:
-            raise OutputError(f"{shown_path(path)}: another process is writing it") from None
-        except OSError as error:
-            raise OutputError(f"{shown_path(path)}: cannot be written: {error.strerror}") from error
-
-    def __exit__(self, *exception: object) -> None:
-        if self._file is not None:
-            with contextlib.suppress(OSError):  # what a full disk does not take was an error before
-                self._file.close()
-
-    def _require_the_same(self, path: Path) -> None:
-        settings = msgspec.to_builtins(self._settings)
-        try:
-            there = msgspec.json.decode(path.read_bytes())
-        except FileNotFoundError:
-            if self.rows:
-                raise OutputError(
-                    f"{shown_path(path)}: is gone, so nothing tells of which tuning the trials of "
-                    f"{TRIALS_NAME} are; choose another directory"
-                ) from None
-            content = msgspec.json.format(msgspec.json.encode(settings), indent=2)
-            write_atomically(path, content)
-            return
-        except (OSError, UnicodeDecodeError, msgspec.DecodeError) as error:
-            raise OutputError(f"{shown_path(path)}: cannot be read: {error}") from None
-        found = first_difference(there, msgspec.json.decode(msgspec.json.encode(settings)))
-        if found is not None:
-            key, old, new = found
-            raise OutputError(
-                f"{shown_path(path)}: is of another tuning: {key} was {old} and is {new}; "
-                "choose another directory"
-            )
-
-    def of(self, name: str) -> list[TrialRow]:
-        """Return the trials of a candidate in the race, in order."""
-        found = [row for row in self.rows.values() if row.candidate == name and row.trial < FRESH]
-        return sorted(found, key=lambda row: row.trial)
-
-    def add(self, row: TrialRow) -> None:
-        """Keep a trial."""
-        self.rows[row.candidate, row.trial] = row
-        if self._file is not None:
-            try:
-                self._file.write(_line(row))
-                self._file.flush()
-            except OSError as error:
-                where = shown_path(Path(self._file.name))
-                raise OutputError(f"{where}: cannot be written: {error.strerror}") from error
-
-
-def _line(values: Iterable[Any]) -> str:
-    _, line = csv_rows((), [tuple(values)])
-    return line
-
-
-def _rows_of(lines: Iterable[str]) -> Iterator[TrialRow]:
-    """Yield the trials; each line is read by itself, so that a damaged one costs no other."""
-    for line in lines:
-        try:
-            ((name, trial, success, failed, steps, reward, *times),) = csv.reader([line])
-            decision_ms, seconds = map(float, times)
-            if not 0.0 <= decision_ms + seconds < math.inf:
-                continue
-            yield TrialRow(
-                name,
-                int(trial),
-                success == "1",
-                failed == "1",
-                int(steps),
-                float(reward) if reward else None,
-                decision_ms,
-                seconds,
-            )
-        except (ValueError, csv.Error):
-            continue  # the head, or a damaged row
+def _note(count: int, kind: str, rest: str) -> str:
+    what = "candidate was" if count == 1 else "candidates were"
+    return f" {count} {kind} {what} {rest}." if count else ""
