@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from holdfast.recording.kept_trials import TrialRow
 from holdfast.tuning.candidates import AS_CONFIGURED, RANDOM
-from holdfast.tuning.verdict import TrialRow, cost_of, judge, mean_difference
+from holdfast.tuning.verdict import cost_of, judge, mean_difference
 
 LIMIT = 100
 WORLDS = np.random.default_rng(5).integers(20, 60, 200)

@@ -167,7 +167,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def _tune(options: TuneOptions) -> int:
     from holdfast.config.loader import load
-    from holdfast.tuning.kept_trials import TRIALS_NAME
+    from holdfast.recording.kept_trials import TRIALS_NAME
     from holdfast.tuning.tune import Progress, tune
     from holdfast.tuning.tuning_report import CONFIGURATION_NAME, tuning_tables
 

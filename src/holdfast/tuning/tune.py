@@ -31,6 +31,7 @@ from holdfast.errors import (
 )
 from holdfast.numerics.arrays import FloatArray, real_number, whole
 from holdfast.recording.fingerprint import fingerprint
+from holdfast.recording.kept_trials import FRESH, KeptTrials, TrialRow
 from holdfast.robot.trial_pool import Arm, TrialPool, available_cores
 from holdfast.runtime.command_line import MAX_JOBS
 from holdfast.runtime.ray_workers import RayCluster
@@ -48,10 +49,9 @@ from holdfast.tuning.candidates import (
     has_rewards,
     later_candidates,
 )
-from holdfast.tuning.kept_trials import FRESH, KeptTrials
 from holdfast.tuning.race import PILOT_TRIALS, MeasuredTrial, Standing, race
 from holdfast.tuning.tuning_report import CandidateRow, Tuning, write_report
-from holdfast.tuning.verdict import MUCH_SLOWER, TrialRow, cost_of, judge, mean_difference
+from holdfast.tuning.verdict import MUCH_SLOWER, cost_of, judge, mean_difference
 
 __all__ = ["Progress", "tune"]
 
@@ -434,14 +434,15 @@ class _Tuner:
         assert isinstance(arm, Arm)
         name, reason = arm.label, f"it fails: {error}"
         if isinstance(error, TrialCrashError):
-            reason = f"it fails: {str(error).splitlines()[-1]}"
+            reason = f"it fails: {' '.join(str(error).splitlines()[-2:])}"
         if isinstance(error, WorkerDiedError):
             reason = f"it died: its process {error.how} in trial {error.trial % FRESH}"
             if error.overdue and self._spent_s() > self._until_s:
                 self.pool.drop()  # time is up, and nobody's fault
                 return
             if error.overdue:
-                reason = f"it hangs, or is too slow: trial {error.trial % FRESH} {error.how}"
+                kind = "it hangs" if name in self._longest_s else "it is too slow, or hangs"
+                reason = f"{kind}: trial {error.trial % FRESH} {error.how}"
             elif error.killed and (name, error.trial) not in self._killed:
                 # Whoever killed it may have meant another one, if memory was short.
                 self._killed.add((name, error.trial))

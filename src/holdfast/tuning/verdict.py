@@ -18,6 +18,7 @@ import msgspec
 import numpy as np
 
 from holdfast.numerics.arrays import FloatArray
+from holdfast.recording.kept_trials import TrialRow
 from holdfast.recording.outcome_comparison import bootstrap_interval
 from holdfast.tuning.candidates import AS_CONFIGURED, RANDOM, Objective
 
@@ -25,7 +26,6 @@ __all__ = [
     "FAMILY_LEVEL",
     "MUCH_SLOWER",
     "Comparison",
-    "TrialRow",
     "Verdict",
     "cost_of",
     "judge",
@@ -41,19 +41,6 @@ _WIDE = 0.1
 MUCH_SLOWER = 2.0
 _NOTICED_MS = 0.5
 """A decision that takes so many times as long, and so much longer, needs a reason."""
-
-
-class TrialRow(NamedTuple):
-    """What is kept of a trial; ``decision_ms`` is the median of its sensing decisions."""
-
-    candidate: str
-    trial: int
-    success: bool
-    failed: bool
-    steps: int
-    reward: float | None
-    decision_ms: float
-    seconds: float
 
 
 class Comparison(msgspec.Struct, frozen=True, kw_only=True):

@@ -8,7 +8,7 @@ import fcntl
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import msgspec
 
@@ -16,15 +16,27 @@ from holdfast.errors import OutputError
 from holdfast.recording.run_directory import first_difference
 from holdfast.recording.table_formats import csv_rows
 from holdfast.runtime.files import shown_path, write_atomically
-from holdfast.tuning.verdict import TrialRow
 
-__all__ = ["FRESH", "KeptTrials"]
+__all__ = ["FRESH", "KeptTrials", "TrialRow"]
 
 FRESH = 1_000_000
 """Number of the first trial that judges; those of the race are below it."""
 
 TRIALS_NAME = "trials.csv"
 SETTINGS_NAME = "tune.json"
+
+
+class TrialRow(NamedTuple):
+    """What is kept of a trial; ``decision_ms`` is the median of its sensing decisions."""
+
+    candidate: str
+    trial: int
+    success: bool
+    failed: bool
+    steps: int
+    reward: float | None
+    decision_ms: float
+    seconds: float
 
 
 class KeptTrials:
