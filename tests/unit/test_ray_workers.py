@@ -40,7 +40,7 @@ def test_it_finds_the_same_and_outlives_its_actors(
     nobody = f"127.0.0.1:{free_port()}"
     said = holdfast(tmp_path, *words, "--ray", nobody)
     assert f"error: no Ray cluster can be used at {nobody}: " in said.stderr
-    kept = []
+    kept: list[dict[tuple[str, ...], tuple[str, ...]]] = []
     with StartedCluster(1) as cluster:
         for place in (
             ("--jobs", "1"),
