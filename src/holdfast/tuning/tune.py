@@ -161,6 +161,7 @@ def tune(
         "max_decision_ms": None if math.isinf(max_decision_ms) else max_decision_ms,
         "code": fingerprint(configuration),
     }
+    began_s = monotonic()
     with contextlib.ExitStack() as stack:
         kept = stack.enter_context(KeptTrials(out, settings))
         cluster = None if ray is None else stack.enter_context(RayCluster(ray))
@@ -168,7 +169,8 @@ def tune(
         jobs = jobs or cores
         tuner = _Tuner(configuration, objective, kept, jobs, max_decision_ms, on_progress)
         with TrialPool(jobs, overdue=tuner.is_overdue, cluster=cluster) as tuner.pool:
-            found = tuner.run(vary, most, max(0.5 * budget_s, budget_s - _REPORT_S))
+            left_s = budget_s - _REPORT_S - (monotonic() - began_s)  # joining takes its time
+            found = tuner.run(vary, most, max(0.5 * budget_s, left_s))
     if out is not None:
         write_report(out, configuration, found)
     return found
