@@ -168,11 +168,28 @@ class DecidedOtherwiseError(RecordError):
 
 
 class WorkerDiedError(HoldfastError):
-    """A worker process ended unexpectedly."""
+    """A worker process ended unexpectedly, or was ended because its trial was overdue.
+
+    Attributes
+    ----------
+    arm, trial
+        What it ran.
+    how : str
+        How it ended, as the predicate of a sentence.
+    killed, overdue : bool
+        Whether a signal ended it, and whether its trial took too long.
+    """
+
+    arm: object = None
+    trial = -1
+    how = ""
+    killed = overdue = False
 
 
 class TrialCrashError(RuntimeError):
-    """An unexpected error in a worker process; the message holds its traceback."""
+    """An unexpected error in a worker process; the message holds its traceback, ``arm`` the arm."""
+
+    arm: object = None
 
 
 class MissingRosbagsError(HoldfastError):

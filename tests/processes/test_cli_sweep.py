@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from pathlib import Path
 
 from tests.processes.faults import holdfast
 
 PROBLEM = """\
+import os
 import pathlib
+import signal
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 
 class Peg(PegInHole2D):
@@ -16,8 +19,11 @@ class Peg(PegInHole2D):
 
     def initial_states(self, stream, count):
         Peg.begun += 1
+        if pathlib.Path("die").exists() and Peg.begun == 6:
+            os._exit(9)
         if pathlib.Path("stop").exists() and Peg.begun == 6:
-            raise KeyboardInterrupt
+            os.kill(os.getppid(), signal.SIGINT)
+            signal.pause()
         return super().initial_states(stream, count)
 """
 CONFIGURATION = """\
@@ -28,12 +34,18 @@ simulator: {num_trials: 3, max_steps: 40, seed: 3}
 SET = ("--set", "selector.method=random,path_entropy")
 
 
-def test_ctrl_c_and_resume(tmp_path: Path) -> None:
+def test_a_process_that_ends_ctrl_c_and_resume(tmp_path: Path) -> None:
     (tmp_path / "swept_peg.py").write_text(PROBLEM)
     (tmp_path / "peg.yaml").write_text(CONFIGURATION)
-    (tmp_path / "stop").touch()
+    (tmp_path / "die").touch()
     words = ("sweep", "peg.yaml", *SET, "--jobs", "1", "--out", "out")
-    stopped = holdfast(tmp_path, *words)
+    died = holdfast(tmp_path, *words)
+    assert died.returncode == 4
+    how = r"a worker process ended with exit code 9 while it ran trial \d of method=\w+; finished"
+    assert re.search(how, died.stderr)
+    (tmp_path / "die").rename(tmp_path / "stop")
+    command = died.stderr.splitlines()[-1].removeprefix("Go on with: ")
+    stopped = holdfast(tmp_path, *shlex.split(command)[1:])
     assert stopped.returncode == 130
     assert "trials are finished and kept in out" in stopped.stderr
     (tmp_path / "stop").unlink()

@@ -139,12 +139,19 @@ def test_the_others_go_on_without_an_arm_that_fails(tmp_path: Path, jobs: int) -
     assert sorted(finished) == [0, 1, 2]
 
 
-def test_a_dead_worker_is_named(tmp_path: Path) -> None:
+def test_a_dead_worker_is_named_and_costs_no_other_trial(tmp_path: Path) -> None:
     arm, _ = arms_of(tmp_path)
-    pool = TrialPool(2)
-    with pool, pytest.raises(WorkerDiedError, match=r"SIGKILL while it ran trial \d+ of as it is"):
-        for _ in pool.run((arm, trial) for trial in range(100_000)):
-            pid = pool._workers[0]._process.pid
-            assert pid is not None
-            os.kill(pid, signal.SIGKILL)
-    assert pool.waiting == 0
+    finished: list[int] = []
+    more = ((arm, trial) for trial in range(60))
+    with TrialPool(2) as pool:
+        with pytest.raises(
+            WorkerDiedError, match=r"SIGKILL while it ran trial \d+ of as it"
+        ) as died:
+            for done in pool.run(more):
+                finished.append(done.trial)
+                if len(finished) == 1:
+                    pid = pool._workers[0]._process.pid
+                    assert pid is not None
+                    os.kill(pid, signal.SIGKILL)
+        finished += [done.trial for done in pool.run(more)]
+    assert sorted([*finished, died.value.trial]) == list(range(60))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-import resource
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,10 @@ import pytest
 
 import holdfast as hf
 from holdfast.config.loader import load
-from holdfast.errors import InvalidValueError, OutputError, TrialError
+from holdfast.errors import InvalidValueError, WorkerDiedError
+from holdfast.recording.kept_trials import FRESH
 from holdfast.tuning.candidates import AS_CONFIGURED, RANDOM
-from holdfast.tuning.tune import FRESH, Progress
+from holdfast.tuning.tune import Progress
 
 RUN = """
 problem: peg_in_hole_2d
@@ -40,7 +41,7 @@ def test_what_it_finds_and_writes(run: Path) -> None:
     names = {each.candidate for each in found.candidates}
     assert names == {AS_CONFIGURED, RANDOM, "always x", "always y", "always θ"}
     assert found.objective == "steps"
-    assert found.fresh_trials == 6
+    assert found.fresh_trials == 12
     assert {each.against for each in found.comparisons} >= {RANDOM, AS_CONFIGURED} - {found.choice}
     written = {each.name for each in out.iterdir()}
     assert written == {
@@ -49,7 +50,7 @@ def test_what_it_finds_and_writes(run: Path) -> None:
     rows = (out / "trials.csv").read_text().splitlines()
     assert len(rows) == 1 + len(set(rows[1:]))
     trials = {int(row.rsplit(",", 7)[1]) for row in rows[1:]}
-    assert trials == {*range(6), *range(FRESH, FRESH + 6)}
+    assert trials == {*range(6), *range(FRESH, FRESH + 12)}
     # The same worlds, so a trial is what a run makes of it.
     result = hf.run_trial(
         hf.Planner(load(run).problem, load(run).planning), seed=3, trial=0, max_steps=25
@@ -57,46 +58,83 @@ def test_what_it_finds_and_writes(run: Path) -> None:
     assert rows[1].startswith(f"as configured,0,{int(result.success)},0,{result.steps},")
 
 
-def test_it_goes_on_where_it_was_interrupted(run: Path) -> None:
-    out, whole = run.parent / "tuned", run.parent / "whole"
-
-    def interrupt(progress: Progress) -> None:
-        if progress.trials == 17:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        tuned(run, out=out, on_progress=interrupt)
-    trials = out / "trials.csv"
-    kept = trials.read_text()
-    assert len(kept.splitlines()) == 1 + 17
-    trials.write_text(kept + "as configured,9,1")  # a kill has cut it short
-    found = tuned(run, out=out)
-    assert trials.read_text().startswith(kept)
-    again = tuned(run, out=whole)
-    assert (found.sentence, found.choice) == (again.sentence, again.choice)
-    assert found.comparisons == again.comparisons
-    with pytest.raises(OutputError, match=r"objective was 'steps' and is 'success'"):
-        tuned(run, out=out, objective="success")
+def test_candidates_that_die_hang_or_fail_leave_the_race(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("holdfast.tuning.tune._PATIENCE_S", 1.0)
+    monkeypatch.setattr("holdfast.tuning.tune._FIRST_SHARE", 0.0)
+    (run.parent / "mean.py").write_text(MEAN)
+    run.write_text(OF_MEAN)
+    found = tuned(run, vary=["particles", "fixed"])
+    states = {each.candidate: each.state for each in found.candidates}
+    (winner,) = {name.rpartition(",")[0] for name in states if name.endswith("90 particles")}
+    died = "it died: its process ended with exit code 9 in trial"
+    assert states[f"{winner}, 90 particles"].startswith(f"refused: {died}")
+    hung = r"refused: it is too slow, or hangs: trial . was ended after [1-9]\.\d s"
+    assert re.fullmatch(hung, states[f"{winner}, 10 particles"])
+    for name in ("always second", RANDOM):
+        assert re.match("(?s)refused: it fails: .* ValueError: not mine", states[name])
+    assert f" {winner}, 90 particles was left out: {died} " in found.sentence
 
 
-def test_a_candidate_that_fails_leaves_the_race(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from holdfast.robot import trial_pool
-
-    real = hf.run_trial
-
-    def failing(planner: hf.Planner, *arguments: Any, **more: Any) -> Any:
-        if planner.settings.selector.sensing_action == bad:
-            raise hf.HoldfastError("no such sensor")
-        return real(planner, *arguments, **more)
-
-    monkeypatch.setattr(trial_pool, "run_trial", failing)
-    bad = 2
-    found = tuned(run)
-    (row,) = (each for each in found.candidates if each.candidate == "always θ")
-    assert row.state.startswith("refused: it fails: trial 0 (seed 3) of always θ: no such sensor")
-    bad = 0
-    with pytest.raises(TrialError, match="no such sensor"):
+@pytest.mark.parametrize(
+    ("particles", "error", "message"),
+    [
+        (10, WorkerDiedError, "your configuration: it is too slow, or hangs: trial . was ended"),
+        (90, WorkerDiedError, "your configuration: it died: its process ended with exit code 9 in"),
+    ],
+)
+def test_the_configuration_itself_dies_or_hangs(
+    run: Path, monkeypatch: pytest.MonkeyPatch, particles: int, error: type[Exception], message: str
+) -> None:
+    monkeypatch.setattr("holdfast.tuning.tune._PATIENCE_S", 1.0)
+    monkeypatch.setattr("holdfast.tuning.tune._FIRST_SHARE", 0.0)
+    (run.parent / "mean.py").write_text(MEAN)
+    run.write_text(OF_MEAN.replace("num_particles: 30", f"num_particles: {particles}"))
+    with pytest.raises(error, match=message):
         tuned(run)
+
+
+OF_MEAN = RUN.replace("peg_in_hole_2d", "mean:Mean") + "selector: {method: fixed}\n"
+MEAN = """
+import os
+import pathlib
+import signal
+from tests.line_problem import Line
+
+class Mean(Line):
+    def observation_mean(self, states, sensing_action):
+        flag = pathlib.Path(__file__).with_name("flag")
+        if sensing_action == 1:
+            raise ValueError("not mine")
+        command = pathlib.Path("/proc/self/cmdline").read_text()
+        if "spawn_main" in command or "ray::" in command:  # in a worker
+            if not flag.exists():  # the memory is short, once
+                flag.touch()
+                os.kill(os.getpid(), signal.SIGKILL)
+            if states.shape[0] == 90:
+                os._exit(9)
+            while states.shape[0] == 10:
+                pass
+        return super().observation_mean(states, sensing_action)
+"""
+
+
+def test_no_trial_begins_when_time_is_up(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = 0.0
+    monkeypatch.setattr("holdfast.tuning.tune.monotonic", lambda: now_s)
+    judging: list[int] = []
+
+    def shows(progress: Progress) -> None:
+        nonlocal now_s
+        if progress.doing.endswith("judged on fresh trials"):
+            judging.append(progress.trials)
+            now_s = 601.0
+
+    found = tuned(run, most=20, on_progress=shows)
+    assert found.sentence.startswith("The budget was too short to judge: ")
+    assert len(judging) <= 20  # what the worker had
+    assert not found.changes and not found.comparisons
 
 
 def test_slow_decisions_are_not_admitted(run: Path) -> None:
@@ -111,44 +149,6 @@ def test_intervals_are_judged_beside_random_sensing_at_the_same(run: Path) -> No
     if "simulator.sensing_intervals" in winner.changes:
         rivals = {each.against for each in found.comparisons} | {found.choice}
         assert any(each.startswith("random, every") for each in rivals)
-
-
-def test_damaged_files(run: Path) -> None:
-    out = run.parent / "tuned"
-    tuned(run, out=out)
-    trials, settings = out / "trials.csv", out / "tune.json"
-    whole, known = trials.read_bytes(), settings.read_bytes()
-    head, first, rest = whole.split(b"\n", 2)
-    odd = [b"", b"\xff\xfe", b"random,1,\x00", b'"always x', b"a" * 200_000, first[:-9] + b"inf"]
-    trials.write_bytes(b"\n".join([head, *odd, rest]) + first[:-9])
-    tuned(run, out=out)
-    again = trials.read_bytes()
-    assert again.startswith(b"\n".join([head, *odd, rest]))  # nothing was lost, nothing cut
-    assert len(again.splitlines()) == len(whole.splitlines()) + len(odd)  # one trial was run again
-    settings.write_bytes(b'{"objective": "\xff"}')
-    with pytest.raises(OutputError, match=r"tune\.json: cannot be read: "):
-        tuned(run, out=out)
-    settings.unlink()
-    with pytest.raises(OutputError, match=r"tune\.json: is gone, so nothing tells of which"):
-        tuned(run, out=out)
-    assert trials.read_bytes() == again
-    settings.write_bytes(known)
-    tuned(run, out=out)
-
-
-def test_a_full_disk_is_an_error_in_words(run: Path) -> None:
-    out = run.parent / "tuned"
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2_500, before[1]))
-    try:
-        with pytest.raises(OutputError, match=r"trials\.csv: cannot be written: "):
-            tuned(run, out=out, most=100)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    kept = (out / "trials.csv").read_bytes()
-    assert len(kept) == 2_500
-    tuned(run, out=out)
-    assert (out / "trials.csv").read_bytes().startswith(kept[: kept.rfind(b"\n") + 1])
 
 
 def test_no_process_has_a_problem_for_each_candidate(run: Path) -> None:

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from holdfast.recording.kept_trials import TrialRow
 from holdfast.tuning.candidates import AS_CONFIGURED, RANDOM
-from holdfast.tuning.verdict import TrialRow, cost_of, judge, mean_difference
+from holdfast.tuning.verdict import cost_of, judge, mean_difference
 
 LIMIT = 100
 WORLDS = np.random.default_rng(5).integers(20, 60, 200)
@@ -46,7 +47,7 @@ def test_a_winner_that_is_better() -> None:
             "state_entropy": rows("state_entropy", 0.0, decision_ms=20.0),
             RANDOM: rows(RANDOM, 20.0),
         },
-        "state_entropy",
+        ["state_entropy"],
         "steps",
         LIMIT,
     )
@@ -63,7 +64,7 @@ def test_a_winner_that_is_better() -> None:
 def test_a_winner_that_was_only_lucky() -> None:
     trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 0.0), "lucky": rows("lucky", 3.0)}
     trials[RANDOM] = rows(RANDOM, 20.0)
-    found = judge(trials, "lucky", "steps", LIMIT)
+    found = judge(trials, ["lucky"], "steps", LIMIT)
     assert found.choice == AS_CONFIGURED
     assert found.sentence.startswith("Keep your configuration: ")
 
@@ -71,7 +72,7 @@ def test_a_winner_that_was_only_lucky() -> None:
 def test_random_where_it_is_best() -> None:
     trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 30.0), "path": rows("path", 20.0)}
     trials[RANDOM] = rows(RANDOM, 0.0)
-    assert judge(trials, "path", "steps", LIMIT).sentence.startswith("Sense at random: ")
+    assert judge(trials, ["path"], "steps", LIMIT).sentence.startswith("Sense at random: ")
 
 
 def test_no_trial_succeeds() -> None:
@@ -79,19 +80,19 @@ def test_no_trial_succeeds() -> None:
         name: [each._replace(success=False) for each in rows(name, 0.0)]
         for name in (AS_CONFIGURED, "other", RANDOM)
     }
-    assert "No trial succeeded" in judge(trials, "other", "steps", LIMIT).sentence
+    assert "No trial succeeded" in judge(trials, ["other"], "steps", LIMIT).sentence
 
 
 def test_nothing_matters() -> None:
     trials = {name: rows(name, 0.0) for name in (AS_CONFIGURED, "other", RANDOM)}
-    found = judge(trials, "other", "steps", LIMIT)
+    found = judge(trials, ["other"], "steps", LIMIT)
     assert (found.choice, found.matters) == (AS_CONFIGURED, False)
     assert found.sentence.startswith("What you sense does not matter here, as far as 200 trials")
     assert found.sentence.endswith("Keep your configuration.")
     # The same with few trials: what they would not have shown is said.
     few = {name: trials[name][:10] for name in trials}
     few["other"][3] = few["other"][3]._replace(success=False)
-    sentence = judge(few, "other", "steps", LIMIT).sentence
+    sentence = judge(few, ["other"], "steps", LIMIT).sentence
     assert "would not have shown" in sentence and sentence.startswith("No difference showed in ")
     same = {AS_CONFIGURED: trials[AS_CONFIGURED], RANDOM: trials[AS_CONFIGURED]}
     assert judge(same, AS_CONFIGURED, "steps", LIMIT).comparisons[0].interval == (0.0, 0.0)
@@ -104,11 +105,11 @@ def test_other_measures_may_say_otherwise() -> None:
         "hasty": rows("hasty", 0.0, failures=failing, reward=-3.0),
         RANDOM: rows(RANDOM, 30.0, reward=-1.0),
     }
-    found = judge(trials, "hasty", "steps", LIMIT)
+    found = judge(trials, ["hasty"], "steps", LIMIT)
     assert found.choice == "hasty"
     assert found.sentence.count("But success says otherwise: -10 [") == 2
     assert found.sentence.count("But reward says otherwise: -2 [-2, -2] of reward") == 2
-    found = judge(trials, "hasty", "reward", LIMIT)
+    found = judge(trials, ["hasty"], "reward", LIMIT)
     assert found.choice == AS_CONFIGURED
     assert "But steps says otherwise: " in found.sentence
 
@@ -119,8 +120,28 @@ def test_slower_decisions_need_a_reason() -> None:
     trials["quick"] = rows("quick", 0.0, decision_ms=1.5)
     quick = {name: trials[name] for name in (AS_CONFIGURED, "quick", RANDOM)}
     slow = {name: trials[name] for name in (AS_CONFIGURED, "slow", RANDOM)}
-    assert judge(quick, "quick", "steps", LIMIT).choice == "quick"
-    assert judge(slow, "slow", "steps", LIMIT).choice == AS_CONFIGURED
+    assert judge(quick, ["quick"], "steps", LIMIT).choice == "quick"
+    assert judge(slow, ["slow"], "steps", LIMIT).choice == AS_CONFIGURED
+
+
+def test_of_two_finalists_the_quick_one_if_it_is_as_good() -> None:
+    trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 30.0), RANDOM: rows(RANDOM, 30.0)}
+    trials["slow"] = rows("slow", 0.0, decision_ms=20.0)
+    trials["quick"] = rows("quick", 0.0, decision_ms=2.0)
+    found = judge(trials, ["slow", "quick"], "steps", LIMIT)
+    assert found.choice == "quick"
+    slower = " slow is no better beyond noise and takes 20 ms to decide, not 2."
+    assert (slower in found.sentence) == (
+        np.mean([a.steps - b.steps for a, b in zip(trials["slow"], trials["quick"], strict=True)])
+        < 0
+    )
+    trials["quick"] = rows("quick", 2.0, decision_ms=2.0)
+    assert judge(trials, ["slow", "quick"], "steps", LIMIT).choice == "slow"
+    few = judge(
+        {name: each[:19] for name, each in trials.items()}, ["slow"], "steps", LIMIT, (), 20
+    )
+    assert (few.choice, few.comparisons) == (AS_CONFIGURED, ())
+    assert few.sentence.startswith("The budget was too short to judge: 19 fresh trials of at least")
 
 
 def test_a_slow_one_does_not_hide_that_random_sensing_is_better() -> None:
@@ -130,19 +151,19 @@ def test_a_slow_one_does_not_hide_that_random_sensing_is_better() -> None:
         row._replace(candidate="slow", steps=row.steps - 2 + swing, decision_ms=20.0)
         for row, swing in zip(trials[RANDOM], swings, strict=True)
     ]
-    found = judge(trials, "slow", "steps", LIMIT)
+    found = judge(trials, ["slow"], "steps", LIMIT)
     assert found.choice == RANDOM
     assert found.sentence.startswith("Sense at random: ")
 
 
 def test_a_finalist_that_failed_afterwards_is_not_chosen() -> None:
     trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 0.0), RANDOM: rows(RANDOM, 0.0)}
-    assert judge(trials, "gone", "steps", LIMIT, {AS_CONFIGURED}).choice == RANDOM
+    assert judge(trials, ["gone"], "steps", LIMIT, {AS_CONFIGURED}).choice == RANDOM
 
 
 def test_who_is_barred_is_not_chosen() -> None:
     trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 0.0), "other": rows("other", 0.0)}
-    found = judge(trials, "other", "steps", LIMIT, {AS_CONFIGURED})
+    found = judge(trials, ["other"], "steps", LIMIT, {AS_CONFIGURED})
     assert found.choice == "other"
     assert found.sentence.endswith("Sense by other.")
 

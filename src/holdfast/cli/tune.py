@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.cli.exit_codes import (
@@ -109,7 +110,7 @@ class TuneOptions(Options):
         metavar="TIME",
         read=duration_text,
         default="10m",
-        help="About how long it may take: 90s, 10m, 2h.",
+        help="How long it may take, but for the trials that run at its end: 90s, 10m, 2h.",
     )
     trials: int = option(
         metavar="N",
@@ -124,6 +125,11 @@ class TuneOptions(Options):
         help="No candidate may win whose median decision takes longer (default: no limit).",
     )
     jobs: int | None = jobs_option(more="")
+    ray: str | None = option(
+        metavar="ADDRESS",
+        help="Run the trials on a Ray cluster: auto (of this machine), HOST:PORT or "
+        "ray://HOST:PORT; on all of its cores unless --jobs says otherwise.",
+    )
     seed: int | None = seed_option()
     assignments: tuple[str, ...] = option(
         "--set",
@@ -161,11 +167,11 @@ def main(arguments: Sequence[str]) -> int:
 
 def _tune(options: TuneOptions) -> int:
     from holdfast.config.loader import load
-    from holdfast.robot.trial_pool import available_cores
-    from holdfast.tuning.tune import TRIALS_NAME, Progress, tune
+    from holdfast.recording.kept_trials import TRIALS_NAME
+    from holdfast.tuning.tune import Progress, tune
     from holdfast.tuning.tuning_report import CONFIGURATION_NAME, tuning_tables
 
-    runs = Path("runs").absolute()
+    runs, began_s = Path("runs").absolute(), monotonic()
     given = [parse_assignment(each) for each in options.assignments]
     path = shown_path(options.configuration)
     configuration = load(
@@ -179,7 +185,8 @@ def _tune(options: TuneOptions) -> int:
         out = options.out
     else:
         out = claim_directory(options.out, runs, f"{options.configuration.stem}-tuned")
-    jobs, budget_s = options.jobs or available_cores(), _seconds(options.budget)
+    budget_s = _seconds(options.budget)
+    left_s = max(0.5 * budget_s, budget_s - (monotonic() - began_s))  # the check had its part
     line = progress_line(round(budget_s), quiet=options.quiet, noun="second", speed=False)
     doing = ""
 
@@ -187,8 +194,8 @@ def _tune(options: TuneOptions) -> int:
         nonlocal doing
         if progress.doing != doing:
             doing = progress.doing
-            line.say(f"{doing}; at most {duration(budget_s - progress.spent_s / jobs)} left")
-        spent = min(round(progress.spent_s / jobs), round(budget_s) - 1)
+            line.say(f"{doing}; at most {duration(max(0.0, left_s - progress.spent_s))} left")
+        spent = min(round(progress.spent_s), round(budget_s) - 1)
         line.show(spent, f"{progress.trials:,} trials")
 
     line.start(f"{configuration.problem_name}; results in {shown_path(out)}", 0, "")
@@ -197,9 +204,10 @@ def _tune(options: TuneOptions) -> int:
             configuration,
             vary=tuple(options.vary.split(",")),  # type: ignore[arg-type]
             objective=options.objective,  # type: ignore[arg-type]
-            budget_s=budget_s,
+            budget_s=left_s,
             most=options.trials,
-            jobs=jobs,
+            jobs=options.jobs,
+            ray=options.ray,
             max_decision_ms=options.max_decision_ms,
             out=out,
             on_progress=show,

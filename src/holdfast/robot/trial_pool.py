@@ -14,11 +14,11 @@ it, so an iterator of ten million trials is never queued anywhere, and one that 
 results so far (a race) has seen all but the trials of :attr:`TrialPool.waiting`. Where the next
 trials follow from results, submit them in the loop: :meth:`TrialPool.submit`, and
 :meth:`TrialPool.drop` takes back what no worker has begun. Leaving the ``with`` ends the workers at
-once, also on Ctrl-C.
+once, also on Ctrl-C. A worker that dies costs the trial that it ran: its other trials go to another
+one, and a further call of :meth:`TrialPool.run` goes on.
 
 The first trials are run in this process, until the time that a trial takes shows that workers would
-pay for their own start. Each worker holds trials for a tenth of a second, at most 16, and answers
-with one message for each.
+pay for their own start. Each worker holds trials for a tenth of a second, at most 16.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from __future__ import annotations
 import os
 import traceback
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from time import perf_counter
@@ -50,12 +50,11 @@ from holdfast.planning.settings import LostSettings, PlanningSettings
 from holdfast.problems.problem import Problem
 from holdfast.robot.trial import (
     NULL_OBSERVER,
-    SensingStep,
-    TaskStep,
     TrialObserver,
     run_trial,
 )
 from holdfast.runtime.command_line import MAX_JOBS
+from holdfast.runtime.ray_workers import RayCluster
 from holdfast.runtime.workers import WorkerProcess, end_workers
 
 __all__ = ["Arm", "FinishedTrial", "TrialPool", "available_cores"]
@@ -67,6 +66,12 @@ _LOOKAHEAD_S = 0.1
 """A worker is sent trials for about this long, so that it never waits for the next one."""
 
 _MAX_LOOKAHEAD = 16
+
+_TICK_S = 0.25
+"""Between two looks at trials that may be overdue."""
+
+_BUILD_S = 60.0
+"""For a worker to start and to build a problem, before the time of a trial begins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +138,11 @@ class TrialPool:
     observer : TrialObserver
         Observes the trials that are run in this process because no worker could help: all of them
         if ``jobs`` is 1, else the last one at most.
+    overdue : callable, optional
+        Asked of each trial that runs, with its arm and the seconds so far: whether its worker is to
+        be ended. If it is given, no trial is run in this process, which none can end or hold up.
+    cluster : RayCluster, optional
+        Where the workers are, in place of this machine; it takes ``overdue``.
 
     Attributes
     ----------
@@ -141,18 +151,27 @@ class TrialPool:
     """
 
     def __init__(
-        self, jobs: int, *, expected: int | None = None, observer: TrialObserver = NULL_OBSERVER
+        self,
+        jobs: int,
+        *,
+        expected: int | None = None,
+        observer: TrialObserver = NULL_OBSERVER,
+        overdue: Callable[[Arm, float], bool] | None = None,
+        cluster: RayCluster | None = None,
     ) -> None:
         if integer(jobs) is None or not 1 <= jobs <= MAX_JOBS:
             raise InvalidValueError(f"jobs is {jobs!r:.80}; it must be from 1 to {MAX_JOBS}")
         self._jobs = jobs
         self._expected = expected
         self._observer = observer
+        self._overdue = overdue
+        self._cluster = cluster
         self._queue: deque[tuple[Arm, int]] = deque()
         self._workers: list[_Worker] = []
         self._times: dict[Arm, _Times] = {}
         self._all_times = _Times()
         self._a_trial_is_long = False
+        self._wanted = 0
 
     def __enter__(self) -> TrialPool:
         return self
@@ -174,15 +193,16 @@ class TrialPool:
     @property
     def has_room(self) -> bool:
         """Whether further trials could keep a worker from waiting."""
-        return len(self._queue) < (1 if self._jobs == 1 else self._jobs * _MAX_LOOKAHEAD)
+        here = self._jobs == 1 and self._overdue is None
+        return len(self._queue) < (1 if here else self._jobs * _MAX_LOOKAHEAD)
 
     def submit(self, arm: Arm, trial: int) -> None:
         """Add a trial, which :meth:`run` yields when it is finished."""
         self._queue.append((arm, trial))
 
-    def drop(self, arm: Arm) -> None:
-        """Take back an arm's trials that no worker has; the others are still yielded."""
-        self._queue = deque(job for job in self._queue if job[0] is not arm)
+    def drop(self, arm: Arm | None = None) -> None:
+        """Take back trials, an arm's or all, that no worker has; the others are still yielded."""
+        self._queue = deque(job for job in self._queue if arm not in (None, job[0]))
 
     def run(self, trials: Iterable[tuple[Arm, int]] = ()) -> Iterator[FinishedTrial]:
         """Yield trials as they are finished, in any order, until none is left.
@@ -197,9 +217,9 @@ class TrialPool:
         TrialError
             If holdfast refuses something in a trial, for example what a problem's function
             returned, or if such a function raises; the message then has the frames of that
-            function. Its ``arm`` is the trial's; the others can go on in another call.
+            function. Its ``arm`` is the trial's, as of the others. Another call can go on.
         WorkerDiedError
-            If a worker process was killed; the message names the trial that it was running.
+            If a worker process ended or was overdue; the message names the trial.
         TrialCrashError
             If anything else went wrong in a worker process. In this process that error is raised
             as it is, with a note that names the trial.
@@ -227,6 +247,8 @@ class TrialPool:
         return max(self._expected - self._all_times.count, len(self._queue))
 
     def _workers_pay(self) -> bool:
+        if self._overdue is not None:
+            return True
         remaining = self._remaining()
         if self._jobs == 1 or remaining <= 1:
             return False
@@ -258,15 +280,17 @@ class TrialPool:
 
     def _start_workers(self) -> None:
         """Start workers one by one, each noted first, so that they can always be ended."""
-        count = min(self._jobs, self._remaining())
-        threads = max(1, available_cores() // count)
-        limit = self._queue[0][0].planning.active_sensing.num_cores
-        for number in range(count):
-            self._workers.append(_Worker(number, threads, min(threads, limit or threads)))
+        self._wanted = self._wanted or min(self._jobs, self._remaining())
+        threads = max(1, available_cores() // self._wanted) if self._cluster is None else 1
+        limit = self._queue[0][0].planning.active_sensing.num_cores or threads
+        while (number := len(self._workers)) < self._wanted:
+            self._workers.append(_Worker(number, threads, min(threads, limit), self._cluster))
             self._workers[-1].start()
 
     def _feed(self) -> None:
         """Send trials, each to the worker with the least to do."""
+        if self._queue:
+            self._start_workers()  # in place of those that died
         while self._queue:
             worker = min(self._workers, key=_Worker.load)
             arm, trial = self._queue[0]
@@ -283,17 +307,45 @@ class TrialPool:
 
     def _receive(self) -> Iterator[FinishedTrial]:
         by_connection = {worker.connection: worker for worker in self._workers}
-        for connection in wait(list(by_connection)):
+        ready = wait(list(by_connection), None if self._overdue is None else _TICK_S)
+        for connection in ready:
             assert isinstance(connection, Connection)
             worker = by_connection[connection]
             answer = worker.receive()
             if answer is None:
-                raise _worker_died(worker)
+                self._lose(worker, *worker.how_it_ended())
+                continue
             message = _ANSWERS.decode(answer)
+            if isinstance(message, _Built):
+                worker.began_s = perf_counter()
+                continue
             arm, trial = worker.take_finished()
             if isinstance(message, _Failed):
                 raise _error_of(arm, message)
             yield self._finished(arm, trial, message.result, message.elapsed_s)
+        for connection, worker in by_connection.items():
+            if self._overdue is not None and connection not in ready and worker.outstanding:
+                ran_s = perf_counter() - worker.began_s
+                if self._overdue(worker.outstanding[0][0], ran_s):
+                    self._lose(worker, f"was ended after {max(0.0, ran_s):.1f} s", False, True)
+
+    def _lose(self, worker: _Worker, how: str, killed: bool, overdue: bool = False) -> None:
+        """Take leave of a worker; raise WorkerDiedError if it had a trial."""
+        self._workers.remove(worker)
+        end_workers([worker])
+        if not worker.outstanding:
+            return
+        (arm, trial, _), *others = worker.outstanding
+        self._queue.extendleft((arm, trial) for arm, trial, _ in reversed(others))
+        what = f"trial {trial}{f' of {arm.label}' if arm.label else ''}"
+        if killed:
+            what += " (often the machine is out of memory: use fewer jobs or fewer particles)"
+        error = WorkerDiedError(
+            f"a worker process {how} while it ran {what}; finished trials are kept"
+        )
+        error.arm, error.trial = arm, trial
+        error.how, error.killed, error.overdue = how, killed, overdue
+        raise error
 
 
 def available_cores() -> int:
@@ -323,19 +375,13 @@ class _Watch(TrialObserver):
     def __init__(self) -> None:
         self._deadline = perf_counter() + _WORKER_START_S
 
-    def sensed(self, step: SensingStep) -> None:
+    def sensed(self, step: object) -> None:
         """Look at the clock."""
         del step
-        self._check()
-
-    def acted(self, step: TaskStep) -> None:
-        """Look at the clock."""
-        del step
-        self._check()
-
-    def _check(self) -> None:
         if perf_counter() > self._deadline:
             raise _TrialIsLongError
+
+    acted = sensed
 
 
 def _run_one(arm: Arm, trial: int, observer: TrialObserver) -> TrialResult:
@@ -351,18 +397,16 @@ def _run_one(arm: Arm, trial: int, observer: TrialObserver) -> TrialResult:
         )
     except (_TrialIsLongError, KeyboardInterrupt):
         raise
-    except HoldfastError as error:
-        raise _trial_error(arm, f"{where}: {error}") from error
     except BaseException as error:
-        account = account_of_user_error(error, arm.problem_name)
-        if account is not None:
-            raise _trial_error(arm, f"{where}: {account}") from error
+        ours = isinstance(error, HoldfastError)
+        text = str(error) if ours else account_of_user_error(error, arm.problem_name)
+        if text is not None:
+            raise _with_arm(TrialError(f"{where}: {text}"), arm) from error
         error.add_note(f"in {where}")
         raise
 
 
-def _trial_error(arm: Arm, text: str) -> TrialError:
-    error = TrialError(text)
+def _with_arm(error: TrialError | TrialCrashError, arm: Arm) -> Exception:
     error.arm = arm
     return error
 
@@ -393,23 +437,30 @@ class _Finished(msgspec.Struct, tag="finished"):
     elapsed_s: float
 
 
+class _Built(msgspec.Struct, tag="built"):
+    """The arm of a trial is built; its first trial there begins."""
+
+
 class _Failed(msgspec.Struct, tag="failed"):
     text: str
     expected: bool
 
 
 _REQUESTS = msgspec.msgpack.Decoder(_NewArm | _Trial)
-_ANSWERS = msgspec.msgpack.Decoder(_Finished | _Failed)
+_ANSWERS = msgspec.msgpack.Decoder(_Finished | _Built | _Failed)
 _ENCODE = msgspec.msgpack.Encoder().encode
 
 
 class _Worker(WorkerProcess):
     """A worker, and the trials that it has been sent."""
 
-    def __init__(self, number: int, threads: int, blas_threads: int) -> None:
-        super().__init__(f"holdfast-worker-{number}", _work, (threads,), blas_threads)
+    def __init__(self, number: int, threads: int, blas: int, cluster: RayCluster | None) -> None:
+        super().__init__(f"holdfast-worker-{number}", _work, (threads,), blas)
+        if cluster is not None:
+            self._process = cluster.process(_Runner, self._theirs, threads)
         self.outstanding: deque[tuple[Arm, int, float]] = deque()
         self.expected_s = 0.0
+        self.began_s = 0.0
         self._arms: dict[Arm, int] = {}
 
     def load(self) -> float:
@@ -418,6 +469,8 @@ class _Worker(WorkerProcess):
 
     def send_trial(self, arm: Arm, trial: int, expected_s: float) -> None:
         # If it is dead, its pipe tells when it is read, where we know which trial it had.
+        if not self.outstanding:
+            self.began_s = perf_counter() + (_BUILD_S if arm not in self._arms else 0.0)
         if arm not in self._arms:
             self.send(_ENCODE(_new_arm(arm)))
             self._arms[arm] = len(self._arms)
@@ -429,6 +482,7 @@ class _Worker(WorkerProcess):
         """Return the trial that an answer was about: they come in order."""
         arm, trial, expected_s = self.outstanding.popleft()
         self.expected_s = self.expected_s - expected_s if self.outstanding else 0.0
+        self.began_s = perf_counter()
         return arm, trial
 
 
@@ -475,30 +529,43 @@ def _pickled(problem: Problem) -> bytes:
 
 def _work(connection: Connection, threads: int) -> None:
     """Run trials until the parent closes the pipe."""
-    arms: list[_NewArm | Arm] = []
-    problems: dict[bytes, Problem] = {}
+    runner = _Runner(threads)
     while True:
-        request = _REQUESTS.decode(connection.recv_bytes())
+        for answer in runner.answers(connection.recv_bytes()):
+            connection.send_bytes(answer)
+
+
+class _Runner:
+    """What runs the trials in a worker, which has as many threads as its share of the cores."""
+
+    def __init__(self, threads: int) -> None:
+        self._threads = threads
+        self._arms: list[_NewArm | Arm] = []
+        self._problems: dict[bytes, Problem] = {}
+
+    def answers(self, message: bytes) -> Iterator[bytes]:
+        """Yield what there is to answer, as soon as it is known."""
+        request = _REQUESTS.decode(message)
         if isinstance(request, _NewArm):
-            arms.append(request)
-            continue
+            self._arms.append(request)
+            return
         started = perf_counter()
-        answer: _Finished | _Failed
         try:
-            arm = arms[request.arm]
+            arm = self._arms[request.arm]
             if isinstance(arm, _NewArm):
-                arms[request.arm] = arm = _arm_in_worker(arm, threads, problems)
+                self._arms[request.arm] = arm = _arm_in_worker(arm, self._threads, self._problems)
+                yield _ENCODE(_Built())
             result = _run_one(arm, request.trial, NULL_OBSERVER)
-            answer = _Finished(result, perf_counter() - started)
+            answer = _ENCODE(_Finished(result, perf_counter() - started))
         except HoldfastError as error:
-            answer = _Failed(str(error), True)
+            answer = _ENCODE(_Failed(str(error), True))
         except Exception:  # noqa: BLE001 - whatever it is, the parent raises it again
-            answer = _Failed(traceback.format_exc(), False)
-        connection.send_bytes(_ENCODE(answer))
+            answer = _ENCODE(_Failed(traceback.format_exc(), False))
+        yield answer
 
 
 def _arm_in_worker(sent: _NewArm, threads: int, problems: dict[bytes, Problem]) -> Arm:
-    """Build an arm in a worker, which has as many threads as its share of the cores.
+    """Build an arm in a worker.
 
     Arms that differ in their settings alone share a problem of ``problems``: it may be large.
     """
@@ -529,18 +596,5 @@ def _arm_in_worker(sent: _NewArm, threads: int, problems: dict[bytes, Problem]) 
 
 
 def _error_of(arm: Arm, failed: _Failed) -> Exception:
-    if failed.expected:
-        return _trial_error(arm, failed.text)
-    return TrialCrashError(f"in a worker process:\n{failed.text}")
-
-
-def _worker_died(worker: _Worker) -> WorkerDiedError:
-    how, killed = worker.how_it_ended()
-    advice = " (often the machine is out of memory: use fewer jobs or fewer particles)"
-    what = "before it had a trial to run"
-    if worker.outstanding:
-        arm, trial, _ = worker.outstanding[0]
-        what = f"while it ran trial {trial}{f' of {arm.label}' if arm.label else ''}"
-    return WorkerDiedError(
-        f"a worker process {how} {what}{advice if killed else ''}; finished trials are kept"
-    )
+    crash = TrialCrashError(f"in a worker process:\n{failed.text}")
+    return _with_arm(TrialError(failed.text) if failed.expected else crash, arm)

@@ -18,11 +18,13 @@ import weakref
 from collections.abc import Callable, Iterable, Iterator
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from types import ModuleType
 from typing import Any
 
 from holdfast.runtime.parent_death import end_with_parent
 from holdfast.runtime.process_ends import signal_name
+from holdfast.runtime.ray_workers import RayProcess
 
 __all__ = ["WorkerProcess", "end_workers"]
 
@@ -71,7 +73,7 @@ class WorkerProcess:
         context = multiprocessing.get_context("spawn")
         self._threads = threads
         self.connection, self._theirs = context.Pipe()
-        self._process = context.Process(
+        self._process: SpawnProcess | RayProcess = context.Process(
             target=_begin, args=(os.getpid(), work, self._theirs, arguments), name=name, daemon=True
         )
 
@@ -101,6 +103,8 @@ class WorkerProcess:
     def how_it_ended(self) -> tuple[str, bool]:
         """Return how it ended, as a part of a sentence, and whether a signal did it."""
         self._process.join(_END_S)
+        if isinstance(self._process, RayProcess):
+            return self._process.how, True
         code = self._process.exitcode
         if code is not None and code < 0:
             return f"was killed by {signal_name(-code)}", True

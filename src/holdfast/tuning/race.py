@@ -22,6 +22,7 @@ the candidates could have twice the trials, the worse half is set aside, as in s
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Literal, NamedTuple, TypeAlias
@@ -118,7 +119,7 @@ def race(
         The first one is never set aside, and of equals it wins.
     run : callable
         Runs trials, each given by candidate and number, and yields them in any order. It may leave
-        some out, of candidates that it then refuses.
+        some out, of candidates that it then refuses, or as time is up.
     limit : float, optional
         Bound on the difference of two costs of a trial. None: the range of those seen so far, with
         which the error rate holds only about.
@@ -159,12 +160,15 @@ def race(
             seconds[each.candidate] += each.seconds
             quickest[each.candidate] = min(quickest[each.candidate], each.seconds)
         for name, by_trial in found.items():
-            new = np.array([by_trial[trial] for trial in sorted(by_trial)])
-            costs[name] = np.concatenate([costs[name], new])
+            # Only while none is missing: they are compared in pairs.
+            numbers = itertools.takewhile(by_trial.__contains__, itertools.count(len(costs[name])))
+            costs[name] = np.concatenate([costs[name], [by_trial[trial] for trial in numbers]])
         for name in alive():
-            if (reason := refuse(name)) is not None or not len(costs[name]):
-                out[name] = ("refused", reason or "it has no trials")
-        return bool(jobs)
+            if (reason := refuse(name)) is not None:
+                out[name] = ("refused", reason)
+            elif not len(costs[name]):
+                out[name] = ("set aside", "there was no time for a trial")
+        return bool(found)
 
     def drop_beaten() -> None:
         bound = limit

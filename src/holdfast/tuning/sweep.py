@@ -163,6 +163,7 @@ class Sweep:
     def run(self, jobs: int, on_result: Callable[[TrialResult], None]) -> None:
         """Run what is not finished; raises what :meth:`TrialPool.run` raises.
 
+        No trial runs in this process, so one that ends its process is an error that names it.
         However it ends, each arm's tables cover its finished trials.
         """
         started = perf_counter()
@@ -177,7 +178,8 @@ class Sweep:
                         yield arm, trial
 
         try:
-            with TrialPool(jobs, expected=self.total - self.finished) as pool:
+            left = self.total - self.finished
+            with TrialPool(jobs, expected=left, overdue=lambda *_: False) as pool:
                 for done in pool.run(trials()):
                     by_arm[done.arm].add(done.result)
                     spent[done.arm] += done.elapsed_s

@@ -7,30 +7,34 @@ it was and random sensing (:mod:`holdfast.tuning.verdict`).
 
 A trial depends on its candidate and number alone, and each is kept as soon as it is finished. So a
 tuning that goes on runs the same race again, with the trials that it has.
+
+Trials run in processes of their own: a candidate that ends its process, or hangs, leaves the race.
 """
 
 from __future__ import annotations
 
 import contextlib
-import csv
-import fcntl
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, NamedTuple, get_args
+from time import monotonic
+from typing import NamedTuple, get_args
 
-import msgspec
 import numpy as np
 
 from holdfast.config.loader import Configuration, load
-from holdfast.errors import InvalidValueError, OutputError, TrialError
-from holdfast.numerics.arrays import real_number, whole
+from holdfast.errors import (
+    InvalidValueError,
+    TrialCrashError,
+    TrialError,
+    WorkerDiedError,
+)
+from holdfast.numerics.arrays import FloatArray, real_number, whole
 from holdfast.recording.fingerprint import fingerprint
-from holdfast.recording.run_directory import first_difference
-from holdfast.recording.table_formats import csv_rows
+from holdfast.recording.kept_trials import FRESH, KeptTrials, TrialRow
 from holdfast.robot.trial_pool import Arm, TrialPool, available_cores
 from holdfast.runtime.command_line import MAX_JOBS
-from holdfast.runtime.files import shown_path, write_atomically
+from holdfast.runtime.ray_workers import RayCluster
 from holdfast.tuning.candidates import (
     AS_CONFIGURED,
     BY_DEFAULT,
@@ -47,22 +51,33 @@ from holdfast.tuning.candidates import (
 )
 from holdfast.tuning.race import PILOT_TRIALS, MeasuredTrial, Standing, race
 from holdfast.tuning.tuning_report import CandidateRow, Tuning, write_report
-from holdfast.tuning.verdict import TrialRow, cost_of, judge, mean_difference
+from holdfast.tuning.verdict import MUCH_SLOWER, cost_of, judge, mean_difference
 
 __all__ = ["Progress", "tune"]
 
-FRESH = 1_000_000
-"""Number of the first trial that judges; those of the race are below it."""
-
-TRIALS_NAME = "trials.csv"
-SETTINGS_NAME = "tune.json"
-
 _SHARE_OF_THE_RACE = 0.6
 _LEAST_FRESH = 20
+_AT_MOST_OF_THE_RACE = 0.75
+"""Where trials take longer than those before."""
+
+_REPORT_S = 3.0
+_JUDGED_ANYWAY = (AS_CONFIGURED, RANDOM)
+
+_PATIENCE_S = 10.0
+"""No trial is ended sooner while there is time."""
+
+_FAR_LONGER = 10.0
+"""Times what the longest possible trial would take, by the seconds per step seen so far."""
+
+_FIRST_SHARE = 0.1
+"""Of the budget: a first trial that takes longer leaves no time for ten."""
+
+_MOST_REFUSED = 4
+"""Of those that could not be tried, the sentence names so many."""
 
 
 class Progress(NamedTuple):
-    """How far a tuning is: seconds of work over the processes, trials, and what it does."""
+    """How far a tuning is: seconds of its budget, trials, and what it does."""
 
     spent_s: float
     trials: int
@@ -77,6 +92,7 @@ def tune(
     budget_s: float = 600.0,
     most: int = 200,
     jobs: int | None = None,
+    ray: str | None = None,
     max_decision_ms: float = math.inf,
     out: str | Path | None = None,
     on_progress: Callable[[Progress], None] = lambda _: None,
@@ -94,11 +110,14 @@ def tune(
     objective : {"reward", "steps", "success"}, optional
         None: ``reward`` if sensing has prices, else ``steps``.
     budget_s : float
-        About how long it may take. The race has three fifths of it.
+        How long it may take, but for the trials that run at its end. The race has three fifths.
     most : int
-        Trials of a candidate in the race, and as many to judge.
+        Trials of a candidate in the race, and up to twice as many to judge.
     jobs : int, optional
         Processes; None: one for each core.
+    ray : str, optional
+        A Ray cluster whose cores run the trials: ``auto`` (of this machine), ``HOST:PORT`` or
+        ``ray://HOST:PORT``. Nodes need the same holdfast, and the problem at the same path.
     max_decision_ms : float
         A candidate whose median decision takes longer must not win.
     out : path, optional
@@ -110,8 +129,8 @@ def tune(
         If a value does not fit.
     OutputError
         If ``out`` belongs to something else, or cannot be written.
-    TrialError
-        If the trials of the configuration itself fail.
+    TrialError, WorkerDiedError, TrialCrashError
+        If trials of the configuration itself fail, end their process, or do not end.
     """
     if not isinstance(configuration, Configuration):
         configuration = load(configuration)
@@ -119,7 +138,7 @@ def tune(
     if unknown:
         raise InvalidValueError(f"vary has {unknown[0]!r}; allowed are {', '.join(VARIATIONS)}")
     most = whole("most", most, 2, FRESH - 1)
-    jobs = available_cores() if jobs is None else whole("jobs", jobs, 1, MAX_JOBS)
+    jobs = None if jobs is None else whole("jobs", jobs, 1, MAX_JOBS)
     for name, value in (("budget_s", budget_s), ("max_decision_ms", max_decision_ms)):
         number = real_number(value)
         if number is None or not number > 0.0:
@@ -142,9 +161,16 @@ def tune(
         "max_decision_ms": None if math.isinf(max_decision_ms) else max_decision_ms,
         "code": fingerprint(configuration),
     }
-    with _Trials(out, settings) as kept, TrialPool(jobs) as pool:
-        tuner = _Tuner(configuration, objective, kept, pool, max_decision_ms, on_progress)
-        found = tuner.run(vary, most, budget_s * jobs)
+    began_s = monotonic()
+    with contextlib.ExitStack() as stack:
+        kept = stack.enter_context(KeptTrials(out, settings))
+        cluster = None if ray is None else stack.enter_context(RayCluster(ray))
+        cores = available_cores() if cluster is None else min(cluster.cores, MAX_JOBS)
+        jobs = jobs or cores
+        tuner = _Tuner(configuration, objective, kept, jobs, max_decision_ms, on_progress)
+        with TrialPool(jobs, overdue=tuner.is_overdue, cluster=cluster) as tuner.pool:
+            left_s = budget_s - _REPORT_S - (monotonic() - began_s)  # joining takes its time
+            found = tuner.run(vary, most, max(0.5 * budget_s, left_s))
     if out is not None:
         write_report(out, configuration, found)
     return found
@@ -153,32 +179,41 @@ def tune(
 class _Tuner:
     """One tuning: its candidates, and the trials that are asked for of them."""
 
+    pool: TrialPool
+
     def __init__(
         self,
         base: Configuration,
         objective: Objective,
-        kept: _Trials,
-        pool: TrialPool,
+        kept: KeptTrials,
+        jobs: int,
         max_decision_ms: float,
         on_progress: Callable[[Progress], None],
     ) -> None:
         self._base = base
         self._objective = objective
         self._kept = kept
-        self._pool = pool
+        self._jobs = jobs
         self._max_decision_ms = max_decision_ms
         self._on_progress = on_progress
         self._limit = base.simulator.max_steps
         self._candidates: dict[str, Candidate] = {}
         self._arms: dict[str, Arm] = {}
         self._failed: dict[str, str] = {}
+        self._killed: set[tuple[str, int]] = set()
         self._counted: set[tuple[str, int]] = set()
-        self._spent_s = 0.0
+        self._longest_s: dict[str, float] = {}
         self._doing = ""
+        self._began_s = monotonic()
+        self._budget_s = self._until_s = math.inf
 
     def run(self, vary: Sequence[Variation], most: int, budget_s: float) -> Tuning:
-        """Race and judge; ``budget_s`` is of a processor."""
+        """Race and judge, within ``budget_s``."""
+        self._budget_s = budget_s
+        # What was run before has had its part of the budget.
+        self._began_s -= self._seconds(key for key in self._kept.rows if key[1] < FRESH)
         candidates, refused = first_candidates(self._base, vary, self._objective)
+        left_out = dict(refused)
         later = [each for each in vary if each in ("interval", "particles")]
         for_first = _SHARE_OF_THE_RACE * budget_s * (0.6 if later else 1.0)
         standings = self._race(candidates, refused, most, for_first)
@@ -187,38 +222,46 @@ class _Tuner:
             others, refused = later_candidates(self._base, winner, later)
             more = self._race(others, refused, most, _SHARE_OF_THE_RACE * budget_s)
             standings = [*more, *(each for each in standings if each.candidate != winner.name)]
-        finalist = self._candidates[standings[0].candidate]
-        judged = self._judged(finalist)
-        self._doing = f"{finalist.name} is judged on fresh trials"
-        fresh = 0
+        finalists = self._finalists(standings)
+        judged = self._judged(finalists)
+        self._doing = f"{', '.join(finalists)}: judged on fresh trials"
+        self._until_s = budget_s
+        most_fresh = 2 * most
+        wanted = [(name, FRESH + trial) for trial in range(most_fresh) for name in judged]
+        self._began_s -= self._seconds(key for key in wanted if key in self._kept.rows)
         # Whether to go on depends on the time alone, never on what has come out.
-        while fresh < most and (fresh < _LEAST_FRESH or self._spent_s < budget_s):
-            block = range(fresh, min(fresh + _LEAST_FRESH, most))
-            for _ in self._measured([(name, FRESH + n) for n in block for name in judged]):
-                pass
-            fresh = block.stop
+        for _ in self._measured(wanted):
+            pass
+        judged = [name for name in judged if name not in self._failed]
+        fresh = next(
+            trial
+            for trial in range(most_fresh + 1)
+            if any((name, FRESH + trial) not in self._kept.rows for name in judged)
+        )
         rows = {
             name: [self._kept.rows[name, FRESH + trial] for trial in range(fresh)]
             for name in judged
-            if name not in self._failed
         }
         barred = {name for name in rows if self._refusal(name) is not None}
-        verdict = judge(rows, finalist.name, self._objective, self._limit, barred)
+        verdict = judge(
+            rows, finalists, self._objective, self._limit, barred, min(most, _LEAST_FRESH)
+        )
+        sentence = verdict.sentence
+        left_out |= self._failed
+        for name, reason in list(left_out.items())[:_MOST_REFUSED]:
+            sentence += f" {name} was left out: {reason.splitlines()[0]}."
+        if len(left_out) > _MOST_REFUSED:
+            sentence += f" So were {len(left_out) - _MOST_REFUSED} more (the table says why)."
         untried = sum(
             each.state == "set aside" and each.trials <= PILOT_TRIALS for each in standings
         )
-        sentence = verdict.sentence
-        if untried:
-            what = "candidate was" if untried == 1 else "candidates were"
-            sentence += f" {untried} slow {what} not tried: a larger budget does that."
+        sentence += _note(untried, "slow", "not tried: a larger budget does that")
         open_ones = sum(
             each.state == "in the race" and each.candidate not in judged for each in standings
         )
-        if open_ones and fresh < most:
-            what = "candidate is" if open_ones == 1 else "candidates are"
-            sentence += (
-                f" {open_ones} more {what} not beaten yet: --resume with a larger budget goes on."
-            )
+        if fresh < most:
+            rest = "not beaten: --resume with a larger budget goes on"
+            sentence += _note(open_ones, "more", rest)
         return Tuning(
             sentence=sentence,
             choice=verdict.choice,
@@ -230,6 +273,13 @@ class _Tuner:
             candidates=tuple(map(self._row, standings)),
         )
 
+    def _spent_s(self) -> float:
+        return monotonic() - self._began_s
+
+    def _seconds(self, keys: Iterable[tuple[str, int]]) -> float:
+        """Return how long kept trials took, over all processes."""
+        return sum(self._kept.rows[key].seconds for key in keys) / self._jobs
+
     def _race(
         self,
         candidates: Sequence[Candidate],
@@ -240,17 +290,24 @@ class _Tuner:
         for each in candidates:
             self._add(each)
         names = [each.name for each in candidates]
-        of_them = {key for key in self._counted if key[0] in names}
-        before_s = sum(self._kept.rows[key].seconds for key in of_them)
         self._doing = f"{len(names)} candidates race"
+        self._until_s = until_s * _AT_MOST_OF_THE_RACE / _SHARE_OF_THE_RACE
+        before_s = self._seconds(
+            key for key in self._kept.rows if key[0] in names and key[1] < FRESH
+        )
         standings = race(
             names,
             self._measured,
             limit={"steps": float(self._limit), "success": 1.0}.get(self._objective),
             most=most,
-            budget_s=until_s - self._spent_s + before_s,
+            budget_s=self._jobs * (until_s - self._spent_s() + before_s),
             refuse=self._refusal,
         )
+        if not self._kept.of(AS_CONFIGURED):
+            raise TrialError(
+                f"{AS_CONFIGURED}: no trial ended within {until_s:.3g} s: a larger budget is "
+                "needed, or it hangs"
+            )
         if standings[0].state == "refused":
             raise InvalidValueError(
                 f"no candidate is admitted: {standings[0].candidate}: {standings[0].reason}"
@@ -260,35 +317,62 @@ class _Tuner:
             nothing._replace(candidate=name, reason=reason) for name, reason in refused.items()
         ]
 
+    def _finalists(self, standings: Sequence[Standing]) -> list[str]:
+        """Return the winner, and one that may be as good, two if the winner is judged anyway."""
+        winner = standings[0].candidate
+        costs, equals = self._costs(winner), []
+        for each in standings[1:]:
+            own = self._costs(each.candidate)
+            common = min(len(own), len(costs))
+            if each.state != "in the race" or each.candidate in _JUDGED_ANYWAY or common < 2:
+                continue
+            differences = own[:common] - costs[:common]
+            if np.mean(differences) <= 2.0 * np.std(differences, ddof=1) / math.sqrt(common):
+                equals.append(each.candidate)
+        bound_ms = self._decision_ms(winner) / MUCH_SLOWER
+        quick = [name for name in equals if self._decision_ms(name) <= bound_ms]
+        each_s = {each.candidate: each.seconds for each in standings}
+        found = [winner]
+        for name in dict.fromkeys([*quick[:1], *equals]):
+            judged = self._judged([*found, name])
+            needed_s = 3 * _LEAST_FRESH * sum(each_s.get(each, 0.0) for each in judged)
+            has_room = len(found) < 2 + (winner in _JUDGED_ANYWAY)
+            if has_room and needed_s <= self._jobs * (self._budget_s - self._spent_s()):
+                found.append(name)
+        return found
+
     def _add(self, candidate: Candidate) -> None:
         if candidate.name not in self._candidates:
             self._candidates[candidate.name] = candidate
             self._arms[candidate.name] = Arm.of(candidate.configuration, candidate.name)
 
-    def _judged(self, finalist: Candidate) -> list[str]:
+    def _judged(self, finalists: Sequence[str]) -> list[str]:
         """Return whom the fresh trials judge, the configuration first."""
-        rivals = {AS_CONFIGURED: None, finalist.name: None}
+        rivals = dict.fromkeys((AS_CONFIGURED, *finalists))
         own = self._base.planning.selector.method
         if own != "random":
             rivals[RANDOM] = None
         if own not in ("random", DEFAULT) and DEFAULT in self._candidates:
             rivals[DEFAULT] = None
-        others = {
-            key: value for key, value in finalist.changes.items() if not key.startswith("selector.")
-        }
-        if others:
-            # It must not be that the particles or the interval do it, and not what is sensed.
-            changes = others | {"selector.method": "random"}
-            name = f"random,{finalist.name.rpartition(',')[2]}"
-            self._add(Candidate(name, changed(self._base, changes), changes))
-            rivals[name] = None
+        for finalist in finalists:
+            others = {
+                key: value
+                for key, value in self._candidates[finalist].changes.items()
+                if not key.startswith("selector.")
+            }
+            if others:
+                # It must not be that the particles or the interval do it, and not what is sensed.
+                changes = others | {"selector.method": "random"}
+                name = f"random,{finalist.rpartition(',')[2]}"
+                self._add(Candidate(name, changed(self._base, changes), changes))
+                rivals[name] = None
         return [name for name in rivals if name not in self._failed]
 
     def _refusal(self, name: str) -> str | None:
         """Return why a candidate must not win."""
         rows = self._kept.of(name)
         if rows and name not in self._failed:
-            decision_ms = float(np.median([row.decision_ms for row in rows]))
+            decision_ms = self._decision_ms(name)
             if decision_ms > self._max_decision_ms:
                 return (
                     f"a decision takes {decision_ms:.3g} ms, and at most "
@@ -296,8 +380,21 @@ class _Tuner:
                 )
         return self._failed.get(name)
 
+    def is_overdue(self, arm: Arm, ran_s: float) -> bool:
+        """Return whether a trial that has run so long is to be ended."""
+        longest_s = self._longest_s.get(arm.label)
+        if arm.label in self._failed or (
+            self._spent_s() > self._until_s and max(0.0, ran_s) >= (longest_s or 0.0)
+        ):
+            return True
+        first_s = _FIRST_SHARE * self._budget_s
+        return ran_s > max(_PATIENCE_S, first_s if longest_s is None else _FAR_LONGER * longest_s)
+
     def _measured(self, jobs: Sequence[tuple[str, int]]) -> Iterator[MeasuredTrial]:
-        """Run trials, or take those that are kept; leave out those of a candidate that fails."""
+        """Run trials while there is time, or take those that are kept.
+
+        Those of a candidate that fails are left out.
+        """
         missing = []
         for name, trial in jobs:
             row = self._kept.rows.get((name, trial))
@@ -305,10 +402,14 @@ class _Tuner:
                 missing.append((name, trial))
             else:
                 yield self._count(row)
-        more = ((self._arms[name], trial) for name, trial in missing if name not in self._failed)
+        more = (
+            (self._arms[name], trial)
+            for name, trial in missing
+            if name not in self._failed and self._spent_s() < self._until_s
+        )
         while True:
             try:
-                for finished in self._pool.run(more):
+                for finished in self.pool.run(more):
                     result = finished.result
                     row = TrialRow(
                         finished.arm.label,
@@ -322,23 +423,56 @@ class _Tuner:
                     )
                     self._kept.add(row)
                     yield self._count(row)
-            except TrialError as error:
-                arm = error.arm
-                if not isinstance(arm, Arm) or arm.label == AS_CONFIGURED:
-                    raise
-                self._failed[arm.label] = f"it fails: {error}"
-                self._pool.drop(arm)
+                    if self._spent_s() >= self._until_s:
+                        self.pool.drop()
+            except (TrialError, TrialCrashError, WorkerDiedError) as error:
+                self._leave_out(error)
             else:
                 return
+
+    def _leave_out(self, error: TrialError | TrialCrashError | WorkerDiedError) -> None:
+        """Take a candidate out of the race; raise the error if it is the configuration itself."""
+        arm = error.arm
+        assert isinstance(arm, Arm)
+        name, reason = arm.label, f"it fails: {error}"
+        if isinstance(error, TrialCrashError):
+            reason = f"it fails: {' '.join(str(error).splitlines()[-2:])}"
+        if isinstance(error, WorkerDiedError):
+            reason = f"it died: its process {error.how} in trial {error.trial % FRESH}"
+            if error.overdue and self._spent_s() > self._until_s:
+                self.pool.drop()  # time is up, and nobody's fault
+                return
+            if error.overdue:
+                kind = "it hangs" if name in self._longest_s else "it is too slow, or hangs"
+                reason = f"{kind}: trial {error.trial % FRESH} {error.how}"
+            elif error.killed and (name, error.trial) not in self._killed:
+                # Whoever killed it may have meant another one, if memory was short.
+                self._killed.add((name, error.trial))
+                self.pool.submit(arm, error.trial)
+                return
+        if name == AS_CONFIGURED and isinstance(error, WorkerDiedError):
+            raise WorkerDiedError(f"your configuration: {reason}") from error
+        if name == AS_CONFIGURED:
+            raise error
+        self._failed.setdefault(name, reason)
+        self.pool.drop(arm)
 
     def _count(self, row: TrialRow) -> MeasuredTrial:
         key = row.candidate, row.trial
         if key not in self._counted:
             self._counted.add(key)
-            self._spent_s += row.seconds
-        self._on_progress(Progress(self._spent_s, len(self._counted), self._doing))
+            possible_s = row.seconds * self._limit / max(1, row.steps)
+            self._longest_s[key[0]] = max(self._longest_s.get(key[0], 0.0), possible_s)
+        self._on_progress(Progress(self._spent_s(), len(self._counted), self._doing))
         cost = cost_of(row, self._objective, self._limit)
         return MeasuredTrial(row.candidate, row.trial, cost, row.seconds)
+
+    def _costs(self, name: str) -> FloatArray:
+        """Return what the trials of the race cost, in order."""
+        return np.array([cost_of(row, self._objective, self._limit) for row in self._kept.of(name)])
+
+    def _decision_ms(self, name: str) -> float:
+        return float(np.median([row.decision_ms for row in self._kept.of(name)]))
 
     def _row(self, standing: Standing) -> CandidateRow:
         name = standing.candidate
@@ -347,10 +481,7 @@ class _Tuner:
         rows = self._kept.of(name)[: standing.trials]
         if len(rows) <= PILOT_TRIALS:
             return CandidateRow(candidate=name, changes=changes, trials=len(rows), state=state)
-        costs, base = (
-            np.array([cost_of(row, self._objective, self._limit) for row in each[: len(rows)]])
-            for each in (rows, self._kept.of(AS_CONFIGURED))
-        )
+        costs, base = self._costs(name)[: len(rows)], self._costs(AS_CONFIGURED)
         common = min(len(costs), len(base))
         difference, interval = mean_difference(costs[:common] - base[:common])
         return CandidateRow(
@@ -361,124 +492,12 @@ class _Tuner:
             difference=difference,
             interval=interval,
             success=float(np.mean([row.success for row in rows])),
-            decision_ms=float(np.median([row.decision_ms for row in rows])),
+            decision_ms=self._decision_ms(name),
             trial_s=standing.seconds,
             state=state,
         )
 
 
-class _Trials:
-    """The trials that are finished, in memory and, if there is a directory, in its file.
-
-    Attributes
-    ----------
-    rows : dict
-        By candidate and number.
-    """
-
-    def __init__(self, directory: Path | None, settings: Mapping[str, Any]) -> None:
-        self.rows: dict[tuple[str, int], TrialRow] = {}
-        self._directory = directory
-        self._settings = settings
-        self._file: IO[str] | None = None
-
-    def __enter__(self) -> _Trials:
-        if self._directory is not None:
-            try:
-                self._open(self._directory)
-            except BaseException:
-                self.__exit__()
-                raise
-        return self
-
-    def _open(self, directory: Path) -> None:
-        path = directory / TRIALS_NAME
-        try:
-            directory.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("a", encoding="utf-8", newline="")
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            content = path.read_bytes()
-            whole = content[: content.rfind(b"\n") + 1]
-            lines = whole.decode(errors="replace").split("\n")
-            self.rows = {(row.candidate, row.trial): row for row in _rows_of(lines)}
-            self._require_the_same(directory / SETTINGS_NAME)
-            # What a kill has cut short goes. The rest stays as it is: a disk may be full.
-            self._file.truncate(len(whole))
-            if not whole:
-                self._file.write(_line(TrialRow._fields))
-                self._file.flush()
-        except BlockingIOError:
-            raise OutputError(f"{shown_path(path)}: another process is writing it") from None
-        except OSError as error:
-            raise OutputError(f"{shown_path(path)}: cannot be written: {error.strerror}") from error
-
-    def __exit__(self, *exception: object) -> None:
-        if self._file is not None:
-            with contextlib.suppress(OSError):  # what a full disk does not take was an error before
-                self._file.close()
-
-    def _require_the_same(self, path: Path) -> None:
-        settings = msgspec.to_builtins(self._settings)
-        try:
-            there = msgspec.json.decode(path.read_bytes())
-        except FileNotFoundError:
-            if self.rows:
-                raise OutputError(
-                    f"{shown_path(path)}: is gone, so nothing tells of which tuning the trials of "
-                    f"{TRIALS_NAME} are; choose another directory"
-                ) from None
-            content = msgspec.json.format(msgspec.json.encode(settings), indent=2)
-            write_atomically(path, content)
-            return
-        except (OSError, UnicodeDecodeError, msgspec.DecodeError) as error:
-            raise OutputError(f"{shown_path(path)}: cannot be read: {error}") from None
-        found = first_difference(there, msgspec.json.decode(msgspec.json.encode(settings)))
-        if found is not None:
-            key, old, new = found
-            raise OutputError(
-                f"{shown_path(path)}: is of another tuning: {key} was {old} and is {new}; "
-                "choose another directory"
-            )
-
-    def of(self, name: str) -> list[TrialRow]:
-        """Return the trials of a candidate in the race, in order."""
-        found = [row for row in self.rows.values() if row.candidate == name and row.trial < FRESH]
-        return sorted(found, key=lambda row: row.trial)
-
-    def add(self, row: TrialRow) -> None:
-        """Keep a trial."""
-        self.rows[row.candidate, row.trial] = row
-        if self._file is not None:
-            try:
-                self._file.write(_line(row))
-                self._file.flush()
-            except OSError as error:
-                where = shown_path(Path(self._file.name))
-                raise OutputError(f"{where}: cannot be written: {error.strerror}") from error
-
-
-def _line(values: Iterable[Any]) -> str:
-    _, line = csv_rows((), [tuple(values)])
-    return line
-
-
-def _rows_of(lines: Iterable[str]) -> Iterator[TrialRow]:
-    """Yield the trials; each line is read by itself, so that a damaged one costs no other."""
-    for line in lines:
-        try:
-            ((name, trial, success, failed, steps, reward, *times),) = csv.reader([line])
-            decision_ms, seconds = map(float, times)
-            if not 0.0 <= decision_ms + seconds < math.inf:
-                continue
-            yield TrialRow(
-                name,
-                int(trial),
-                success == "1",
-                failed == "1",
-                int(steps),
-                float(reward) if reward else None,
-                decision_ms,
-                seconds,
-            )
-        except (ValueError, csv.Error):
-            continue  # the head, or a damaged row
+def _note(count: int, kind: str, rest: str) -> str:
+    what = "candidate was" if count == 1 else "candidates were"
+    return f" {count} {kind} {what} {rest}." if count else ""

@@ -4,7 +4,8 @@ Of many candidates the luckiest wins, so its mean in the race is too good to be 
 curse). It is measured anew, beside the configuration as it was and random sensing, and only these
 trials confirm. Their few intervals hold together at 95 % (Bonferroni). If none shows a difference,
 what is sensed does not matter as far as these trials tell, and the configuration stays. Otherwise
-the least mean cost of these trials wins: not the winner of the race if it was only lucky.
+the least mean cost of these trials wins: not the winner of the race if it was only lucky, and not
+one that decides slowly if a much quicker one is as good.
 """
 
 from __future__ import annotations
@@ -17,13 +18,14 @@ import msgspec
 import numpy as np
 
 from holdfast.numerics.arrays import FloatArray
+from holdfast.recording.kept_trials import TrialRow
 from holdfast.recording.outcome_comparison import bootstrap_interval
 from holdfast.tuning.candidates import AS_CONFIGURED, RANDOM, Objective
 
 __all__ = [
     "FAMILY_LEVEL",
+    "MUCH_SLOWER",
     "Comparison",
-    "TrialRow",
     "Verdict",
     "cost_of",
     "judge",
@@ -36,21 +38,9 @@ FAMILY_LEVEL = 0.95
 _WIDE = 0.1
 """An interval that reaches so far, as a share of the mean, says little."""
 
-_MUCH_SLOWER = 2.0
-"""A decision that takes so many times as long needs a reason."""
-
-
-class TrialRow(NamedTuple):
-    """What is kept of a trial; ``decision_ms`` is the median of its sensing decisions."""
-
-    candidate: str
-    trial: int
-    success: bool
-    failed: bool
-    steps: int
-    reward: float | None
-    decision_ms: float
-    seconds: float
+MUCH_SLOWER = 2.0
+_NOTICED_MS = 0.5
+"""A decision that takes so many times as long, and so much longer, needs a reason."""
 
 
 class Comparison(msgspec.Struct, frozen=True, kw_only=True):
@@ -118,12 +108,13 @@ def mean_difference(
 
 def judge(
     rows: Mapping[str, Sequence[TrialRow]],
-    finalist: str,
+    finalists: Sequence[str],
     objective: Objective,
     limit: int,
     barred: Collection[str] = (),
+    least: int = 1,
 ) -> Verdict:
-    """Choose among the configuration as it was, the finalist and random sensing.
+    """Choose among the configuration as it was, the finalists and random sensing.
 
     Parameters
     ----------
@@ -134,13 +125,20 @@ def judge(
         Steps of a trial that does not succeed.
     barred : collection of str
         Those that must not be chosen.
+    least : int
+        With fewer trials, nothing is said.
     """
     names = list(rows)
     configured = names[0]
+    admitted = [name for name in names if name not in barred] or names
+    choice = next(name for name in (configured, *finalists, *admitted) if name in admitted)
+    trials, slower = len(rows[configured]), ""
+    if trials < least:
+        return Verdict(choice, False, _too_few(choice, configured, trials, least), ())
     pairs = [
         (one, other)
         for other, one in combinations(names, 2)
-        if finalist in (one, other) or configured in (one, other)
+        if not {configured, *finalists}.isdisjoint((one, other))
     ]
     level = 1.0 - (1.0 - FAMILY_LEVEL) / max(1, len(pairs))
 
@@ -162,19 +160,27 @@ def judge(
 
     decisive = [found for pair in pairs if (found := compare(*pair, objective)) is not None]
     matters = any(each.finding for each in decisive)
-    admitted = [name for name in names if name not in barred] or names
-    choice = next(name for name in (configured, finalist, *admitted) if name in admitted)
     if matters:
         costs = {
             name: np.mean([cost_of(row, objective, limit) for row in rows[name]]) for name in names
         }
-        choice = min(admitted, key=costs.__getitem__)
-        found = compare(choice, configured, objective)
-        bound_ms = _MUCH_SLOWER * _decision_ms(rows[configured])
-        quick = [name for name in admitted if _decision_ms(rows[name]) <= bound_ms]
-        if configured in quick and found is not None and found.finding < 1:
-            # What is as quick may be better than the configuration beyond noise, as random sensing.
-            choice = min(quick, key=costs.__getitem__)
+        best = choice = min(admitted, key=costs.__getitem__)
+        best_ms = _decision_ms(rows[best])
+        equals = []
+        for name in admitted:
+            found, own_ms = compare(best, name, objective), _decision_ms(rows[name])
+            if found is None or best_ms <= max(MUCH_SLOWER * own_ms, own_ms + _NOTICED_MS):
+                continue
+            # About one standard error: what is likely better is worth its time.
+            near = abs(found.difference) <= 0.25 * (found.interval[1] - found.interval[0])
+            if found.finding < 1 and (near or name == configured):
+                equals.append(name)
+        if equals:
+            choice = min(equals, key=costs.__getitem__)
+            slower = (
+                f" {best} is no better beyond noise and takes {best_ms:.2g} ms to decide, not "
+                f"{_decision_ms(rows[choice]):.2g}."
+            )
     against = [name for name in names if name != choice]
     comparisons = [
         found
@@ -182,8 +188,7 @@ def judge(
         for measure in sorted(_MEASURES, key=lambda each: each != objective)
         if (found := compare(choice, name, measure)) is not None
     ]
-    trials = len(rows[configured])
-    sentence = _sentence(choice, configured, matters, objective, comparisons, trials)
+    sentence = _sentence(choice, configured, matters, objective, comparisons, trials) + slower
     if not any(row.success for each in rows.values() for row in each):
         sentence += " No trial succeeded: ask holdfast check first whether the goal can be reached."
     return Verdict(choice, matters, sentence, tuple(comparisons))
@@ -194,6 +199,14 @@ def _decision_ms(rows: Sequence[TrialRow]) -> float:
 
 
 # -- words -----------------------------------------------------------------------------------------
+
+
+def _too_few(choice: str, configured: str, trials: int, least: int) -> str:
+    keep = "keep your configuration" if choice == configured else f"sense by {choice}"
+    return (
+        f"The budget was too short to judge: {trials} fresh trials of at least {least}. "
+        f"A larger one goes on (--resume); until then, {keep}."
+    )
 
 
 def _sentence(
@@ -207,14 +220,16 @@ def _sentence(
     decisive = [each for each in comparisons if each.measure == objective]
     effects = "; ".join(map(_effect, decisive))
     fresh = f"{trials:,} trials that had no part in the choice"
+    if not decisive:
+        return f"{choice} alone could be judged, in {fresh}."
     if not matters:
-        reach = max((abs(end) for each in decisive for end in each.interval), default=0.0)
-        wide = bool(decisive) and reach > _WIDE * abs(decisive[0].value)
+        reach = max(abs(end) for each in decisive for end in each.interval)
+        wide = reach > _WIDE * abs(decisive[0].value)
         text = f"What you sense does not matter here, as far as {fresh} tell"
         if wide:
             text = f"No difference showed in {fresh}"
         keep = "Keep your configuration" if choice == configured else f"Sense by {choice}"
-        text += f": {effects}. {keep}." if effects else "."
+        text += f": {effects}. {keep}."
         if wide:
             text += (
                 f" One of up to {_amount(reach, objective)} would not have shown: "
