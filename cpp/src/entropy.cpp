@@ -259,33 +259,6 @@ double own_tree_entropy(const Task& task, const double* weights, std::size_t sur
     return group.entropy(0);
 }
 
-/// Set by set, because neighbourhoods may be large: values[set][posterior].
-void prior_entropies(const std::vector<Task>& tasks, const std::vector<double>& weights,
-                     const std::vector<std::size_t>& survivors, std::size_t number,
-                     std::vector<double>& values, EntropyCounts& counts) {
-    for (std::size_t set = 0; set < tasks.size(); ++set) {
-        const Task& task = tasks[set];
-        const EntropySettings& settings = *task.settings;
-        const PriorNeighbors neighbors(task.points, task.count, task.dimension, settings.prior,
-                                       settings.neighbors, task.constants, settings.threads);
-        counts.visits += task.count * task.count;
-        const std::size_t pieces = (number + prior_lanes - 1) / prior_lanes;
-        const double work = static_cast<double>(pieces) *
-                            (4.0 * static_cast<double>(neighbors.members()) +
-                             prior_lanes * work_that_follows * static_cast<double>(task.count));
-        parallel_for(pieces, threads_for(work, pieces, settings.threads), [&](std::size_t piece) {
-            const std::size_t first = piece * prior_lanes;
-            const std::size_t here = std::min(prior_lanes, number - first);
-            double* out = &values[set * number + first];
-            neighbors.entropies(&weights[first * task.count], here, out);
-            for (std::size_t i = 0; i < here; ++i) {
-                out[i] = survivors[first + i] == 0 ? std::numeric_limits<double>::quiet_NaN()
-                                                   : out[i] + settings.offset;
-            }
-        });
-    }
-}
-
 }  // namespace
 
 void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSource& source,
@@ -363,7 +336,14 @@ void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSou
                 work_alone += cost_alone(s);
             }
         }
-        if (shared) prior_entropies(tasks, weights, survivors, number, values, counts);
+        if (shared) {
+            prior_entropies(sets, weights.data(), number, settings, constants, values.data());
+            counts.visits += sets.number * count * count;
+            for (std::size_t i = 0; i < values.size(); ++i) {
+                values[i] = survivors[i % number] == 0 ? std::numeric_limits<double>::quiet_NaN()
+                                                       : values[i] + settings.offset;
+            }
+        }
         const std::size_t pieces = sets.number * alone.size();
         parallel_for(
             pieces,

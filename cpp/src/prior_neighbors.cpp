@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <limits>
+#include <vector>
 
 #include "deterministic_math.hpp"
 #include "thread_pool.hpp"
@@ -11,132 +12,142 @@ namespace holdfast {
 namespace {
 
 constexpr double infinity = std::numeric_limits<double>::infinity();
-// The share s of a point that counts in its own neighbourhood.
-constexpr double own_share = 0.05;
-// Distances that differ by rounding alone are equal.
-constexpr double tolerance = 1.0 + 0x1p-40;
 constexpr std::size_t block_size = 16;
-// Nanoseconds for a distance and its part in the selection of the k nearest.
-constexpr double cost_of_a_pair = 2.0;
+// Nanoseconds for a distance with its part in the choice of the nearest, and for the sums of a
+// point and eight posteriors.
+constexpr double cost_of_a_pair = 0.6;
+constexpr double cost_of_sums = 40.0;
+// Gains that are kept at once: 16 MB.
+constexpr std::size_t most_gains = std::size_t{1} << 21;
 
-double mass_around(double others, double own) {
-    return (others + own_share * own) / (1.0 - (1.0 - own_share) * own);
+/// Eight doubles in one line of the cache.
+struct alignas(64) Line {
+    double values[lane_count];
+};
+
+/// Doubles that begin with a line of the cache.
+class Lined {
+  public:
+    explicit Lined(std::size_t count = 0, double value = 0.0) { resize(count, value); }
+    void resize(std::size_t count, double value = 0.0) {
+        Line line;
+        std::fill_n(line.values, lane_count, value);
+        lines_.resize((count + lane_count - 1) / lane_count, line);
+    }
+    double* data() { return lines_.data()->values; }
+    const double* data() const { return lines_.data()->values; }
+    double& operator[](std::size_t i) { return data()[i]; }
+
+  private:
+    std::vector<Line> lines_;
+};
+
+/// The points of positive prior weight of one set, coordinate by coordinate.
+Lined coordinates_of(const PointSets& sets, std::size_t set,
+                     const std::vector<std::uint32_t>& present, std::size_t stride) {
+    Lined coordinates(sets.dimension * stride, infinity);
+    const double* points = sets.points + set * sets.count * sets.dimension;
+    for (std::size_t i = 0; i < present.size(); ++i) {
+        for (std::size_t c = 0; c < sets.dimension; ++c) {
+            coordinates[c * stride + i] = points[present[i] * sets.dimension + c];
+        }
+    }
+    return coordinates;
+}
+
+/// Point by point, the prior and the posteriors beside each other.
+Lined rows_of(const std::vector<std::uint32_t>& present, const double* prior, const double* weights,
+              std::size_t count, std::size_t number, std::size_t columns) {
+    Lined rows(present.size() * columns);
+    for (std::size_t first = 0; first < present.size(); first += block_size) {
+        const std::size_t end = std::min(first + block_size, present.size());
+        for (std::size_t i = first; i < end; ++i) rows[i * columns] = prior[present[i]];
+        for (std::size_t p = 0; p < number; ++p) {
+            const double* own = weights + p * count;
+            for (std::size_t i = first; i < end; ++i) rows[i * columns + 1 + p] = own[present[i]];
+        }
+    }
+    return rows;
 }
 
 }  // namespace
 
-PriorNeighbors::PriorNeighbors(const double* points, std::size_t count, std::size_t dimension,
-                               const double* prior, std::uint32_t neighbors,
-                               const NearestNeighborConstants& constants, int threads)
-    : count_(count), inverse_mass_(count), blocks_((count + block_size - 1) / block_size) {
-    std::vector<double> coordinates(count * dimension);
-    std::size_t present = 0;
-    for (std::size_t n = 0; n < count; ++n) {
-        if (prior[n] > 0.0) ++present;
-        for (std::size_t c = 0; c < dimension; ++c) {
-            coordinates[c * count + n] = points[n * dimension + c];
-        }
+void prior_entropies(const PointSets& sets, const double* weights, std::size_t number,
+                     const EntropySettings& settings, const NearestNeighborConstants& constants,
+                     double* out) {
+    std::vector<std::uint32_t> present;
+    for (std::size_t n = 0; n < sets.count; ++n) {
+        if (settings.prior[n] > 0.0) present.push_back(static_cast<std::uint32_t>(n));
     }
-    const double d = static_cast<double>(dimension);
-    if (present == 1) {  // known to within the resolution
-        entropy_ = constants.log_ball_volume + d * log(constants.resolution);
-        for (Block& block : blocks_) block.ends.resize(block_size);
-        for (std::size_t n = 0; n < count; ++n) inverse_mass_[n] = prior[n] > 0.0 ? 1.0 : 0.0;
-        return;
-    }
-    const std::size_t k = std::min<std::size_t>(neighbors, present - 1);
-    const double least = constants.resolution * constants.resolution;
-    std::vector<double> terms(count);
-    const double work = cost_of_a_pair * static_cast<double>(count) * static_cast<double>(count);
-    parallel_for(blocks_.size(), threads_for(work, blocks_.size(), threads), [&](std::size_t at) {
-        Block& block = blocks_[at];
-        std::vector<double> distances(count), nearest(k);
-        for (std::size_t n = at * block_size; n < std::min((at + 1) * block_size, count); ++n) {
-            if (prior[n] > 0.0) {
-                std::fill(distances.begin(), distances.end(), 0.0);
-                for (std::size_t c = 0; c < dimension; ++c) {
-                    const double* column = &coordinates[c * count];
-                    for (std::size_t j = 0; j < count; ++j) {
-                        const double difference = column[j] - column[n];
-                        distances[j] += difference * difference;
+    const std::size_t size = present.size();
+    const std::size_t stride = (size + lane_count - 1) / lane_count * lane_count;
+    const std::size_t blocks = (size + block_size - 1) / block_size;
+    const auto k = static_cast<std::uint32_t>(std::min<std::size_t>(settings.neighbors, size - 1));
+    // As many posteriors at a time as one set allows, then as many sets.
+    const std::size_t most = std::max<std::size_t>(lane_count, most_gains / size) - 1;
+    for (std::size_t first = 0; first < number; first += most) {
+        const std::size_t here = std::min(most, number - first);
+        const std::size_t vectors = (1 + here + lane_count - 1) / lane_count;
+        const std::size_t columns = vectors * lane_count;
+        const double* own = weights + first * sets.count;
+        const Lined rows = rows_of(present, settings.prior, own, sets.count, here, columns);
+        const std::size_t together =
+            std::clamp<std::size_t>(most_gains / (size * columns), 1, sets.number);
+        Lined gains(together * size * columns), terms(together * size);
+        for (std::size_t from = 0; from < sets.number; from += together) {
+            const std::size_t of_sets = std::min(together, sets.number - from);
+            std::vector<Lined> coordinates;
+            for (std::size_t h = 0; h < of_sets; ++h) {
+                coordinates.push_back(coordinates_of(sets, from + h, present, stride));
+            }
+            const double work =
+                static_cast<double>(of_sets * size) * (cost_of_a_pair * static_cast<double>(size) +
+                                                       cost_of_sums * static_cast<double>(vectors));
+            const std::size_t pieces = of_sets * blocks;
+            parallel_for(pieces, threads_for(work, pieces, settings.threads), [&](std::size_t i) {
+                const std::size_t h = i / blocks, begin = i % blocks * block_size;
+                thread_local Lined scratch;
+                thread_local std::vector<std::uint32_t> numbers;
+                scratch.resize(2 * stride + k);
+                numbers.resize(stride + lane_count);
+                vector_kernels().prior_block({size, stride, sets.dimension, coordinates[h].data(),
+                                              vectors, rows.data(), k, constants},
+                                             begin, std::min(begin + block_size, size),
+                                             scratch.data(), numbers.data(), &terms[h * size],
+                                             &gains[h * size * columns]);
+            });
+            for (std::size_t h = 0; h < of_sets; ++h) {
+                // A single point is known to within the resolution.
+                double entropy = 0.0;
+                if (k == 0) {
+                    entropy = constants.log_ball_volume +
+                              static_cast<double>(sets.dimension) * log(constants.resolution);
+                } else {
+                    for (std::size_t n = 0; n < size; ++n) entropy += terms[h * size + n];
+                }
+                std::vector<double> gained(columns);
+                for (std::size_t n = 0; n < size; ++n) {
+                    const double* gain = &gains[(h * size + n) * columns];
+                    for (std::size_t column = 0; column < columns; ++column) {
+                        gained[column] += gain[column];
                     }
                 }
-                distances[n] = infinity;
-                for (std::size_t j = 0; j < count && present < count; ++j) {
-                    if (!(prior[j] > 0.0)) distances[j] = infinity;
+                for (std::size_t p = 0; p < here; ++p) {
+                    out[(from + h) * number + first + p] = entropy - gained[1 + p];
                 }
-                std::size_t within = 0;
-                for (std::size_t j = 0; j < count; ++j) within += distances[j] <= least * tolerance;
-                const bool resolved = within < k;
-                if (resolved) {
-                    std::partial_sort_copy(distances.begin(), distances.end(), nearest.begin(),
-                                           nearest.end());
-                }
-                const double radius = (resolved ? nearest[k - 1] : least) * tolerance;
-                double mass = 0.0;
-                const std::size_t first = block.members.size();
-                for (std::size_t j = 0; j < count; ++j) {
-                    if (distances[j] > radius) continue;
-                    block.members.push_back(static_cast<std::uint32_t>(j));
-                    mass += prior[j];
-                }
-                const std::size_t q = resolved ? k : block.members.size() - first;
-                // Rounding may leave nothing for the others, or less than their own sum.
-                const double rest = 1.0 - prior[n];
-                const double share = mass < rest ? mass / rest : 1.0;
-                terms[n] = prior[n] * (-log(share) + constants.log_ball_volume +
-                                       0.5 * d * log(radius) + constants.bias_correction[q]);
-                inverse_mass_[n] = 1.0 / mass_around(mass, prior[n]);
             }
-            block.ends.push_back(static_cast<std::uint32_t>(block.members.size()));
         }
-    });
-    for (const double term : terms) entropy_ += term;
-}
-
-void PriorNeighbors::entropies(const double* weights, std::size_t number, double* out) const {
-    // Point by point, the posteriors beside each other.
-    std::vector<double> columns(count_ * prior_lanes), ratios(count_ * prior_lanes);
-    for (std::size_t p = 0; p < number; ++p) {
-        for (std::size_t n = 0; n < count_; ++n) {
-            columns[n * prior_lanes + p] = weights[p * count_ + n];
-        }
-    }
-    std::size_t n = 0;
-    for (const Block& block : blocks_) {
-        std::size_t begin = 0;
-        for (std::size_t i = 0; i < block.ends.size() && n < count_; ++i, ++n) {
-            double others[prior_lanes] = {};
-            bool present = false;
-            for (std::size_t p = 0; p < prior_lanes; ++p) {
-                present |= columns[n * prior_lanes + p] > 0.0;
+        // Weight where the prior has none is without bound.
+        for (std::size_t p = 0; p < here && size < sets.count; ++p) {
+            bool outside = false;
+            for (std::size_t n = 0; n < sets.count; ++n) {
+                outside |= own[p * sets.count + n] > 0.0 && !(settings.prior[n] > 0.0);
             }
-            for (std::size_t at = present ? begin : block.ends[i]; at < block.ends[i]; ++at) {
-                const double* column = &columns[block.members[at] * prior_lanes];
-                for (std::size_t p = 0; p < prior_lanes; ++p) others[p] += column[p];
-            }
-            begin = block.ends[i];
-            for (std::size_t p = 0; p < prior_lanes; ++p) {
-                const double own = columns[n * prior_lanes + p];
-                ratios[n * prior_lanes + p] =
-                    own > 0.0 ? mass_around(others[p], own) * inverse_mass_[n] : 1.0;
+            for (std::size_t set = 0; set < sets.number && outside; ++set) {
+                out[set * number + first + p] = infinity;
             }
         }
     }
-    vector_kernels().log(ratios.data(), ratios.data(), ratios.size());
-    double gained[prior_lanes] = {};
-    for (std::size_t row = 0; row < count_; ++row) {
-        for (std::size_t p = 0; p < prior_lanes; ++p) {
-            gained[p] += columns[row * prior_lanes + p] * ratios[row * prior_lanes + p];
-        }
-    }
-    for (std::size_t p = 0; p < number; ++p) out[p] = entropy_ - gained[p];
-}
-
-std::size_t PriorNeighbors::members() const {
-    std::size_t total = 0;
-    for (const Block& block : blocks_) total += block.members.size();
-    return total;
 }
 
 }  // namespace holdfast

@@ -15,39 +15,16 @@
 #pragma once
 
 #include <cstddef>
-#include <cstdint>
-#include <vector>
 
+#include "entropy.hpp"
 #include "vector_kernels.hpp"
 
 namespace holdfast {
 
-/// Posteriors whose entropies are computed side by side.
-inline constexpr std::size_t prior_lanes = 8;
-
-class PriorNeighbors {
-  public:
-    /// `prior` [count]: not negative, one of them positive, sum 1.
-    PriorNeighbors(const double* points, std::size_t count, std::size_t dimension,
-                   const double* prior, std::uint32_t neighbors,
-                   const NearestNeighborConstants& constants, int threads);
-
-    /// `weights` [number][count], number <= prior_lanes. For several of them from several threads.
-    void entropies(const double* weights, std::size_t number, double* out) const;
-
-    /// Members of all neighbourhoods together.
-    std::size_t members() const;
-
-  private:
-    /// The neighbourhoods of points one after another.
-    struct Block {
-        std::vector<std::uint32_t> members, ends;
-    };
-
-    std::size_t count_;
-    double entropy_ = 0.0;              // of the prior
-    std::vector<double> inverse_mass_;  // [count] 1 / m_n(w), 0 where w_n is 0
-    std::vector<Block> blocks_;
-};
+/// Entropies out[set][posterior] of `number` posteriors, weights[number][count]. The prior,
+/// settings.prior: not negative, one of them positive, sum 1.
+void prior_entropies(const PointSets& sets, const double* weights, std::size_t number,
+                     const EntropySettings& settings, const NearestNeighborConstants& constants,
+                     double* out);
 
 }  // namespace holdfast

@@ -61,6 +61,18 @@ struct CompactPosterior {
     double* scratch;  // [stride + the k of the nearest neighbours]
 };
 
+/// Points of a prior and posteriors over them, side by side (prior_neighbors.hpp).
+struct PriorGroup {
+    std::size_t count;   // points of positive prior weight
+    std::size_t stride;  // a multiple of 8
+    std::size_t dimension;
+    const double* coordinates;  // [dimension][stride], +infinity beyond count
+    std::size_t vectors;        // Lanes in a row
+    const double* weights;      // [count][vectors * 8]: in column 0 of the prior
+    std::uint32_t neighbors;    // the k, 0 if there is one point
+    NearestNeighborConstants constants;
+};
+
 struct VectorKernels {
     const char* name;
     void (*exp)(const double* in, double* out, std::size_t count);
@@ -85,6 +97,9 @@ struct VectorKernels {
                           double* scratch, double* out, std::uint64_t* visits);
     void (*group_mixture)(const PosteriorGroup&, std::size_t leaf, double exponent, double* out,
                           std::uint64_t* visits);
+    /// The terms of the points [begin, end) of a prior; see lanes/prior_block.hpp.
+    void (*prior_block)(const PriorGroup&, std::size_t begin, std::size_t end, double* scratch,
+                        std::uint32_t* numbers, double* terms, double* gains);
 };
 
 /// The best of the compiled sets that this processor runs; HOLDFAST_SIMD names another one.

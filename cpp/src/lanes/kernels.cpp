@@ -9,6 +9,7 @@
 #include "elementwise.hpp"
 #include "group_entropy.hpp"
 #include "posterior.hpp"
+#include "prior_block.hpp"
 
 namespace holdfast::inline HOLDFAST_ISA {
 
@@ -16,7 +17,7 @@ extern const VectorKernels table;
 const VectorKernels table = {
     HOLDFAST_ISA_NAME, exp_array,       log_array,     sin_array,     cos_array,
     normals_array,     sum_array,       weighted_sums, posterior,     normalize,
-    compact_nearest,   compact_mixture, group_nearest, group_mixture,
+    compact_nearest,   compact_mixture, group_nearest, group_mixture, prior_block,
 };
 
 }  // namespace holdfast::inline HOLDFAST_ISA
