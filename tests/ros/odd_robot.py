@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import threading
 import time
 from typing import Any
 
@@ -30,6 +31,7 @@ class OddRobot(Node):  # type: ignore[misc]
         self._act = self.declare_parameter("act", "well").value
         self._done = self.declare_parameter("done", "").value
         self._steps = 0
+        self._moving = threading.Lock()
         group = ReentrantCallbackGroup()
         if self._sense != "absent":
             self.create_service(Sense, "robot/sense", self.sense, callback_group=group)
@@ -64,14 +66,16 @@ class OddRobot(Node):  # type: ignore[misc]
         if request.begin:
             self._steps = 0
         response.success = True
-        response.steps = self._steps
+        with self._moving:
+            response.steps = self._steps
         response.failed = self._done == "failed"
         response.message = "the arm has hit the table" if response.failed else ""
         return response
 
     def act(self, goal: Any) -> Any:
         result = Act.Result(reward=math.nan)
-        say(f"moving {list(goal.request.task_action)}")
+        if self._act != "long":
+            say(f"moving {list(goal.request.task_action)}")
         if self._act == "die":
             os._exit(1)
         if self._act == "abort":
@@ -90,9 +94,11 @@ class OddRobot(Node):  # type: ignore[misc]
                     result.message = "stopped"
                     return result
                 time.sleep(0.05)
-        if self._act == "long":
-            time.sleep(2.0)
-        self._steps += 1
+        with self._moving:
+            if self._act == "long":
+                say("moving, and whoever asks waits")
+                time.sleep(2.0)
+            self._steps += 1
         result.success = True
         result.reward = -1.0
         goal.succeed()

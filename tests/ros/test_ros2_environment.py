@@ -151,7 +151,6 @@ class TestARobot:
         assert robot.next_line().startswith("moving")
         driver.kill()
         again = start_driver()
-        # This robot answers while it moves, and counts a task action at its end.
         again.do("make", resumed=True)
         assert again.do("steps_performed") == 1
 

@@ -34,8 +34,8 @@ def robot() -> Iterator[Robot]:
     robot.pool.shutdown()
 
 
-def executive(interval: int = 1) -> DecisionHandover:
-    return DecisionHandover(problem_class("peg_in_hole_2d")(), interval)
+def executive() -> DecisionHandover:
+    return DecisionHandover(problem_class("peg_in_hole_2d")())
 
 
 def observation() -> np.ndarray:
@@ -43,7 +43,7 @@ def observation() -> np.ndarray:
 
 
 def test_a_trial_goes_from_call_to_call(robot: Robot) -> None:
-    meeting = executive(interval=1)
+    meeting = executive()
     world = ExecutiveEnvironment(meeting, trial=3)
     sensed = robot.ask(world.perform_sensing, 2)
     first = meeting.call(DecideRequest(), FOREVER_S)
@@ -87,21 +87,20 @@ def test_a_repeated_call_gets_the_same_decision(robot: Robot) -> None:
 
 
 @pytest.mark.parametrize(
-    ("interval", "step", "sensing", "before"),
+    ("step", "sensing", "before"),
     [
-        (1, 0, True, (4, 17)),
-        (1, 0, False, (5, 1)),
-        (1, 1, False, (5, 2)),
-        (1, 2, True, (5, 4)),
-        (1, 2, False, (5, 5)),
-        (0, 1, True, (5, 2)),
+        (0, True, (4, 17)),
+        (0, False, (5, 1)),
+        (1, False, (5, 2)),
+        (2, True, (5, 4)),
+        (2, False, (5, 1)),
     ],
 )
 def test_after_a_crash_the_call_before_is_known_as_such(
-    robot: Robot, interval: int, step: int, sensing: bool, before: tuple[int, int]
+    robot: Robot, step: int, sensing: bool, before: tuple[int, int]
 ) -> None:
-    meeting = executive(interval)
-    world = ExecutiveEnvironment(meeting, 5, step)
+    meeting = executive()
+    world = ExecutiveEnvironment(meeting, 5, [np.zeros(2)] * step)
     if sensing:
         robot.ask(world.perform_sensing, 0)
     else:
@@ -130,6 +129,7 @@ def test_after_a_crash_the_call_before_is_known_as_such(
             "observation of 4 values: sensing action 0 of peg_in_hole_2d",
         ),
         (DecideRequest(0, 1, np.array([np.inf])), "observation[0] is inf: must be a finite number"),
+        (DecideRequest(0, 1, observation(), done=3), "done 3: allowed are 0 to 2"),  # type: ignore[arg-type]
         (DecideRequest(0, 1, observation(), np.inf), "reward inf: must be a finite number"),
         (
             DecideRequest(0, 1, observation(), done=True),
@@ -163,7 +163,7 @@ def test_nan_is_no_reading(robot: Robot) -> None:
 
 def test_a_task_action_shows_nothing(robot: Robot) -> None:
     meeting = executive()
-    robot.ask(ExecutiveEnvironment(meeting, 0, 1).perform, np.zeros(2))
+    robot.ask(ExecutiveEnvironment(meeting, 0, [np.zeros(2)]).perform, np.zeros(2))
     assert meeting.call(DecideRequest(), FOREVER_S).code == DecideCode.OK
     reply = meeting.call(DecideRequest(0, 4, observation()), FOREVER_S)
     assert "observation of 1 values: number 4 is a task action" in reply.message

@@ -131,10 +131,6 @@ def test_help_needs_no_ros_and_names_every_parameter(
         ({"assignments": "a.b=1"}, 'assignments is "a.b=1"; expected a list, as in [a.b=1]'),
         ({"assignments": ["a.b="]}, "assignments[0] is 'a.b='; expected SECTION.KEY=YAML"),
         ({"assignments": ["a.b=1"]}, "a is not a known section"),
-        (
-            {"environment__kind": "ros", "environment__sense__index": "axis"},
-            "environment.sense.index: fields of other types are mapped no more; the robot offers",
-        ),
         ({"environment__act": "topic"}, 'environment.act is "topic"; expected'),
         ({"environment__discovery_timeout_ms": 0}, "environment.discovery_timeout_ms is 0"),
         (

@@ -43,10 +43,9 @@ class Segments:
             self.on_order(segment, self.orders)
 
         segment = RunSegment(
-            self.configuration,
-            self.path,
-            World(self.maker, lambda _: None),
-            rate_hz=None,
+            configuration=self.configuration,
+            path=self.path,
+            world=World(self.maker, lambda _: None),
             after_reboot=after_reboot,
             sink=BoundedEventLog(),
             on_order=order,

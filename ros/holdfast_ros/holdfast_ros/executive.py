@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import enum
 import threading
+from collections.abc import Sequence
 from time import monotonic
 from typing import NamedTuple
 
@@ -23,7 +24,6 @@ from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.outcome import Done
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import ObservationSizes, is_no_reading
-from holdfast.robot.environment_maker import EnvironmentMaker
 
 __all__ = [
     "DecideCode",
@@ -31,7 +31,6 @@ __all__ = [
     "DecisionHandover",
     "DueDecision",
     "ExecutiveEnvironment",
-    "ExecutiveMaker",
 ]
 
 
@@ -92,9 +91,8 @@ class DecisionHandover:
     It serves one run, until that ends or is held. Only callers' threads may use ``problem``.
     """
 
-    def __init__(self, problem: Problem, sensing_interval: int) -> None:
+    def __init__(self, problem: Problem) -> None:
         self._problem = problem
-        self._interval = sensing_interval
         self._sizes = ObservationSizes(problem)
         self._changed = threading.Condition()
         self._due: DueDecision | None = None
@@ -136,7 +134,8 @@ class DecisionHandover:
             while self._end is None:
                 due = self._due
                 if due is not None:
-                    if not call.number or self._precedes(named, due):
+                    # An outcome of before was taken; this is a repeated call.
+                    if not call.number or named < (due.trial, due.number):
                         return DecideReply(DecideCode.OK, due=due)
                     try:
                         self._check(call, due)
@@ -154,16 +153,6 @@ class DecisionHandover:
                     )
             return self._end
 
-    def _precedes(self, named: tuple[int, int], due: DueDecision) -> bool:
-        """Return whether a decision directly precedes the due one."""
-        if due.number <= 1 or (due.number == 2 and not self._senses_at(0)):
-            return named[0] == due.trial - 1
-        by_sensing = due.sensing_action is None and self._senses_at(due.step)
-        return named == (due.trial, due.number - 1 if by_sensing else 2 * due.step)
-
-    def _senses_at(self, step: int) -> bool:
-        return step % (self._interval + 1) == 0
-
     @staticmethod
     def _wrong_number(named: tuple[int, int], expected: tuple[int, int] | None) -> str:
         trial, number = expected or (0, 0)
@@ -177,6 +166,8 @@ class DecisionHandover:
             raise InvalidValueError(
                 self._wrong_number((call.trial, call.number), (due.trial, due.number))
             )
+        if call.done not in (False, True, "failed"):
+            raise InvalidValueError(f"done {call.done}: allowed are 0 to 2")
         if call.reward is not None and not np.isfinite(call.reward):
             raise InvalidValueError(f"reward {call.reward}: must be a finite number")
         if due.sensing_action is None:
@@ -206,12 +197,14 @@ class DecisionHandover:
 
 
 class ExecutiveEnvironment:
-    """One trial that an executive performs; the journal has ``step`` task actions of it."""
+    """One trial that an executive performs; the journal has ``performed`` task actions of it."""
 
-    def __init__(self, executive: DecisionHandover, trial: int = 0, step: int = 0) -> None:
+    def __init__(
+        self, executive: DecisionHandover, trial: int = 0, performed: Sequence[FloatArray] = ()
+    ) -> None:
         self._executive = executive
         self._trial = trial
-        self._step = step
+        self._step = len(performed)
         self._done: Done = False
 
     def perform_sensing(self, sensing_action: int) -> FloatArray:
@@ -240,28 +233,3 @@ class ExecutiveEnvironment:
         has performed it, and answers without performing it twice.
         """
         return self._step
-
-
-class ExecutiveMaker(EnvironmentMaker):
-    """Makes the environment of each trial; a decision may take the executive ``timeout_ms``."""
-
-    def __init__(
-        self,
-        executive: DecisionHandover,
-        problem: Problem,
-        timeout_ms: float,
-        max_missing_in_a_row: int,
-    ) -> None:
-        super().__init__(
-            "the executive", problem, 0, timeout_ms, max_missing_in_a_row=max_missing_in_a_row
-        )
-        self.simulated = False
-        self._executive = executive
-
-    def __call__(
-        self, trial: int, *, resumed: bool = False, performed: object = ()
-    ) -> ExecutiveEnvironment:
-        """Make the environment of a trial."""
-        del resumed
-        assert isinstance(performed, list | tuple)
-        return ExecutiveEnvironment(self._executive, trial, len(performed))

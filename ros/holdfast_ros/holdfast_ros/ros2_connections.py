@@ -1,4 +1,4 @@
-"""A node's clients and subscriptions to a robot, kept from trial to trial."""
+"""A node's clients to a robot, kept from trial to trial."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-__all__ = ["CallClients", "Connections", "LatchedTopic", "RobotCall"]
+__all__ = ["CallClients", "Connections", "RobotCall"]
 
 
 class RobotCall(NamedTuple):
@@ -32,17 +31,6 @@ class RobotCall(NamedTuple):
         return f"{word} {self.name} ({package}/{kind}/{self.type.__name__})"
 
 
-class LatchedTopic:
-    """The last message of a topic that tells a state; None before the first."""
-
-    def __init__(self) -> None:
-        self.message: Any = None
-
-    def take(self, message: Any) -> None:
-        """Keep a message."""
-        self.message = message
-
-
 class CallClients(NamedTuple):
     """The clients of one service, or the three of one action."""
 
@@ -56,7 +44,7 @@ class CallClients(NamedTuple):
 
 
 class Connections:
-    """A node's clients and subscriptions, kept from trial to trial to save discovery.
+    """A node's clients, kept from trial to trial to save discovery.
 
     An executor must spin the node in other threads than those that use this.
     """
@@ -66,7 +54,6 @@ class Connections:
         # Answers arrive whatever else the node does in its callbacks.
         self._group = ReentrantCallbackGroup()
         self._clients: dict[RobotCall, CallClients] = {}
-        self._topics: dict[str, LatchedTopic] = {}
         self._lock = threading.Lock()
         self._users: weakref.WeakSet[Any] = weakref.WeakSet()
 
@@ -100,20 +87,6 @@ class Connections:
                     self._client(parts.CancelGoalService, f"{call.name}/_action/cancel_goal"),
                 )
         return self._clients[call]
-
-    def latched_topic(self, name: str, message_type: Any) -> LatchedTopic:
-        """Return the last message of a topic."""
-        if name not in self._topics:
-            topic = self._topics[name] = LatchedTopic()
-            quality = QoSProfile(
-                depth=1,
-                reliability=ReliabilityPolicy.RELIABLE,
-                durability=DurabilityPolicy.TRANSIENT_LOCAL,
-            )
-            self.node.create_subscription(
-                message_type, name, topic.take, quality, callback_group=self._group
-            )
-        return self._topics[name]
 
     def _client(self, service_type: Any, name: str) -> Any:
         return self.node.create_client(service_type, name, callback_group=self._group)

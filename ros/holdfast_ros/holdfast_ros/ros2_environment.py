@@ -51,12 +51,6 @@ _CANCEL_S = 1.0
 _GOAL_ENDED = {4: "succeeded", 5: "was cancelled", 6: "was aborted"}
 """``action_msgs/msg/GoalStatus`` of ended goals."""
 
-_GOAL_ACTIVE = (1, 2, 3)
-"""Of goals that are accepted, executing or being cancelled."""
-
-_STATUS_S = 1.0
-"""Longest wait for a server's goal status; a server without goals sends none."""
-
 
 class Ros2Environment:
     """A trial of a robot that is reached through ROS.
@@ -96,7 +90,7 @@ class Ros2Environment:
         if not resumed:
             self._ask(begin=True)
         else:
-            self._wait_until_it_stands()
+            # A robot that still moves answers when it stands.
             self._step = self.steps_performed()
 
     # -- what the robot's loop calls -------------------------------------------------------------
@@ -154,32 +148,6 @@ class Ros2Environment:
 
     def _ask(self, *, begin: bool = False) -> Any:
         return self._call(self._trial_call, _Trial.Request(trial=self._trial, begin=begin))
-
-    def _wait_until_it_stands(self) -> None:
-        """Wait for the end of a goal of an earlier process: until then the count may change."""
-        act = self._act_call
-        if not act.is_action:
-            return
-        status = self._connections.latched_topic(
-            f"{act.name}/_action/status", act.type.Impl.GoalStatusMessage
-        )
-        # The topic is latched, but a server without goals has published nothing.
-        first = Deadline(_STATUS_S, "")
-        while status.message is None and not self._wait(first, lambda: False, 0.02):
-            pass
-        deadline = self._deadline()
-        while status.message is not None and any(
-            goal.status in _GOAL_ACTIVE for goal in status.message.status_list
-        ):
-            if self._wait(deadline, lambda: False, 0.02):
-                raise EnvironmentFailedError(
-                    f"{act} is still busy with a goal of before"
-                    + (
-                        f": {self._cancelled}"
-                        if self._cancelled
-                        else f", {deadline.limit_s:g} s later ({deadline.key})"
-                    )
-                )
 
     @staticmethod
     def _reason(answer: Any) -> str:

@@ -17,13 +17,12 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-import diagnostic_msgs.msg
-import geometry_msgs.msg
 import holdfast_interfaces.action
-import holdfast_interfaces.msg
 import holdfast_interfaces.srv
 import numpy as np
-import std_msgs.msg
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseArray
+from holdfast_interfaces.msg import BeliefStamped, Decision
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
@@ -31,6 +30,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
 
 from holdfast.errors import HoldfastError
 from holdfast.planning.planner import PlanningState
@@ -58,10 +58,12 @@ __all__ = ["NUM_THREADS", "HoldfastNode"]
 
 _Run = holdfast_interfaces.action.Run
 _Decide = holdfast_interfaces.srv.Decide
-_Level = diagnostic_msgs.msg.DiagnosticStatus
 
 _MOST_CALLS = 3
 """Calls of ``~/decide`` that may wait at once."""
+
+_DONE: Mapping[int, Any] = {0: False, 1: True, 2: "failed"}
+"""Of a call's ``done``; any other number is refused."""
 
 NUM_THREADS = 4 + _MOST_CALLS
 """Of the executor: a goal and the calls may keep theirs for a while, the rest is always free."""
@@ -71,38 +73,15 @@ _DIAGNOSTICS_S = 1.0
 _RESULT_S = 0.5
 """At the end of the process: for the client that waits for its result to get it."""
 
-_TOLD_AT_ONCE = frozenset(
-    (
-        "status",
-        "holding",
-        "resumed",
-        "launch_failed",
-        "recovery_exited",
-        "unexplained",
-        "lost",
-        "sensor_suspect",
-        "reinitialised",
-        "service_vanished",
-        "service_appeared",
-        "wrong_answer",
-        "stopped",
-        "trial",
-    )
-)
+_LOGGED = {
+    *("status", "holding", "resumed", "lost", "sensor_suspect", "reinitialised", "wrong_answer"),
+    "stopped",
+}
+_TOLD_AT_ONCE = _LOGGED | {
+    *("launch_failed", "recovery_exited", "unexplained", "service_vanished", "service_appeared"),
+    "trial",
+}
 """Events that change the diagnostics."""
-
-_LOGGED = frozenset(
-    (
-        "status",
-        "holding",
-        "resumed",
-        "lost",
-        "sensor_suspect",
-        "reinitialised",
-        "wrong_answer",
-        "stopped",
-    )
-)
 
 
 class _Events:
@@ -154,21 +133,12 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         self._goals_ended.set()
 
         best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self._cloud_publisher = self.create_lifecycle_publisher(
-            geometry_msgs.msg.PoseArray, "~/particle_cloud", best_effort
-        )
-        self._belief_publisher = self.create_lifecycle_publisher(
-            holdfast_interfaces.msg.BeliefStamped, "~/belief", best_effort
-        )
-        self._decision_publisher = self.create_lifecycle_publisher(
-            holdfast_interfaces.msg.Decision, "~/decision", QoSProfile(depth=100)
-        )
-        self._status_publisher = self.create_lifecycle_publisher(
-            std_msgs.msg.String, "~/status", QoSProfile(depth=10)
-        )
-        self._diagnostics_publisher = self.create_lifecycle_publisher(
-            diagnostic_msgs.msg.DiagnosticArray, "/diagnostics", QoSProfile(depth=10)
-        )
+        publish = self.create_lifecycle_publisher
+        self._cloud_publisher = publish(PoseArray, "~/particle_cloud", best_effort)
+        self._belief_publisher = publish(BeliefStamped, "~/belief", best_effort)
+        self._decision_publisher = publish(Decision, "~/decision", 100)
+        self._status_publisher = publish(String, "~/status", 10)
+        self._diagnostics_publisher = publish(DiagnosticArray, "/diagnostics", 10)
         self._group = ReentrantCallbackGroup()
         self._decide_server = self.create_service(
             _Decide, "~/decide", self._decide, callback_group=self._group
@@ -205,15 +175,11 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def _judge_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         known = known_parameters()
-        if self._parameters_read is not None:
-            for parameter in parameters:
-                if parameter.name in known or "." in parameter.name:
-                    return SetParametersResult(
-                        successful=False,
-                        reason=f"{parameter.name} is read-only once the node is configured: "
-                        "clean it up first",
-                    )
-        return SetParametersResult(successful=True)
+        ours = [each.name for each in parameters if each.name in known or "." in each.name]
+        if self._parameters_read is None or not ours:
+            return SetParametersResult(successful=True)
+        reason = f"{ours[0]} is read-only once the node is configured: clean it up first"
+        return SetParametersResult(successful=False, reason=reason)
 
     def _values(self) -> Mapping[str, Any]:
         return {
@@ -353,9 +319,9 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             telemetry.order(state, order, segment.status)
 
         segment = RunSegment(
-            configuration,
-            read.run_directory,
-            world,
+            configuration=configuration,
+            path=read.run_directory,
+            world=world,
             rate_hz=read.own.rate_hz or None,
             after_reboot=read.own.after_reboot,
             sink=_Events(self, diagnostics, telemetry),
@@ -478,20 +444,14 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             response.code = DecideCode.FINISHED
             response.message = "" if last is None else last.message
             return response
-        if request.done > _Decide.Request.FAILED:
-            reply = handover.call(DecideRequest(), read.own.decide_timeout_s)  # asks what is due
-            if reply.code in (DecideCode.OK, DecideCode.HOLDING):
-                message = f"done {request.done}: allowed are 0 to {_Decide.Request.FAILED}"
-                reply = reply._replace(code=DecideCode.BAD_REQUEST, message=message)
-        else:
-            call = DecideRequest(
-                request.trial,
-                request.number,
-                np.array(request.observation, dtype=np.float64),
-                request.reward if request.has_reward else None,
-                (False, True, "failed")[request.done],
-            )
-            reply = handover.call(call, read.own.decide_timeout_s)
+        call = DecideRequest(
+            request.trial,
+            request.number,
+            np.array(request.observation, dtype=np.float64),
+            request.reward if request.has_reward else None,
+            _DONE.get(request.done, request.done),
+        )
+        reply = handover.call(call, read.own.decide_timeout_s)
         response.code, response.message = reply.code, reply.message
         response.status = segment.status
         due = reply.due
@@ -562,21 +522,19 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             return
         told = diagnostics.tell(segment, last, telemetry)
         facts = told.facts | {"run_directory": str(read.run_directory)}
-        status = _Level(
+        status = DiagnosticStatus(
             level=bytes((told.level,)),
             name=f"{self.get_name()}: active sensing",
             message=told.word,
             hardware_id=read.configuration.offload.name or "",
-            values=[
-                diagnostic_msgs.msg.KeyValue(key=key, value=value) for key, value in facts.items()
-            ],
+            values=[KeyValue(key=key, value=value) for key, value in facts.items()],
         )
-        message = diagnostic_msgs.msg.DiagnosticArray(status=[status])
+        message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(message)
         # The status; after the end of the run, how it ended.
         word = told.word if segment is None else told.facts["status"] or told.word
-        self._status_publisher.publish(std_msgs.msg.String(data=word))
+        self._status_publisher.publish(String(data=word))
 
 
 def _in_words(error: Exception) -> str:

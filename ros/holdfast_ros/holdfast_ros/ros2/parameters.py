@@ -35,10 +35,6 @@ __all__ = [
 ]
 
 _SECTIONS_OF_PROBLEMS = ("model.", "state_space_planner.")
-_MAPPED = tuple(
-    f"environment.{role}." for role in ("sense", "act", "done", "steps", "reset", "observation")
-)
-"""Sections of earlier versions, which mapped the fields of other types."""
 _OF_ROS = ("use_sim_time", "start_type_description_service")
 _OF_ROS_SECTIONS = ("qos_overrides.",)
 
@@ -211,10 +207,5 @@ def _assigned(index: int, assignment: str) -> tuple[str, Any]:
 
 
 def _unknown(name: str) -> ConfigurationError:
-    if name.startswith(_MAPPED):
-        return ConfigurationError(
-            f"{name}: fields of other types are mapped no more; the robot offers robot/sense, "
-            "robot/act and robot/trial, or it is a Python class (environment.object): docs/ros.md"
-        )
     hint = close_match(name, known_parameters())
     return ConfigurationError(f"{name} is no parameter of this node{hint}")

@@ -13,6 +13,7 @@ import itertools
 import threading
 import traceback
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -34,7 +35,7 @@ from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
 from holdfast.robot.health import Condition
 from holdfast.robot.process import RobotProcess
 from holdfast.runtime.events import EventSink
-from holdfast_ros.executive import DecideCode, DecisionHandover, ExecutiveMaker
+from holdfast_ros.executive import DecideCode, DecisionHandover, ExecutiveEnvironment
 from holdfast_ros.ros2.parameters import NodeParameters, in_parameters
 
 __all__ = ["MAX_TRIALS_TOLD", "Ending", "RunSegment", "SegmentResult", "World", "make_world"]
@@ -94,41 +95,41 @@ def make_world(connections: Any, parameters: NodeParameters) -> World:
 
     Raises HoldfastError if that cannot be; the message names the parameter.
     """
-    configuration = parameters.configuration
-    if parameters.own.environment == "configuration":
+    configuration, own = parameters.configuration, parameters.own
+    if own.environment == "configuration":
         return World(load_environment(configuration), lambda _: None)
     # Other threads than the robot's use it.
     problem = Configuration.from_plain(configuration.plain()).problem
+    handover = DecisionHandover(problem) if own.environment == "executive" else None
     timeout_ms = configuration.environment.timeout_ms
-    missing = configuration.environment.max_missing_in_a_row
-    if parameters.own.environment == "executive":
-        handover = DecisionHandover(problem, configuration.planning.sensing_interval)
-        return World(
-            ExecutiveMaker(handover, configuration.problem, timeout_ms, missing),
-            functools.partial(handover.end, DecideCode.ENDED),
-            interrupt_at_once=True,
-            handover=handover,
-        )
-    from holdfast_ros.ros2_environment import Ros2Environment
+    make: Any
+    if handover is not None:
+        make = functools.partial(ExecutiveEnvironment, handover)
+    else:
+        from holdfast_ros.ros2_environment import Ros2Environment
 
-    make: Any = functools.partial(
-        Ros2Environment,
-        connections,
-        act=parameters.own.act,
-        timeout_ms=timeout_ms,
-        discovery_timeout_ms=parameters.own.discovery_timeout_ms,
-    )
+        make = functools.partial(
+            Ros2Environment,
+            connections,
+            act=own.act,
+            timeout_ms=timeout_ms,
+            discovery_timeout_ms=own.discovery_timeout_ms,
+        )
     maker = EnvironmentMaker(
-        "the robot",
-        problem,
+        "the executive" if handover else "the robot",
+        configuration.problem if handover else problem,
         configuration.simulator.seed,
         timeout_ms,
         make,
-        max_missing_in_a_row=missing,
+        max_missing_in_a_row=configuration.environment.max_missing_in_a_row,
     )
-    return World(maker, lambda _: connections.cancel())
+    if handover is None:
+        return World(maker, lambda _: connections.cancel())
+    ended = functools.partial(handover.end, DecideCode.ENDED)
+    return World(maker, ended, interrupt_at_once=True, handover=handover)
 
 
+@dataclass(eq=False, kw_only=True)
 class RunSegment:
     """Runs the remaining trials of the run in the directory ``path``, once it is started.
 
@@ -137,28 +138,17 @@ class RunSegment:
     segment's thread. ``outcome`` is there when ``ended`` is set.
     """
 
-    def __init__(
-        self,
-        configuration: Configuration,
-        path: Path,
-        world: World,
-        *,
-        rate_hz: float | None,
-        after_reboot: bool = False,
-        sink: EventSink,
-        on_order: Callable[[PlanningState, Act | Sense], None],
-        on_timing: Callable[[Timing], None],
-        on_end: Callable[[SegmentResult], None],
-    ) -> None:
-        self._configuration = configuration
-        self._path = path
-        self.world = world
-        self._rate_hz = rate_hz
-        self._after_reboot = after_reboot
-        self._sink = sink
-        self._on_order = on_order
-        self._on_timing = on_timing
-        self._on_end = on_end
+    configuration: Configuration
+    path: Path
+    world: World
+    sink: EventSink
+    on_order: Callable[[PlanningState, Act | Sense], None]
+    on_timing: Callable[[Timing], None]
+    on_end: Callable[[SegmentResult], None]
+    rate_hz: float | None = None
+    after_reboot: bool = False
+
+    def __post_init__(self) -> None:
         self._changed = threading.Lock()
         self._process: RobotProcess | None = None
         self._why_paused: str | None = None
@@ -223,12 +213,12 @@ class RunSegment:
     def _work(self) -> None:
         trials: tuple[TrialResult, ...] = ()
         try:
-            with RunDirectory.resume_if_begun(self._path, self._configuration) as directory:
+            with RunDirectory.resume_if_begun(self.path, self.configuration) as directory:
                 try:
                     self._run(directory)
                 finally:
                     trials = tuple(itertools.islice(directory.journal.results(), MAX_TRIALS_TOLD))
-                complete = self.num_finished >= self._configuration.simulator.num_trials
+                complete = self.num_finished >= self.configuration.simulator.num_trials
             if complete:
                 result = SegmentResult(Ending.FINISHED, f"{self.num_finished} trials", trials)
             else:
@@ -242,7 +232,7 @@ class RunSegment:
         result = result._replace(status=self.status, num_finished=self.num_finished)
         self.outcome = result
         try:
-            self._on_end(result)
+            self.on_end(result)
         finally:
             self.ended.set()
 
@@ -263,16 +253,16 @@ class RunSegment:
             directory.add(result)
             self.num_finished += 1
 
-        observer = RobotObserver(self._take_process, self._on_order, self._on_timing)
+        observer = RobotObserver(self._take_process, self.on_order, self.on_timing)
         try:
             perform_trials(
-                self._configuration,
+                self.configuration,
                 directory,
                 self.world.maker,
                 on_result,
-                rate_hz=self._rate_hz,
-                after_reboot=self._after_reboot,
-                sinks=[self._sink],
+                rate_hz=self.rate_hz,
+                after_reboot=self.after_reboot,
+                sinks=[self.sink],
                 observer=observer,
             )
         except BaseException:
