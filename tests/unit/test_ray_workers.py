@@ -5,12 +5,16 @@ from __future__ import annotations
 import csv
 import secrets
 import sys
+from collections.abc import Callable
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import pytest
 from tests.processes.faults import holdfast
-from tests.unit.test_tuning_tune import MEAN, OF_MEAN
+from tests.unit.test_tuning_tune import MEAN, OF_MEAN, RUN, tuned
 
 from holdfast.errors import InvalidValueError
 from holdfast.runtime.ray_workers import RayCluster
@@ -24,6 +28,55 @@ def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InvalidValueError, match=r"Ray cannot be .*pip install 'holdfast\[ray\]'"):
         RayCluster("auto")
+
+
+class FakeRay(ModuleType):
+    """Ray's part that is used, of which the actors are in this process; the first one is lost."""
+
+    def __init__(self) -> None:
+        super().__init__("ray")
+        self.calls: list[str] = []
+
+    def init(self, **_: Any) -> None:
+        self.calls.append("init")
+
+    def shutdown(self) -> None:
+        self.calls.append("shutdown")
+
+    def cluster_resources(self) -> dict[str, float]:
+        return {"CPU": 1.0}
+
+    def get(self, asked: Callable[[], list[bytes]]) -> list[bytes]:
+        return asked()
+
+    def kill(self, actor: Any) -> None:
+        self.calls.append("kill")
+
+    def remote(self, **_: Any) -> Callable[[type], Any]:
+        self.calls.append("actor")
+        lost = self.calls.count("actor") == 1
+
+        def answers(runner: Any, message: bytes) -> list[bytes]:
+            if lost:
+                raise RuntimeError("The node\nhas died.")
+            return runner.all_answers(message)  # type: ignore[no-any-return]
+
+        def started(kind: type, threads: int) -> Any:
+            runner = kind(threads)
+            method = SimpleNamespace(remote=lambda message: partial(answers, runner, message))
+            return SimpleNamespace(all_answers=method)
+
+        return lambda kind: SimpleNamespace(remote=lambda threads: started(kind, threads))
+
+
+def test_a_lost_actor_costs_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "run.yaml").write_text(RUN)
+    here = tuned(tmp_path / "run.yaml")
+    fake = FakeRay()
+    monkeypatch.setitem(sys.modules, "ray", fake)
+    there = tuned(tmp_path / "run.yaml", jobs=None, ray="auto")
+    assert there.comparisons == here.comparisons
+    assert fake.calls == ["init", "actor", "kill", "actor", "kill", "shutdown"]
 
 
 @absent
