@@ -172,12 +172,10 @@ class WorkerDiedError(HoldfastError):
 
     Attributes
     ----------
-    arm, trial
-        What it ran.
+    arm : Arm or None
+        What it ran, in its trial ``trial``.
     how : str
-        How it ended, as the predicate of a sentence.
-    killed, overdue : bool
-        Whether a signal ended it, and whether its trial took too long.
+        How it ended, as the predicate of a sentence; ``killed`` if by a signal.
     """
 
     arm: object = None

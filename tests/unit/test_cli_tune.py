@@ -22,7 +22,7 @@ def here(tmp_path: Path) -> Path:
 
 
 def test_it_says_what_to_do(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = run_here(capsys, here, *WORDS, "--budget", "20s")
+    said = run_here(capsys, here, *WORDS)
     assert said.code == 0, said.stderr
     assert (here / "runs/run-tuned/tune.md").read_text() == said.stdout
     assert said.stderr.endswith("Take it: holdfast run runs/run-tuned/tuned.yaml\n")

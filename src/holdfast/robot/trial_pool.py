@@ -143,11 +143,6 @@ class TrialPool:
         be ended. If it is given, no trial is run in this process, which none can end or hold up.
     cluster : RayCluster, optional
         Where the workers are, in place of this machine; it takes ``overdue``.
-
-    Attributes
-    ----------
-    waiting : int
-        Trials that were submitted and are not finished.
     """
 
     def __init__(
@@ -542,6 +537,10 @@ class _Runner:
         self._threads = threads
         self._arms: list[_NewArm | Arm] = []
         self._problems: dict[bytes, Problem] = {}
+
+    def all_answers(self, message: bytes) -> list[bytes]:
+        """Return what there is to answer, for who cannot wait for it one by one."""
+        return list(self.answers(message))
 
     def answers(self, message: bytes) -> Iterator[bytes]:
         """Yield what there is to answer, as soon as it is known."""

@@ -81,7 +81,7 @@ class RayCluster:
         self._ray.shutdown()
 
     def process(self, runner: type, pipe: Connection, threads: int) -> RayProcess:
-        """Return an actor of a class whose ``answers`` gets a message and yields several."""
+        """Return an actor of a class whose ``all_answers`` gets a message and returns several."""
         return RayProcess(self._ray, runner, pipe, threads)
 
 
@@ -115,10 +115,10 @@ class RayProcess:
         with self._pipe:
             try:
                 while True:
-                    # As it yields them: Ray's name for that is "streaming".
-                    answers = self._actor.answers.options(num_returns="streaming")
-                    for reference in answers.remote(self._pipe.recv_bytes()):
-                        self._pipe.send_bytes(self._ray.get(reference))
+                    # All at once: Ray's client knows no generators.
+                    asked = self._actor.all_answers.remote(self._pipe.recv_bytes())
+                    for answer in self._ray.get(asked):
+                        self._pipe.send_bytes(answer)
             except (EOFError, OSError):
                 return
             except Exception as error:  # noqa: BLE001 - whatever it is, the worker is lost

@@ -303,11 +303,6 @@ class _Tuner:
             budget_s=self._jobs * (until_s - self._spent_s() + before_s),
             refuse=self._refusal,
         )
-        if not self._kept.of(AS_CONFIGURED):
-            raise TrialError(
-                f"{AS_CONFIGURED}: no trial ended within {until_s:.3g} s: a larger budget is "
-                "needed, or it hangs"
-            )
         if standings[0].state == "refused":
             raise InvalidValueError(
                 f"no candidate is admitted: {standings[0].candidate}: {standings[0].reason}"
@@ -329,6 +324,8 @@ class _Tuner:
             differences = own[:common] - costs[:common]
             if np.mean(differences) <= 2.0 * np.std(differences, ddof=1) / math.sqrt(common):
                 equals.append(each.candidate)
+        if not equals:
+            return [winner]
         bound_ms = self._decision_ms(winner) / MUCH_SLOWER
         quick = [name for name in equals if self._decision_ms(name) <= bound_ms]
         each_s = {each.candidate: each.seconds for each in standings}
@@ -477,12 +474,12 @@ class _Tuner:
     def _row(self, standing: Standing) -> CandidateRow:
         name = standing.candidate
         changes = dict(self._candidates[name].changes) if name in self._candidates else {}
-        state = f"{standing.state}{': ' * bool(standing.reason)}{standing.reason}"
+        state = " ".join(f"{standing.state}{': ' * bool(standing.reason)}{standing.reason}".split())
         rows = self._kept.of(name)[: standing.trials]
-        if len(rows) <= PILOT_TRIALS:
-            return CandidateRow(candidate=name, changes=changes, trials=len(rows), state=state)
         costs, base = self._costs(name)[: len(rows)], self._costs(AS_CONFIGURED)
         common = min(len(costs), len(base))
+        if common <= PILOT_TRIALS:
+            return CandidateRow(candidate=name, changes=changes, trials=len(rows), state=state)
         difference, interval = mean_difference(costs[:common] - base[:common])
         return CandidateRow(
             candidate=name,
