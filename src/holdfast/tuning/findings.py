@@ -32,10 +32,12 @@ from holdfast.problems.attributes import sensing_labels, state_labels
 __all__ = [
     "CONTRACT",
     "FALSE_ALARM_RATE",
+    "OVER",
     "WHERE",
     "CheckEndedError",
     "Finding",
     "Inspection",
+    "OutOfTimeError",
     "Walk",
     "spread_out",
 ]
@@ -43,12 +45,17 @@ __all__ = [
 FALSE_ALARM_RATE = 0.001
 """Probability that the statistical tests of a right problem, all together, find an error."""
 
+OVER = "not looked at, or not at all of it: the time was over"
+"""What is seen of a check that the budget has cut short."""
+
 Severity = Literal["error", "warning", "information"]
 
 CONTRACT = "docs/problems.md#your-own"
 WHERE = {
     "depletion": "docs/settings.md",
     "likelihood": "docs/problems.md#check-it",
+    "method": "docs/tuning.md",
+    "prices": "docs/problems.md#when-to-sense",
     "resolution": "docs/problems.md#a-sharp-sensor-beside-a-weak-one",
     "sensors": "docs/problems.md#when-to-sense",
     "time": "docs/settings.md",
@@ -119,6 +126,10 @@ class CheckEndedError(Exception):
     """A check cannot go on, and why is among the findings."""
 
 
+class OutOfTimeError(BaseException):
+    """The budget is over; raised in the problem's code, which may catch any Exception."""
+
+
 class Walk(NamedTuple):
     """Trials with the state known: m states and stages of theirs, and when each was at the goal."""
 
@@ -131,9 +142,16 @@ class Inspection:
     """What the checks of one problem share: its settings, random streams, time and findings."""
 
     def __init__(
-        self, problem: Any, settings: PlanningSettings, max_steps: int, seed: int, budget_s: float
+        self,
+        problem: Any,
+        settings: PlanningSettings,
+        max_steps: int,
+        seed: int,
+        budget_s: float,
+        trials: int = 0,
     ) -> None:
         self.problem, self.settings, self.max_steps, self.seed = problem, settings, max_steps, seed
+        self.trials = trials
         self.findings: list[Finding] = []
         self.walk: Walk | None = None
         self.beliefs: list[PlanningState] = []
@@ -156,18 +174,25 @@ class Inspection:
         labels = state_labels(self.problem)
         return labels[number] if labels else f"coordinate {number} of a state"
 
-    def deadline(self, share: float, check: str) -> Callable[[], bool]:
-        """Return a function that tells whether a check has used up its share of the time."""
+    def deadline(self, share: float, check: str = "") -> Callable[[], bool]:
+        """Return a function that tells whether a check has used up its share of the time.
+
+        It adds a finding then, if the check has a name.
+        """
         end = min(self._end, perf_counter() + share * self._budget_s)
 
         def late() -> bool:
             if perf_counter() <= end:
                 return False
-            seen = "the time for this check was over before it had looked at all"
-            self.add("information", check, seen, "Give it more (--budget).")
+            if check:
+                self.add_over(check)
             return True
 
         return late
+
+    def add_over(self, check: str) -> None:
+        """Say that the time for a check was over."""
+        self.add("information", check, OVER, "Give it more (--budget).")
 
     def add(
         self, severity: Severity, check: str, seen: str, advice: str = "", details: str = ""
@@ -208,6 +233,9 @@ class Inspection:
                 return call(*arguments)
         except (KeyboardInterrupt, CheckEndedError):
             raise
+        except OutOfTimeError as over:
+            self.add_over(check)
+            raise CheckEndedError from over
         except BaseException as error:
             self._add_error(function, check, error)
             raise CheckEndedError from error

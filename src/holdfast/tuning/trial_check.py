@@ -19,11 +19,11 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from holdfast.errors import HoldfastError
 from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
 from holdfast.numerics.circular import differences
 from holdfast.numerics.randomness import NoiseFreeStream
 from holdfast.planning.belief import Belief
+from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.problems import checked
 from holdfast.problems.attributes import (
@@ -35,10 +35,17 @@ from holdfast.problems.attributes import (
 from holdfast.problems.problem import ProblemBase
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
-from holdfast.tuning.contract_check import acted, check_contract, truths
-from holdfast.tuning.findings import Inspection, Severity, Walk, spread_out
+from holdfast.tuning.contract_check import acted, check_contract
+from holdfast.tuning.findings import (
+    CheckEndedError,
+    Inspection,
+    Severity,
+    Walk,
+    spread_out,
+)
+from holdfast.tuning.verdict import mean_difference
 
-__all__ = ["check_decision_time", "check_goals", "check_trials"]
+__all__ = ["check_decision_time", "check_goals", "check_method", "check_trials"]
 
 _WALKS = 64
 _KEPT, _CHOSEN = 24, 48  # steps whose states are kept, and states whose contract is checked
@@ -47,6 +54,7 @@ _INITIAL, _WAY, _NOISE = 8, 9, 10  # trial numbers of the streams here
 _DRAWS, _STATES = 100, 12  # moves from each of some states, whose noise is compared
 _TRIALS, _MOST_STEPS, _DECISIONS = 8, 1000, 5
 _BELIEFS, _PARTICLES = 24, 400  # beliefs before sensing that are kept, and particles of each
+_FEWEST_PAIRS = 10  # of trials from which an interval is made
 _ENOUGH = 0.5  # share of the trials that should reach the goal
 _OFTEN = 0.2  # share of the observations from which on it is worth a warning
 _FEW_LEFT = 3.0  # effective particles below which an observation leaves hardly any
@@ -75,8 +83,8 @@ def _follow_policy(inspection: Inspection) -> Walk:
     step = still = 0
     stride = 1
     while True:
-        done = ask("is_goal", truths, problem, "is_goal", states)
-        lost = ask("is_failure", truths, problem, "is_failure", states)
+        done = ask("is_goal", checked.truths, problem, "is_goal", states)
+        lost = ask("is_failure", checked.truths, problem, "is_failure", states)
         running = (reached < 0) & (failed < 0)
         reached[running & done] = step
         failed[running & lost & ~done] = step
@@ -232,15 +240,24 @@ def _slopes(problem: Any, state: FloatArray, action: FloatArray) -> FloatArray:
     return slopes
 
 
-class _EndedError(HoldfastError):
-    """The time for this check is over, or the trial has failed."""
-
-
-class _Watcher(TrialObserver):
-    """Keeps what the checks need of a trial, and ends it when time is over."""
+class _Clock(TrialObserver):
+    """Ends a trial when time is over."""
 
     def __init__(self, inspection: Inspection, late: Callable[[], bool]) -> None:
         self.inspection, self.late = inspection, late
+
+    def acted(self, step: TaskStep) -> None:
+        """Look at the clock."""
+        del step
+        if self.late():
+            raise CheckEndedError
+
+
+class _Watcher(_Clock):
+    """Keeps what the checks need of a trial."""
+
+    def __init__(self, inspection: Inspection, late: Callable[[], bool]) -> None:
+        super().__init__(inspection, late)
         self.steps: list[SensingStep] = []
         self.outside: list[BoolArray] = []
 
@@ -258,41 +275,24 @@ class _Watcher(TrialObserver):
         self.outside.append(np.asarray((apart > 0.0).all(axis=0) | (apart < 0.0).all(axis=0)))
 
     def acted(self, step: TaskStep) -> None:
-        """End the trial if the time is over, or in a failure, which the world does not know."""
-        if self.late():
-            raise _EndedError("late")
+        """Keep the reward."""
+        super().acted(step)
         if step.reward is not None:
             self.inspection.rewards.append(step.reward)
-        if truths(self.inspection.problem, "is_failure", self.world.state):
-            raise _EndedError("failed")
 
 
 def check_trials(inspection: Inspection) -> None:
     """Run a few trials with random sensing, and keep beliefs from before sensing."""
-    settings, late = inspection.settings, inspection.deadline(0.25, "trials")
-    selector = msgspec.structs.replace(
-        settings.selector, method="random", sensing_is_optional=False
-    )
-    planner = Planner(inspection.problem, msgspec.structs.replace(settings, selector=selector))
+    late = inspection.deadline(0.25, "trials")
     steps = min(inspection.max_steps, _MOST_STEPS)
-    reached: list[int] = []
-    endings: list[str] = []
-    watchers: list[_Watcher] = []
-
-    def run(trial: int, watcher: _Watcher) -> str:
-        try:
-            result = run_trial(planner, inspection.seed, trial, max_steps=steps, observer=watcher)
-        except _EndedError as error:
-            return str(error)
-        reached.extend([result.steps] if result.success else [])
-        return "ended"
-
-    while len(watchers) < _TRIALS and not late():
-        watchers.append(_Watcher(inspection, late))
-        endings.append(inspection.ask("a simulated trial", run, len(endings), watchers[-1]))
-    count, failed = len(endings) - endings.count("late"), endings.count("failed")
-    if count:
-        _report_endings(inspection, reached, count, failed, steps)
+    watchers = [_Watcher(inspection, late) for _ in range(_TRIALS)]
+    results = []
+    with contextlib.suppress(CheckEndedError):
+        planner = _sensing_at_random(inspection)
+        for trial, watcher in enumerate(watchers):
+            results.append(_simulated(inspection, planner, trial, steps, watcher))
+    if results:
+        _report_endings(inspection, results, steps)
     _report_depletion(inspection, [each for each in watchers if each.steps])
     states = [step.before for watcher in watchers for step in watcher.steps]
     kept = [states[index] for index in spread_out(_BELIEFS, len(states))]
@@ -303,10 +303,73 @@ def check_trials(inspection: Inspection) -> None:
     _check_rewards(inspection)
 
 
-def _report_endings(
-    inspection: Inspection, reached: list[int], count: int, failed: int, steps: int
-) -> None:
-    seen = f"with random sensing, {len(reached)} of {count} trials reach the goal"
+def _sensing_at_random(inspection: Inspection) -> Planner:
+    selector = msgspec.structs.replace(
+        inspection.settings.selector, method="random", sensing_is_optional=False
+    )
+    settings = msgspec.structs.replace(inspection.settings, selector=selector)
+    return Planner(inspection.problem, settings)
+
+
+def _simulated(
+    inspection: Inspection, planner: Planner, trial: int, steps: int, observer: TrialObserver
+) -> TrialResult:
+    def run() -> TrialResult:
+        return run_trial(planner, inspection.seed, trial, max_steps=steps, observer=observer)
+
+    return inspection.ask("a simulated trial", run, check="trials")
+
+
+def check_method(inspection: Inspection) -> None:
+    """Compare the method with random sensing in trials of the same worlds."""
+    problem, settings = inspection.problem, inspection.settings
+    method = settings.selector.method
+    wrong = any(each.severity == "error" for each in inspection.findings)
+    if method == "random" or wrong or not inspection.trials:
+        return
+    late = inspection.deadline(0.6)
+    planners = [Planner(problem, settings), _sensing_at_random(inspection)]
+    priced = getattr(problem, "sensing_costs", None) is not None
+    costs: list[list[float]] = []
+
+    def cost_of(result: TrialResult) -> float:
+        if priced:
+            return -(result.reward or 0.0)
+        return float(result.steps if result.success else inspection.max_steps)
+
+    with contextlib.suppress(CheckEndedError):
+        for trial in range(_TRIALS, _TRIALS + inspection.trials):
+            steps, clock = inspection.max_steps, _Clock(inspection, late)
+            pair = [_simulated(inspection, each, trial, steps, clock) for each in planners]
+            costs.append([cost_of(result) for result in pair])
+    if len(costs) < min(_FEWEST_PAIRS, inspection.trials):
+        inspection.add_over("method")
+        return
+    own, at_random = np.transpose(costs)
+    difference, (low, high) = mean_difference(own - at_random)
+    verb, unit = ("loses", "of reward") if priced else ("takes", "steps")
+    seen = f"{method} {verb} {difference:+.3g} [{low:+.3g}, {high:+.3g}] {unit} beside random "
+    seen += f"sensing ({len(costs)} paired trials, 95% interval"
+    seen += ")" if priced else "; a failure counts as the limit)"
+    if low > 0.0:
+        seen += ": here it is worse"
+        advice = "Run holdfast tune, which finds what suits this problem. Of methods that are as "
+        advice += "good as random sensing, one in forty is called worse by chance."
+        inspection.add("warning", "method", seen, advice)
+        return
+    advice = ""
+    if high < 0.0:
+        seen += ": here it is better"
+    else:
+        seen += f": {len(costs)} trials cannot tell which is better"
+        advice = "More can: --trials and --budget, or holdfast tune."
+    inspection.add("information", "method", seen, advice)
+
+
+def _report_endings(inspection: Inspection, results: list[TrialResult], steps: int) -> None:
+    reached = [result.steps for result in results if result.success]
+    failed = sum(result.failed for result in results)
+    seen = f"with random sensing, {len(reached)} of {len(results)} trials reach the goal"
     seen += f", after {np.median(reached):.0f} steps (median)" if reached else ""
     seen += f", and {failed} fail" if failed else ""
     walk = inspection.walk

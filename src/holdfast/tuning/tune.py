@@ -45,6 +45,7 @@ from holdfast.tuning.candidates import (
     has_rewards,
     later_candidates,
 )
+from holdfast.tuning.check_process import require_right
 from holdfast.tuning.race import PILOT_TRIALS, MeasuredTrial, Standing, race
 from holdfast.tuning.tuning_report import CandidateRow, Tuning, write_report
 from holdfast.tuning.verdict import TrialRow, cost_of, judge, mean_difference
@@ -78,10 +79,11 @@ def tune(
     most: int = 200,
     jobs: int | None = None,
     max_decision_ms: float = math.inf,
+    check: bool = True,
     out: str | Path | None = None,
     on_progress: Callable[[Progress], None] = lambda _: None,
 ) -> Tuning:
-    """Find what to sense on a problem, by simulating it; :func:`hf.check_problem` comes first.
+    """Find what to sense on a problem, by simulating it.
 
     Parameters
     ----------
@@ -101,6 +103,9 @@ def tune(
         Processes; None: one for each core.
     max_decision_ms : float
         A candidate whose median decision takes longer must not win.
+    check : bool
+        Whether the problem is checked first (:func:`hf.check_problem`), for a tenth of the budget
+        and at most 20 s; not if ``out`` has trials of this tuning.
     out : path, optional
         A directory for the files; if it has trials of the same tuning, it goes on with these.
 
@@ -110,6 +115,8 @@ def tune(
         If a value does not fit.
     OutputError
         If ``out`` belongs to something else, or cannot be written.
+    ProblemError
+        If the check finds an error.
     TrialError
         If the trials of the configuration itself fail.
     """
@@ -142,6 +149,8 @@ def tune(
         "max_decision_ms": None if math.isinf(max_decision_ms) else max_decision_ms,
         "code": fingerprint(configuration),
     }
+    if check and not (out is not None and (out / TRIALS_NAME).exists()):
+        require_right(configuration, budget_s)
     with _Trials(out, settings) as kept, TrialPool(jobs) as pool:
         tuner = _Tuner(configuration, objective, kept, pool, max_decision_ms, on_progress)
         found = tuner.run(vary, most, budget_s * jobs)
