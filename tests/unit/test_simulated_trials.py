@@ -94,7 +94,14 @@ def test_comparison_against_the_named_baseline() -> None:
     assert frame["effect"]["steps"] == {each.measure: each for each in expected}["steps"].effect
     assert frame["low"]["reward"] <= frame["effect"]["reward"] <= frame["high"]["reward"]
     head, baseline, other = found.shown()
-    assert head[:3] == ("", "trials", "success")
+    assert head[:3] == ("", "success (%)", "steps")
+    assert found.names()[1:] == ("success_rate", "steps", "reward", "decision_ms")
+    latex = found.to_latex(columns=["reward", "success_rate"])
+    assert latex.splitlines()[2] == r" & reward & success (\%) \\"
+    assert r"\par decision" not in latex
+    assert r"\par decision" in found.to_latex()
+    with pytest.raises(InvalidValueError, match="columns has 'cost'; allowed are success_rate, st"):
+        found.to_markdown(columns=["cost"])
     assert (baseline[0], other[0]) == ("chance (baseline)", "ours")
     assert "60 steps" in repr(found)
     longest = max(map(len, repr(found).splitlines()[:3]))
@@ -107,7 +114,8 @@ def test_runs_on_the_disk_and_other_tasks(tmp_path: Path) -> None:
     mine = trials_of("random", max_steps=100)
     found = hf.compare({"recorded": run, "mine": mine})
     assert found.runs[0].notes == (
-        "problem is 'PegInHole2D' here and 'peg_in_hole_2d' in recorded: these are two tasks",
+        "problem is 'PegInHole2D' here and 'peg_in_hole_2d' there, "
+        "so the trials are of different tasks",
     )
     with pytest.raises(OutputError, match=r"mine: .* the limit is 60 steps here and 100 there"):
         hf.compare({"recorded": run, "mine": trials_of("random", 2)})
