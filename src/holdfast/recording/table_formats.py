@@ -17,6 +17,7 @@ from typing import Any
 from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.printable import cell
 from holdfast.runtime.files import write_atomically
+from holdfast.validation import as_path
 
 __all__ = ["TIMES", "Table", "aligned", "cells", "csv_rows", "decimals"]
 
@@ -111,8 +112,8 @@ class Table:
         shown, names = self.shown(), list(self.names())
         if columns is None:
             return shown
-        for each in [columns] if isinstance(columns, str) else columns:
-            if each not in names[1:]:
+        for each in columns if isinstance(columns, list | tuple) else [columns]:
+            if not isinstance(each, str) or each not in names[1:]:
                 allowed = ", ".join(names[1:])
                 raise InvalidValueError(f"columns has {each!r:.80}; allowed are {allowed}")
         kept = [0, *map(names.index, columns)]
@@ -166,7 +167,7 @@ def _quoted(text: str) -> str:
 
 def _written(text: str, path: str | Path | None) -> str:
     if path is not None:
-        write_atomically(Path(path), text.encode())
+        write_atomically(as_path("path", path), text.encode())
     return text
 
 

@@ -23,6 +23,7 @@ with one message for each.
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import traceback
 from collections import deque
@@ -145,7 +146,8 @@ class TrialPool:
     ) -> None:
         if integer(jobs) is None or not 1 <= jobs <= MAX_JOBS:
             raise InvalidValueError(f"jobs is {jobs!r:.80}; it must be from 1 to {MAX_JOBS}")
-        self._jobs = jobs
+        # A worker of multiprocessing's pools, which is daemonic, may start no processes.
+        self._jobs = 1 if multiprocessing.current_process().daemon else jobs
         self._expected = expected
         self._observer = observer
         self._queue: deque[tuple[Arm, int]] = deque()

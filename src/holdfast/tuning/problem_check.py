@@ -30,6 +30,7 @@ from holdfast.tuning.trial_check import (
     check_method,
     check_trials,
 )
+from holdfast.validation import as_function
 
 __all__ = ["CHECKS", "check_problem"]
 
@@ -82,7 +83,9 @@ def check_problem(
     InvalidValueError
         If an argument other than the problem is out of bounds.
     """
-    settings = check_settings(settings or PlanningSettings(), PlanningSettings)
+    as_function("on_check", on_check)
+    settings = PlanningSettings() if settings is None else settings
+    settings = check_settings(settings, PlanningSettings)
     max_steps = whole("max_steps", max_steps, 1)
     seed = whole("seed", seed, 0, 2**63 - 1)
     budget = real_number(budget_s)

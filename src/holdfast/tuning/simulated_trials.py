@@ -32,6 +32,7 @@ from holdfast.recording.run_directory import world_of
 from holdfast.recording.table_formats import Table
 from holdfast.robot.trial_pool import Arm, TrialPool, available_cores
 from holdfast.runtime.command_line import MAX_SEED, MAX_TRIALS
+from holdfast.validation import as_function, as_path
 
 __all__ = [
     "SimulatedTrial",
@@ -199,7 +200,8 @@ def run_trials(
     seed, max_steps, lost : optional
         Default: the configuration's, otherwise 0 and those of :func:`holdfast.run_trial`.
     jobs : int, optional
-        Largest number of processes (default: one for each core). Changes time only.
+        Largest number of processes (default: one for each core). Changes time only. In a worker
+        of ``multiprocessing`` or joblib, which may start none, all trials run in that process.
     progress : callable, optional
         Called with the number of finished trials and ``n`` after each trial.
 
@@ -214,6 +216,7 @@ def run_trials(
         If a worker process was killed.
     """
     n = whole("n", n, 1, MAX_TRIALS)
+    told = as_function("progress", (lambda *_: None) if progress is None else progress)
     arm = arm_of(planner)
     if seed is not None:
         arm = dataclasses.replace(arm, seed=whole("seed", seed, 0, MAX_SEED))
@@ -225,8 +228,7 @@ def run_trials(
     with TrialPool(available_cores() if jobs is None else jobs, expected=n) as pool:
         for done in pool.run((arm, trial) for trial in range(n)):
             results.append(SimulatedTrial.of(done.result, arm.problem))
-            if progress is not None:
-                progress(len(results), n)
+            told(len(results), n)
     return table_of(arm, results)
 
 
@@ -289,18 +291,20 @@ def compare(
     OutputError
         If a path is no run, or if limits or (paired) seeds differ, or there are too few trials.
     """
-    if len(runs) < 2:
-        raise InvalidValueError(f"runs has {len(runs)} entries; compare takes at least 2")
+    if not isinstance(runs, Mapping) or len(runs) < 2:
+        raise InvalidValueError(f"runs is {runs!r:.80}; compare takes a mapping of at least 2")
     names = list(runs)
+    if not isinstance(paired, bool):
+        raise InvalidValueError(f"paired is {paired!r:.80}; it must be True or False")
     if baseline is not None:
-        if baseline not in runs:
-            raise InvalidValueError(f"baseline is {baseline!r}; it must be one of {names}")
+        if not isinstance(baseline, str) or baseline not in runs:
+            raise InvalidValueError(f"baseline is {baseline!r:.80}; it must be one of {names}")
         names = [baseline, *(name for name in names if name != baseline)]
     return compare_results([_compared(runs[name], name) for name in names], paired=paired)
 
 
 def _compared(trials: Trials | str | Path, name: str) -> ComparedRun:
     if not isinstance(trials, Trials):
-        return read_outcomes(Path(trials), name)
+        return read_outcomes(as_path(f"runs[{name!r}]", trials), name)
     results = {result.trial: result for result in trials.results}
     return ComparedRun(name, results, trials.seed, trials.max_steps, trials.world)

@@ -49,6 +49,7 @@ from holdfast.tuning.check_process import require_right
 from holdfast.tuning.race import PILOT_TRIALS, MeasuredTrial, Standing, race
 from holdfast.tuning.tuning_report import CandidateRow, Tuning, write_report
 from holdfast.tuning.verdict import TrialRow, cost_of, judge, mean_difference
+from holdfast.validation import as_function, as_path
 
 __all__ = ["Progress", "tune"]
 
@@ -121,20 +122,22 @@ def tune(
         If the trials of the configuration itself fail.
     """
     if not isinstance(configuration, Configuration):
-        configuration = load(configuration)
-    unknown = [each for each in vary if each not in VARIATIONS]
-    if unknown:
-        raise InvalidValueError(f"vary has {unknown[0]!r}; allowed are {', '.join(VARIATIONS)}")
+        configuration = load(as_path("configuration", configuration))
+    for each in vary if isinstance(vary, list | tuple) else [vary]:
+        if not isinstance(each, str) or each not in VARIATIONS:
+            allowed = ", ".join(VARIATIONS)
+            raise InvalidValueError(f"vary has {each!r:.80}; allowed are {allowed}")
+    as_function("on_progress", on_progress)
     most = whole("most", most, 2, FRESH - 1)
     jobs = available_cores() if jobs is None else whole("jobs", jobs, 1, MAX_JOBS)
     for name, value in (("budget_s", budget_s), ("max_decision_ms", max_decision_ms)):
         number = real_number(value)
         if number is None or not number > 0.0:
             raise InvalidValueError(f"{name} is {value!r:.80}; it must be a number above 0")
-    if objective is not None and objective not in get_args(Objective):
+    if objective not in (None, *get_args(Objective)):
         allowed = ", ".join(get_args(Objective))
         raise InvalidValueError(f"objective is {objective!r:.80}; allowed are {allowed}")
-    out = None if out is None else Path(out)
+    out = None if out is None else as_path("out", out)
     if objective is None:
         priced = getattr(configuration.problem, "sensing_costs", None) is not None
         objective = "reward" if priced else "steps"
