@@ -67,7 +67,7 @@ def test_a_right_problem(
     assert "the policy comes to the goal in 64 of 64 trials" in " ".join(shown.out.split())
     assert shown.out.endswith("0 errors, 0 warnings\n")
     assert shown.err.startswith(f"checking {name}\n")
-    assert "12 paired trials, 95% interval; a" in " ".join(shown.out.split())
+    assert "beside random sensing in 12 paired trials: " in " ".join(shown.out.split())
     # A configuration, and values instead of its own.
     Path("right.yaml").write_text(f"problem: {name}\nmodel: {{width: 0.1}}\n")
     assert main(["right.yaml", "--set", "model.width=100.0", "-q", "--budget", "1000"]) == 1

@@ -459,7 +459,7 @@ def test_the_method_is_compared_with_random_sensing() -> None:
     """The boat's difference is 4 standard errors of 40 trials."""
     found = {each.check: each for each in check(FineBesideWeak(), trials=40)}["method"]
     assert found.severity == W
-    assert re.search(r"takes \+\d.* steps beside random sensing \(40 paired .* worse", found.seen)
+    assert re.search(r"takes \+\d.* steps .* in 40 paired .* worse", found.seen)
     found = {each.check: each for each in check(Rover(), trials=12)}["method"]
     assert found.severity == NOTE
     assert re.search("12 trials cannot tell|here it is better", found.seen)

@@ -1,16 +1,16 @@
 """A check in a process of its own, which the problem's code may end, hang or crash.
 
-A problem is a user's own code. It may call ``os._exit``, run into a defect of a library, never
-return, or leave threads behind that keep its process alive. So a command checks it in a child
-process: what the child has not said is said here, and it is killed at the end.
+A problem is a user's own code: it may call ``os._exit``, crash in a library, never return, or leave
+threads behind. So a command checks it in a child process, says what that did not, and kills it.
 
-The budget says when no further work is begun; a slow problem is then looked at in part, which is no
-error. What never returns is one: a single call that takes longer than :data:`PATIENCE_S`.
+A slow problem is looked at in part when the budget is over, which is no error. A single call that
+takes longer than :data:`PATIENCE_S` is one.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import multiprocessing
 import os
 import pickle
@@ -52,21 +52,12 @@ def check_apart(
 ) -> list[Finding]:
     """Return what :func:`check_problem` finds in a process of its own.
 
-    Parameters
-    ----------
-    load : callable
-        Returns the configuration; called in the child process, so it must be picklable.
-    **how
-        As :func:`check_problem` has it.
-
-    Raises
-    ------
-    HoldfastError
-        That of ``load``.
+    ``load``, which must be picklable, returns the configuration there; ``how`` is for
+    :func:`check_problem`. HoldfastError is that of ``load``.
     """
     how |= {"budget_s": budget_s}
     if multiprocessing.current_process().daemon:  # which may have no children
-        return _checked(load, on_check, **how)
+        return _checked(load, on_check, how)
     worker = WorkerProcess("holdfast-check", _work, (load, PATIENCE_S, how), threads=1)
     doing = "import"
     try:
@@ -92,14 +83,14 @@ def require_right(
     budget_s: float,
     on_warning: Callable[[Finding], None] = lambda _: None,
 ) -> None:
-    """Check a problem before it is tuned; ProblemError if it has an error.
+    """Check a problem before it is tuned, for a tenth of that budget and at most 20 s.
 
-    Parameters
-    ----------
-    budget_s : float
-        Of the tuning; a tenth of it is for the check, and at most 20 s.
+    Raises
+    ------
+    ProblemError
+        If it finds an error.
     """
-    load = _Loaded(configuration.plain())
+    load = functools.partial(Configuration.from_plain, configuration.plain())
     found = check_apart(load, budget_s=min(_LONGEST_CHECK_S, 0.1 * budget_s), trials=0)
     for each in found:
         if each.severity == "warning":
@@ -113,28 +104,12 @@ def require_right(
         )
 
 
-class _Loaded:
-    """Builds a configuration again, in whatever process."""
-
-    def __init__(self, plain: dict[str, Any]) -> None:
-        self._plain = plain
-
-    def __call__(self) -> Configuration:
-        return Configuration.from_plain(self._plain)
-
-
 def _checked(
-    load: Callable[[], Configuration], on_check: Callable[[str], None], **how: Any
+    load: Callable[[], Configuration], on_check: Callable[[str], None], how: dict[str, Any]
 ) -> list[Finding]:
-    configuration = load()
-    limit = configuration.simulator.max_steps
-    return check_problem(
-        configuration.problem,
-        configuration.planning,
-        max_steps=limit,
-        on_check=on_check,
-        **how,
-    )
+    found = load()
+    limit = found.simulator.max_steps
+    return check_problem(found.problem, found.planning, max_steps=limit, on_check=on_check, **how)
 
 
 def _work(
@@ -152,7 +127,7 @@ def _work(
     try:
         # What the problem's code prints is no finding.
         with contextlib.redirect_stdout(sys.stderr), _clock(how["budget_s"], patience_s):
-            tell(_checked(load, tell, **how))
+            tell(_checked(load, tell, how))
     except HoldfastError as error:
         tell(error)
     except Exception:  # noqa: BLE001 - whatever it is, the parent raises it again

@@ -49,27 +49,23 @@ def check_problem(
     trials: int = 100,
     on_check: Callable[[str], None] = lambda _: None,
 ) -> list[Finding]:
-    """Look for what is wrong with a problem.
+    """Look for what is wrong with a problem, or with any object that is to be one.
 
     Nothing that the problem's code raises comes through, but Ctrl-C: it is a finding. The same
     seed gives the same findings, but for the times of a decision, as long as the budget lasts.
 
     Parameters
     ----------
-    problem : Problem
-        Or any object that is to be one.
     settings : PlanningSettings, optional
         With which it is to be used.
     max_steps : int
         Steps after which a simulated trial has failed.
-    seed : int
-        Names all random draws.
     budget_s : float
         Seconds after which no further work is begun; a single call of the problem's code is not
         interrupted. What was not looked at is said.
     trials : int
         Pairs of trials, at most, that compare the method with random sensing; 0 compares nothing.
-    on_check : callable, optional
+    on_check : callable
         Is told the name of each check as it begins, one of :data:`CHECKS`.
 
     Returns
@@ -93,8 +89,8 @@ def check_problem(
         raise InvalidValueError(
             f"budget_s is {budget_s!r:.80}; allowed are numbers above 0 to 86400"
         )
-    trials = whole("trials", trials, 0, MAX_TRIALS)
-    inspection = Inspection(problem, settings, max_steps, seed, budget, trials)
+    inspection = Inspection(problem, settings, max_steps, seed, budget)
+    inspection.trials = whole("trials", trials, 0, MAX_TRIALS)
     late = inspection.deadline(1.0)
     for name, check in CHECKS.items():
         errors = {each.check for each in inspection.findings if each.severity == "error"}

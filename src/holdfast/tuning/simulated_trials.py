@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import InvalidValueError
@@ -62,14 +63,10 @@ class SimulatedTrial(TrialResult, frozen=True, kw_only=True):
     @classmethod
     def of(cls, result: TrialResult, problem: Problem) -> SimulatedTrial:
         """Return a result that has its decisions, with the price."""
-        price = None
-        if getattr(problem, "sensing_costs", None) is not None:
-            costs = sensing_costs(problem, optional=True)
-            price = sum(
-                float(costs[decision.sensing_action])
-                for decision in result.decisions or ()
-                if isinstance(decision, SensingDecision)
-            )
+        costs = sensing_costs(problem, optional=True)
+        looks = [each for each in result.decisions or () if isinstance(each, SensingDecision)]
+        priced = getattr(problem, "sensing_costs", None) is not None
+        price = sum(float(costs[each.sensing_action]) for each in looks) if priced else None
         fields = {name: getattr(result, name) for name in TrialResult.__struct_fields__}
         return cls(**{**fields, "decisions": None}, sensing_price=price)
 
@@ -126,12 +123,7 @@ class Trials(Table):
     """
 
     def __init__(
-        self,
-        label: str,
-        seed: int,
-        max_steps: int,
-        results: Sequence[SimulatedTrial],
-        world: Mapping[str, object],
+        self, label: str, seed: int, max_steps: int, results: Sequence[SimulatedTrial], world: Any
     ) -> None:
         self.label, self.seed, self.max_steps, self.world = label, seed, max_steps, world
         self.results = tuple(sorted(results, key=lambda result: result.trial))
@@ -153,10 +145,14 @@ class Trials(Table):
 
     def shown(self) -> list[tuple[str, ...]]:
         """Return a row for each trial, with the columns that people compare."""
-        prices = any(result.sensing_price is not None for result in self.results)
-        names = (*_SHOWN, *(("sensing_price",) if prices else ()))
+        names = self.names()
         rows = ((_short(getattr(result, name)) for name in names) for result in self.results)
         return [tuple(name.replace("_", " ") for name in names), *map(tuple, rows)]
+
+    def names(self) -> Sequence[str]:
+        """Return the names of those columns."""
+        prices = any(result.sensing_price is not None for result in self.results)
+        return (*_SHOWN, *(("sensing_price",) if prices else ()))
 
     def summary(self) -> TrialSummary:
         """Return each measure with its interval."""
@@ -266,7 +262,9 @@ def table_of(arm: Arm, results: Sequence[SimulatedTrial]) -> Trials:
 def compare(
     runs: Mapping[str, Trials | str | Path], baseline: str | None = None, *, paired: bool = True
 ) -> OutcomeComparison:
-    """Compare trials with those of a baseline: effects with 95 % intervals.
+    """Compare trials with those of a baseline: effects with 95 % intervals, and notes.
+
+    Steps of a trial that did not reach the goal are the limit. Decision times get no verdict.
 
     Parameters
     ----------
@@ -277,12 +275,6 @@ def compare(
     paired : bool
         Whether trials of one number are in the same world, as those of one seed and problem are.
         If False, each is a sample of its own, so that other seeds can be compared.
-
-    Returns
-    -------
-    OutcomeComparison
-        A row for each run and measure. Steps of a trial that did not reach the goal are the limit.
-        Notes say where the tasks differ.
 
     Raises
     ------

@@ -1,11 +1,10 @@
 """Whether the task can be done, and what a few simulated trials show of the beliefs.
 
-What sensing can gain is bounded by what the policy does in a state that is known. So first some
-trials are simulated all at once without any belief: if they do not come to the goal, no sensing
-will. They also show where the robot goes, for the checks that need states from along the way.
+Sensing cannot gain more than a known state. So first some trials are simulated all at once without
+any belief: if these do not come to the goal, no sensing will. They also show where the robot goes.
 
-Then a few trials sense at random, which costs no time for choosing and favours no sensor. Their
-beliefs before sensing are kept for the checks of the sensors and of the time of a decision.
+Then a few trials sense at random, which favours no sensor; their beliefs are kept for other checks.
+At last the method that is to be used runs beside random sensing.
 """
 
 from __future__ import annotations
@@ -130,15 +129,12 @@ def _report_angles(inspection: Inspection, jumps: IntArray, turns: IntArray) -> 
         (turns, "circular_actions", circular_actions(problem), "the task action"),
     ):
         for at in np.flatnonzero((counts[1] >= 2) & (counts[1] == counts[0])).tolist():
-            if at in declared:
-                continue
             seen = f"coordinate {at} of {whose} jumps by a whole turn (2 pi) in one step, and is "
             seen += "not declared to be an angle: the mean of 3.1 and -3.1 is taken for 0"
-            advice = (
-                f"Give the problem {attribute} = ({at},), and circular_observations if a sensor "
-            )
-            advice += "shows it; in a policy take numerics.wrapped(goal - heading)."
-            inspection.add("warning", "units", seen, advice)
+            advice = f"Give the problem {attribute} = ({at},), and circular_observations if it "
+            advice += "is sensed; in a policy take numerics.wrapped(goal - heading)."
+            if at not in declared:
+                inspection.add("warning", "units", seen, advice)
 
 
 def _report_walk(
@@ -189,30 +185,27 @@ def _check_rewards(inspection: Inspection) -> None:
     seen = f"the reward is {rewards[0]:g} in all of {len(rewards)} simulated steps: "
     severity: Severity = "information"
     if rewards[0] > 0.0:
-        severity, why = "warning", "a trial that never reaches the goal has the greatest return"
+        severity = "warning"
+        seen += "a trial that never reaches the goal has the greatest return"
     else:
-        why = "expected_return has nothing to tell sensing actions by"
+        seen += "expected_return has nothing to tell sensing actions by"
     if selector.method == "expected_return" and selector.rollout_reward == "problem":
         severity = "error"
-    advice = "With selector.rollout_reward: steps the return counts steps instead; so it does "
-    advice += "without a reward."
-    inspection.add(severity, "goals", seen + why, advice)
+    advice = "selector.rollout_reward: steps counts steps instead, as without a reward."
+    inspection.add(severity, "goals", seen, advice)
 
 
 def _check_motion(inspection: Inspection, walk: Walk) -> None:
     """Compare the noise of ``move`` with what the problem says of it."""
     problem, ask = inspection.problem, inspection.ask
-    declared = np.asarray(problem.motion_variance, dtype=np.float64)
-    circular = circular_states(problem)
     ratios = []
     for number, at in enumerate(spread_out(_STATES, len(walk.states))):
         state, own = walk.states[at], inspection.random(_NOISE, number)
         action = ask("execute", acted, problem, state, int(walk.stages[at]))
-        many = np.tile(state, (_DRAWS, 1))
-        moved = ask("move", checked.move, problem, many, action, own)
+        moved = ask("move", checked.move, problem, np.tile(state, (_DRAWS, 1)), action, own)
         slopes = ask("move", _slopes, problem, state, action)
-        variance = differences(moved, moved[0], circular).var(axis=0)
-        predicted = (slopes**2 * declared).sum(axis=1)
+        variance = differences(moved, moved[0], circular_states(problem)).var(axis=0)
+        predicted = (slopes**2 * np.asarray(problem.motion_variance)).sum(axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratios.append(np.where(predicted > 0.0, variance / predicted, np.nan))
     for at, values in enumerate(np.transpose(ratios)):
@@ -240,24 +233,11 @@ def _slopes(problem: Any, state: FloatArray, action: FloatArray) -> FloatArray:
     return slopes
 
 
-class _Clock(TrialObserver):
-    """Ends a trial when time is over."""
+class _Watcher(TrialObserver):
+    """Keeps what the checks need of a trial, and ends it when time is over."""
 
-    def __init__(self, inspection: Inspection, late: Callable[[], bool]) -> None:
-        self.inspection, self.late = inspection, late
-
-    def acted(self, step: TaskStep) -> None:
-        """Look at the clock."""
-        del step
-        if self.late():
-            raise CheckEndedError
-
-
-class _Watcher(_Clock):
-    """Keeps what the checks need of a trial."""
-
-    def __init__(self, inspection: Inspection, late: Callable[[], bool]) -> None:
-        super().__init__(inspection, late)
+    def __init__(self, inspection: Inspection, late: Callable[[], bool], keep: bool = True) -> None:
+        self.inspection, self.late, self.keep = inspection, late, keep
         self.steps: list[SensingStep] = []
         self.outside: list[BoolArray] = []
 
@@ -269,6 +249,8 @@ class _Watcher(_Clock):
 
     def sensed(self, step: SensingStep) -> None:
         """Note the step, and in which coordinates the true state was beyond all particles."""
+        if not self.keep:
+            return
         self.steps.append(step)
         angles = circular_states(self.inspection.problem)
         apart = differences(step.before.belief.states, self.world.state, angles)
@@ -276,8 +258,9 @@ class _Watcher(_Clock):
 
     def acted(self, step: TaskStep) -> None:
         """Keep the reward."""
-        super().acted(step)
-        if step.reward is not None:
+        if self.late():
+            raise CheckEndedError
+        if step.reward is not None and self.keep:
             self.inspection.rewards.append(step.reward)
 
 
@@ -329,41 +312,35 @@ def check_method(inspection: Inspection) -> None:
         return
     late = inspection.deadline(0.6)
     planners = [Planner(problem, settings), _sensing_at_random(inspection)]
-    priced = getattr(problem, "sensing_costs", None) is not None
-    costs: list[list[float]] = []
-
-    def cost_of(result: TrialResult) -> float:
-        if priced:
-            return -(result.reward or 0.0)
-        return float(result.steps if result.success else inspection.max_steps)
-
+    priced, limit = getattr(problem, "sensing_costs", None) is not None, inspection.max_steps
+    more: list[float] = []
     with contextlib.suppress(CheckEndedError):
         for trial in range(_TRIALS, _TRIALS + inspection.trials):
-            steps, clock = inspection.max_steps, _Clock(inspection, late)
-            pair = [_simulated(inspection, each, trial, steps, clock) for each in planners]
-            costs.append([cost_of(result) for result in pair])
-    if len(costs) < min(_FEWEST_PAIRS, inspection.trials):
+            clock = _Watcher(inspection, late, keep=False)
+            pair = [_simulated(inspection, each, trial, limit, clock) for each in planners]
+            own, other = (
+                -(each.reward or 0.0) if priced else each.steps if each.success else limit
+                for each in pair
+            )
+            more.append(float(own - other))
+    count = len(more)
+    if count < min(_FEWEST_PAIRS, inspection.trials):
         inspection.add_over("method")
         return
-    own, at_random = np.transpose(costs)
-    difference, (low, high) = mean_difference(own - at_random)
-    verb, unit = ("loses", "of reward") if priced else ("takes", "steps")
+    difference, (low, high) = mean_difference(np.array(more))
+    verb, unit = ("loses", "of reward") if priced else ("takes", "steps (a failure: the limit)")
     seen = f"{method} {verb} {difference:+.3g} [{low:+.3g}, {high:+.3g}] {unit} beside random "
-    seen += f"sensing ({len(costs)} paired trials, 95% interval"
-    seen += ")" if priced else "; a failure counts as the limit)"
+    seen += f"sensing in {count} paired trials: "
     if low > 0.0:
-        seen += ": here it is worse"
         advice = "Run holdfast tune, which finds what suits this problem. Of methods that are as "
-        advice += "good as random sensing, one in forty is called worse by chance."
-        inspection.add("warning", "method", seen, advice)
-        return
-    advice = ""
-    if high < 0.0:
-        seen += ": here it is better"
+        advice += "good as random sensing, one in thirty is called worse by chance."
+        inspection.add("warning", "method", seen + "here it is worse", advice)
+    elif high < 0.0:
+        inspection.add("information", "method", seen + "here it is better")
     else:
-        seen += f": {len(costs)} trials cannot tell which is better"
+        seen += f"{count} trials cannot tell which is better"
         advice = "More can: --trials and --budget, or holdfast tune."
-    inspection.add("information", "method", seen, advice)
+        inspection.add("information", "method", seen, advice)
 
 
 def _report_endings(inspection: Inspection, results: list[TrialResult], steps: int) -> None:
