@@ -188,10 +188,14 @@ def _report_dominated(
             if better == worse or costs[better] > costs[worse]:
                 continue
             left = (1.0 - shares[worse]) / np.maximum(1.0 - shares[better], 1e-9)
+            apart = gains.states[:, worse] - gains.states[:, better]
+            apart = np.where(known[:, worse], apart, 0.0)
+            # What neither of them shows scatters, as an observation leaves few particles.
+            chance = 2.0 * apart.std(axis=0) / np.sqrt(len(apart))
             if (
                 (told[:, better] >= told[:, worse] - _NOTHING).mean() > 0.95
-                and (shares[better] >= shares[worse] - 0.02).all()
-                and np.nanmax(gains.states[:, worse] - gains.states[:, better]) < 0.3
+                and (apart.mean(axis=0) < 0.02 + chance).all()
+                and np.quantile(apart, 0.95, axis=0).max() < 0.3
                 and left.max() > 1.25
             ):
                 seen = f"{inspection.label(worse)} is dominated: {inspection.label(better)} shows "
