@@ -10,18 +10,22 @@ from __future__ import annotations
 import json
 import re
 import types
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin
 
 import msgspec
 import msgspec.inspect
 from msgspec.inspect import FloatType, IntType, ListType, StrType, VarTupleType
 
+from holdfast.errors import InvalidValueError
 from holdfast.printable import did_you_mean
 
 __all__ = [
     "KeyPath",
     "Mismatch",
+    "as_function",
+    "as_path",
     "close_match",
     "described",
     "dotted",
@@ -215,6 +219,24 @@ def close_match(text: str, allowed: Iterable[str]) -> str:
     part = rf"(?:^|_){re.escape(text.lower())}(?:_|$)"
     close = [each for each in texts if re.search(part, each)]
     return did_you_mean(text.lower(), texts, sure=close if len(close) == 2 else ())
+
+
+def as_path(what: str, value: Any) -> Path:
+    """Return a path; otherwise InvalidValueError names ``what``."""
+    try:
+        path = Path(value)
+    except TypeError:
+        path = Path()
+    if str(value) in ("", "\0") or not isinstance(value, str | Path) or "\0" in str(path):
+        raise InvalidValueError(f"{what} is {value!r:.80}; it must be a path")
+    return path
+
+
+def as_function(what: str, value: Any) -> Callable[..., Any]:
+    """Return a function; otherwise InvalidValueError names ``what``."""
+    if not callable(value):
+        raise InvalidValueError(f"{what} is {value!r:.80}; it must be a function")
+    return value  # type: ignore[no-any-return]
 
 
 def shown(value: Any) -> str:

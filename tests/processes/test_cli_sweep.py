@@ -55,12 +55,12 @@ def test_a_process_that_ends_ctrl_c_and_resume(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert " finished before; results in out" in done.stderr
     head, first, second, *_ = done.stdout.splitlines()
-    assert head.split()[:2] == ["trials", "success"]
-    assert first.startswith("method=random (baseline)  3 ")
+    assert head.split()[:2] == ["success", "(%)"]
+    assert first.startswith("method=random (baseline)  ")
     assert second.startswith("method=path_entropy")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         *("method=random", "method=path_entropy"),
-        *("table.md", "table.tex", "table.csv", "trials.csv"),
+        *("table.md", "table.tex", "table.csv", "trials.csv", "sweep.json"),
     }
 
 

@@ -38,6 +38,13 @@ def test_a_problem_of_the_users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert there.digest == hf.run_trial(planner, 3, max_steps=40).digest
 
 
+def test_in_a_worker_of_a_pool_its_trials_run_there() -> None:
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        there = pool.apply(hf.run_trials, (hf.make("peg_in_hole_2d"), 2), {"max_steps": 20})
+    here = hf.run_trials(hf.make("peg_in_hole_2d"), 2, max_steps=20, jobs=1)
+    assert [each.digest for each in there] == [each.digest for each in here]
+
+
 def test_a_script_runs_trials_on_several_cores(tmp_path: Path) -> None:
     """Its class goes to the workers, and they do not run the script: it has no guard."""
     pytest.importorskip("cloudpickle")

@@ -31,38 +31,6 @@ def test_it_says_what_to_do(here: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert again.stdout == said.stdout.splitlines(keepends=True)[0]
 
 
-def test_a_wrong_problem_is_not_tuned(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """In 25 steps nobody comes to the goal, whatever is sensed."""
-    said = run_here(capsys, here, *WORDS[:-1])
-    assert said.code == 2
-    assert "holdfast: error: goals: " in said.stderr
-    assert said.stderr.endswith("--no-check tunes all the same\n")
-    assert not (here / "runs").exists()
-
-
-def test_a_problem_that_hangs_is_not_waited_for(
-    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (here / "hanging.py").write_text(HANGING)
-    (here / "run.yaml").write_text(RUN.replace("peg_in_hole_2d", "hanging:Hanging"))
-    monkeypatch.setattr("holdfast.cli.tune._PATIENCE_S", 0.5)
-    said = run_here(capsys, here, *WORDS[:-1])
-    assert said.code == 2
-    assert "contract: policy raised TimeoutError: it was still running 0.5 s" in said.stderr
-    assert said.stdout == ""
-
-
-HANGING = """
-from tests.line_problem import Line
-
-class Hanging(Line):
-    def policy(self, states, stage):
-        print("not a result")
-        while True:
-            pass
-"""
-
-
 def test_an_interrupted_one_goes_on(
     here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

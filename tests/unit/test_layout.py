@@ -37,6 +37,7 @@ WITHOUT_TESTS = {
     "ros/ros2/__main__": "one line, which tests/ros runs",
     "robot/session_configuration": "one function; tests/unit/test_reference_decisions.py calls it",
     "ros/ros2/messages": "converts rclpy's messages, which only tests/ros has",
+    "tuning/check_process": "tests/processes/test_cli_check.py",
     "tuning/contract_check": WRONG_PROBLEMS,
     "tuning/findings": WRONG_PROBLEMS,
     "tuning/sensor_check": WRONG_PROBLEMS,

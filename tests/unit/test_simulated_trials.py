@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 from pathlib import Path
@@ -14,7 +15,7 @@ from tests.unit.test_outcome_comparison import result_of, run_of
 from tests.unit.test_trial import configuration_of, one
 
 import holdfast as hf
-from holdfast.errors import InvalidValueError, OutputError
+from holdfast.errors import HoldfastError, InvalidValueError, OutputError
 from holdfast.planning.outcome import SensingDecision
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.recording.outcome_comparison import effects_of
@@ -94,7 +95,14 @@ def test_comparison_against_the_named_baseline() -> None:
     assert frame["effect"]["steps"] == {each.measure: each for each in expected}["steps"].effect
     assert frame["low"]["reward"] <= frame["effect"]["reward"] <= frame["high"]["reward"]
     head, baseline, other = found.shown()
-    assert head[:3] == ("", "trials", "success")
+    assert head[:3] == ("", "success (%)", "steps")
+    assert found.names()[1:] == ("success_rate", "steps", "reward", "decision_ms")
+    latex = found.to_latex(columns=["reward", "success_rate"])
+    assert latex.splitlines()[2] == r" & reward & success (\%) \\"
+    assert r"\par decision" not in latex
+    assert r"\par decision" in found.to_latex()
+    with pytest.raises(InvalidValueError, match="columns has 'cost'; allowed are success_rate, st"):
+        found.to_markdown(columns=["cost"])
     assert (baseline[0], other[0]) == ("chance (baseline)", "ours")
     assert "60 steps" in repr(found)
     longest = max(map(len, repr(found).splitlines()[:3]))
@@ -107,7 +115,8 @@ def test_runs_on_the_disk_and_other_tasks(tmp_path: Path) -> None:
     mine = trials_of("random", max_steps=100)
     found = hf.compare({"recorded": run, "mine": mine})
     assert found.runs[0].notes == (
-        "problem is 'PegInHole2D' here and 'peg_in_hole_2d' in recorded: these are two tasks",
+        "problem is 'PegInHole2D' here and 'peg_in_hole_2d' there, "
+        "so the trials are of different tasks",
     )
     with pytest.raises(OutputError, match=r"mine: .* the limit is 60 steps here and 100 there"):
         hf.compare({"recorded": run, "mine": trials_of("random", 2)})
@@ -128,7 +137,7 @@ def test_runs_on_the_disk_and_other_tasks(tmp_path: Path) -> None:
             lambda: hf.run_trials(cast("Any", "peg.yaml"), 3),
             r"planner is 'peg.yaml': load_configuration\(path\)",
         ),
-        (lambda: hf.compare({}), "runs has 0 entries"),
+        (lambda: hf.compare({}), "runs is {}; compare takes a mapping of at least 2"),
         (
             lambda: hf.compare({"a": "x", "b": "y"}, baseline="c"),
             r"baseline is 'c'; it must be one of \['a', 'b'\]",
@@ -138,6 +147,41 @@ def test_runs_on_the_disk_and_other_tasks(tmp_path: Path) -> None:
 def test_a_wrong_argument_is_named(call: Any, message: str) -> None:
     with pytest.raises(InvalidValueError, match=message):
         call()
+
+
+def test_wrong_types_are_errors_of_holdfast(tmp_path: Path) -> None:
+    """Whatever one argument is, the function works or says what is wrong with it."""
+    configuration = configuration_of(tmp_path)
+    planner = hf.Planner(PegInHole2D(), particles=20, method="random")
+    mine = hf.run_trials(planner, 3, max_steps=10, jobs=1)
+    compared = hf.compare({"a": mine, "b": mine})
+    calls: list[tuple[Any, dict[str, Any]]] = [
+        (hf.run_trials, {"planner": planner, "n": 2, "seed": 0, "jobs": 1, "max_steps": 9}),
+        (hf.run_trials, {"planner": planner, "n": 2, "jobs": 1, "lost": None, "progress": None}),
+        (hf.compare, {"runs": {"a": mine, "b": mine}, "baseline": "a", "paired": True}),
+        (lambda run: hf.compare({"a": mine, "b": run}), {"run": mine}),
+        (compared.to_latex, {"path": None, "columns": None}),
+        (
+            hf.check_problem,
+            {"problem": 3, "settings": None, "max_steps": 9, "seed": 0, "budget_s": 1e-6}
+            | {"trials": 0, "on_check": print},
+        ),
+        (
+            hf.tune,
+            {"configuration": 3, "vary": ["fixed"], "objective": "steps", "budget_s": 1.0}
+            | {"most": 2, "jobs": 1, "max_decision_ms": 1e9, "out": None, "on_progress": print},
+        ),
+    ]
+    wrong = [-1, 2.5, np.nan, True, "", b"x", [], {}, object(), [1], {"a": 1}, 10**30, "\0"]
+    for call, arguments in calls:
+        for name in arguments:
+            for value in wrong:
+                given = {**arguments, name: value}
+                if call is hf.tune and name != "configuration":
+                    given["configuration"] = configuration
+                    given["out"] = value if name == "out" else 3  # so that none begins
+                with contextlib.suppress(HoldfastError):
+                    call(**given)
 
 
 def test_a_world_that_is_not_simulated_is_refused(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ class Prices(Table):
         return [("a|b, 5%_<", 0.1 + 0.2), ("=1+1", None)]
 
     def shown(self) -> list[tuple[str, ...]]:
-        return [("", "price"), ("a|b, 5%_<", "0.3 [0.1, 0.5]")]
+        return [("", "price"), ("a|b, 5%_<", "0.3\n-1 [0, 5]*")]
 
     def legend(self) -> str:
         return "prices in <EUR>"
@@ -31,13 +31,25 @@ def test_formats(tmp_path: Path) -> None:
     table = Prices()
     markdown = table.to_markdown(tmp_path / "table.md")
     assert markdown.splitlines() == [
-        "|           | price          |",
-        "| --------- | -------------- |",
-        r"| a\|b, 5%_< | 0.3 [0.1, 0.5] |",
+        "|           | price            |",
+        "| --------- | ---------------- |",
+        r"| a\|b, 5%_< | 0.3 (-1 [0, 5]*) |",
+        "",
+        "prices in <EUR>",
     ]
     assert (tmp_path / "table.md").read_text() == markdown
-    assert r"a|b, 5\%\_< & 0.3 [0.1, 0.5] \\" in table.to_latex().splitlines()
-    assert "\\begin{tabular}{lr}\n" in table.to_latex()
+    assert table.to_latex().splitlines() == [
+        r"{\footnotesize\begin{tabular}{lr}",
+        r"\hline",
+        r" & price \\",
+        r"\hline",
+        r"a|b, 5\%\_< & 0.3 \\",
+        r" & $-$1 [0, 5]* \\",
+        r"\hline",
+        r"\end{tabular}",
+        r"\par\smallskip prices in <EUR>",
+        "}",
+    ]
     # Numbers come back as they are, and no spreadsheet runs a text.
     assert list(csv.reader(table.to_csv().splitlines())) == [
         ["what", "price"],

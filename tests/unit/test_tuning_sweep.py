@@ -11,7 +11,7 @@ import pytest
 from tests.unit.test_trial import configuration_of, one
 
 from holdfast.config.loader import Configuration, load
-from holdfast.errors import InvalidValueError
+from holdfast.errors import InvalidValueError, OutputError
 from holdfast.planning.outcome import TrialResult
 from holdfast.recording.outcome_comparison import compare_outcomes
 from holdfast.tuning.sweep import Sweep, SweptArm, arms_of
@@ -98,10 +98,22 @@ def test_a_sweep_that_was_interrupted_goes_on(tmp_path: Path) -> None:
         ]
     assert comparison.baseline == "method=path_entropy"
     alone = compare_outcomes([out / found[1].directory, out / found[0].directory])
-    assert comparison.runs[0].effects == alone.runs[0].effects
+    assert comparison.runs[0].effects[:-1] == alone.runs[0].effects[:-1]
     with (out / "trials.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["selector.method"] for row in rows] == ["random"] * 3 + ["path_entropy"] * 3
     assert rows[0]["particle_filter.num_particles"] == "30"
     assert rows[4]["digest"] == one(found[1].configuration, 1).digest
     assert "| method=path_entropy (baseline) |" in (out / "table.md").read_text()
+    judged = {each.measure: each.verdict for each in comparison.runs[0].effects}
+    assert judged["decision_ms"] == "too few trials"
+    # More values extend it, and their times are of another moment; other keys are another sweep.
+    more = arms(tmp_path, {**AXES, "selector.method": [*AXES["selector.method"], "fixed"]})
+    with Sweep(out, more) as sweep:
+        assert (sweep.finished, sweep.new) == (6, ["method=fixed"])
+        sweep.run(1, lambda _: None)
+        judged = {each.measure: each.verdict for each in sweep.comparison().runs[0].effects}
+    assert judged["decision_ms"] == "not judged"
+    other = arms(tmp_path, {**AXES, "particle_filter.num_particles": [30, 40]})
+    with pytest.raises(OutputError, match=r"out: has a sweep of selector.method, and this one is"):
+        Sweep(out, other).__enter__()

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import json
 import shutil
-import signal
 import sys
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.cli.exit_codes import EXIT_DIFFERENT, ended_by_signals
 from holdfast.errors import ConfigurationError, InvalidValueError
 from holdfast.printable import printable
 from holdfast.runtime.command_line import (
     MAX_SEED,
+    MAX_TRIALS,
     Options,
     argument,
     flag,
@@ -27,17 +27,11 @@ from holdfast.runtime.command_line import (
 )
 
 if TYPE_CHECKING:
-    from types import FrameType
-
     from holdfast.config.loader import Configuration
-    from holdfast.tuning.findings import Finding
 
-__all__ = ["inspected", "main"]
+__all__ = ["main"]
 
 _WIDEST = 110
-
-_PATIENCE = 3.0
-"""A call that takes so many times the budget is ended, where the system can."""
 
 
 class CheckOptions(Options):
@@ -45,7 +39,7 @@ class CheckOptions(Options):
 
     PROBLEM is a configuration file, a registered name, or module:Class of a module in the current
     directory. Of a configuration the simulated world is used, never its environment: no robot
-    moves.
+    moves. The check is a process of its own, so the problem's code cannot end or hang it.
 
     Errors make decisions wrong, warnings make them worse. The statistical tests of a right
     problem, all together, find an error in one check of a thousand.
@@ -78,6 +72,12 @@ class CheckOptions(Options):
         default=20.0,
         help="Time after which no further work is begun; most problems need a few seconds.",
     )
+    trials: int = option(
+        metavar="N",
+        read=whole_number(0, MAX_TRIALS),
+        default=100,
+        help="Pairs of trials, at most, to tell whether the method beats random sensing.",
+    )
     json: bool = flag(help="Print each finding as a JSON object, one a line.")
     quiet: bool = flag("-q", help="Show no progress, and no information: errors and warnings only.")
 
@@ -91,18 +91,21 @@ def main(arguments: Sequence[str]) -> int:
 
 def _check(options: CheckOptions) -> int:
     from holdfast.cli.terminal import counted, progress_line
+    from holdfast.tuning.check_process import check_apart
+    from holdfast.tuning.findings import OVER
     from holdfast.tuning.problem_check import CHECKS
 
-    configuration = _configuration(options)
     line = progress_line(len(CHECKS), quiet=options.quiet or options.json, noun="check")
     names = list(CHECKS)
-    line.start(f"checking {configuration.problem_name}", 0, "")
+    line.start(f"checking {options.problem}", 0, "")
     try:
-        found = inspected(
-            configuration,
-            _PATIENCE * options.budget,
+        found = check_apart(
+            functools.partial(
+                _configuration, options.problem, options.problem_directory, options.assignments
+            ),
             seed=options.seed,
             budget_s=options.budget,
+            trials=options.trials,
             on_check=lambda name: line.show(names.index(name), name),
         )
     finally:
@@ -115,39 +118,28 @@ def _check(options: CheckOptions) -> int:
         sum(each.severity == kind for each in found) for kind in ("error", "warning")
     )
     if not options.json:
-        sys.stdout.write(f"{counted(errors, 'error')}, {counted(warnings, 'warning')}\n")
+        left_out = [each.check for each in found if each.seen == OVER]
+        more = f"; too little time for {', '.join(left_out)} (--budget)" if left_out else ""
+        sys.stdout.write(f"{counted(errors, 'error')}, {counted(warnings, 'warning')}{more}\n")
     return EXIT_DIFFERENT if errors else 0
 
 
-def inspected(configuration: Configuration, patience_s: float, **how: Any) -> list[Finding]:
-    """Check the problem of a configuration, which may print and hang; ``how`` as it is checked."""
-    from holdfast.tuning.problem_check import check_problem
-
-    # What the problem's code prints is no finding.
-    with contextlib.redirect_stdout(sys.stderr), _impatient(patience_s):
-        return check_problem(
-            configuration.problem,
-            configuration.planning,
-            max_steps=configuration.simulator.max_steps,
-            **how,
-        )
-
-
-def _configuration(options: CheckOptions) -> Configuration:
+def _configuration(
+    problem: str, directory: Path | None, assignments: Sequence[str]
+) -> Configuration:
     """Return the configuration of a file, or one of defaults for a problem's name."""
     from holdfast.cli.overrides import combined, parse_assignment
     from holdfast.config.loader import Configuration, load
 
-    given = combined(parse_assignment(each) for each in options.assignments)
-    directory = options.problem_directory
-    if options.problem.endswith((".yaml", ".yml")) or Path(options.problem).is_file():
+    given = combined(parse_assignment(each) for each in assignments)
+    if problem.endswith((".yaml", ".yml")) or Path(problem).is_file():
         if directory is not None:
             raise InvalidValueError(
                 "--problem-directory goes with module:Class; a configuration file has the key "
                 "problem_directory"
             )
-        return load(Path(options.problem).absolute(), overrides=given)
-    sections: dict[str, object] = {"problem": options.problem}
+        return load(Path(problem).absolute(), overrides=given)
+    sections: dict[str, object] = {"problem": problem}
     if directory is not None:
         sections["problem_directory"] = str(directory)
     for name, value in given.items():
@@ -156,36 +148,12 @@ def _configuration(options: CheckOptions) -> Configuration:
         if not isinstance(own, dict):
             raise InvalidValueError(f"--set {name}: {section} has no keys")
         own[key] = value
-    path = str(Path.cwd() / options.problem.replace("/", "_"))
+    path = str(Path.cwd() / problem.replace("/", "_"))
     try:
         return Configuration.from_plain({"path": path, "configuration": sections})
     except ConfigurationError as error:
         # There is no such file.
         raise type(error)(str(error).removeprefix(f"{path}: ")) from error
-
-
-@contextlib.contextmanager
-def _impatient(seconds: float) -> Iterator[None]:
-    """Raise TimeoutError in the problem's code if it takes so long: a finding with its lines."""
-    from holdfast.config.user_code import is_users_file
-
-    ours = str(Path(__file__).parents[1] / "tuning")
-
-    def end(number: int, frame: FrameType | None) -> None:
-        del number
-        while frame is not None and not frame.f_code.co_filename.startswith(ours):
-            if is_users_file(frame.f_code.co_filename):
-                raise TimeoutError(f"it was still running {seconds:g} s after the check began")
-            frame = frame.f_back
-
-    before = signal.signal(signal.SIGALRM, end)
-    # Again each second: what runs then may be ours, or a second function of the problem's.
-    signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
 
 
 def _wrapped(text: str) -> str:

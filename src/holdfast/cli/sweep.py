@@ -150,6 +150,8 @@ def _sweep(options: SweepOptions) -> int:
         try:
             title = f"{arms[0].configuration.problem_name}, {note}, {counted(sweep.total, 'trial')}"
             before = f", {finished:,} finished before" if finished else ""
+            if sweep.new:
+                before += f"; the sweep is extended by {'; '.join(sweep.new)}"
             where = shown_path(directory)
             line.start(f"{title}{before}; results in {where}", finished, note)
             try:

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from holdfast.cli.exit_codes import (
     EXIT_CAN_GO_ON,
@@ -17,11 +17,10 @@ from holdfast.cli.exit_codes import (
     say_interrupted,
 )
 from holdfast.cli.overrides import combined, parse_assignment
-from holdfast.cli.terminal import counted, duration, progress_line
+from holdfast.cli.terminal import duration, progress_line
 from holdfast.errors import (
     InvalidValueError,
     OutputError,
-    ProblemError,
     RunError,
     WorkerDiedError,
 )
@@ -42,14 +41,9 @@ from holdfast.runtime.command_line import (
 from holdfast.runtime.files import shown_path
 from holdfast.runtime.output_directory import claim_directory
 
-if TYPE_CHECKING:
-    from holdfast.config.loader import Configuration
-
 __all__ = ["TuneOptions", "main"]
 
 _MOST_TRIALS = 100_000
-_LONGEST_CHECK_S = 20.0
-_PATIENCE_S = 60.0
 _LONGEST_S = 30 * 86_400.0
 _UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
@@ -168,8 +162,14 @@ def main(arguments: Sequence[str]) -> int:
 def _tune(options: TuneOptions) -> int:
     from holdfast.config.loader import load
     from holdfast.recording.kept_trials import TRIALS_NAME
+    from holdfast.tuning.check_process import require_right
+    from holdfast.tuning.findings import Finding
     from holdfast.tuning.tune import Progress, tune
     from holdfast.tuning.tuning_report import CONFIGURATION_NAME, tuning_tables
+
+    def warn(found: Finding) -> None:
+        if not options.quiet:
+            sys.stderr.write(printable(f"note: {found.check}: {found.seen}\n"))
 
     runs, began_s = Path("runs").absolute(), monotonic()
     given = [parse_assignment(each) for each in options.assignments]
@@ -178,7 +178,7 @@ def _tune(options: TuneOptions) -> int:
         path, problem=options.problem, seed=options.seed, overrides=combined(given)
     )
     if options.check and not options.resume:
-        _check(configuration, options)
+        require_right(configuration, _seconds(options.budget), warn)
     if options.resume:
         if options.out is None or not (options.out / TRIALS_NAME).is_file():
             raise InvalidValueError(f"--resume needs --out DIR, of a tuning that has {TRIALS_NAME}")
@@ -209,6 +209,7 @@ def _tune(options: TuneOptions) -> int:
             jobs=options.jobs,
             ray=options.ray,
             max_decision_ms=options.max_decision_ms,
+            check=False,
             out=out,
             on_progress=show,
         )
@@ -228,21 +229,3 @@ def _tune(options: TuneOptions) -> int:
     if not options.quiet:
         sys.stderr.write(f"Take it: holdfast run {shown_path(out / CONFIGURATION_NAME)}\n")
     return 0
-
-
-def _check(configuration: Configuration, options: TuneOptions) -> None:
-    """Show what is wrong with the problem; raise ProblemError if that is an error."""
-    from holdfast.cli.check import inspected
-
-    budget_s = min(_LONGEST_CHECK_S, 0.1 * _seconds(options.budget))
-    found = inspected(configuration, _PATIENCE_S, budget_s=budget_s)
-    errors = [each for each in found if each.severity == "error"]
-    for each in found:
-        if each.severity == "warning" and not options.quiet:
-            sys.stderr.write(printable(f"note: {each.check}: {each.seen}\n"))
-    if errors:
-        first = errors[0]
-        raise ProblemError(
-            f"{first.check}: {first.seen}. holdfast check {shown_path(options.configuration)} says "
-            f"more of {counted(len(errors), 'error')}; --no-check tunes all the same"
-        )

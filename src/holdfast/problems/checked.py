@@ -61,6 +61,7 @@ __all__ = [
     "rollout_returns",
     "sample_observation",
     "scene",
+    "truths",
 ]
 
 MAX_OBSERVATION_SIZE = 1024
@@ -349,22 +350,23 @@ def ends(problem: Any, states: FloatArray) -> tuple[BoolArray, BoolArray | None]
 
     The second is None for a problem that has no failures. A state that is a goal, too, is one.
     """
-    reached = _truths(problem, "is_goal", states)
+    reached = truths(problem, "is_goal", states)
     if getattr(problem, "is_failure", None) is None:
         return reached, None
-    failed = _truths(problem, "is_failure", states)
+    failed = truths(problem, "is_failure", states)
     return reached | failed, failed
 
 
-def _truths(problem: Any, function: str, states: FloatArray) -> BoolArray:
-    found = _ask(problem, function, states)
+def truths(problem: Any, function: str, states: FloatArray) -> BoolArray:
+    """Return which states are goals, or failures, of which a problem need not know."""
     shape = states.shape[:-1]
-    if not isinstance(found, np.ndarray) or found.dtype != np.bool_ or found.shape != shape:
-        raise ProblemError(
-            f"{function} of {name_of(problem)}, asked of {states.shape[0]} states at once, "
-            f"returned {found!r:.80}: need as many truth values"
-        )
-    return found.copy()
+    if getattr(problem, function, None) is None:
+        return np.zeros(shape, dtype=bool)
+    found = _ask(problem, function, states)
+    is_array = isinstance(found, np.ndarray) or not shape  # of one state a truth value will do
+    if not is_array or np.shape(found) != shape or np.asarray(found).dtype != np.bool_:
+        raise _returned(problem, function, found, f"truth values of shape {_written(shape)}")
+    return np.array(found)
 
 
 def known_state_return(problem: Any, states: FloatArray, stages: IntArray) -> FloatArray | None:

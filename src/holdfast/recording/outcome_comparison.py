@@ -24,7 +24,7 @@ from holdfast.recording.run_directory import (
     recorded_configuration,
     world_of,
 )
-from holdfast.recording.table_formats import Table
+from holdfast.recording.table_formats import TIMES, Table, aligned, decimals
 from holdfast.recording.tables import wilson_interval
 from holdfast.robot.environment_maker import BUILT_IN
 
@@ -53,7 +53,9 @@ too few."""
 
 _NUMBERS_IN_MEMORY = 10_000_000
 
-Verdict: TypeAlias = Literal["better", "worse", "no difference found", "too few trials"]
+Verdict: TypeAlias = Literal[
+    "better", "worse", "no difference found", "too few trials", "not judged"
+]
 
 
 class OutcomeEffect(msgspec.Struct, frozen=True, kw_only=True):
@@ -71,9 +73,10 @@ class OutcomeEffect(msgspec.Struct, frozen=True, kw_only=True):
         mean reward, median of the decision times.
     interval : tuple of float, or None
         For ``effect``; None if no two trials differ in it, so nothing is known of its scatter.
-    verdict : {"better", "worse", "no difference found", "too few trials"}
+    verdict : {"better", "worse", "no difference found", "too few trials", "not judged"}
         Of the run, by whether the interval has the value of no difference. With fewer than ten
-        trials an interval is too short to say so.
+        trials an interval is too short to say so. Times are judged only if they were measured in
+        turns: another moment, load or machine makes a difference as well.
     """
 
     measure: str
@@ -155,41 +158,55 @@ class OutcomeComparison(Table, msgspec.Struct, frozen=True, kw_only=True):
                 rows.append((run.run, each.measure, each.kind, *numbers, *bounds, each.verdict))
         return rows
 
+    def names(self) -> Sequence[str]:
+        """Return the names by which columns are chosen: ``trials`` and the measures."""
+        there = {effect.measure for run in self.runs for effect in run.effects}
+        counts = len({run.trials for run in self.runs}) > 1
+        return ("", *("trials",) * counts, *(name for name in _TEXTS if name in there))
+
     def shown(self) -> list[tuple[str, ...]]:
-        """Return a row for each run: its value of each measure, and the effect in brackets."""
-        found = [{effect.measure: effect for effect in run.effects} for run in self.runs]
-        names = [name for name in _TEXTS if any(name in effects for effects in found)]
-        head = ("", "trials", *(_TEXTS[name][0] for name in names))
-        of_baseline = []
-        for name in names:
-            effect = next(effects[name] for effects in found if name in effects)
-            of_baseline.append(_TEXTS[name][2].format(effect.baseline))
-        rows = [(f"{self.baseline} (baseline)", str(self.runs[0].trials), *of_baseline)]
-        for run, effects in zip(self.runs, found, strict=True):
-            cells = (_cell(effects[name]) if name in effects else "-" for name in names)
-            rows.append((run.run, str(run.trials), *cells))
-        return [head, *rows]
+        """Return a row for each run: its value of each measure, and beneath it the effect."""
+        names = self.names()
+        rows = [[f"{self.baseline} (baseline)", *len(names[1:]) * [""]]]
+        for run in self.runs:
+            texts: dict[str, str] = {"trials": str(run.trials)}
+            for each in run.effects:
+                baseline, value, *effect = _texts_of(each)
+                at = names.index(each.measure)
+                rows[0][at] = rows[0][at] or baseline
+                texts[each.measure] = value
+                if each.verdict != "not judged":
+                    star = "*" if each.verdict in ("better", "worse") else ""
+                    texts[each.measure] += f"\n{' '.join(effect)}{star}"
+            rows.append([run.run, *(texts.get(name, "-") for name in names[1:])])
+        heads = (_TEXTS[name][0] if name in _TEXTS else name for name in names)
+        return [tuple(heads), *map(tuple, rows)]
 
     def legend(self) -> str:
         """Return how the numbers are defined, and the notes."""
-        return "\n".join(
-            [
-                "In brackets: the effect against the baseline and its interval (points of a rate, "
-                "ratios of steps and times, differences of rewards).",
-                *self._definitions(),
-                *self.notes(),
-            ]
+        counts = " or ".join(sorted({f"{run.trials:,}" for run in self.runs}))
+        first = (
+            f"{counts} {self._pairs()}; with each value the effect against the baseline and its "
+            f"interval (points of a rate, {TIMES} for ratios of steps and times, differences of "
+            "rewards). *: the interval excludes no effect."
         )
+        return "\n".join([first, *self._definitions(), *self.notes()])
 
     def notes(self) -> list[str]:
         """Return what else a person should know, a line for each."""
         return [f"{run.run}: {note}" for run in self.runs for note in run.notes]
 
+    def _pairs(self) -> str:
+        return f"trials {'paired by number' if self.paired else 'not paired'}"
+
     def _definitions(self) -> list[str]:
+        apart = "measured at different moments, so not compared (holdfast sweep takes turns)."
+        verdicts = {each.verdict for run in self.runs for each in run.effects}
         return [
             "steps: the geometric mean fits ratios (the summary has the arithmetic one); a trial "
             f"that did not reach the goal counts as its limit, {self.step_limit:,} steps.",
-            f"intervals: {self.method}, each by itself.",
+            *[f"decision (ms): {apart}"] * ("not judged" in verdicts),
+            f"intervals: {self.level:.0%}, {self.method}, each by itself.",
         ]
 
     def fitting(self, width: int) -> str:
@@ -202,17 +219,12 @@ class OutcomeComparison(Table, msgspec.Struct, frozen=True, kw_only=True):
         """Return a table for each run, and how its numbers are defined."""
         lines = []
         for run in self.runs:
-            how = "paired by number" if self.paired else "not paired"
-            lines.append(f"{run.run} against {self.baseline}, {run.trials:,} trials {how}:")
-            rows: list[tuple[str, ...]] = [
-                ("", "baseline", "run", "effect", f"{self.level:.0%} interval", "")
+            lines.append(f"{run.run} against {self.baseline}, {run.trials:,} {self._pairs()}:")
+            head = ("", "baseline", "run", "effect", f"{self.level:.0%} interval", "")
+            rows = [
+                (_TEXTS[each.measure][0], *_texts_of(each), each.verdict) for each in run.effects
             ]
-            rows += [_row(effect) for effect in run.effects]
-            widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-            for row in rows:
-                cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
-                lines.append(f"  {'  '.join(cells)}".rstrip())
-            lines.append("")
+            lines += [*(f"  {'  '.join(row)}".rstrip() for row in aligned([head, *rows])), ""]
         return "\n".join([*lines, *self._definitions()])
 
     def to_json(self) -> str:
@@ -221,15 +233,9 @@ class OutcomeComparison(Table, msgspec.Struct, frozen=True, kw_only=True):
 
 
 def compare_outcomes(runs: Sequence[Path], *, paired: bool = True) -> OutcomeComparison:
-    """Compare the outcomes of runs with those of the first; none of them is changed.
+    """Compare the outcomes of runs on the disk, which nobody may be using, with the first one's.
 
-    Parameters
-    ----------
-    runs : sequence of Path
-        Directories of runs, or their journals. Nobody may be using them.
-    paired : bool
-        Whether trials of one number are in the same world. If False, each run is a sample of its
-        own, so that runs with other seeds can be compared.
+    Unless ``paired``, each is a sample of its own, so that runs with other seeds can be compared.
 
     Raises
     ------
@@ -238,13 +244,20 @@ def compare_outcomes(runs: Sequence[Path], *, paired: bool = True) -> OutcomeCom
         limits or (if paired) seeds differ, or they have too few trials.
     """
     found = [read_outcomes(path, str(path)) for path in runs]
-    for other in found[1:]:
-        _require_comparable(found[0], other, paired=paired)
-    return compare_results(found, paired=paired)
+    return compare_results(found, paired=paired, strict=True)
 
 
-def compare_results(runs: Sequence[ComparedRun], *, paired: bool = True) -> OutcomeComparison:
-    """Compare results with those of the first run; where settings differ, notes say so.
+def compare_results(
+    runs: Sequence[ComparedRun],
+    *,
+    paired: bool = True,
+    in_turns: bool = False,
+    strict: bool = False,
+) -> OutcomeComparison:
+    """Compare results with those of the first run; where their tasks differ, notes say so.
+
+    If they were measured ``in_turns``, trial by trial, decision times are judged, too. If
+    ``strict``, other tasks are an error.
 
     Raises
     ------
@@ -252,8 +265,6 @@ def compare_results(runs: Sequence[ComparedRun], *, paired: bool = True) -> Outc
         If their limits or (if paired) their seeds differ, or they have too few trials.
     """
     baseline, *others = runs
-    for other in others:
-        _require_same_worlds(baseline, other, paired=paired)
     over = "pairs of trials" if paired else "trials"
     return OutcomeComparison(
         baseline=baseline.name,
@@ -261,7 +272,7 @@ def compare_results(runs: Sequence[ComparedRun], *, paired: bool = True) -> Outc
         step_limit=baseline.step_limit,
         level=LEVEL,
         method=f"percentile bootstrap over {over}, {RESAMPLES:,} resamples, fixed seed",
-        runs=tuple(_compare(baseline, other, paired=paired) for other in others),
+        runs=tuple(_compare(baseline, other, paired, in_turns, strict) for other in others),
     )
 
 
@@ -311,7 +322,6 @@ def read_outcomes(path: Path, name: str) -> ComparedRun:
         world={
             "problem": configuration["problem"],
             "model": configuration.get("model"),
-            "simulator": {"max_steps": int(simulator["max_steps"])},
             "environment": environment,
         },
         arguments=arguments,
@@ -319,36 +329,42 @@ def read_outcomes(path: Path, name: str) -> ComparedRun:
     )
 
 
-def _require_comparable(baseline: ComparedRun, other: ComparedRun, *, paired: bool) -> None:
-    found = first_difference(baseline.world, other.world)
-    if found is not None:
-        key, old, new = found
-        raise OutputError(
-            f"{other.name}: cannot be compared with {baseline.name}: {key} is {new} here and {old} "
-            "there, so the trials are of different tasks"
-        )
-    _require_same_worlds(baseline, other, paired=paired)
-
-
-def _require_same_worlds(baseline: ComparedRun, other: ComparedRun, *, paired: bool) -> None:
+def _compare(
+    baseline: ComparedRun, other: ComparedRun, paired: bool, in_turns: bool, strict: bool
+) -> RunOutcomes:
+    runs = baseline, other
+    refused = f"{other.name}: cannot be {{}} with {baseline.name}: "
+    # What both are known by; a table of Python knows less than a run.
+    there, here = (
+        {key: run.world[key] for key in runs[0].world.keys() & runs[1].world} for run in runs
+    )
+    notes = []
+    for found, so in (
+        (first_difference(there, here), "so the trials are of different tasks"),
+        (
+            first_difference(baseline.arguments, other.arguments, "environment.arguments"),
+            "so these may be two worlds",
+        ),
+    ):
+        if found is not None:
+            notes.append(f"{found[0]} is {found[2]} here and {found[1]} there, {so}")
+            if strict and "tasks" in so:
+                raise OutputError(refused.format("compared") + notes[-1])
     if baseline.step_limit != other.step_limit:
         raise OutputError(
-            f"{other.name}: cannot be compared with {baseline.name}: the limit is "
-            f"{other.step_limit:,} steps here and {baseline.step_limit:,} there"
+            f"{refused.format('compared')}the limit is {other.step_limit:,} steps here and "
+            f"{baseline.step_limit:,} there"
         )
     if paired and baseline.seed != other.seed:
         raise OutputError(
-            f"{other.name}: cannot be paired with {baseline.name}: the seed is {other.seed} here "
-            f"and {baseline.seed} there, so the worlds differ; compare them as independent samples "
-            "(--unpaired), which takes more trials to find a difference"
+            f"{refused.format('paired')}the seed is {other.seed} here and {baseline.seed} there, "
+            "so the worlds differ; compare them as independent samples (--unpaired), which takes "
+            "more trials to find a difference"
         )
-
-
-def _compare(baseline: ComparedRun, other: ComparedRun, *, paired: bool) -> RunOutcomes:
-    notes = []
+    pairs = [list(run.results.values()) for run in runs]
     if paired:
         trials = sorted(baseline.results.keys() & other.results.keys())
-        pairs = [[run.results[trial] for trial in trials] for run in (baseline, other)]
+        pairs = [[run.results[trial] for trial in trials] for run in runs]
         left_out = len(baseline.results.keys() ^ other.results.keys())
         if left_out:
             notes.append(f"trials that only one of the runs has finished, left out: {left_out:,}")
@@ -356,9 +372,7 @@ def _compare(baseline: ComparedRun, other: ComparedRun, *, paired: bool) -> RunO
             notes.append(
                 "the world is not simulated: trials of one number need not be in the same world"
             )
-    else:
-        pairs = [list(run.results.values()) for run in (baseline, other)]
-    notes += [f"{run.name}: is not finished" for run in (baseline, other) if not run.is_finished]
+    notes += [f"{run.name}: is not finished" for run in runs if not run.is_finished]
     if min(map(len, pairs)) < _LEAST_TRIALS:
         raise OutputError(
             f"{other.name}: too few trials to compare with {baseline.name}: "
@@ -366,25 +380,18 @@ def _compare(baseline: ComparedRun, other: ComparedRun, *, paired: bool) -> RunO
         )
     if other.problem_sources != baseline.problem_sources:
         notes.append("the source of the problem differs")
-    worlds = baseline.world, other.world
-    here, there = ({key: world[key] for key in worlds[0].keys() & worlds[1]} for world in worlds)
-    if (found := first_difference(here, there)) is not None:
-        key, old, new = found
-        notes.append(f"{key} is {new} here and {old} in {baseline.name}: these are two tasks")
-    found = first_difference(baseline.arguments, other.arguments, "environment.arguments")
-    if found is not None:
-        key, old, new = found
-        notes.append(f"{key} is {new} here and {old} there: these may be two worlds")
-    return RunOutcomes(
-        run=other.name,
-        trials=len(pairs[1]),
-        effects=effects_of(*pairs, step_limit=baseline.step_limit, paired=paired),
-        notes=tuple(notes),
-    )
+    limit = baseline.step_limit
+    effects = effects_of(*pairs, step_limit=limit, paired=paired, in_turns=in_turns)
+    return RunOutcomes(run=other.name, trials=len(pairs[1]), effects=effects, notes=tuple(notes))
 
 
 def effects_of(
-    first: Sequence[TrialResult], second: Sequence[TrialResult], *, step_limit: int, paired: bool
+    first: Sequence[TrialResult],
+    second: Sequence[TrialResult],
+    *,
+    step_limit: int,
+    paired: bool,
+    in_turns: bool = False,
 ) -> tuple[OutcomeEffect, ...]:
     """Compare the results of two runs, the first the baseline.
 
@@ -392,7 +399,9 @@ def effects_of(
     trials of a run have is left out.
     """
     pairs = (first, second)
-    effects = (_effect_of(measure, pairs, step_limit, paired=paired) for measure in _MEASURES)
+    effects = [_effect_of(measure, pairs, step_limit, paired=paired) for measure in _MEASURES]
+    if not in_turns and effects[-1] is not None:
+        effects[-1] = msgspec.structs.replace(effects[-1], verdict="not judged")
     return tuple(filter(None, effects))
 
 
@@ -544,51 +553,45 @@ def bootstrap_interval(
 
 
 _TEXTS = {
-    "success_rate": ("success", " points", "{:.1%}", "{:+.1f}"),
-    "failure_rate": ("failed", " points", "{:.1%}", "{:+.1f}"),
-    "steps": ("steps, geometric mean", " times", "{:.4g}", "{:.3g}"),
-    "reward": ("reward, mean", "", "{:.4g}", "{:+.4g}"),
-    "decision_ms": ("decision time, median", " times", "{:.3g} ms", "{:.3g}"),
+    "success_rate": ("success (%)", 100.0),
+    "failure_rate": ("failed (%)", 100.0),
+    "steps": ("steps", 1.0),
+    "reward": ("reward", 1.0),
+    "decision_ms": ("decision (ms)", 1.0),
 }
-"""For people: a measure's title, the unit of its effect, and the formats of value and effect."""
+"""For people: a measure's title, and its scale."""
 
 
-def _row(effect: OutcomeEffect) -> tuple[str, ...]:
-    """Return what the table says of a measure."""
-    title, unit, of_run, _ = _TEXTS[effect.measure]
-    changed, low_high = _texts_of(effect)
-    return (
-        title,
-        of_run.format(effect.baseline),
-        of_run.format(effect.run),
-        changed + unit,
-        low_high,
-        effect.verdict,
-    )
-
-
-def _texts_of(effect: OutcomeEffect) -> tuple[str, str]:
-    """Return the effect, and its interval."""
-    of_effect = _TEXTS[effect.measure][3]
-    scale = 100.0 if effect.measure.endswith("_rate") else 1.0
-    changed = of_effect.format(scale * effect.effect)
+def _texts_of(effect: OutcomeEffect) -> tuple[str, str, str, str]:
+    """Return the baseline's value and the run's, the effect and its interval, rounded to it."""
+    scale = _TEXTS[effect.measure][1]
+    values = scale * effect.baseline, scale * effect.run
+    ratio = effect.kind == "ratio"
     if effect.interval is None:
-        return changed, "all alike"
-    low, high = (of_effect.format(scale * end) for end in effect.interval)
-    return changed, f"[{low}, {high}]"
-
-
-def _cell(effect: OutcomeEffect) -> str:
-    """Return a run's value, with the effect; a verdict only if there is a difference."""
-    changed, low_high = _texts_of(effect)
-    verdict = f", {effect.verdict}" if effect.verdict in ("better", "worse") else ""
-    return f"{_TEXTS[effect.measure][2].format(effect.run)} ({changed} {low_high}{verdict})"
+        change = f"{TIMES}{effect.effect:.3g}" if ratio else f"{scale * effect.effect:+.4g}"
+        return f"{values[0]:.4g}", f"{values[1]:.4g}", change, "all alike"
+    own, sign, none = (1.0, "", 1.0) if ratio else (scale, "+", 0.0)
+    bounds = [own * end for end in effect.interval]
+    digits = decimals(bounds)
+    # What does not have the value of no effect must not be rounded to it.
+    while none in (round(bounds[0], digits), round(bounds[1], digits)) and none not in bounds:
+        digits += 1
+    change, low, high = (f"{each:{sign}.{digits}f}" for each in (own * effect.effect, *bounds))
+    # Of a ratio the values are as sure as their share of it.
+    shares = [each / effect.effect if ratio and effect.effect else 1.0 for each in values]
+    baseline, value = (
+        f"{each:.{decimals([share * end for end in bounds])}f}"
+        for each, share in zip(values, shares, strict=True)
+    )
+    return baseline, value, f"{TIMES}{change}" if ratio else change, f"[{low}, {high}]"
 
 
 def shown_estimate(estimate: OutcomeEstimate) -> tuple[str, str, str]:
     """Return a measure's title, its value and its interval, for people."""
-    title, _, of_run, _ = _TEXTS[estimate.measure]
-    low_high = "all alike"
-    if estimate.interval is not None:
-        low_high = f"[{', '.join(of_run.format(end) for end in estimate.interval)}]"
-    return title, of_run.format(estimate.value), low_high
+    title, scale = _TEXTS[estimate.measure]
+    value = scale * estimate.value
+    if estimate.interval is None:
+        return title, f"{value:.4g}", "all alike"
+    bounds = [scale * end for end in estimate.interval]
+    value_text, low, high = (f"{each:.{decimals(bounds)}f}" for each in (value, *bounds))
+    return title, value_text, f"[{low}, {high}]"

@@ -23,6 +23,7 @@ pay for their own start. Each worker holds trials for a tenth of a second, at mo
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import traceback
 from collections import deque
@@ -156,10 +157,12 @@ class TrialPool:
     ) -> None:
         if integer(jobs) is None or not 1 <= jobs <= MAX_JOBS:
             raise InvalidValueError(f"jobs is {jobs!r:.80}; it must be from 1 to {MAX_JOBS}")
-        self._jobs = jobs
+        # A worker of multiprocessing's pools, which is daemonic, may start no processes.
+        alone = multiprocessing.current_process().daemon
+        self._jobs = 1 if alone else jobs
         self._expected = expected
         self._observer = observer
-        self._overdue = overdue
+        self._overdue = None if alone else overdue
         self._cluster = cluster
         self._queue: deque[tuple[Arm, int]] = deque()
         self._workers: list[_Worker] = []

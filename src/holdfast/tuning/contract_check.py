@@ -16,39 +16,18 @@ import numpy as np
 
 from holdfast.errors import ProblemError
 from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
-from holdfast.numerics.floating_mode import as_caller
 from holdfast.numerics.randomness import NoiseFreeStream, Purpose, Stream, stream
 from holdfast.problems import checked
-from holdfast.problems.attributes import has_general_observations, name_of, sensing_labels
+from holdfast.problems.attributes import has_general_observations, sensing_labels
 from holdfast.tuning.findings import CheckEndedError, Inspection
 
-__all__ = [
-    "acted",
-    "check_contract",
-    "check_streams",
-    "draw_observation",
-    "truths",
-]
+__all__ = ["acted", "check_contract", "check_streams", "draw_observation"]
 
 _SHAPES = ((1,), (3, 4))  # leading shapes beside () and (n,)
 _SAME = 1e-9  # relative difference up to which a batch and its rows differ by rounding alone
 _DRAWS = 200  # of each of two samples that are compared
 _MANY_ACTIONS = 32  # bound on the sensing actions of which single states are tried
 _INITIAL, _MOVE = 1, 2  # trial numbers of the streams here
-
-
-def truths(problem: Any, function: str, states: FloatArray) -> BoolArray:
-    """Return which states are goals, or failures, of which a problem need not know."""
-    leading = states.shape[:-1]
-    if getattr(problem, function, None) is None:
-        return np.zeros(leading, dtype=bool)
-    found = as_caller(getattr(problem, function), states)
-    if np.shape(found) != leading or np.asarray(found).dtype != np.bool_:
-        raise ProblemError(
-            f"{function} of {name_of(problem)} returned {found!r:.80} for states of shape "
-            f"{states.shape}: need truth values of shape {leading}"
-        )
-    return np.array(found)
 
 
 def draw_observation(problem: Any, state: FloatArray, action: int, random: Stream) -> FloatArray:
@@ -103,8 +82,8 @@ def _calls(p: Any) -> Iterator[_Call]:
         _Call("move", lambda s, k: c.move(p, s, do(s, k), own)),
         _Call("move", lambda s, k: c.move(p, s, do(s, k)[0], own)),
         _Call("expected_move", lambda s, k: c.expected_move(p, s, do(s, k), still)),
-        _Call("is_goal", lambda s, _: truths(p, "is_goal", s), True),
-        _Call("is_failure", lambda s, _: truths(p, "is_failure", s), True),
+        _Call("is_goal", lambda s, _: c.truths(p, "is_goal", s), True),
+        _Call("is_failure", lambda s, _: c.truths(p, "is_failure", s), True),
         _Call("reward", rewarded, True),
         _Call("next_stage", staged, True),
         _Call("known_state_return", lambda s, k: c.known_state_return(p, s, k)),

@@ -1,12 +1,10 @@
 """Findings about a problem, and the inspection that collects them.
 
-A problem is a user's own code and may do anything. So an inspection calls it through
-:meth:`Inspection.ask`: whatever it raises becomes a finding with the user's own lines, that one
-check ends, and the next one begins.
+A problem is a user's own code. So an inspection calls it through :meth:`Inspection.ask`: whatever
+it raises becomes a finding with the user's own lines, that check ends, and the next one begins.
 
-A statistical test is wrong now and then. All tests of an inspection share one false-alarm rate:
-they are collected, and only at the end, when their number is known, each is compared with its share
-(Bonferroni's correction).
+A statistical test is wrong now and then. All tests share one false-alarm rate: they are collected,
+and when their number is known, each is compared with its share (Bonferroni's correction).
 """
 
 from __future__ import annotations
@@ -32,10 +30,12 @@ from holdfast.problems.attributes import sensing_labels, state_labels
 __all__ = [
     "CONTRACT",
     "FALSE_ALARM_RATE",
+    "OVER",
     "WHERE",
     "CheckEndedError",
     "Finding",
     "Inspection",
+    "OutOfTimeError",
     "Walk",
     "spread_out",
 ]
@@ -43,12 +43,17 @@ __all__ = [
 FALSE_ALARM_RATE = 0.001
 """Probability that the statistical tests of a right problem, all together, find an error."""
 
+OVER = "not looked at, or not at all of it: the time was over"
+"""What is seen of a check that the budget has cut short."""
+
 Severity = Literal["error", "warning", "information"]
 
 CONTRACT = "docs/problems.md#your-own"
 WHERE = {
     "depletion": "docs/settings.md",
     "likelihood": "docs/problems.md#check-it",
+    "method": "docs/tuning.md",
+    "prices": "docs/problems.md#when-to-sense",
     "resolution": "docs/problems.md#a-sharp-sensor-beside-a-weak-one",
     "sensors": "docs/problems.md#when-to-sense",
     "time": "docs/settings.md",
@@ -82,30 +87,17 @@ ResultT = TypeVar("ResultT")
 
 
 class Finding(NamedTuple):
-    """One thing that a check has found.
+    """One thing that a check has found: what was seen, and what to do.
 
-    Attributes
-    ----------
-    severity : {"error", "warning", "information"}
-        An error makes decisions wrong, a warning makes them worse, information is to be read.
-    check : str
-        Which check found it: contract, purity, streams, goals, likelihood, ...
-    seen : str
-        What was seen, with numbers.
-    advice : str
-        What to do; empty for most information.
-    where : str
-        The part of the documentation that says more.
-    details : str
-        The lines of the user's code that raised, if any did.
+    An error makes decisions wrong, a warning makes them worse, information is to be read.
     """
 
     severity: Severity
-    check: str
+    check: str  # contract, purity, streams, goals, likelihood, ...
     seen: str
-    advice: str = ""
-    where: str = CONTRACT
-    details: str = ""
+    advice: str = ""  # of most information there is none
+    where: str = CONTRACT  # the part of the documentation that says more
+    details: str = ""  # the lines of the user's code that raised, if any did
 
     def __str__(self) -> str:
         lines = [f"{self.severity:<11} {self.check}: {self.seen}"]
@@ -117,6 +109,10 @@ class Finding(NamedTuple):
 
 class CheckEndedError(Exception):
     """A check cannot go on, and why is among the findings."""
+
+
+class OutOfTimeError(BaseException):
+    """The budget is over; raised in the problem's code, which may catch any Exception."""
 
 
 class Walk(NamedTuple):
@@ -134,6 +130,7 @@ class Inspection:
         self, problem: Any, settings: PlanningSettings, max_steps: int, seed: int, budget_s: float
     ) -> None:
         self.problem, self.settings, self.max_steps, self.seed = problem, settings, max_steps, seed
+        self.trials = 0
         self.findings: list[Finding] = []
         self.walk: Walk | None = None
         self.beliefs: list[PlanningState] = []
@@ -156,18 +153,21 @@ class Inspection:
         labels = state_labels(self.problem)
         return labels[number] if labels else f"coordinate {number} of a state"
 
-    def deadline(self, share: float, check: str) -> Callable[[], bool]:
-        """Return a function that tells whether a check has used up its share of the time."""
+    def deadline(self, share: float, check: str = "") -> Callable[[], bool]:
+        """Return a function that tells whether a check, if named, is over its share of the time."""
         end = min(self._end, perf_counter() + share * self._budget_s)
 
         def late() -> bool:
-            if perf_counter() <= end:
-                return False
-            seen = "the time for this check was over before it had looked at all"
-            self.add("information", check, seen, "Give it more (--budget).")
-            return True
+            over = perf_counter() > end
+            if over and check:
+                self.add_over(check)
+            return over
 
         return late
+
+    def add_over(self, check: str) -> None:
+        """Say that the time for a check was over."""
+        self.add("information", check, OVER, "Give it more (--budget).")
 
     def add(
         self, severity: Severity, check: str, seen: str, advice: str = "", details: str = ""
@@ -186,8 +186,8 @@ class Inspection:
     def judge_tests(self) -> None:
         """Add what has a p-value below its share of the false alarms, one for each function."""
         if self.num_tests:
-            seen = f"{self.num_tests} statistical tests were made; of a right problem they find an "
-            seen += f"error, all together, with a probability of at most {FALSE_ALARM_RATE:g}"
+            seen = f"{self.num_tests} statistical tests were made; all together they find an error "
+            seen += f"in a right problem with a probability of at most {FALSE_ALARM_RATE:g}"
             self.add("information", "likelihood", seen)
         judged = set()
         for p, found in sorted(self._tests, key=lambda test: test[0]):
@@ -208,6 +208,9 @@ class Inspection:
                 return call(*arguments)
         except (KeyboardInterrupt, CheckEndedError):
             raise
+        except OutOfTimeError as over:
+            self.add_over(check)
+            raise CheckEndedError from over
         except BaseException as error:
             self._add_error(function, check, error)
             raise CheckEndedError from error

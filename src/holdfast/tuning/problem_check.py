@@ -19,11 +19,18 @@ from holdfast.numerics.arrays import real_number, whole
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.planning.settings import PlanningSettings, SimulatorSettings, check_settings
 from holdfast.problems import attributes, checked
+from holdfast.runtime.command_line import MAX_TRIALS
 from holdfast.tuning.calibration_check import check_likelihoods
 from holdfast.tuning.contract_check import check_contract, check_streams
 from holdfast.tuning.findings import CheckEndedError, Finding, Inspection
 from holdfast.tuning.sensor_check import check_sensors
-from holdfast.tuning.trial_check import check_decision_time, check_goals, check_trials
+from holdfast.tuning.trial_check import (
+    check_decision_time,
+    check_goals,
+    check_method,
+    check_trials,
+)
+from holdfast.validation import as_function
 
 __all__ = ["CHECKS", "check_problem"]
 
@@ -39,27 +46,26 @@ def check_problem(
     max_steps: int = SimulatorSettings().max_steps,
     seed: int = 0,
     budget_s: float = 20.0,
+    trials: int = 100,
     on_check: Callable[[str], None] = lambda _: None,
 ) -> list[Finding]:
-    """Look for what is wrong with a problem.
+    """Look for what is wrong with a problem, or with any object that is to be one.
 
     Nothing that the problem's code raises comes through, but Ctrl-C: it is a finding. The same
     seed gives the same findings, but for the times of a decision, as long as the budget lasts.
 
     Parameters
     ----------
-    problem : Problem
-        Or any object that is to be one.
     settings : PlanningSettings, optional
         With which it is to be used.
     max_steps : int
         Steps after which a simulated trial has failed.
-    seed : int
-        Names all random draws.
     budget_s : float
         Seconds after which no further work is begun; a single call of the problem's code is not
-        interrupted.
-    on_check : callable, optional
+        interrupted. What was not looked at is said.
+    trials : int
+        Pairs of trials, at most, that compare the method with random sensing; 0 compares nothing.
+    on_check : callable
         Is told the name of each check as it begins, one of :data:`CHECKS`.
 
     Returns
@@ -73,7 +79,9 @@ def check_problem(
     InvalidValueError
         If an argument other than the problem is out of bounds.
     """
-    settings = check_settings(settings or PlanningSettings(), PlanningSettings)
+    as_function("on_check", on_check)
+    settings = PlanningSettings() if settings is None else settings
+    settings = check_settings(settings, PlanningSettings)
     max_steps = whole("max_steps", max_steps, 1)
     seed = whole("seed", seed, 0, 2**63 - 1)
     budget = real_number(budget_s)
@@ -82,6 +90,8 @@ def check_problem(
             f"budget_s is {budget_s!r:.80}; allowed are numbers above 0 to 86400"
         )
     inspection = Inspection(problem, settings, max_steps, seed, budget)
+    inspection.trials = whole("trials", trials, 0, MAX_TRIALS)
+    late = inspection.deadline(1.0)
     for name, check in CHECKS.items():
         errors = {each.check for each in inspection.findings if each.severity == "error"}
         if name == "contract" and errors:
@@ -90,6 +100,9 @@ def check_problem(
         if name in ("trials", "sensors") and "likelihood" in errors:
             seen = "beliefs, sensors and resolution were not looked at: the likelihood comes first"
             inspection.add("information", "sensors", seen)
+            continue
+        if name not in ("declarations", "contract") and late():
+            inspection.add_over(name)
             continue
         with contextlib.suppress(CheckEndedError):
             # What a check itself does with a strange object must not end the others.
@@ -151,5 +164,6 @@ CHECKS: Mapping[str, Callable[[Inspection], None]] = {
     "trials": check_trials,
     "sensors": check_sensors,
     "time": check_decision_time,
+    "method": check_method,
 }
 """The checks in their order, as they are reported while they run."""

@@ -27,7 +27,7 @@ from holdfast.problems.attributes import (
     sensing_costs,
     sensing_labels,
 )
-from holdfast.tuning.contract_check import draw_observation, truths
+from holdfast.tuning.contract_check import draw_observation
 from holdfast.tuning.findings import Inspection, Walk
 
 __all__ = ["check_sensors"]
@@ -53,10 +53,11 @@ class _Gains(NamedTuple):
 def check_sensors(inspection: Inspection) -> None:
     """Look for sensing actions that tell nothing, or nothing that another does not tell."""
     problem, walk, beliefs = inspection.problem, inspection.walk, inspection.beliefs
+    costs = sensing_costs(problem)
+    _check_prices(inspection, costs)
     if not beliefs or walk is None:
         return
     gains = _gains_of(inspection)
-    costs = sensing_costs(problem)
     silent = (gains.information.mean(axis=0) < _NOTHING) & (gains.information.max(axis=0) < 0.1)
     for action in np.flatnonzero(silent).tolist():
         seen = f"{inspection.label(action)} tells nothing: "
@@ -74,6 +75,21 @@ def check_sensors(inspection: Inspection) -> None:
     resolution = np.broadcast_to(np.asarray(own, dtype=np.float64), (problem.action_size,))
     _report_useless(inspection, gains, silent, resolution)
     _check_resolution(inspection, gains, resolution, walk)
+
+
+def _check_prices(inspection: Inspection, costs: FloatArray) -> None:
+    """Warn of prices that the method does not weigh."""
+    selector = inspection.settings.selector
+    weighs = selector.nats_per_cost > 0.0 or selector.method == "expected_return"
+    # Of equal prices each choice pays the same, unless it is not to sense.
+    matter = np.ptp(costs) > 0.0 or (selector.sensing_is_optional and costs.any())
+    if weighs or not matter or selector.method in UNINFORMED_METHODS:
+        return
+    seen = f"sensing has prices ({_written(costs)}), but {selector.method} does not weigh them: "
+    seen += "selector.nats_per_cost is 0"
+    advice = "Set selector.nats_per_cost to 0.69 / the price that halving the uncertainty of one "
+    advice += "coordinate is worth, or selector.method: expected_return."
+    inspection.add("warning", "prices", seen, advice)
 
 
 def _gains_of(inspection: Inspection) -> _Gains:
@@ -172,10 +188,14 @@ def _report_dominated(
             if better == worse or costs[better] > costs[worse]:
                 continue
             left = (1.0 - shares[worse]) / np.maximum(1.0 - shares[better], 1e-9)
+            apart = gains.states[:, worse] - gains.states[:, better]
+            apart = np.where(known[:, worse], apart, 0.0)
+            # What neither of them shows scatters, as an observation leaves few particles.
+            chance = 2.0 * apart.std(axis=0) / np.sqrt(len(apart))
             if (
                 (told[:, better] >= told[:, worse] - _NOTHING).mean() > 0.95
-                and (shares[better] >= shares[worse] - 0.02).all()
-                and np.nanmax(gains.states[:, worse] - gains.states[:, better]) < 0.3
+                and (apart.mean(axis=0) < 0.02 + chance).all()
+                and np.quantile(apart, 0.95, axis=0).max() < 0.3
                 and left.max() > 1.25
             ):
                 seen = f"{inspection.label(worse)} is dominated: {inspection.label(better)} shows "
@@ -260,7 +280,7 @@ def _tolerance(inspection: Inspection, walk: Walk) -> FloatArray:
     """Return how far each task action may be off at the goal, about; 0 for what is not known."""
     problem, ask = inspection.problem, inspection.ask
     rows = walk.states
-    at_goal = ask("is_goal", truths, problem, "is_goal", rows)
+    at_goal = ask("is_goal", checked.truths, problem, "is_goal", rows)
     goals, stages = rows[at_goal][:50], walk.stages[at_goal][:50]
     tolerated = np.full(problem.action_size, np.inf)
     if len(goals) < 3:
@@ -275,7 +295,7 @@ def _tolerance(inspection: Inspection, walk: Walk) -> FloatArray:
         for _ in range(20):
             width = 0.5 * (low + high)
             beside = np.concatenate([goals - width * apart, goals + width * apart])
-            inside = ask("is_goal", truths, problem, "is_goal", beside)
+            inside = ask("is_goal", checked.truths, problem, "is_goal", beside)
             low, high = (width, high) if inside.mean() > 0.5 else (low, width)
         if 0.0 < low < 0.97:
             asked = ask("policy", checked.policy, problem, goals + low * apart, stages)

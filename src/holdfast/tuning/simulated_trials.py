@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import InvalidValueError
@@ -32,6 +33,7 @@ from holdfast.recording.run_directory import world_of
 from holdfast.recording.table_formats import Table
 from holdfast.robot.trial_pool import Arm, TrialPool, available_cores
 from holdfast.runtime.command_line import MAX_SEED, MAX_TRIALS
+from holdfast.validation import as_function, as_path
 
 __all__ = [
     "SimulatedTrial",
@@ -61,14 +63,10 @@ class SimulatedTrial(TrialResult, frozen=True, kw_only=True):
     @classmethod
     def of(cls, result: TrialResult, problem: Problem) -> SimulatedTrial:
         """Return a result that has its decisions, with the price."""
-        price = None
-        if getattr(problem, "sensing_costs", None) is not None:
-            costs = sensing_costs(problem, optional=True)
-            price = sum(
-                float(costs[decision.sensing_action])
-                for decision in result.decisions or ()
-                if isinstance(decision, SensingDecision)
-            )
+        costs = sensing_costs(problem, optional=True)
+        looks = [each for each in result.decisions or () if isinstance(each, SensingDecision)]
+        priced = getattr(problem, "sensing_costs", None) is not None
+        price = sum(float(costs[each.sensing_action]) for each in looks) if priced else None
         fields = {name: getattr(result, name) for name in TrialResult.__struct_fields__}
         return cls(**{**fields, "decisions": None}, sensing_price=price)
 
@@ -125,12 +123,7 @@ class Trials(Table):
     """
 
     def __init__(
-        self,
-        label: str,
-        seed: int,
-        max_steps: int,
-        results: Sequence[SimulatedTrial],
-        world: Mapping[str, object],
+        self, label: str, seed: int, max_steps: int, results: Sequence[SimulatedTrial], world: Any
     ) -> None:
         self.label, self.seed, self.max_steps, self.world = label, seed, max_steps, world
         self.results = tuple(sorted(results, key=lambda result: result.trial))
@@ -152,10 +145,14 @@ class Trials(Table):
 
     def shown(self) -> list[tuple[str, ...]]:
         """Return a row for each trial, with the columns that people compare."""
-        prices = any(result.sensing_price is not None for result in self.results)
-        names = (*_SHOWN, *(("sensing_price",) if prices else ()))
+        names = self.names()
         rows = ((_short(getattr(result, name)) for name in names) for result in self.results)
         return [tuple(name.replace("_", " ") for name in names), *map(tuple, rows)]
+
+    def names(self) -> Sequence[str]:
+        """Return the names of those columns."""
+        prices = any(result.sensing_price is not None for result in self.results)
+        return (*_SHOWN, *(("sensing_price",) if prices else ()))
 
     def summary(self) -> TrialSummary:
         """Return each measure with its interval."""
@@ -199,7 +196,8 @@ def run_trials(
     seed, max_steps, lost : optional
         Default: the configuration's, otherwise 0 and those of :func:`holdfast.run_trial`.
     jobs : int, optional
-        Largest number of processes (default: one for each core). Changes time only.
+        Largest number of processes (default: one for each core). Changes time only. In a worker
+        of ``multiprocessing`` or joblib, which may start none, all trials run in that process.
     progress : callable, optional
         Called with the number of finished trials and ``n`` after each trial.
 
@@ -214,6 +212,7 @@ def run_trials(
         If a worker process was killed.
     """
     n = whole("n", n, 1, MAX_TRIALS)
+    told = as_function("progress", (lambda *_: None) if progress is None else progress)
     arm = arm_of(planner)
     if seed is not None:
         arm = dataclasses.replace(arm, seed=whole("seed", seed, 0, MAX_SEED))
@@ -225,8 +224,7 @@ def run_trials(
     with TrialPool(available_cores() if jobs is None else jobs, expected=n) as pool:
         for done in pool.run((arm, trial) for trial in range(n)):
             results.append(SimulatedTrial.of(done.result, arm.problem))
-            if progress is not None:
-                progress(len(results), n)
+            told(len(results), n)
     return table_of(arm, results)
 
 
@@ -264,7 +262,9 @@ def table_of(arm: Arm, results: Sequence[SimulatedTrial]) -> Trials:
 def compare(
     runs: Mapping[str, Trials | str | Path], baseline: str | None = None, *, paired: bool = True
 ) -> OutcomeComparison:
-    """Compare trials with those of a baseline: effects with 95 % intervals.
+    """Compare trials with those of a baseline: effects with 95 % intervals, and notes.
+
+    Steps of a trial that did not reach the goal are the limit. Decision times get no verdict.
 
     Parameters
     ----------
@@ -276,12 +276,6 @@ def compare(
         Whether trials of one number are in the same world, as those of one seed and problem are.
         If False, each is a sample of its own, so that other seeds can be compared.
 
-    Returns
-    -------
-    OutcomeComparison
-        A row for each run and measure. Steps of a trial that did not reach the goal are the limit.
-        Notes say where the tasks differ.
-
     Raises
     ------
     InvalidValueError
@@ -289,18 +283,20 @@ def compare(
     OutputError
         If a path is no run, or if limits or (paired) seeds differ, or there are too few trials.
     """
-    if len(runs) < 2:
-        raise InvalidValueError(f"runs has {len(runs)} entries; compare takes at least 2")
+    if not isinstance(runs, Mapping) or len(runs) < 2:
+        raise InvalidValueError(f"runs is {runs!r:.80}; compare takes a mapping of at least 2")
     names = list(runs)
+    if not isinstance(paired, bool):
+        raise InvalidValueError(f"paired is {paired!r:.80}; it must be True or False")
     if baseline is not None:
-        if baseline not in runs:
-            raise InvalidValueError(f"baseline is {baseline!r}; it must be one of {names}")
+        if not isinstance(baseline, str) or baseline not in runs:
+            raise InvalidValueError(f"baseline is {baseline!r:.80}; it must be one of {names}")
         names = [baseline, *(name for name in names if name != baseline)]
     return compare_results([_compared(runs[name], name) for name in names], paired=paired)
 
 
 def _compared(trials: Trials | str | Path, name: str) -> ComparedRun:
     if not isinstance(trials, Trials):
-        return read_outcomes(Path(trials), name)
+        return read_outcomes(as_path(f"runs[{name!r}]", trials), name)
     results = {result.trial: result for result in trials.results}
     return ComparedRun(name, results, trials.seed, trials.max_steps, trials.world)

@@ -16,8 +16,10 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple, Self
 
+import msgspec
+
 from holdfast.config.loader import Configuration
-from holdfast.errors import InvalidValueError
+from holdfast.errors import InvalidValueError, OutputError
 from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
 from holdfast.recording.outcome_comparison import (
     ComparedRun,
@@ -28,7 +30,7 @@ from holdfast.recording.run_directory import RunDirectory
 from holdfast.recording.table_formats import csv_rows
 from holdfast.recording.tables import trial_row
 from holdfast.robot.trial_pool import Arm, TrialPool
-from holdfast.runtime.files import write_atomically
+from holdfast.runtime.files import shown_path, write_atomically
 from holdfast.tuning.simulated_trials import arm_of, table_of
 
 __all__ = ["MAX_ARMS", "Sweep", "SweptArm", "arms_of"]
@@ -38,16 +40,28 @@ MAX_ARMS = 200
 
 _MAX_NAME = 100
 _UNSAFE = re.compile(r"[^\w.=,+-]+")
-_TABLE, _TRIALS = "table", "trials.csv"
+_TABLE, _TRIALS, _SWEEP = "table", "trials.csv", "sweep.json"
 
 
 class SweptArm(NamedTuple):
-    """A combination: its name, its directory's name, and the values by ``section.key``."""
+    """A combination: its name, its directory's name, and the values by ``section.key``.
+
+    ``varied`` are the keys that have several values, in their order.
+    """
 
     label: str
     directory: str
     values: Mapping[str, Any]
     configuration: Configuration
+    varied: list[str]
+
+
+class _Begun(msgspec.Struct):
+    """What ``sweep.json`` says: the keys, the arms, and whether all arms took turns so far."""
+
+    keys: list[str]
+    arms: list[str]
+    in_turns: bool = True
 
 
 def arms_of(
@@ -85,7 +99,7 @@ def arms_of(
         label = ", ".join(f"{_short(key, varied)}={_text(chosen[key])}" for key in varied)
         configuration = load(chosen)
         name = _free_name(label or "run", [arm.directory for arm in arms])
-        arms.append(SweptArm(label or configuration.path.stem, name, chosen, configuration))
+        arms.append(SweptArm(label or configuration.path.stem, name, chosen, configuration, varied))
         first, this = arms[0].configuration.simulator, configuration.simulator
         for key in ("seed", "num_trials", "max_steps"):
             if getattr(this, key) != getattr(first, key):
@@ -127,25 +141,61 @@ class Sweep:
     Attributes
     ----------
     total, finished : int
-        Trials of all arms.
+        Trials of all arms, and how many of them were finished before.
+    new : list of str
+        The arms that a sweep which goes on did not have before.
+
+    Raises
+    ------
+    OutputError
+        On entry, if the directory has a sweep of other keys, or cannot be used.
     """
 
     def __init__(self, directory: Path, arms: Sequence[SweptArm]) -> None:
         self.directory = directory.absolute()
         self.arms = arms
+        self.finished = 0
+        self.new: list[str] = []
         self._pool_arms = [arm_of(arm.configuration, arm.label) for arm in arms]
         self._runs: list[RunDirectory] = []
+        self._before: list[set[int]] = []
+        self._in_turns = True
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
+            begun = self._go_on()
             for arm in self.arms:
                 run = RunDirectory.resume_if_begun(
                     self.directory / arm.directory, arm.configuration
                 )
                 self._runs.append(stack.enter_context(run))
+            content = msgspec.json.format(msgspec.json.encode(begun), indent=2)
+            write_atomically(self.directory / _SWEEP, content)
+            self._before = [run.journal.finished() for run in self._runs]
+            self.finished = sum(map(len, self._before))
             self._stack = stack.pop_all()
         return self
+
+    def _go_on(self) -> _Begun:
+        """Return which keys and arms the directory is to have; refuse those of another sweep."""
+        path, keys = self.directory / _SWEEP, self.arms[0].varied
+        labels = [arm.label for arm in self.arms]
+        try:
+            there = msgspec.json.decode(path.read_bytes(), type=_Begun)
+        except FileNotFoundError:
+            there = _Begun(keys, labels)
+        except (OSError, msgspec.DecodeError) as error:
+            raise OutputError(f"{shown_path(path)}: cannot be read: {error}") from error
+        if there.keys != keys:
+            raise OutputError(
+                f"{shown_path(self.directory)}: has a sweep of {', '.join(there.keys)}, and this "
+                f"one is of {', '.join(keys)}; name the same keys in the same order (more values "
+                "extend it), or choose another directory (--out)"
+            )
+        self.new = [label for label in labels if label not in there.arms]
+        self._in_turns = there.in_turns and not self.new
+        return _Begun(keys, [*there.arms, *self.new], self._in_turns)
 
     def __exit__(self, *error: object) -> None:
         self._stack.close()
@@ -155,11 +205,6 @@ class Sweep:
         """Trials of all arms."""
         return sum(arm.configuration.simulator.num_trials for arm in self.arms)
 
-    @property
-    def finished(self) -> int:
-        """Finished trials of all arms."""
-        return sum(len(run.journal.finished()) for run in self._runs)
-
     def run(self, jobs: int, on_result: Callable[[TrialResult], None]) -> None:
         """Run what is not finished; raises what :meth:`TrialPool.run` raises.
 
@@ -168,7 +213,7 @@ class Sweep:
         """
         started = perf_counter()
         by_arm = dict(zip(self._pool_arms, self._runs, strict=True))
-        finished = {arm: run.journal.finished() for arm, run in by_arm.items()}
+        finished = dict(zip(self._pool_arms, self._before, strict=True))
         spent: dict[Arm, float] = dict.fromkeys(by_arm, 0.0)
 
         def trials() -> Iterator[tuple[Arm, int]]:
@@ -193,7 +238,8 @@ class Sweep:
     def comparison(self, baseline: int = 0) -> OutcomeComparison:
         """Compare all arms, which are finished, with one of them."""
         order = [baseline, *(each for each in range(len(self.arms)) if each != baseline)]
-        return compare_results([self._compared(number) for number in order])
+        compared = [self._compared(number) for number in order]
+        return compare_results(compared, in_turns=self._in_turns)
 
     def _compared(self, number: int) -> ComparedRun:
         arm, journal = self._pool_arms[number], self._runs[number].journal
@@ -209,9 +255,7 @@ class Sweep:
         )
         comparison.to_csv(self.directory / f"{_TABLE}.csv")
         comparison.to_latex(self.directory / f"{_TABLE}.tex")
-        legend = comparison.legend().replace("\n", "\n\n")  # a paragraph for each line
-        text = f"{comparison.to_markdown()}\n{legend}\n"
-        write_atomically(self.directory / f"{_TABLE}.md", text.encode())
+        comparison.to_markdown(self.directory / f"{_TABLE}.md")
         return [f"{_TABLE}.md", f"{_TABLE}.tex", f"{_TABLE}.csv", _TRIALS]
 
     def _rows(self, keys: Sequence[str]) -> Iterator[tuple[object, ...]]:

@@ -1,11 +1,10 @@
 """Whether the task can be done, and what a few simulated trials show of the beliefs.
 
-What sensing can gain is bounded by what the policy does in a state that is known. So first some
-trials are simulated all at once without any belief: if they do not come to the goal, no sensing
-will. They also show where the robot goes, for the checks that need states from along the way.
+Sensing cannot gain more than a known state. So first some trials are simulated all at once without
+any belief: if these do not come to the goal, no sensing will. They also show where the robot goes.
 
-Then a few trials sense at random, which costs no time for choosing and favours no sensor. Their
-beliefs before sensing are kept for the checks of the sensors and of the time of a decision.
+Then a few trials sense at random, which favours no sensor; their beliefs are kept for other checks.
+At last the method that is to be used runs beside random sensing.
 """
 
 from __future__ import annotations
@@ -19,11 +18,11 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from holdfast.errors import HoldfastError
 from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
 from holdfast.numerics.circular import differences
 from holdfast.numerics.randomness import NoiseFreeStream
 from holdfast.planning.belief import Belief
+from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.problems import checked
 from holdfast.problems.attributes import (
@@ -35,10 +34,17 @@ from holdfast.problems.attributes import (
 from holdfast.problems.problem import ProblemBase
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
-from holdfast.tuning.contract_check import acted, check_contract, truths
-from holdfast.tuning.findings import Inspection, Severity, Walk, spread_out
+from holdfast.tuning.contract_check import acted, check_contract
+from holdfast.tuning.findings import (
+    CheckEndedError,
+    Inspection,
+    Severity,
+    Walk,
+    spread_out,
+)
+from holdfast.tuning.verdict import mean_difference
 
-__all__ = ["check_decision_time", "check_goals", "check_trials"]
+__all__ = ["check_decision_time", "check_goals", "check_method", "check_trials"]
 
 _WALKS = 64
 _KEPT, _CHOSEN = 24, 48  # steps whose states are kept, and states whose contract is checked
@@ -47,6 +53,7 @@ _INITIAL, _WAY, _NOISE = 8, 9, 10  # trial numbers of the streams here
 _DRAWS, _STATES = 100, 12  # moves from each of some states, whose noise is compared
 _TRIALS, _MOST_STEPS, _DECISIONS = 8, 1000, 5
 _BELIEFS, _PARTICLES = 24, 400  # beliefs before sensing that are kept, and particles of each
+_FEWEST_PAIRS = 10  # of trials from which an interval is made
 _ENOUGH = 0.5  # share of the trials that should reach the goal
 _OFTEN = 0.2  # share of the observations from which on it is worth a warning
 _FEW_LEFT = 3.0  # effective particles below which an observation leaves hardly any
@@ -75,8 +82,8 @@ def _follow_policy(inspection: Inspection) -> Walk:
     step = still = 0
     stride = 1
     while True:
-        done = ask("is_goal", truths, problem, "is_goal", states)
-        lost = ask("is_failure", truths, problem, "is_failure", states)
+        done = ask("is_goal", checked.truths, problem, "is_goal", states)
+        lost = ask("is_failure", checked.truths, problem, "is_failure", states)
         running = (reached < 0) & (failed < 0)
         reached[running & done] = step
         failed[running & lost & ~done] = step
@@ -122,15 +129,12 @@ def _report_angles(inspection: Inspection, jumps: IntArray, turns: IntArray) -> 
         (turns, "circular_actions", circular_actions(problem), "the task action"),
     ):
         for at in np.flatnonzero((counts[1] >= 2) & (counts[1] == counts[0])).tolist():
-            if at in declared:
-                continue
             seen = f"coordinate {at} of {whose} jumps by a whole turn (2 pi) in one step, and is "
             seen += "not declared to be an angle: the mean of 3.1 and -3.1 is taken for 0"
-            advice = (
-                f"Give the problem {attribute} = ({at},), and circular_observations if a sensor "
-            )
-            advice += "shows it; in a policy take numerics.wrapped(goal - heading)."
-            inspection.add("warning", "units", seen, advice)
+            advice = f"Give the problem {attribute} = ({at},), and circular_observations if it "
+            advice += "is sensed; in a policy take numerics.wrapped(goal - heading)."
+            if at not in declared:
+                inspection.add("warning", "units", seen, advice)
 
 
 def _report_walk(
@@ -181,30 +185,27 @@ def _check_rewards(inspection: Inspection) -> None:
     seen = f"the reward is {rewards[0]:g} in all of {len(rewards)} simulated steps: "
     severity: Severity = "information"
     if rewards[0] > 0.0:
-        severity, why = "warning", "a trial that never reaches the goal has the greatest return"
+        severity = "warning"
+        seen += "a trial that never reaches the goal has the greatest return"
     else:
-        why = "expected_return has nothing to tell sensing actions by"
+        seen += "expected_return has nothing to tell sensing actions by"
     if selector.method == "expected_return" and selector.rollout_reward == "problem":
         severity = "error"
-    advice = "With selector.rollout_reward: steps the return counts steps instead; so it does "
-    advice += "without a reward."
-    inspection.add(severity, "goals", seen + why, advice)
+    advice = "selector.rollout_reward: steps counts steps instead, as without a reward."
+    inspection.add(severity, "goals", seen, advice)
 
 
 def _check_motion(inspection: Inspection, walk: Walk) -> None:
     """Compare the noise of ``move`` with what the problem says of it."""
     problem, ask = inspection.problem, inspection.ask
-    declared = np.asarray(problem.motion_variance, dtype=np.float64)
-    circular = circular_states(problem)
     ratios = []
     for number, at in enumerate(spread_out(_STATES, len(walk.states))):
         state, own = walk.states[at], inspection.random(_NOISE, number)
         action = ask("limit_action", acted, problem, state, int(walk.stages[at]))
-        many = np.tile(state, (_DRAWS, 1))
-        moved = ask("move", checked.move, problem, many, action, own)
+        moved = ask("move", checked.move, problem, np.tile(state, (_DRAWS, 1)), action, own)
         slopes = ask("move", _slopes, problem, state, action)
-        variance = differences(moved, moved[0], circular).var(axis=0)
-        predicted = (slopes**2 * declared).sum(axis=1)
+        variance = differences(moved, moved[0], circular_states(problem)).var(axis=0)
+        predicted = (slopes**2 * np.asarray(problem.motion_variance)).sum(axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratios.append(np.where(predicted > 0.0, variance / predicted, np.nan))
     for at, values in enumerate(np.transpose(ratios)):
@@ -232,15 +233,11 @@ def _slopes(problem: Any, state: FloatArray, action: FloatArray) -> FloatArray:
     return slopes
 
 
-class _EndedError(HoldfastError):
-    """The time for this check is over, or the trial has failed."""
-
-
 class _Watcher(TrialObserver):
     """Keeps what the checks need of a trial, and ends it when time is over."""
 
-    def __init__(self, inspection: Inspection, late: Callable[[], bool]) -> None:
-        self.inspection, self.late = inspection, late
+    def __init__(self, inspection: Inspection, late: Callable[[], bool], keep: bool = True) -> None:
+        self.inspection, self.late, self.keep = inspection, late, keep
         self.steps: list[SensingStep] = []
         self.outside: list[BoolArray] = []
 
@@ -252,47 +249,33 @@ class _Watcher(TrialObserver):
 
     def sensed(self, step: SensingStep) -> None:
         """Note the step, and in which coordinates the true state was beyond all particles."""
+        if not self.keep:
+            return
         self.steps.append(step)
         angles = circular_states(self.inspection.problem)
         apart = differences(step.before.belief.states, self.world.state, angles)
         self.outside.append(np.asarray((apart > 0.0).all(axis=0) | (apart < 0.0).all(axis=0)))
 
     def acted(self, step: TaskStep) -> None:
-        """End the trial if the time is over, or in a failure, which the world does not know."""
+        """Keep the reward."""
         if self.late():
-            raise _EndedError("late")
-        if step.reward is not None:
+            raise CheckEndedError
+        if step.reward is not None and self.keep:
             self.inspection.rewards.append(step.reward)
-        if truths(self.inspection.problem, "is_failure", self.world.state):
-            raise _EndedError("failed")
 
 
 def check_trials(inspection: Inspection) -> None:
     """Run a few trials with random sensing, and keep beliefs from before sensing."""
-    settings, late = inspection.settings, inspection.deadline(0.25, "trials")
-    selector = msgspec.structs.replace(
-        settings.selector, method="random", sensing_is_optional=False
-    )
-    planner = Planner(inspection.problem, msgspec.structs.replace(settings, selector=selector))
+    late = inspection.deadline(0.25, "trials")
     steps = min(inspection.max_steps, _MOST_STEPS)
-    reached: list[int] = []
-    endings: list[str] = []
-    watchers: list[_Watcher] = []
-
-    def run(trial: int, watcher: _Watcher) -> str:
-        try:
-            result = run_trial(planner, inspection.seed, trial, max_steps=steps, observer=watcher)
-        except _EndedError as error:
-            return str(error)
-        reached.extend([result.steps] if result.success else [])
-        return "ended"
-
-    while len(watchers) < _TRIALS and not late():
-        watchers.append(_Watcher(inspection, late))
-        endings.append(inspection.ask("a simulated trial", run, len(endings), watchers[-1]))
-    count, failed = len(endings) - endings.count("late"), endings.count("failed")
-    if count:
-        _report_endings(inspection, reached, count, failed, steps)
+    watchers = [_Watcher(inspection, late) for _ in range(_TRIALS)]
+    results = []
+    with contextlib.suppress(CheckEndedError):
+        planner = _sensing_at_random(inspection)
+        for trial, watcher in enumerate(watchers):
+            results.append(_simulated(inspection, planner, trial, steps, watcher))
+    if results:
+        _report_endings(inspection, results, steps)
     _report_depletion(inspection, [each for each in watchers if each.steps])
     states = [step.before for watcher in watchers for step in watcher.steps]
     kept = [states[index] for index in spread_out(_BELIEFS, len(states))]
@@ -303,10 +286,67 @@ def check_trials(inspection: Inspection) -> None:
     _check_rewards(inspection)
 
 
-def _report_endings(
-    inspection: Inspection, reached: list[int], count: int, failed: int, steps: int
-) -> None:
-    seen = f"with random sensing, {len(reached)} of {count} trials reach the goal"
+def _sensing_at_random(inspection: Inspection) -> Planner:
+    selector = msgspec.structs.replace(
+        inspection.settings.selector, method="random", sensing_is_optional=False
+    )
+    settings = msgspec.structs.replace(inspection.settings, selector=selector)
+    return Planner(inspection.problem, settings)
+
+
+def _simulated(
+    inspection: Inspection, planner: Planner, trial: int, steps: int, observer: TrialObserver
+) -> TrialResult:
+    def run() -> TrialResult:
+        return run_trial(planner, inspection.seed, trial, max_steps=steps, observer=observer)
+
+    return inspection.ask("a simulated trial", run, check="trials")
+
+
+def check_method(inspection: Inspection) -> None:
+    """Compare the method with random sensing in trials of the same worlds."""
+    problem, settings = inspection.problem, inspection.settings
+    method = settings.selector.method
+    wrong = any(each.severity == "error" for each in inspection.findings)
+    if method == "random" or wrong or not inspection.trials:
+        return
+    late = inspection.deadline(0.6)
+    planners = [Planner(problem, settings), _sensing_at_random(inspection)]
+    priced, limit = getattr(problem, "sensing_costs", None) is not None, inspection.max_steps
+    more: list[float] = []
+    with contextlib.suppress(CheckEndedError):
+        for trial in range(_TRIALS, _TRIALS + inspection.trials):
+            clock = _Watcher(inspection, late, keep=False)
+            pair = [_simulated(inspection, each, trial, limit, clock) for each in planners]
+            own, other = (
+                -(each.reward or 0.0) if priced else each.steps if each.success else limit
+                for each in pair
+            )
+            more.append(float(own - other))
+    count = len(more)
+    if count < min(_FEWEST_PAIRS, inspection.trials):
+        inspection.add_over("method")
+        return
+    difference, (low, high) = mean_difference(np.array(more))
+    verb, unit = ("loses", "of reward") if priced else ("takes", "steps (a failure: the limit)")
+    seen = f"{method} {verb} {difference:+.3g} [{low:+.3g}, {high:+.3g}] {unit} beside random "
+    seen += f"sensing in {count} paired trials: "
+    if low > 0.0:
+        advice = "Run holdfast tune, which finds what suits this problem. Of methods that are as "
+        advice += "good as random sensing, one in thirty is called worse by chance."
+        inspection.add("warning", "method", seen + "here it is worse", advice)
+    elif high < 0.0:
+        inspection.add("information", "method", seen + "here it is better")
+    else:
+        seen += f"{count} trials cannot tell which is better"
+        advice = "More can: --trials and --budget, or holdfast tune."
+        inspection.add("information", "method", seen, advice)
+
+
+def _report_endings(inspection: Inspection, results: list[TrialResult], steps: int) -> None:
+    reached = [result.steps for result in results if result.success]
+    failed = sum(result.failed for result in results)
+    seen = f"with random sensing, {len(reached)} of {len(results)} trials reach the goal"
     seen += f", after {np.median(reached):.0f} steps (median)" if reached else ""
     seen += f", and {failed} fail" if failed else ""
     walk = inspection.walk

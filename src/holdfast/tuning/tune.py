@@ -31,7 +31,7 @@ from holdfast.errors import (
 )
 from holdfast.numerics.arrays import FloatArray, real_number, whole
 from holdfast.recording.fingerprint import fingerprint
-from holdfast.recording.kept_trials import FRESH, KeptTrials, TrialRow
+from holdfast.recording.kept_trials import FRESH, TRIALS_NAME, KeptTrials, TrialRow
 from holdfast.robot.trial_pool import Arm, TrialPool, available_cores
 from holdfast.runtime.command_line import MAX_JOBS
 from holdfast.runtime.ray_workers import RayCluster
@@ -49,9 +49,11 @@ from holdfast.tuning.candidates import (
     has_rewards,
     later_candidates,
 )
+from holdfast.tuning.check_process import require_right
 from holdfast.tuning.race import PILOT_TRIALS, MeasuredTrial, Standing, race
 from holdfast.tuning.tuning_report import CandidateRow, Tuning, write_report
 from holdfast.tuning.verdict import MUCH_SLOWER, cost_of, judge, mean_difference
+from holdfast.validation import as_function, as_path
 
 __all__ = ["Progress", "tune"]
 
@@ -94,10 +96,11 @@ def tune(
     jobs: int | None = None,
     ray: str | None = None,
     max_decision_ms: float = math.inf,
+    check: bool = True,
     out: str | Path | None = None,
     on_progress: Callable[[Progress], None] = lambda _: None,
 ) -> Tuning:
-    """Find what to sense on a problem, by simulating it; :func:`hf.check_problem` comes first.
+    """Find what to sense on a problem, by simulating it.
 
     Parameters
     ----------
@@ -120,6 +123,9 @@ def tune(
         ``ray://HOST:PORT``. Nodes need the same holdfast, and the problem at the same path.
     max_decision_ms : float
         A candidate whose median decision takes longer must not win.
+    check : bool
+        Whether the problem is checked first (:func:`hf.check_problem`), for a tenth of the budget
+        and at most 20 s; not if ``out`` has trials of this tuning.
     out : path, optional
         A directory for the files; if it has trials of the same tuning, it goes on with these.
 
@@ -129,24 +135,28 @@ def tune(
         If a value does not fit.
     OutputError
         If ``out`` belongs to something else, or cannot be written.
+    ProblemError
+        If the check finds an error.
     TrialError, WorkerDiedError, TrialCrashError
         If trials of the configuration itself fail, end their process, or do not end.
     """
     if not isinstance(configuration, Configuration):
-        configuration = load(configuration)
-    unknown = [each for each in vary if each not in VARIATIONS]
-    if unknown:
-        raise InvalidValueError(f"vary has {unknown[0]!r}; allowed are {', '.join(VARIATIONS)}")
+        configuration = load(as_path("configuration", configuration))
+    for each in vary if isinstance(vary, list | tuple) else [vary]:
+        if not isinstance(each, str) or each not in VARIATIONS:
+            allowed = ", ".join(VARIATIONS)
+            raise InvalidValueError(f"vary has {each!r:.80}; allowed are {allowed}")
+    as_function("on_progress", on_progress)
     most = whole("most", most, 2, FRESH - 1)
     jobs = None if jobs is None else whole("jobs", jobs, 1, MAX_JOBS)
     for name, value in (("budget_s", budget_s), ("max_decision_ms", max_decision_ms)):
         number = real_number(value)
         if number is None or not number > 0.0:
             raise InvalidValueError(f"{name} is {value!r:.80}; it must be a number above 0")
-    if objective is not None and objective not in get_args(Objective):
+    if objective not in (None, *get_args(Objective)):
         allowed = ", ".join(get_args(Objective))
         raise InvalidValueError(f"objective is {objective!r:.80}; allowed are {allowed}")
-    out = None if out is None else Path(out)
+    out = None if out is None else as_path("out", out)
     if objective is None:
         priced = getattr(configuration.problem, "sensing_costs", None) is not None
         objective = "reward" if priced else "steps"
@@ -162,6 +172,8 @@ def tune(
         "code": fingerprint(configuration),
     }
     began_s = monotonic()
+    if check and not (out is not None and (out / TRIALS_NAME).exists()):
+        require_right(configuration, budget_s)
     with contextlib.ExitStack() as stack:
         kept = stack.enter_context(KeptTrials(out, settings))
         cluster = None if ray is None else stack.enter_context(RayCluster(ray))

@@ -222,7 +222,7 @@ def tuning_tables(found: Tuning) -> str:
     return (
         f"{found.sentence}\n\nJudged on {found.fresh_trials:,} fresh trials in the same worlds. "
         f"The intervals of {found.objective} hold together at {FAMILY_LEVEL:.0%}.\n\n"
-        f"{_Judged(found).to_markdown()}\n{found.legend()}\n\n{found.to_markdown()}"
+        f"{_Judged(found).to_markdown()}\n{found.to_markdown()}"
     )
 
 

@@ -1,4 +1,4 @@
-"""``holdfast check``: what it prints, and its exit codes."""
+"""``holdfast check``: what it prints, its exit codes, and problems that end or hang its process."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import json
 from pathlib import Path
 
 import pytest
+from tests.command_line import run_here
 
+import holdfast as hf
 from holdfast.cli.check import main
-from holdfast.errors import HoldfastError, InvalidValueError, UnknownProblemError
+from holdfast.errors import HoldfastError, InvalidValueError, ProblemError, UnknownProblemError
+from holdfast.tuning import check_process
 
 SOURCE = """
 import numpy as np
@@ -39,6 +42,14 @@ RIGHT = "return states + actions + 0.1 * stream.normal(states.shape)"
 SHARED = "return states + actions + 0.1 * stream.normal((1,))"
 RAISES = 'raise KeyError("wheel")'
 LOOPS = "while stream is not None: pass"
+ENDS = "__import__('os')._exit(0)"
+CRASHES = "__import__('ctypes').string_at(0)"
+SLOW = f"""for _ in range(300_000): pass
+        {RIGHT}"""
+THREAD = f"""import threading
+        for each in threading.enumerate()[1:2] or [threading.Thread(target=threading.Event().wait)]:
+            each.is_alive() or each.start()
+        {RIGHT}"""
 
 
 def written(directory: Path, name: str, move: str) -> str:
@@ -51,11 +62,12 @@ def test_a_right_problem(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     name = written(tmp_path, "Right", RIGHT)
-    assert main([name, "--budget", "1000"]) == 0
+    assert main([name, "--budget", "1000", "--trials", "12"]) == 0
     shown = capsys.readouterr()
     assert "the policy comes to the goal in 64 of 64 trials" in " ".join(shown.out.split())
     assert shown.out.endswith("0 errors, 0 warnings\n")
     assert shown.err.startswith(f"checking {name}\n")
+    assert "beside random sensing in 12 paired trials: " in " ".join(shown.out.split())
     # A configuration, and values instead of its own.
     Path("right.yaml").write_text(f"problem: {name}\nmodel: {{width: 0.1}}\n")
     assert main(["right.yaml", "--set", "model.width=100.0", "-q", "--budget", "1000"]) == 1
@@ -78,14 +90,43 @@ def test_json_and_the_lines_of_the_user(tmp_path: Path, capsys: pytest.CaptureFi
     assert '        raise KeyError("wheel")\n' in capsys.readouterr().out
 
 
-def test_a_call_that_does_not_return_is_ended(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("kind", "move", "code", "seen"),
+    [
+        ("Loops", LOOPS, 1, "move raised TimeoutError: it has not returned in 2 s"),
+        ("Ends", ENDS, 1, "move raised _EndedError: os._exit(0) would end the process"),
+        ("Crashes", CRASHES, 1, "ended the process of the check: it was killed by SIGSEGV in the"),
+        ("Slow", SLOW, 0, "0 errors, 0 warnings; too little time for "),
+        ("Thread", THREAD, 0, "0 errors, 0 warnings"),
+    ],
+)
+def test_what_ends_or_hangs_the_process(
+    kind: str,
+    move: str,
+    code: int,
+    seen: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    name = written(tmp_path, "Loops", LOOPS)
-    assert main([name, "--problem-directory", str(tmp_path), "-q", "--budget", "0.1"]) == 1
+    monkeypatch.setattr(check_process, "PATIENCE_S", 2.0)
+    name, budget = written(tmp_path, kind, move), "1000" if kind == "Thread" else "0.1"
+    assert main([name, "--problem-directory", str(tmp_path), "-q", "--budget", budget]) == code
     shown = " ".join(capsys.readouterr().out.split())
-    assert "move raised TimeoutError: it was still running" in shown
-    assert shown.count("TimeoutError") == 1
+    assert seen in shown
+    assert shown.count("TimeoutError") == (kind == "Loops")
+
+
+def test_a_wrong_problem_is_not_tuned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    name = written(tmp_path, "Raised", RAISES)
+    (tmp_path / "run.yaml").write_text(f"problem: {name}\n")
+    said = run_here(capsys, tmp_path, "tune", "run.yaml", "--budget", "10s")
+    assert said.code == 2
+    assert "holdfast: error: contract: move raised KeyError: 'wheel'. holdfast check" in said.stderr
+    assert "--no-check (check=False) tunes all the same" in said.stderr
+    assert not (tmp_path / "runs").exists()
+    with pytest.raises(ProblemError, match="move raised KeyError"):
+        hf.tune(tmp_path / "run.yaml", budget_s=10.0)
 
 
 def test_what_is_no_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
