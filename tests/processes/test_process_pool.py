@@ -40,8 +40,8 @@ def test_a_problem_of_the_users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 def test_in_a_worker_of_a_pool_its_trials_run_there() -> None:
     with multiprocessing.get_context("spawn").Pool(1) as pool:
-        there = pool.apply(hf.run_trials, (hf.make("peg_in_hole_2d"), 2), {"max_steps": 20})
-    here = hf.run_trials(hf.make("peg_in_hole_2d"), 2, max_steps=20, jobs=1)
+        there = pool.apply(hf.run_trials, (hf.make_problem("peg_in_hole_2d"), 2), {"max_steps": 20})
+    here = hf.run_trials(hf.make_problem("peg_in_hole_2d"), 2, max_steps=20, jobs=1)
     assert [each.digest for each in there] == [each.digest for each in here]
 
 
