@@ -87,13 +87,13 @@ def mistake(node: ast.AST, *, make: bool) -> str:
             type(operator) in OPPOSITES
         ):
             if make:
-                node.op = OPPOSITES[type(operator)]()  # type: ignore[assignment, attr-defined]
+                node.op = OPPOSITES[type(operator)]()  # type: ignore[assignment]
         case ast.If() | ast.IfExp() | ast.While():
             if make:
                 node.test = ast.UnaryOp(ast.Not(), node.test)
-        case ast.Constant(value=bool() | int() | float()):
+        case ast.Constant(value=bool() | int() | float() as value):
             if make:
-                node.value = not node.value if isinstance(node.value, bool) else node.value + 1
+                node.value = not value if isinstance(value, bool) else value + 1
         case ast.Expr(value=ast.Call() | ast.Await()) | ast.Return(value=ast.expr()):
             if make:
                 node.value = ast.Constant(None)
@@ -165,7 +165,7 @@ def killers(file: str, number: int, tests: Sequence[str], *options: str) -> list
         for stream in range(3):
             os.dup2(null, stream)
         if number >= 0:
-            sys.meta_path.insert(0, Mutated(file, number))  # type: ignore[arg-type]
+            sys.meta_path.insert(0, Mutated(file, number))
         failures = Failures()
         plain = ["-q", "-p", "no:cacheprovider", "-m", "not real and not slow"]
         code = pytest.main([*plain, *options, *tests], plugins=[failures])
