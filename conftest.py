@@ -161,6 +161,19 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     return True
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out files of which ``-m`` chooses nothing: to import them all takes many seconds."""
+    chosen = config.option.markexpr.split(" and ")
+    if collection_path.suffix != ".py":
+        return None
+    place = collection_path.relative_to(ROOT).as_posix().removeprefix("tests/")
+    if "real" in chosen and not any(each.startswith(place) for each in REAL):
+        return True if not place.startswith(REAL) else None
+    # Of the contracts' tests some have a wire within the process.
+    in_process = place.startswith("contracts/")
+    return True if "not real" in chosen and place.startswith(REAL) and not in_process else None
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what is real before ``-m`` chooses."""
