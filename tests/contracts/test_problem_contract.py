@@ -18,6 +18,7 @@ from holdfast.problems.problem import Problem
 
 SEED = 11
 LEADING_SHAPES = [(), (1,), (13,), (3, 5), (2, 3, 4), (0,)]
+MOVED: dict[tuple[Any, tuple[int, ...]], FloatArray] = {}
 initial = partial(stream, SEED, 0, 0, Purpose.INITIAL_BELIEF)  # anew at each call
 OF_EXPERIMENTS = [
     "studies.light_dark:LightDark",
@@ -36,7 +37,14 @@ def problem(request: pytest.FixtureRequest) -> Problem:
 
 
 def some_states(problem: Problem, leading: tuple[int, ...]) -> FloatArray:
-    """Return states from all along the way: started, then moved by the policy for a while."""
+    """Return states from all along the way."""
+    if (problem, leading) not in MOVED:
+        MOVED[problem, leading] = moved_states(problem, leading)
+    return MOVED[problem, leading].copy()
+
+
+def moved_states(problem: Problem, leading: tuple[int, ...]) -> FloatArray:
+    """Return states that have started, and then were moved by the policy for a while."""
     count = int(np.prod(leading, dtype=int))
     states = problem.initial_states(initial(), count)
     for step in range(30):
