@@ -151,6 +151,8 @@ def test_a_batch_is_its_elements(problem: Problem) -> None:
     rewards = problem.reward(states, executed)
     goals = problem.is_goal(states)
     following = np.asarray(problem.next_stage(states, stages))
+    sensing_actions = range(len(problem.sensing_actions))
+    means = [problem.observation_mean(states, each) for each in sensing_actions]
     for n, state in enumerate(states):
         stage = int(stages[n])
         assert problem.policy(state, stage).tobytes() == actions[n].tobytes()
@@ -158,11 +160,8 @@ def test_a_batch_is_its_elements(problem: Problem) -> None:
         assert problem.reward(state, executed[n]) == rewards[n]
         assert problem.is_goal(state) == goals[n]
         assert problem.next_stage(state, stage) == following[n]
-        for sensing_action in range(len(problem.sensing_actions)):
-            assert (
-                problem.observation_mean(state, sensing_action).tobytes()
-                == problem.observation_mean(states, sensing_action)[n].tobytes()
-            )
+        for each in sensing_actions:
+            assert problem.observation_mean(state, each).tobytes() == means[each][n].tobytes()
 
 
 def test_one_stage_for_a_belief_each(problem: Problem) -> None:
