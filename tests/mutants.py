@@ -65,6 +65,8 @@ def places(tree: ast.AST, within: bool = False) -> Iterator[ast.AST]:
 def mistake(node: ast.AST, *, make: bool) -> str:
     """Return the mistake that a node can have, or nothing; and make it."""
     match node:
+        case ast.Return(value=ast.Constant(value=None)):
+            return ""
         case ast.Compare(ops=[operator]) if type(operator) in OPPOSITES:
             if make:
                 node.ops = [OPPOSITES[type(operator)]()]  # type: ignore[list-item]
