@@ -31,7 +31,7 @@ PACKAGE_SOURCES := $(shell find cmake src lab/src -type f -not -name '*.pyc') la
 CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
 
 .DEFAULT_GOAL := help
-.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-ros test-ros1 test-compiled lint format simulate chaos fuzz soak bench results docs wheel sbom requirements clean
+.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-ros test-ros1 test-compiled lint format simulate chaos fuzz soak mutants bench results docs wheel sbom requirements clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -85,6 +85,9 @@ fuzz: $(INSTALLED_DEV) ## a live service is attacked in all ways, 5 minutes over
 
 soak: $(INSTALLED_DEV) ## sessions come and go for 10 minutes, and nothing may grow
 	$(BIN)/python -m tests.fuzz.soak --minutes 10 --seed 1
+
+mutants: $(INSTALLED_DEV) ## small mistakes in the product: how many do its tests notice? An hour at most, and again to go on
+	nice -n 19 $(BIN)/python -m tests.mutants
 
 lint: $(INSTALLED_DEV) ## style, types and layers
 	$(BIN)/ruff check .

@@ -162,6 +162,22 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     return True
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out files of which ``-m`` chooses nothing: to import them all takes many seconds."""
+    if collection_path.suffix != ".py":
+        return None
+    chosen = config.option.markexpr.split(" and ")
+    place = collection_path.relative_to(ROOT).as_posix().removeprefix("tests/")
+    real = place.startswith(REAL)
+    in_part = any(each.startswith(place) for each in REAL)
+    # Of the contracts' tests some have a wire within the process.
+    in_process = place.startswith("contracts/")
+    useless = ("real" in chosen and not (real or in_part)) or (
+        "not real" in chosen and real and not in_process
+    )
+    return useless or None
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what is real before ``-m`` chooses."""

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from tests.command_line import run_here
 from tests.process_states import state_of
 
 from holdfast_lab.chaos.schedule import WIRES, Schedule, Wire, kinds_over
@@ -265,8 +266,10 @@ def test_nothing_is_left_of_it_even_if_it_is_killed(tmp_path: Path, started: lis
         ),
     ],
 )
-def test_what_is_no_kind_is_refused(tmp_path: Path, arguments: tuple[str, ...], says: str) -> None:
-    done = subprocess.run([*COMMAND, *arguments], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 2
+def test_what_is_no_kind_is_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, arguments: tuple[str, ...], says: str
+) -> None:
+    done = run_here(capsys, tmp_path, "chaos", *arguments)
+    assert done.code == 2
     assert says in done.stderr
     assert list(tmp_path.iterdir()) == []

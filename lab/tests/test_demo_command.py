@@ -206,6 +206,7 @@ def test_an_interruption_ends_all_processes(directory: Path) -> None:
         demo.close()
 
 
+@pytest.mark.slow
 def test_a_process_that_ends_by_itself_ends_the_demo(directory: Path) -> None:
     demo = Demo(directory)
     try:

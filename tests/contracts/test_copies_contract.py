@@ -35,7 +35,7 @@ def pickled(protocol: int, value: Any) -> Any:
 COPIES: dict[str, Callable[[Any], Any]] = {
     **{
         f"protocol {number}": functools.partial(pickled, number)
-        for number in range(pickle.HIGHEST_PROTOCOL + 1)
+        for number in (0, 2, pickle.HIGHEST_PROTOCOL)
     },
     "copy": copy.copy,
     "deepcopy": copy.deepcopy,
@@ -166,7 +166,7 @@ OBJECTS: dict[str, Kept] = {
 @pytest.mark.parametrize("how", COPIES)
 @pytest.mark.parametrize("name", OBJECTS)
 def test_a_copy_does_what_the_original_does(name: str, how: str) -> None:
-    if name.startswith("stream") and how in ("protocol 0", "protocol 1"):
+    if name.startswith("stream") and how == "protocol 0":
         pytest.skip("classes with slots have no such protocol")
     kept = OBJECTS[name]
     copied = COPIES[how](kept.make())

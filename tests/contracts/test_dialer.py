@@ -67,7 +67,7 @@ class Replicas:
 
 
 class TestReplicas:
-    @pytest.fixture(params=["tcp", "tls", "udp"])
+    @pytest.fixture(params=["tcp", "udp"])
     def wire(
         self,
         request: pytest.FixtureRequest,

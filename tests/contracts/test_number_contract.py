@@ -134,8 +134,8 @@ WHOLE: dict[str, tuple[Callable[[Any], Any], int]] = {
 }
 """A call of each entry that takes a whole number, and a number that it takes."""
 
-NO_WHOLE = [True, np.True_, 3.0, np.float64(3.0), "3", np.datetime64(3, "s"), Fraction(3)]
-NO_WHOLE += [np.array([3, 3]), np.ma.array(3, mask=True)]
+NO_WHOLE = [True, 3.0, "3", np.ma.array(3, mask=True)]
+"""Of each kind one: unit/test_arrays.py has all, and here each entry has to look."""
 
 
 def leaf(value: Any) -> Any:
@@ -145,7 +145,7 @@ def leaf(value: Any) -> Any:
     return tuple(map(leaf, value)) if isinstance(value, tuple | list) else value
 
 
-@pytest.mark.parametrize("kind", [np.int64, np.uint8, np.int32, np.array])
+@pytest.mark.parametrize("kind", [np.int64, np.array])
 @pytest.mark.parametrize("name", WHOLE)
 def test_a_whole_number_of_numpy_is_one(name: str, kind: Any) -> None:
     call, number = WHOLE[name]
@@ -216,12 +216,7 @@ REAL: dict[str, tuple[Callable[[Any], Any], Any]] = {
 
 FORMS: dict[str, Callable[[Any], Any]] = {
     "tuple": lambda x: tuple(map(FORMS["tuple"], x)) if isinstance(x, list) else x,
-    "array": np.array,
     "float32": lambda x: np.array(x, np.float32),
-    "masked, nothing hidden": np.ma.array,
-    "list of scalars": lambda x: (
-        [FORMS["list of scalars"](each) for each in x] if isinstance(x, list) else np.float64(x)
-    ),
 }
 
 
@@ -234,15 +229,9 @@ def test_real_numbers_of_numpy_are_numbers(name: str, form: str) -> None:
 
 WRONG: dict[str, Callable[[Any], Any]] = {
     "masked": lambda x: np.ma.array(x, mask=np.arange(np.size(x)).reshape(np.shape(x)) == 0),
-    "list with a masked entry": lambda x: [np.ma.masked, *x[1:]],
     "texts": lambda x: np.array(x).astype(str),
-    "list of texts": lambda x: np.array(x).astype(str).tolist(),
-    "truth values": lambda x: np.array(x) > 0.3,
     "list with a truth value": lambda x: [True, *x[1:]],
-    "objects": lambda x: np.array(x, dtype=object),
-    "complex": lambda x: np.array(x, dtype=complex),
     "dates": lambda x: (4 * np.array(x)).astype("datetime64[s]"),
-    "fractions": lambda x: [Fraction(1, 2)] * len(x),
     "ragged": lambda x: [*x, [1.0, [2.0]]],
 }
 

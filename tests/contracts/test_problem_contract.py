@@ -18,6 +18,7 @@ from holdfast.problems.problem import Problem
 
 SEED = 11
 LEADING_SHAPES = [(), (1,), (13,), (3, 5), (2, 3, 4), (0,)]
+MOVED: dict[tuple[Any, tuple[int, ...]], FloatArray] = {}
 initial = partial(stream, SEED, 0, 0, Purpose.INITIAL_BELIEF)  # anew at each call
 OF_EXPERIMENTS = [
     "studies.light_dark:LightDark",
@@ -36,7 +37,14 @@ def problem(request: pytest.FixtureRequest) -> Problem:
 
 
 def some_states(problem: Problem, leading: tuple[int, ...]) -> FloatArray:
-    """Return states from all along the way: started, then moved by the policy for a while."""
+    """Return states from all along the way."""
+    if (problem, leading) not in MOVED:
+        MOVED[problem, leading] = moved_states(problem, leading)
+    return MOVED[problem, leading].copy()
+
+
+def moved_states(problem: Problem, leading: tuple[int, ...]) -> FloatArray:
+    """Return states that have started, and then were moved by the policy for a while."""
     count = int(np.prod(leading, dtype=int))
     states = problem.initial_states(initial(), count)
     for step in range(30):
@@ -143,6 +151,8 @@ def test_a_batch_is_its_elements(problem: Problem) -> None:
     rewards = problem.reward(states, executed)
     goals = problem.is_goal(states)
     following = np.asarray(problem.next_stage(states, stages))
+    sensing_actions = range(len(problem.sensing_actions))
+    means = [problem.observation_mean(states, each) for each in sensing_actions]
     for n, state in enumerate(states):
         stage = int(stages[n])
         assert problem.policy(state, stage).tobytes() == actions[n].tobytes()
@@ -150,11 +160,8 @@ def test_a_batch_is_its_elements(problem: Problem) -> None:
         assert problem.reward(state, executed[n]) == rewards[n]
         assert problem.is_goal(state) == goals[n]
         assert problem.next_stage(state, stage) == following[n]
-        for sensing_action in range(len(problem.sensing_actions)):
-            assert (
-                problem.observation_mean(state, sensing_action).tobytes()
-                == problem.observation_mean(states, sensing_action)[n].tobytes()
-            )
+        for each in sensing_actions:
+            assert problem.observation_mean(state, each).tobytes() == means[each][n].tobytes()
 
 
 def test_one_stage_for_a_belief_each(problem: Problem) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
-import os
-import signal
 import socket
 import subprocess
 import sys
@@ -252,53 +250,6 @@ class TestHandshakeIsEnough:
         await until(lambda: len(tls.reasons()) >= 3)
         assert len(inbox.incarnations()) <= 2
         await inbox.wait(lambda events: sum(isinstance(e, ServiceVanished) for e in events) >= 1)
-
-
-ROBOT_THAT_STANDS_STILL = """
-import asyncio, os, signal, sys
-from holdfast.protocol.events import CallEnded, ServiceAppeared, ServiceVanished
-from holdfast.transport.robot_end import StreamRobotTransport
-
-async def main():
-    robot = StreamRobotTransport({"cloud": sys.argv[1]}, lease_ms=60_000.0)
-    events = asyncio.Queue()
-    robot.start(events.put_nowait)
-    print(await events.get(), flush=True)
-    os.kill(os.getpid(), signal.SIGSTOP)
-    robot.call("cloud", 1, b"echo")
-    while True:
-        event = await events.get()
-        print(event, flush=True)
-        if isinstance(event, (CallEnded, ServiceVanished)):
-            break
-    await robot.close()
-
-asyncio.run(main())
-"""
-
-
-async def test_a_robot_that_stood_still_longer_than_the_lease_gives_nobody_up(
-    tcp: StreamWire,
-) -> None:
-    endpoint = tcp.endpoint("cloud")
-    loop = asyncio.get_running_loop()
-    async with service_process(endpoint, "b1", lease_ms=300.0):
-        robot = subprocess.Popen(
-            [sys.executable, "-c", ROBOT_THAT_STANDS_STILL, endpoint], stdout=subprocess.PIPE
-        )
-        try:
-            assert robot.stdout is not None
-            read = functools.partial(loop.run_in_executor, None, robot.stdout.readline)
-            assert await read() == b"ServiceAppeared(service='cloud', incarnation='b1')\n"
-            await loop.run_in_executor(None, os.waitpid, robot.pid, os.WUNTRACED)
-            await asyncio.sleep(1.0)  # three leases; the service has spoken in each
-            robot.send_signal(signal.SIGCONT)
-            assert await read() == b"ReplyReceived(call=1, payload=b'echo')\n"
-            assert await read() == b"CallEnded(call=1)\n"
-        finally:
-            robot.send_signal(signal.SIGCONT)
-            robot.kill()
-            robot.communicate()
 
 
 async def test_what_came_while_a_robot_stood_still_is_read_before_anybody_is_given_up(

@@ -7,7 +7,7 @@ of threads; nothing changed that was handed in; finite entropies even where a be
 from __future__ import annotations
 
 import itertools
-from typing import get_args
+from typing import Any, get_args
 
 import msgspec
 import numpy as np
@@ -31,6 +31,7 @@ from holdfast.problems.problem import Problem
 
 SEED = 17
 COUNT = 60
+BELIEFS: dict[tuple[Any, int], Belief] = {}
 
 LOOKING = [
     SelectorSettings(
@@ -93,6 +94,13 @@ def settings_of(
 
 
 def belief_of(problem: Problem, count: int = COUNT) -> Belief:
+    """Return the same belief each time; nobody can change it."""
+    if (problem, count) not in BELIEFS:
+        BELIEFS[problem, count] = made_belief(problem, count)
+    return BELIEFS[problem, count]
+
+
+def made_belief(problem: Problem, count: int) -> Belief:
     """Return a belief on the way, where limited actions differ too."""
     draws = stream(SEED, 0, 0, Purpose.INITIAL_BELIEF)
     states = problem.initial_states(draws, count)
@@ -101,7 +109,10 @@ def belief_of(problem: Problem, count: int = COUNT) -> Belief:
         states = problem.move(states, actions, draws.substream(2).substream(step))
     weights = draws.substream(1).uniform(count)
     weights[::7] = 0.0
-    return Belief.weighted(states, weights)
+    belief = Belief.weighted(states, weights)
+    for array in belief:
+        array.setflags(write=False)
+    return belief
 
 
 def choose(
@@ -150,8 +161,6 @@ class TestEverySelector:
     def test_nothing_is_changed(self, problem: Problem, selector: SelectorSettings) -> None:
         belief = belief_of(problem)
         before = belief.states.tobytes(), belief.weights.tobytes()
-        for array in belief:
-            array.setflags(write=False)
         horizon = 1 if selector.method == "path_entropy" else 2
         _, info = choose(problem, settings_of(selector, horizon=horizon), belief)
         assert (belief.states.tobytes(), belief.weights.tobytes()) == before
@@ -162,7 +171,7 @@ class TestEverySelector:
         belief = belief_of(problem, 600)
         results = {
             as_bytes(choose(problem, settings_of(selector, cores=cores), belief))
-            for cores in (0, 1, 2, 7)
+            for cores in (0, 1, 7)
         }
         assert len(results) == 1
 

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import functools
 import socket
-import stat
 from pathlib import Path
 
 import pytest
@@ -135,18 +134,6 @@ class TestStreams:
         await connected(tcp)
         assert len(made) == 2
 
-    async def test_a_taken_port_is_an_error_that_names_it(self, tcp: StreamWire) -> None:
-        await tcp.service("cloud", "b1").start(echo)
-        endpoint = tcp.endpoint("cloud")
-        with pytest.raises(TransportError, match=f"cannot listen on {endpoint}: Address already"):
-            await tcp.service("cloud", "b2").start(echo)
-
-    async def test_an_address_of_another_machine_is_an_error_that_says_so(self) -> None:
-        service = StreamServiceTransport("cloud", incarnation="b1", listen=["tcp/192.0.2.1:7447"])
-        reason = r"tcp/192\.0\.2\.1:7447: .*: this machine has no such address \(0\.0\.0\.0"
-        with pytest.raises(TransportError, match=reason):
-            await service.start(echo)
-
     async def test_one_bad_endpoint_of_two_is_an_error(self, tcp: StreamWire) -> None:
         taken, free = tcp.endpoint("taken"), tcp.endpoint("free")
         await tcp.service("taken", "b1").start(echo)
@@ -154,33 +141,6 @@ class TestStreams:
         with pytest.raises(TransportError, match="cannot listen on"):
             await both.start(echo)
         await tcp.service("free", "b1").start(echo)  # the first one was given back
-
-    async def test_a_taken_socket_is_an_error_that_names_it(self, socket_directory: Path) -> None:
-        wire = StreamWire("unix", socket_directory)
-        _, inbox, _ = await connected(wire)
-        with pytest.raises(TransportError, match=r"unix/.*: another process listens there"):
-            await wire.service("cloud", "b2").start(echo)
-        assert ServiceVanished("cloud", "b1") not in inbox
-        await wire.close_on_loop()
-
-    async def test_what_a_killed_process_left_is_replaced_and_nothing_else(
-        self, socket_directory: Path
-    ) -> None:
-        wire = StreamWire("unix", socket_directory)
-        path = Path(wire.endpoint("cloud").removeprefix("unix/"))
-        with socket.socket(socket.AF_UNIX) as left:
-            left.bind(str(path))
-        robot, inbox, service = await connected(wire)
-        robot.call("cloud", 1, b"question")
-        assert await inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
-        assert stat.S_ISSOCK(path.stat().st_mode)
-        await service.close()
-        assert not path.exists()
-        path.write_text("somebody's data")
-        with pytest.raises(TransportError, match=r"unix/.*: there is a file of that name"):
-            await wire.service("cloud", "b2").start(echo)
-        assert path.read_text() == "somebody's data"
-        await wire.close_on_loop()
 
     async def test_another_one_s_socket_is_not_removed(self, socket_directory: Path) -> None:
         wire = StreamWire("unix", socket_directory)
@@ -527,23 +487,6 @@ class TestPeers:
             assert [frame.kind for frame in decoder.feed(await small.hear())][1] == frames.LAST
         robot.call("cloud", 1, b"question")
         assert await inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
-
-    async def test_half_received_messages_share_a_bound(self, tcp: StreamWire) -> None:
-        robot, inbox, _ = await connected(tcp)
-        with contextlib.ExitStack() as stack:
-            visitors = [stack.enter_context(Visitor(tcp.endpoint("cloud"))) for _ in range(3)]
-            for visitor in visitors:
-                await visitor.connect()
-                begun = frames.encode_frame(frames.CALL, 1, bytes(MAX_BYTES))[:-1]
-                await visitor.say(HELLO + begun)
-            lost = "has not finished a message, and others need the memory"
-            await until(lambda: tcp.events[-1][1].get("reason") == lost)
-            # The first of them began first; the others are still there.
-            await visitors[0].hear()
-            await visitors[1].say(b"\0")
-            robot.call("cloud", 1, bytes(MAX_BYTES))
-            assert await inbox.of_call(1) == [ReplyReceived(1, bytes(MAX_BYTES)), CallEnded(1)]
-        assert ServiceVanished("cloud", "b1") not in inbox
 
     @pytest.mark.parametrize(
         ("frame", "reason"),

@@ -359,8 +359,15 @@ class Run:
             return self.story.run(self.cloud, options=("--tls", str(self._keys / "robot")))
 
 
-@BOTH
-@pytest.mark.parametrize("wire", ["tls", "udp"])
+@pytest.mark.parametrize(
+    ("kind", "wire"),
+    [
+        ("openvpn", "udp"),
+        ("wireguard", "tls"),
+        pytest.param("openvpn", "tls", marks=pytest.mark.slow),
+        pytest.param("wireguard", "udp", marks=pytest.mark.slow),
+    ],
+)
 def test_cut_and_restored(
     tunnel: Tunnel, wire: str, site: Site, references: References, keys: Path
 ) -> None:

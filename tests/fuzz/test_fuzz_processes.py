@@ -71,15 +71,6 @@ def test_an_attacker_ends_no_process_and_changes_no_decision(
     assert all(attacks)
 
 
-def test_an_attack_that_does_not_come_about_is_found(tmp_path: Path) -> None:
-    """Each way of attacking that was asked for is missed: one has no meaning over this link."""
-    report, findings = attacked("tcp", 1.0, 1, tmp_path, ["cut", "flood"])
-    assert report["attacks"]["cut"]
-    assert [finding for finding in findings if finding.startswith("no attack")] == [
-        "no attack: flood"
-    ]
-
-
 def test_every_number_of_the_settings_is_attacked() -> None:
     keys = {".".join(key.path) for key in keys_of(PlanningSettings)}
     plain = msgspec.to_builtins(PlanningSettings())

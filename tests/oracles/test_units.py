@@ -134,6 +134,21 @@ SELECTORS: dict[str, SelectorSettings] = {
 }
 
 
+QUICK = {"path_entropy, nearest_neighbor", "state_entropy, gaussian_mixture_upper"}
+EACH_PROBLEM_AND_EACH_SELECTOR = pytest.mark.parametrize(
+    ("name", "selector"),
+    [
+        pytest.param(
+            *(name, selector),
+            id=f"{name}, {how}",
+            marks=[] if name == "plane" or how in QUICK else [pytest.mark.slow],
+        )
+        for name, (how, selector) in product(PROBLEMS, SELECTORS.items())
+    ],
+)
+"""Quickly each problem with two ways of choosing, and each way with one problem."""
+
+
 def choices_of(
     name: str,
     trial: int,
@@ -177,8 +192,7 @@ def choices_of(
     return found, entropies
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
-@pytest.mark.parametrize("selector", SELECTORS.values(), ids=SELECTORS.keys())
+@EACH_PROBLEM_AND_EACH_SELECTOR
 def test_the_same_bits_in_units_of_a_power_of_two(name: str, selector: SelectorSettings) -> None:
     """Each coordinate in turn: its states and its actions apart, what is observed with it or not.
 
@@ -250,8 +264,7 @@ def test_the_same_bits_two_steps_ahead(method: str) -> None:
         np.testing.assert_allclose(other, one + 1.5 * shift, rtol=0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
-@pytest.mark.parametrize("selector", SELECTORS.values(), ids=SELECTORS.keys())
+@EACH_PROBLEM_AND_EACH_SELECTOR
 def test_the_same_sensing_in_other_units(name: str, selector: SelectorSettings) -> None:
     """Millimetres and degrees round: what is sensed is the same here, task actions but nearly."""
     size = PROBLEMS[name].state_size

@@ -111,33 +111,6 @@ def test_a_revoked_robot_is_cut_off_and_no_other(
     assert ended["reason"] == "has a certificate that has been revoked"
 
 
-def test_several_processes_read_them_again(home: Path, site: Site, references: References) -> None:
-    cloud = cloud_of(site, home, "--processes", "2").start()
-    story = Story(site, references, document_of(PEG))
-
-    def revoke() -> None:
-        revoke_credentials(home, names=["anna"])
-        reload(cloud, count=2)
-
-    story.at("perform", 20, revoke, story.status(LOCAL_RECOVERY))
-    robot = story.run(cloud, options=("--tls", str(home / "anna")))
-    assert robot.statuses() == [LOST]
-    ended = [each["links_ended"] for each in cloud.process.matching("credentials_reloaded")]
-    assert sorted(map(int, ended)) == [0, 1]
-
-
-def test_runs_of_one_certificate_have_a_limit(
-    home: Path, site: Site, references: References
-) -> None:
-    cloud = cloud_of(site, home, "--max-sessions-per-robot", "1").start()
-    for count in (1, 2):
-        story = Story(site, references, document_of(PEG))
-        robot = site.run(story.file, "--tls", home / "anna", services=[cloud], out=f"out-{count}")
-        story.finish(robot)
-    (evicted,) = cloud.process.matching("evicted")
-    assert (evicted["robot"], evicted["reason"]) == ("anna", "room needed")
-
-
 def test_a_robot_without_a_certificate_has_the_name_that_it_says(
     site: Site, references: References
 ) -> None:
@@ -182,7 +155,7 @@ class Mounted:
         (self.directory / "..new").rename(self.directory / "..data")
 
 
-@pytest.mark.parametrize("processes", [1, 2])
+@pytest.mark.parametrize("processes", [2, pytest.param(1, marks=pytest.mark.slow)])
 def test_what_is_renewed_where_it_is_mounted_is_read_without_a_signal(
     processes: int, home: Path, site: Site, references: References, tmp_path: Path
 ) -> None:
@@ -218,7 +191,7 @@ def test_what_is_renewed_where_it_is_mounted_is_read_without_a_signal(
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root mounts")
-@pytest.mark.parametrize("processes", [1, 2])
+@pytest.mark.parametrize("processes", [2, pytest.param(1, marks=pytest.mark.slow)])
 def test_where_keys_are_mounted_a_rotation_and_then_a_revocation_take_effect(
     processes: int, home: Path, site: Site, references: References, tmp_path: Path
 ) -> None:

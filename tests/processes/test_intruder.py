@@ -41,7 +41,9 @@ def stolen(keys: Path) -> Path:
 
 
 # Over udp it also says everything that can be said over tls.
-@pytest.fixture(params=["tcp", pytest.param("tls", marks=pytest.mark.slow), "udp"])
+@pytest.fixture(
+    params=["udp", *(pytest.param(each, marks=pytest.mark.slow) for each in ("tcp", "tls"))]
+)
 def protocol(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 

@@ -30,7 +30,10 @@ def done_by(process: Process) -> int:
     return int(process.output.splitlines()[-1])
 
 
-@pytest.mark.parametrize("kind", ["deaf", "slow", "scanner", "greetings", "silent"])
+SLOWLY = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("slow", "scanner", "silent")]
+
+
+@pytest.mark.parametrize("kind", ["deaf", "greetings", *SLOWLY])
 def test_a_robot_at_work_notices_nothing(kind: str, site: Site, references: References) -> None:
     cloud = site.service().start()
     story = Story(site, references, DOCUMENT)
@@ -60,7 +63,7 @@ def test_a_robot_over_udp_is_answered_in_a_flood_of_datagrams(
     story.at(
         "perform",
         10,
-        lambda: floods.append(neighbour(site, "flood", cloud.endpoint, "--seconds", "3")),
+        lambda: floods.append(neighbour(site, "flood", cloud.endpoint, "--seconds", "1")),
     )
     story.at("perform", 78, lambda: floods[0].wait())
     robot = story.run(cloud, options=("--tls", str(keys / "ours" / "robot")))
@@ -70,7 +73,10 @@ def test_a_robot_over_udp_is_answered_in_a_flood_of_datagrams(
     assert not robot.matching("service_vanished")
 
 
-@pytest.mark.parametrize("kind", ["hasty", "trickle", "silent"])
+@pytest.mark.parametrize(
+    "kind",
+    ["hasty", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("trickle", "silent"))],
+)
 def test_a_new_robot_is_let_in(kind: str, keys: Path, site: Site, references: References) -> None:
     """However many connections to a service with TLS never come to their handshakes."""
     cloud = secure(site, keys, "tls").start()

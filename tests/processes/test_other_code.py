@@ -36,13 +36,6 @@ def older_copy(site: Site) -> Service:
     return site.service("--problem", NAME, "--problem-directory", str(older))
 
 
-def current_copy(site: Site) -> Service:
-    newer = site.directory / "newer"
-    newer.mkdir()
-    shutil.copy(EXAMPLE, newer)
-    return site.service("--problem", NAME, "--problem-directory", str(newer))
-
-
 def digests_in(reason: str) -> tuple[str, str]:
     """Return the digests of the service and of the robot that a refusal names."""
     assert reason.startswith(f"problem {NAME}: the digest of the problem's code is ")
@@ -73,30 +66,6 @@ class TestOlderCopyOfTheProblem:
         assert "deploy the same version" in refused["reason"]
         said = f"{cloud.endpoint} was asked no more: other_code: {refused['reason']}"
         assert robot.matching("note", reason=said)
-
-    def test_another_service_with_the_same_code_is_waited_for(self, site: Site) -> None:
-        shutil.copy(EXAMPLE, site.directory)
-        file = site.configure(DOCUMENT, offload=PATIENT)
-        older, current = older_copy(site).start(), current_copy(site)
-        robot = site.run(file, services=[older, current])
-        robot.wait_for("refused")
-        current.start()
-        robot.finish()
-        assert robot.statuses() == []
-        assert services_in_order(robot) == [current.endpoint]
-        (refused,) = robot.matching("refused")
-        assert (refused["service"], refused["code"]) == (older.endpoint, "other_code")
-
-    def test_alone_it_ends_the_run_and_says_what_to_do(self, site: Site) -> None:
-        shutil.copy(EXAMPLE, site.directory)
-        file = site.configure(DOCUMENT, offload=PATIENT, recovery={"launch": "never"})
-        cloud = older_copy(site).start()
-        robot = site.run(file, services=[cloud])
-        assert robot.wait() == 2
-        assert f"no service will decide: {cloud.endpoint}: other_code: problem {NAME}" in (
-            robot.output
-        )
-        assert "deploy the same version on both" in robot.output
 
 
 IMPLEMENTED = """

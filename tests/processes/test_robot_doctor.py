@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import json
 import shutil
-import signal
 import socket
 import ssl
 import subprocess
@@ -22,7 +21,7 @@ from typing import Any, get_args
 import pytest
 from tests.ports import free_port
 from tests.processes import lying_problem, test_other_code
-from tests.processes.faults import HERE, PATIENCE_S, PATIENT, Process, Service, Site, document_of
+from tests.processes.faults import HERE, PATIENT, Service, Site, document_of
 from tests.unit.test_transport_credentials import sign_with_names
 from tests.wire import CALL, LAST, frame_of, hello_of
 
@@ -137,13 +136,11 @@ def answering(answer: Callable[[socket.socket], None]) -> Iterator[int]:
 
 
 class TestAllIsWell:
-    @pytest.mark.parametrize("protocol", ["tcp", "tls", "udp", "unix"])
+    @pytest.mark.parametrize("protocol", ["tls", "udp", "unix"])
     def test_with_a_configuration(self, protocol: str, home: Path, site: Site) -> None:
         options: tuple[str | Path, ...] = ()
         if protocol == "unix":
             cloud = site.service(endpoint=f"unix/{site.directory / 's'}").start()
-        elif protocol == "tcp":
-            cloud = service_of(site, protocol)
         else:
             cloud = service_of(site, protocol, home / "cloud")
             options = ("--tls", home / "anna")
@@ -278,7 +275,7 @@ def test_a_host_with_two_addresses(home: Path, site: Site, monkeypatch: pytest.M
 
 
 class TestTlsAndProtocol:
-    @pytest.mark.parametrize(("protocol", "robot"), [("tcp", None), ("tls", "anna"), ("tls", None)])
+    @pytest.mark.parametrize(("protocol", "robot"), [("tcp", None), ("tls", "anna")])
     def test_another_program(
         self, protocol: str, robot: str | None, home: Path, site: Site
     ) -> None:
@@ -304,7 +301,7 @@ class TestTlsAndProtocol:
         seen = look(site, cloud.endpoint.replace("tls", "tcp"))
         assert_fails(seen, "protocol", "refuses this end, which does not speak TLS; as at that end")
 
-    @pytest.mark.parametrize("protocol", ["tcp", "tls"])
+    @pytest.mark.parametrize("protocol", ["tls"])
     def test_a_process_that_stands_still(self, protocol: str, home: Path, site: Site) -> None:
         cloud = service_of(site, protocol, home / "cloud" if protocol == "tls" else None)
         options = ("--tls", home / "anna") if protocol == "tls" else ()
@@ -357,22 +354,6 @@ class TestTlsAndProtocol:
         # Nor does it come to the state of a run that it has been told of.
         assert "comes to another state" in seen["problem"]["seen"]
 
-    def test_ctrl_c(self, site: Site) -> None:
-        heard = threading.Event()
-
-        def answer(taken: socket.socket) -> None:
-            taken.recv(1000)
-            heard.set()
-            taken.recv(1000)
-
-        with answering(answer) as port:
-            command = (sys.executable, "-m", "holdfast", "doctor", "--service")
-            process: Process = site.process(*command, f"tcp/127.0.0.1:{port}")
-            assert heard.wait(PATIENCE_S)
-            process.signal(signal.SIGINT)
-            assert process.wait() == 130
-        assert "Traceback" not in process.output
-
 
 def play_service(
     taken: socket.socket,
@@ -400,9 +381,6 @@ class TestCertificates:
             ("keys/old", "certificate.pem: has expired (valid from ", ""),
             ("keys/early", "certificate.pem: is not valid yet; is a clock wrong?", ""),
             ("keys/thief", "certificate.pem: has been revoked", ""),
-            ("keys/cloud", "certificate.pem: is not for a robot", ""),
-            ("keys/nobody", "authority.pem: cannot be read: No such file", ""),
-            ("crossed", "key.pem: is not the key of", ""),
             ("thief", "ours: thief, until", ""),
             ("other/anna", "theirs: was not signed by", "shown is cloud"),
         ],
@@ -421,7 +399,6 @@ class TestCertificates:
         ("service", "what"),
         [
             ("old-cloud", "has expired; 'holdfast keys DIR --renew --service NAME' makes another"),
-            ("early-cloud", "is not valid yet; is a clock wrong?"),
             ("two-names", "theirs: has 2 common names, and must have one"),
         ],
     )
@@ -444,7 +421,6 @@ class TestCertificates:
         ("service", "host", "what"),
         [
             ("keys/cloud", "127.0.0.2", "does not name this host"),
-            ("other/cloud", "127.0.0.1", "was not signed by the authority in authority.pem"),
             ("thief-cloud", "127.0.0.1", "has been revoked"),
         ],
     )
@@ -490,7 +466,7 @@ class TestProblem:
         assert "is not known to this service" in seen["problem"]["seen"]
         assert "(--problem)" in seen["problem"]["seen"]
 
-    @pytest.mark.parametrize("what", ["half", "sensing"])
+    @pytest.mark.parametrize("what", ["sensing"])
     def test_a_service_that_decides_otherwise(self, what: str, site: Site) -> None:
         name = "lying_problem:LyingPeg"
         cloud = site.service("--problem", name, "--problem-directory", str(HERE))
@@ -508,9 +484,7 @@ class TestProblem:
     [
         ((), "usage"),
         (("--json",), "no service is named: give --service ENDPOINT"),
-        (("--service", "quic/a:1"), "protocol quic is not allowed"),
         (("--service", "tcp/a:1", "--tls", "keys"), "tcp does not use the credentials"),
-        (("--service", "tcp/a:1", "missing.yaml"), "missing.yaml: there is no such file"),
     ],
 )
 def test_options_that_cannot_be_used(arguments: tuple[str, ...], message: str, site: Site) -> None:

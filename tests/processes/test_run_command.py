@@ -250,7 +250,7 @@ class TestInterruption:
         ("ending", "group"),
         [
             (signal.SIGTERM, False),
-            (signal.SIGHUP, True),
+            pytest.param(signal.SIGHUP, True, marks=pytest.mark.slow),
             pytest.param(signal.SIGTERM, True, marks=pytest.mark.slow),
             pytest.param(signal.SIGHUP, False, marks=pytest.mark.slow),
         ],
@@ -315,10 +315,6 @@ class TestErrors:
         assert done.stderr.startswith("holdfast: error: ")
         assert "Traceback" not in done.stderr
         return done.stderr
-
-    def test_a_missing_configuration(self, workplace: Path) -> None:
-        assert "missing.yaml" in self.fails(workplace, "run", "missing.yaml")
-        assert not (workplace / "runs").exists()
 
     def test_the_exit_code_says_it_where_nothing_can_be_written(self, workplace: Path) -> None:
         for command, code in ((["run", "missing.yaml"], 2), (["run", "--bogus"], 2)):

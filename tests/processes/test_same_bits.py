@@ -24,10 +24,10 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 # name: the example, trials, and what is changed in it.
 RUNS: dict[str, tuple[str, int, dict[str, dict[str, object]]]] = {
-    "peg": ("peg_in_hole_2d", 15, {}),
+    "peg": ("peg_in_hole_2d", 6, {}),
     "more particles": (
         "peg_in_hole_2d",
-        10,
+        4,
         {"particle_filter": {"num_particles": 700}, "simulator": {"max_steps": 60}},
     ),
     # From 4,096 particles on, motion runs on several threads, too.
@@ -38,7 +38,7 @@ RUNS: dict[str, tuple[str, int, dict[str, dict[str, object]]]] = {
     ),
     "few resamplings": (
         "peg_in_hole_2d",
-        4,
+        2,
         {
             "particle_filter": {"num_particles": 100, "resampling_threshold": 0.3},
             "selector": {
@@ -50,7 +50,7 @@ RUNS: dict[str, tuple[str, int, dict[str, dict[str, object]]]] = {
             "simulator": {"max_steps": 60},
         },
     ),
-    "capsule": ("capsule_robot", 4, {}),
+    "capsule": ("capsule_robot", 2, {}),
     "multitier": ("multitier_peg_in_hole_2d", 2, {}),
     "peg in space": ("peg_in_hole_3d", 2, {"simulator": {"max_steps": 60}}),
 }
@@ -219,7 +219,7 @@ def test_all_at_once(run: Run, usual: Report) -> None:
 def test_the_command(tmp_path: Path, usual: Report, jobs: str) -> None:
     """``holdfast run`` on the example itself, which leaves the number of threads open."""
     command = [sys.executable, "-c", "from holdfast.cli import main; main()", "run"]
-    arguments = ["--trials", "15", "--jobs", jobs, "--out", str(tmp_path / "out")]
+    arguments = ["--trials", "6", "--jobs", jobs, "--out", str(tmp_path / "out")]
     subprocess.run(
         [*command, str(EXAMPLES / "peg_in_hole_2d.yaml"), *arguments],
         env={key: value for key, value in os.environ.items() if key not in SETTINGS},

@@ -91,12 +91,12 @@ def test_a_service_that_is_killed(site: Site, reference: Path) -> None:
     assert_identical(robot.out, reference)
 
 
-@pytest.mark.parametrize("with_service", [False, True])
+@pytest.mark.parametrize("with_service", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_robot_that_is_killed_in_mid_move(
     site: Site, reference: Path, with_service: bool
 ) -> None:
     """What the move has shown is asked for again."""
-    kill_at = (6, 7, 15, STEPS - 1)
+    kill_at = (6, STEPS - 1)
     path = configure(site.directory, kill_at)
     (site.directory / "victim").write_text("")
     services = [service_of(site)] if with_service else []

@@ -56,21 +56,6 @@ def test_it_ends_as_other_tools_do(tmp_path: Path, arguments: tuple[str, ...]) -
     assert "Exception" not in done.stderr
 
 
-def test_a_reader_that_has_had_enough(tmp_path: Path) -> None:
-    with subprocess.Popen(
-        [*COMMAND, "simulate", "--story", "--seeds", "0:1000"],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
-        assert process.stdout is not None and process.stderr is not None
-        assert process.stdout.readline() == "# seed 0\n"
-        process.stdout.close()
-        assert process.stderr.read() == ""
-        assert process.wait(120) == 141
-
-
 def test_a_run_keeps_what_it_has_done(tmp_path: Path) -> None:
     path = tmp_path / "capsule.yaml"
     path.write_text(CONFIGURATION, encoding="utf-8")

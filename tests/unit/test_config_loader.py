@@ -345,9 +345,6 @@ class TestFiles:
     def test_directory(self, tmp_path: Path) -> None:
         assert f"{tmp_path}: is a directory" in complaint(tmp_path)
 
-    def test_below_a_file(self, write: Write) -> None:
-        assert "cannot be read: Not a directory" in complaint(write(THESIS) / "run.yaml")
-
     def test_a_name_that_no_file_can_have(self) -> None:
         assert "cannot be read" in complaint(Path("a\0b"))
 
@@ -384,7 +381,6 @@ class TestYaml:
         ("text", "expected"),
         [
             ("model:\n\tpeg_width: 1\n", "run.yaml, line 2, column 1: not YAML: found character"),
-            ("model: {peg_width: 1\n", "run.yaml, line 2, column 1: not YAML: expected"),
             ("a: 1\n---\nb: 2\n", "line 2, column 1: not YAML: but found another document"),
             ("model: *x\n", "line 1, column 8: not YAML: found undefined alias 'x'"),
             ("model:\n  a: '\x01'\n", "line 2: not YAML: the character U+0001 is not allowed"),
@@ -401,7 +397,6 @@ class TestYaml:
                 "line 4, column 3: the key simulator.seed stands twice, on lines 2 and 4",
             ),
             ("simulator: {seed: 1, seed: 1}", "simulator.seed stands twice, on line 1"),
-            ("model: {a: 1}\nmodel: {b: 1}", "the key model stands twice, on lines 1 and 2"),
         ],
     )
     def test_a_key_that_stands_twice(self, text: str, expected: str, write: Write) -> None:
@@ -462,10 +457,7 @@ class TestKeysAndValues:
                 "run.yaml, line 3: particle_filter.num_particles is 0;"
                 " expected a whole number >= 1 and <= 10000000",
             ),
-            ("particle_filter: {num_particles: ten}", 'is "ten"; expected a whole number'),
             ("particle_filter: {num_particles: 2.5}", "is 2.5; expected a whole number"),
-            ("particle_filter: {num_particles: true}", "is true; expected a whole number"),
-            ("particle_filter: {num_particles: }", "is null; expected a whole number"),
             ("particle_filter: {num_particles: [1]}", "is [1] (a list of 1); expected a whole"),
             ("active_sensing: {discount: 1.5}", "discount is 1.5; expected a number >= 0 and <= 1"),
             (
@@ -474,10 +466,6 @@ class TestKeysAndValues:
             ),
             ("selector: {resolution: [1, 1, 0]}", "selector.resolution[2] is 0; expected a number"),
             ("selector: {resolution: []}", "resolution is [] (a list of 0); expected a number >="),
-            (
-                "selector:\n  resolution: 1e-160",
-                "line 3: selector.resolution is 1e-160; expected a number >= 1e-150 and <= 1e+150",
-            ),
             ("selector: {resolution: [1, 1e151, 1]}", "selector.resolution[1] is 1e+151; expected"),
             (
                 "selector: {method: action-entropy}",
@@ -486,13 +474,8 @@ class TestKeysAndValues:
                 "you mean action_entropy?",
             ),
             ("model: {init_mean: [1, 2]}", "is [1, 2] (a list of 2); expected a list of 3"),
-            ("model: {init_mean: [1, 2, x]}", 'model.init_mean[2] is "x"; expected a number'),
             ("model: {peg_width: -1}", "model.peg_width is -1; expected a number > 0"),
-            ("state_space_planner: {rotation_step_size: 0}", "rotation_step_size is 0; expected"),
-            ("simulator: {seed: -1}", "simulator.seed is -1; expected a whole number >= 0"),
             ("simulator: 3", "line 2: simulator is 3; expected a mapping of keys"),
-            ("simulator: [seed]", 'simulator is ["seed"]; expected a mapping of keys'),
-            ("simulator: ''", 'simulator is ""; expected a mapping of keys'),
             (f"simulator: {{seed: {'x' * 500}}}", f'is "{"x" * 56}...; expected a whole number'),
         ],
     )
@@ -516,10 +499,6 @@ class TestKeysAndValues:
                 "particle_filter.horizon is a key of active_sensing, not of particle_filter",
             ),
             (
-                "model: {rotation_step_size: 2}",
-                "model.rotation_step_size is a key of state_space_planner, not of model",
-            ),
-            (
                 "particle_filters: {num_particles: 10}",
                 "particle_filters is not a known section; did you mean particle_filter?\n"
                 "allowed: problem, problem_directory, model, particle_filter, state_space_planner,",
@@ -531,10 +510,6 @@ class TestKeysAndValues:
             (
                 "active_sensing: {sensing_interval: 2}",
                 "sensing_interval is not a known key; did you mean simulator.sensing_intervals?",
-            ),
-            (
-                "simulator: {sensing_interval: 2}",
-                "sensing_interval is not a known key; did you mean sensing_intervals?",
             ),
             ("simulator: {'\\e[2J': 1}", "is not a known key"),
         ],
@@ -598,15 +573,6 @@ class TestTwoKeys:
 class TestOffload:
     """The sections `offload` and `recovery`."""
 
-    def test_what_they_are_without_the_sections(self, write: Write) -> None:
-        configuration = load(write("problem: peg_in_hole_2d"))
-        assert configuration.offload == OffloadSettings()
-        assert configuration.recovery == RecoverySettings()
-        assert configuration.environment == EnvironmentSettings()
-        assert configuration.offload.services == ()
-        assert configuration.recovery.launch == "on_failure"
-        assert configuration.environment.object is None
-
     def test_they_load_and_come_back(self, write: Write) -> None:
         configuration = load(
             write(
@@ -652,11 +618,6 @@ class TestOffload:
                 "offload: {services: tcp/a:1}",
                 'is "tcp/a:1"; expected a list of at most 16, as in [tcp/a:1]',
             ),
-            ("offload: {services: [3]}", "offload.services[0] is 3; expected text of at least 1"),
-            (
-                "offload:\n  services:\n    - tcp/a:1\n    - ''",
-                'line 5: offload.services[1] is ""; expected text of at least 1',
-            ),
             (
                 f"offload: {{services: [{', '.join(f'tcp/a:{port}' for port in range(17))}]}}",
                 "(a list of 17); expected a list of at most 16",
@@ -665,13 +626,11 @@ class TestOffload:
                 "offload:\n  services:\n    - tcp/a:1\n    - tcp/b:1\n    - tcp/a:1",
                 'line 6: offload.services[2] is "tcp/a:1", as offload.services[0] is already',
             ),
-            ("offload: {tls: 3}", "offload.tls is 3; expected text of at least 1"),
             (
                 "recovery: {launch: always}",
                 'recovery.launch is "always"; expected one of at_start, never, on_failure',
             ),
             ("recovery: {lauch: never}", "recovery.lauch is not a known key; did you mean launch?"),
-            ("recovery: {lease_ms: 100}", "lease_ms is a key of offload, not of recovery"),
             (
                 "recovery: {launch: never}\noffload:\n  decision_deadline_ms: 50",
                 "line 4: offload.decision_deadline_ms is 50; then the local service decides instead"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import pytest
 from tests.robot_world import LOCAL, SmallService, World, answer_third_slowly, nth
 
@@ -119,21 +117,6 @@ def test_at_the_start_nobody_is_waited_for_where_the_others_refuse_or_were_there
     assert launch < 1e-3 * world.offload.startup_timeout_ms
 
 
-def test_a_problem_that_every_service_refuses_stops_the_robot() -> None:
-    world = World()
-
-    def refuse(request: Request) -> list[Reply] | None:
-        return [Refused(request.number, "failed", "policy gives nan")]
-
-    world.services["cloud"].rule = refuse
-    world.services[LOCAL].rule = refuse
-    world.start()
-    world.run()
-    assert world.stopped is not None
-    assert isinstance(world.stopped.error, ServiceRefusedError)
-    assert "policy gives nan" in str(world.stopped.error)
-
-
 @pytest.mark.parametrize("code", ["failed", "out_of_memory"])
 @pytest.mark.parametrize("launch", ["on_failure", "never"])
 def test_a_sensing_part_that_fails_after_its_task_part_stops_the_robot(
@@ -167,29 +150,6 @@ def test_who_fails_in_its_sensing_part_leaves_the_rest_to_another_service() -> N
         ("broken", True),
     ]
     assert world.statuses() == []
-
-
-def test_out_of_memory_for_a_while_is_asked_again_ever_later() -> None:
-    world = World(launch="never")
-    fails_in_its_sensing_part(world.services["cloud"], "out_of_memory", calls=4)
-    world.complete()
-    told = [at for at, e in world.trace if isinstance(e, LogEvent) and e.name == "refused"]
-    waits = [after - before for before, after in itertools.pairwise(told)]
-    assert len(waits) == 3
-    assert all(later > 1.5 * wait for wait, later in itertools.pairwise(waits))
-    assert waits[0] > 0.1
-    reasons = {str(each["reason"]) for each in world.reports("holding")}
-    assert reasons == {"cloud: out_of_memory: observation_mean raised"}
-
-
-def test_an_answer_clears_earlier_refusals_of_the_same_part() -> None:
-    world = World(launch="never")
-    refuse = {5, 6, 8, 9, 11, 12}
-    world.services["cloud"].rule = lambda r: (
-        [Refused(r.number, "failed", "policy gives nan")] if nth(r) in refuse else None
-    )
-    world.complete()
-    assert len(world.reports("refused")) == len(refuse)
 
 
 def test_the_machine_sleeps_while_nothing_can_be_done() -> None:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import csv
-import io
 import itertools
 import json
-import re
 import resource
 import shutil
 import signal
@@ -22,8 +20,6 @@ import mcap.records
 import numpy as np
 import pytest
 import yaml
-from mcap.records import Chunk, MessageIndex
-from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
@@ -443,43 +439,6 @@ class TestTheFile:
         assert info["message_count"] == len(times)
         assert info["custom_data"]["holdfast_seed"] == "5"
 
-    def test_every_index_points_at_its_messages(self, built_in: Any) -> None:
-        """As ``mcap doctor`` looks: what a chunk holds, and what the records after it say of it."""
-        _, directory, _ = built_in
-        content = (directory / "run.mcap").read_bytes()
-        stream = StreamReader(io.BytesIO(content), emit_chunks=True)
-        records = list(stream.records)
-        summary = mcap.reader.make_reader(io.BytesIO(content)).get_summary()
-        assert summary is not None
-        chunks = [record for record in records if isinstance(record, Chunk)]
-        assert len(chunks) == len(summary.chunk_indexes) > 0
-        for chunk, index in zip(chunks, summary.chunk_indexes, strict=True):
-            inside = [
-                each for each in breakup_chunk(chunk) if isinstance(each, mcap.records.Message)
-            ]
-            times = [message.log_time for message in inside]
-            assert (chunk.message_start_time, chunk.message_end_time) == (min(times), max(times))
-            assert (index.message_start_time, index.message_end_time) == (min(times), max(times))
-            assert content[index.chunk_start_offset] == 0x06
-            following = records[records.index(chunk) + 1 :]
-            by_channel = {}
-            for record in following:
-                if not isinstance(record, MessageIndex):
-                    break
-                by_channel[record.channel_id] = record.records
-            assert by_channel.keys() == index.message_index_offsets.keys()
-            assert all(content[each] == 0x07 for each in index.message_index_offsets.values())
-            expected: dict[int, list[int]] = defaultdict(list)
-            for message in inside:
-                expected[message.channel_id].append(message.log_time)
-            data, size = get_chunk_data_stream(chunk)
-            raw = data.read(size)
-            for channel, entries in by_channel.items():
-                assert [time for time, _ in entries] == expected[channel]
-                for _, offset in entries:
-                    assert raw[offset] == 0x05
-                    assert int.from_bytes(raw[offset + 9 : offset + 11], "little") == channel
-
     def test_qualities_of_service(self, built_in: Any) -> None:
         _, directory, _ = built_in
         with AnyReader([directory / "run.mcap"]) as reader:
@@ -533,17 +492,6 @@ class TestTheFile:
 
 
 class TestTimes:
-    def test_without_recorded_ones_every_step_takes_the_same(
-        self, place: Place, tmp_path: Path
-    ) -> None:
-        place.run(PEG)
-        said = place.export("--csv", "tables")
-        assert "recorded without times, so every step takes 0.1 s" in said.stderr
-        steps = rows_of(tmp_path / "tables" / "steps.csv")
-        times = [float(row["action_time"]) for row in steps]
-        assert times[0] == 1.05
-        assert np.diff(times[:20]).tolist() == pytest.approx([0.1] * 19)
-
     def test_recorded_ones_are_kept(self, place: Place, tmp_path: Path) -> None:
         run = place.run(PEG, "--rate", "5000")
         said = place.export("--csv", "tables", "--mcap", "run.mcap")
@@ -570,28 +518,6 @@ class TestTimes:
         assert {message.data.status[0].hardware_id for message in statuses} == {"in_process"}
         events = [row["event"] for row in rows_of(tmp_path / "tables" / "events.csv")]
         assert events.count("trial") == 2
-
-    def test_a_clock_that_was_set_back_is_not_followed(self, place: Place, tmp_path: Path) -> None:
-        run = place.run(PEG, "--rate", "5000")
-        table = run / "timings.csv"
-        head, *lines = table.read_text().splitlines(keepends=True)
-        middle = len(lines) // 2
-        for index in range(middle, len(lines)):
-            rest = lines[index].rpartition(",")[0]
-            lines[index] = f"{rest},1999-01-01T00:00:00.000000Z\n"
-        table.write_text(head + "".join(lines) + "0,1,task,x\n\0broken")
-        place.export("--csv", "tables")
-        times = [float(row["action_time"]) for row in rows_of(tmp_path / "tables" / "steps.csv")]
-        assert all(later > earlier for earlier, later in itertools.pairwise(times))
-        assert times[0] > 1.7e9
-
-    def test_a_table_of_times_that_lacks_trials_is_said(self, place: Place, tmp_path: Path) -> None:
-        run = place.run(PEG, "--rate", "5000")
-        table = run / "timings.csv"
-        lines = table.read_text().splitlines(keepends=True)
-        table.write_text("".join(line for line in lines if not line.startswith("1,")))
-        said = place.call("export", "run", "--csv", "tables")
-        assert "timings.csv lacks 1 trial from 1 on; all have one clock" in said.stderr
 
     def test_events_are_told_between_the_steps(self, place: Place, tmp_path: Path) -> None:
         run = place.run(PEG, "--rate", "5000")
@@ -693,13 +619,6 @@ class TestOwnCode:
         options = ("--csv", "tables", "--problem-directory", "elsewhere")
         assert "there is no module cart" in place.export(*options, code=2).stderr
 
-    def test_a_pose_that_cannot_be(self, place: Place, tmp_path: Path) -> None:
-        (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", 'pose = ("z", "angle")'))
-        place.run(PEG.replace("peg_in_hole_2d", "cart:Cart"))
-        said = place.export("--mcap", "run.mcap", *MINE, code=2)
-        assert "pose[1] of cart is 'angle': allowed are x, y, z, roll" in said.stderr
-        assert not (tmp_path / "run.mcap").exists()
-
     def test_in_a_world_of_ones_own(self, place: Place, tmp_path: Path) -> None:
         """What the world has shown is in the journal, of the trial that is not finished as well."""
         (tmp_path / "world.py").write_text(OWN_WORLD)
@@ -729,30 +648,6 @@ class TestOwnCode:
         assert len(of_topic(messages, "/holdfast/task_action")) == 12
         assert len(of_topic(messages, "/holdfast/estimate")) == 13
 
-    def test_a_clock_that_was_set_while_it_ran(self, place: Place, tmp_path: Path) -> None:
-        """A board that boots in 1970, until it hears from a time server."""
-        run = place.run(PEG, "--rate", "5000")
-        timings, events = run / "timings.csv", run / "events.jsonl"
-        place.export("--csv", "before")
-        for table in (timings, events):
-            lines = table.read_text().splitlines(keepends=True)
-            early = [re.sub(r"20\d\d-\d\d-\d\dT\d\d", "1970-01-01T00", line) for line in lines]
-            half = len(lines) // 2
-            table.write_text("".join(early[:half] + lines[half:]))
-        said = place.export("--csv", "after")
-        assert "note: the robot's clock was set by +" in said.stderr
-        for name in ("steps.csv", "events.csv", "trials.csv"):
-            before, after = (rows_of(tmp_path / side / name) for side in ("before", "after"))
-            assert len(before) == len(after) > 0
-            for row, shifted in zip(before, after, strict=True):
-                for key in row:
-                    if key.endswith("time") or key in ("began", "ended"):
-                        # The last reading of the clock counts, so nothing has moved.
-                        known = float(row[key] or 0)
-                        assert float(shifted[key] or 0) == pytest.approx(known, abs=1.0)
-                    else:
-                        assert shifted[key] == row[key]
-
     def test_a_run_that_was_copied_from_the_robot(
         self, capsys: pytest.CaptureFixture[str], tmp_path: Path
     ) -> None:
@@ -774,16 +669,6 @@ class TestOwnCode:
         said = Place(desk, capsys).export("--csv", "again", *MINE, code=2)
         assert "cart" in said.stderr
 
-    def test_code_that_fails_now(self, place: Place, tmp_path: Path) -> None:
-        (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", ""))
-        place.run(PEG.replace("peg_in_hole_2d", "cart:Cart"))
-        spoilt = OWN_PROBLEM.replace("POSE", "").replace("return 0.3", "raise OSError('hm')\n#")
-        (tmp_path / "cart.py").write_text(spoilt)
-        said = place.export("--csv", "tables", *MINE, code=2)
-        assert "hm" in said.stderr
-        assert "cart.py" in said.stderr
-        assert not (tmp_path / "tables").exists()
-
 
 class TestDecisionsAreCompared:
     def test_another_problem_is_noticed(self, place: Place, tmp_path: Path) -> None:
@@ -795,34 +680,6 @@ class TestDecisionsAreCompared:
         assert "the problem's source has changed since (module cart)" in said.stderr
         assert not (tmp_path / "tables").exists()
         assert not (tmp_path / "run.mcap").exists()
-
-    @pytest.mark.parametrize("what", ["sensing", "task"])
-    def test_a_decision_that_is_not_the_planners(
-        self, what: str, place: Place, tmp_path: Path
-    ) -> None:
-        run = place.run(PEG)
-        with Journal.read(run / "journal.sqlite") as journal:
-            meta = journal.meta()
-            results = list(journal.results(with_decisions=True))
-        (run / "journal.sqlite").unlink()
-        decisions = results[1].decisions
-        assert decisions is not None
-        log = bytearray(decisions.log)
-        # A sensing record is 45 bytes: kind, step, action, digest; then an action of 9 and 24.
-        position = 9 if what == "sensing" else 45 + 9
-        log[position] ^= 1
-        spoilt = type(decisions)(decisions.action_size, bytes(log))
-        import msgspec
-
-        results[1] = msgspec.structs.replace(results[1], decisions=spoilt, digest=spoilt.digest())
-        with Journal.create(run / "journal.sqlite", meta) as journal:
-            for result in results:
-                journal.add(result)
-        said = place.export("--csv", "tables", code=2)
-        assert "trial 1: the decision of step 0 differs" in said.stderr
-        assert "--trials leaves it out" in said.stderr
-        assert not (tmp_path / "tables").exists()
-        place.export("--csv", "tables", "--trials", "0:1")
 
 
 class TestUnfinished:
@@ -882,12 +739,10 @@ class TestRefusals:
             ((), "nothing to write: give --mcap FILE or --csv DIR, or both"),
             (("--csv", "there"), "there: holds files already; remove it, or choose another"),
             (("--csv", "run.yaml"), "run.yaml: exists already; remove it, or choose another"),
-            (("--mcap", "run.yaml"), "run.yaml: exists already; remove it, or choose another"),
             (("--mcap", "there"), "there: exists already"),
             (("--mcap", "no/run.mcap"), "there is no directory no"),
             (("--csv", "one", "--mcap", "one"), "--mcap and --csv are both one; give two places"),
             (("--csv", "one", "--trials", "5"), "--trials is '5'; allowed are two whole numbers"),
-            (("--csv", "one", "--trials", "1:1"), "allowed are A:B with B above A"),
             (("--csv", "one", "--trials", "2:9"), "has no trial from 2 to 8 (--trials); it has 2"),
         ],
     )

@@ -26,10 +26,10 @@ def test_a_sleep_is_refused() -> None:
         time.sleep(0.001)
 
 
-@pytest.mark.parametrize("place", REAL)
-def test_what_is_named_is_there(place: str) -> None:
-    where, *names = place.split("::")
-    path = next(each for each in (ROOT / where, ROOT / "tests" / where) if each.exists())
-    for name in names:
-        text = path.read_text()
-        assert f"class {name}:" in text or f"def {name}(" in text
+def test_what_is_named_is_there() -> None:
+    for place in REAL:
+        where, *names = place.split("::")
+        path = next(each for each in (ROOT / where, ROOT / "tests" / where) if each.exists())
+        for name in names:
+            text = path.read_text()
+            assert f"class {name}:" in text or f"def {name}(" in text, place

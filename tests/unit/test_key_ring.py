@@ -18,6 +18,7 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from tests.command_line import Said, run_here
 
 from holdfast.errors import CredentialsError, OutputError
 from holdfast.runtime.files import NewFile, create_directory_atomically
@@ -140,10 +141,6 @@ class TestWhatIsMade:
         authority = certificate_of(tmp_path / "authority", "authority.pem")
         for name in ("left", "right", "cloud-2.lab"):
             certificate_of(tmp_path / name).verify_directly_issued_by(authority)
-
-    def test_only_the_names_given_are_made(self, tmp_path: Path) -> None:
-        make_credentials(tmp_path, robots=["arm"])
-        assert {path.name for path in tmp_path.iterdir()} == {"authority", "arm"}
 
     def test_two_authorities_have_different_names(self, tmp_path: Path) -> None:
         subjects = set()
@@ -351,7 +348,7 @@ class TestArguments:
             make_credentials(tmp_path, robots=[name + "x"])
 
     def test_as_many_names_as_one_call_may_have(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(key_ring, "MAX_PARTIES", 2)
         make_credentials(tmp_path, robots=["a"], services=["b"])
@@ -359,13 +356,8 @@ class TestArguments:
             make_credentials(tmp_path, robots=["c", "d"], services=["e"])
 
 
-def run_keys(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "holdfast", "keys", *arguments],
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+def run_keys(capsys: pytest.CaptureFixture[str], home: Path, *arguments: str) -> Said:
+    return run_here(capsys, home.parent, "keys", str(home), *arguments)
 
 
 KILLED_AT_EACH_MOMENT = """
@@ -476,29 +468,35 @@ class TestCommand:
         assert serials[0] == before
         assert serials[2] == certificate_of(tmp_path / "anna").serial_number
 
-    def test_it_makes_keys_and_says_what_goes_where(self, tmp_path: Path) -> None:
+    def test_it_makes_keys_and_says_what_goes_where(
+        self, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    ) -> None:
         home = tmp_path / "keys"
-        done = run_keys(str(home), "--host", "10.0.0.7", "--days", "30")
-        assert (done.returncode, done.stderr) == (0, "")
+        done = run_keys(capsys, home, "--host", "10.0.0.7", "--days", "30")
+        assert (done.code, done.stderr) == (0, "")
         assert f"{home / 'authority' / 'authority.key'} stays here" in done.stdout
         assert f"--tls {home / 'service'}" in done.stdout
         assert f"--tls {home / 'robot'}" in done.stdout
         assert "10.0.0.7" in done.stdout
         load_credentials(home / "service", "service")
 
-    def test_again_it_refuses_and_renews_if_told_to(self, tmp_path: Path) -> None:
-        assert run_keys(str(tmp_path)).returncode == 0
-        done = run_keys(str(tmp_path))
-        assert done.returncode == 2
+    def test_again_it_refuses_and_renews_if_told_to(
+        self, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    ) -> None:
+        assert run_keys(capsys, tmp_path).code == 0
+        done = run_keys(capsys, tmp_path)
+        assert done.code == 2
         assert done.stderr.startswith("holdfast: error: ")
         assert "service/certificate.pem: exists already" in done.stderr
-        done = run_keys(str(tmp_path), "--renew")
-        assert done.returncode == 0
+        done = run_keys(capsys, tmp_path, "--renew")
+        assert done.code == 0
         assert f"{tmp_path / 'robot' / 'certificate.pem'} for robot 'robot'" in done.stdout
 
-    def test_names_are_repeated_options(self, tmp_path: Path) -> None:
-        done = run_keys(str(tmp_path), "--robot", "a", "--robot", "b", "--service", "c")
-        assert done.returncode == 0
+    def test_names_are_repeated_options(
+        self, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    ) -> None:
+        done = run_keys(capsys, tmp_path, "--robot", "a", "--robot", "b", "--service", "c")
+        assert done.code == 0
         assert {path.name for path in tmp_path.iterdir()} == {"authority", "a", "b", "c"}
         # Each has its own command.
         commands = [line.split() for line in done.stdout.splitlines() if "--tls" in line]
@@ -507,8 +505,3 @@ class TestCommand:
             ("run", str(tmp_path / "a")),
             ("run", str(tmp_path / "b")),
         ]
-
-    def test_the_default_of_days_is_the_librarys(self) -> None:
-        from holdfast.transport.key_ring import DEFAULT_DAYS
-
-        assert f"(default: {DEFAULT_DAYS})" in run_keys("--help").stdout

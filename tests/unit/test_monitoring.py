@@ -203,11 +203,3 @@ class TestAddresses:
                         pass
 
         asyncio.run(main())
-
-    def test_an_address_that_is_not_this_machines_is_named(self) -> None:
-        async def main() -> None:
-            with pytest.raises(HealthError, match=r"192\.0\.2\.1:0: "):
-                async with serving("192.0.2.1"):
-                    pass
-
-        asyncio.run(main())

@@ -95,7 +95,7 @@ def last_words(
     return said.err
 
 
-@pytest.mark.parametrize("value", ["ten", "", "-1", "nan", "1e400", "9" * 30])
+@pytest.mark.parametrize("value", ["ten", "-1", "1e400"])
 @pytest.mark.parametrize("words", NUMBERS, ids=" ".join)
 def test_a_number(
     words: list[str],

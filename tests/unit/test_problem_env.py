@@ -111,7 +111,7 @@ class TestItIsAGymnasiumEnvironment:
 
 
 class TestAnEpisodeIsATrial:
-    @pytest.mark.parametrize("method", ["path_entropy", "state_entropy", "random", "fixed"])
+    @pytest.mark.parametrize("method", ["path_entropy", "random"])
     @pytest.mark.parametrize("problem", ["peg_in_hole_2d", "capsule_robot"])
     def test_our_methods_as_agents_decide_as_in_run_trial(self, problem: str, method: Any) -> None:
         environment, inner = made(problem=problem)

@@ -31,13 +31,11 @@ from holdfast.problems.problem import (
     [
         ("name", "", "name of .* is ''"),
         ("state_size", 0, "state_size of line is 0"),
-        ("sensing_actions", "abcd", "sensing_actions of line is 'abcd'"),
         ("sensing_actions", (), "sensing_actions of line"),
         ("state_labels", "xy", "state_labels of line is 'xy': must be a sequence of labels"),
         ("sensing_actions", "xy", "sensing_actions of line is 'xy': must be a sequence of labels"),
         ("state_labels", ("x",), "state_labels of line has 1 labels: must have 2"),
         ("resolution", 0.0, "resolution of line is 0.0"),
-        ("resolution", np.inf, "resolution of line is inf"),
         ("resolution", None, "resolution of line is None: must be one number or 1, one for each"),
         ("resolution", np.array([0.1, 0.1]), r"line is \[0.1 0.1\]: must be one number or 1, one"),
         ("resolution", np.array([np.nan]), r"line is \[nan\].* coordinate of an action, positive"),
@@ -49,13 +47,11 @@ from holdfast.problems.problem import (
             r"state_resolution of line is \[0.1 0. \]: must be one number or 2, one for each "
             "coordinate of a state",
         ),
-        ("state_resolution", np.array([0.1]), "state_resolution of line"),
         (
             "resolution",
             [[1], [1, 2]],
             r"^resolution of line is \[\[1\], \[1, 2\]\]: must be one num",
         ),
-        ("state_resolution", [[1], [1, 2]], r"^state_resolution of line is .*: must be one num"),
         ("sensing_costs", [[1], [1, 2]], r"sensing_costs of line is .*: must be 2 numbers"),
         (
             "circular",
@@ -64,9 +60,7 @@ from holdfast.problems.problem import (
         ),
         ("circular", (0, 0), "circular of line is .*: must be different indices"),
         ("circular", (True,), "circular of line"),
-        ("circular", "0", "circular of line"),
         ("circular", 0, "circular of line is 0: must be different indices"),
-        ("circular", (0.5,), "circular of line"),
         (
             "static_parameters",
             (2,),
@@ -78,7 +72,6 @@ from holdfast.problems.problem import (
         ("circular_observations", ((0,), (-1,)), r"circular_observations\[1\] of line is"),
         ("motion_variance", [[1], [1, 2]], r"motion_variance of line is .*: must be 1 numbers"),
         ("resolution", True, "resolution of line is True: must be one number"),
-        ("resolution", np.array(0.0), "resolution of line is 0.0: must be positive and finite"),
         ("motion_variance", np.array([0.1, 0.1]), "motion_variance of line"),
         ("log_likelihood", lambda *_: 0.0, "log_likelihood alone"),
         ("sample_observation", lambda *_: 0.0, "sample_observation alone"),

@@ -648,27 +648,6 @@ class TestCapacity:
         bench.run_all()
         assert bench.ended == set(calls)
 
-    def test_by_the_time_that_jobs_take(self) -> None:
-        bench = Bench(max_wait_ms=100.0)
-        slow = Robot(key=1)
-        slow.sense()
-        for _ in range(30):
-            bench.send(slow.request())
-            while bench.jobs:
-                bench.now += 0.02
-                bench.run()
-            slow.act() if not needs_sensing(slow.planning, slow.state) else slow.sense()
-        others = [Robot(key=key) for key in range(2, 40)]
-        for robot in others:
-            robot.sense()
-        calls = [bench.send(robot.request()) for robot in others]
-        accepted = [call for call in calls if not bench.replies[call]]
-        # About 40 ms for each, one in work and two to three before the wait is above 100 ms.
-        assert 2 <= len(accepted) <= 5
-        busy = only(bench.replies[calls[-1]])
-        assert isinstance(busy, Busy)
-        assert 60 <= busy.retry_after_ms <= 250
-
     def test_newcomers_turn_nobody_away_who_was_served_before(self) -> None:
         """To be somebody new costs nothing: one client can be thousands of them."""
         bench = Bench(max_wait_ms=10.0)
@@ -891,46 +870,6 @@ def test_only_what_was_measured_of_a_robot_is_expected_to_be_brief() -> None:
         light.act_until_sensing()
         light.sense()
     assert runs_of(service, 11, light.request(since=len(light.observed) - 3), 21.0)[0] == math.inf
-
-
-def test_nothing_is_expected_of_states_that_came_from_outside() -> None:
-    service, robot = Service(make_problem, 1), Robot()
-    for call in range(4):
-        request = robot.request(since=max(0, len(robot.observed) - 1))
-        found = runs_of(service, call, request, call)
-        robot.act_until_sensing()
-        robot.sense()
-    assert found[0] < math.inf
-    runs_of(service, 5, robot.restore(), 5.0)
-    robot.act_until_sensing()
-    robot.sense()
-    request = robot.request(since=len(robot.observed) - 1)
-    assert set(runs_of(service, 6, request, 6.0)) == {math.inf}
-    robot.begin(1)
-    assert runs_of(service, 7, robot.request(), 7.0)[0] < math.inf, "another trial is its own"
-
-
-def test_other_peoples_code_is_not_expected_to_be_brief() -> None:
-    service, robot = Service(lambda _: CapsuleRobot(), 1), Robot()
-    robot.session_configuration = msgspec.structs.replace(
-        robot.session_configuration, problem="own_problem:Mine"
-    )
-    for call in range(5):
-        request = robot.request(since=max(0, len(robot.observed) - 1))
-        assert set(runs_of(service, call, request, call)) == {math.inf}
-        robot.act_until_sensing()
-        robot.sense()
-
-
-def test_what_may_be_of_few_steps_or_many_is_not_expected_to_be_brief() -> None:
-    service, robot = Service(make_problem, 1), Robot(planning=planning_of(interval=33))
-    for call in range(5):
-        request = robot.request(since=max(0, len(robot.observed) - 1))
-        expected = runs_of(service, call, request, call)
-        assert expected[0] == math.inf
-        robot.act_until_sensing()
-        robot.sense()
-    assert expected[1] < math.inf  # the sensing part is of none
 
 
 def test_the_first_question_of_a_trial_is_as_brief_as_those_before() -> None:

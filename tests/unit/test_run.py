@@ -247,8 +247,7 @@ def test_a_world_of_ones_own_has_a_figure_of_the_belief(workplace: Workplace) ->
     assert "note: no figure, because trial 0 ended in an earlier part of the run" in said.stderr
 
 
-@pytest.mark.parametrize("moment", ["import", "sensing"])
-@pytest.mark.parametrize("out", [("--out", "out"), ()])
+@pytest.mark.parametrize(("moment", "out"), [("import", ("--out", "out")), ("sensing", ())])
 def test_a_robot_that_changes_the_directory_writes_where_it_was_started(
     workplace: Workplace, moment: str, out: tuple[str, ...]
 ) -> None:
@@ -303,7 +302,7 @@ def test_a_figure_that_a_problem_fails_to_describe(
     assert workplace.summary("out")["finished"] == 6
 
 
-@pytest.mark.parametrize("error", [KeyError("a"), ValueError("b"), OSError(28, "full")])
+@pytest.mark.parametrize("error", [KeyError("a")])
 @pytest.mark.parametrize(
     ("function", "says"),
     [
@@ -378,10 +377,8 @@ def test_nothing_to_resume(workplace: Workplace) -> None:
     [
         ("my_robot:Robot", "class MyRobot: pass\n", "did you mean MyRobot?"),
         ("my_robt:MyRobot", "class MyRobot: pass\n", "No module named 'my_robt'"),
-        ("my_robot:MyRobot", "import no_such_library\n", "No module named 'no_such_library'"),
         ("my_robot:MyRobot", "import math\nmath.sqrt(-1)\n", 'my_robot.py", line 2'),
         ("my_robot:MyRobot", "import sys\nsys.exit(0)\n", "raised SystemExit: 0"),
-        ("my_robot:MyRobot", "class MyRobot\n", 'my_robot.py", line 1'),
     ],
 )
 @pytest.mark.parametrize("out", [("--out", "out"), ()])
@@ -432,11 +429,10 @@ def test_a_service_in_the_file_that_cannot_be_one_is_named_with_its_key(
         (["serve", "--lease-ms", "1"], "--lease-ms is '1'; allowed are numbers from 50"),
     ],
 )
-@pytest.mark.parametrize("log", [("--log", "json"), ("--log=json",)])
 def test_with_log_json_the_error_is_an_event(
-    workplace: Workplace, command: list[str], expected: str, log: tuple[str, ...]
+    workplace: Workplace, command: list[str], expected: str
 ) -> None:
-    said = workplace.run(*command, *log)
+    said = workplace.run(*command, "--log=json")
     assert said.code == 2
     (event,) = map(json.loads, said.stderr.splitlines())
     assert event["event"] == "error"
@@ -472,21 +468,14 @@ def test_a_configuration_without_a_command(workplace: Workplace) -> None:
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
-        ("selector=random", "--set selector=random: must be SECTION.KEY=VALUE, such as"),
-        ("selector.method", "--set selector.method: must be SECTION.KEY=VALUE, such as"),
-        (".method=random", "must be SECTION.KEY=VALUE"),
-        ("selector.resolution=", "--set selector.resolution=: has no value"),
-        ("simulator.seed={", "--set simulator.seed, line 1, column 2: not YAML"),
         (
             "selector.method=dance",
             'selector.method, given instead of what peg.yaml says, is "dance',
         ),
-        ("selektor.method=random", "selektor is not a known section; did you mean selector?"),
         (
             "simulator.max_step=9",
             "holdfast: error: simulator.max_step is not a known key; did you mean max_steps?",
         ),
-        ("selector.method=entropy", "did you mean path_entropy?"),
         (
             "environment.arguments.noise=0.2",
             "write --set 'environment.arguments={noise: 0.2}'",
@@ -499,29 +488,6 @@ def test_a_wrong_value_instead_of_the_files(
     error = workplace.fails("run", "peg.yaml", "--out", "wrong", "--set", assignment)
     assert message in error
     assert workplace.names() == {"peg.yaml"}
-
-
-def test_what_a_problem_raises_is_shown_without_our_frames(workplace: Workplace) -> None:
-    workplace.write(
-        "broken.py",
-        "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
-        "class Broken(PegInHole2D):\n"
-        "    def policy(self, states, stage):\n"
-        "        return states + 'one'\n",
-    )
-    arguments = ("run", "peg.yaml", "--problem", "broken:Broken", "--out", "out", "--jobs", "1")
-    error = workplace.fails(*arguments, "--quiet")
-    assert "trial 0 (seed 3): broken:Broken raised " in error
-    assert f'File "{workplace.directory / "broken.py"}", line 4, in policy' in error
-    assert "return states + 'one'" in error
-    assert error.count("  File ") == 1
-    # Nothing is finished, so the mended problem may have the same directory.
-    workplace.write(
-        "broken.py",
-        "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
-        "class Broken(PegInHole2D): pass\n",
-    )
-    assert workplace.run(*arguments, "--quiet", "--trials", "1").code == 0
 
 
 class TestAfterAReboot:

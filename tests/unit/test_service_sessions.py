@@ -94,59 +94,6 @@ class TestTurns:
         assert sorted(ended) == sorted([*order, mine])
         assert [call for call in ended if call != mine] == order, "her own as they came"
 
-    def test_old_works_of_one_owner_do_not_starve_prefetches_of_another(self) -> None:
-        bench = Bench(max_wait_ms=1e9, prefetch_patience_ms=20.0)
-        annas = [Robot(key=100 + number) for number in range(12)]
-        berta = Robot(key=1)
-        for robot in annas:
-            bench.ask(robot.request(), "anna")
-        bench.ask(berta.request(), "berta")
-        for robot in (*annas, berta):
-            robot.sense()
-        mine = bench.send(berta.request(), "berta")
-        for robot in annas:
-            bench.send(robot.request(), "anna")
-        bench.run()  # Berta's task part; her sensing part waits behind Anna's task parts now.
-        assert bench.kinds(mine) == ["TaskAnswer"]
-        turns = 0
-        while mine not in bench.ended:
-            bench.now += 0.01
-            bench.run()
-            turns += 1
-        assert turns <= 5
-
-    def test_a_flood_of_one_owner_turns_no_other_away(self) -> None:
-        bench = Bench(max_waiting=100, max_waiting_per_robot=10, max_wait_ms=1e9)
-        calls = [bench.send(Robot(key=100 + n).request(), "anna") for n in range(40)]
-        told = [call for call in calls if bench.kinds(call) == ["Busy"]]
-        # One is in work, ten wait.
-        assert len(told) == 40 - 11
-        for number in range(5):
-            call = bench.send(Robot(key=1).request(), f"robot-{number}")
-            assert bench.kinds(call) == []
-        bench.run_all()
-        assert bench.service.statistics.busy == len(told)
-
-    def test_the_wait_behind_one_owner_is_a_turn(self) -> None:
-        """Ten sessions of one owner would take ten times what another may wait."""
-        bench = Bench(max_wait_ms=100.0)
-        annas = [Robot(key=100 + number) for number in range(10)]
-        berta = Robot(key=1)
-        for robot, owner in [*((each, "anna") for each in annas), (berta, "berta")]:
-            for _ in range(3):
-                bench.send(robot.request(), owner)
-                while bench.jobs:
-                    bench.now += 0.06
-                    bench.run()
-                robot.act_until_sensing()
-                robot.sense()
-        calls = [bench.send(robot.request(), "anna") for robot in annas]
-        assert "Busy" in [kind for call in calls for kind in bench.kinds(call)]
-        mine = bench.send(berta.request(), "berta")
-        assert bench.kinds(mine) == []
-        bench.run_all()
-        assert content(bench.replies[mine]) == berta.right_answer()
-
 
 class TestRoom:
     def test_one_owner_does_not_push_out_another(self) -> None:

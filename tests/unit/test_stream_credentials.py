@@ -399,7 +399,7 @@ def short_lived(directory: Path, seconds: float, **names: list[str]) -> None:
 
 def test_a_robots_link_ends_when_its_certificate_expires(tmp_path: Path) -> None:
     make_credentials(tmp_path, robots=["berta"], services=["cloud"])
-    short_lived(tmp_path, 4.0, robots=["anna"])
+    short_lived(tmp_path, 3.0, robots=["anna"])
     load_credentials(tmp_path / "anna", "robot", warn=lambda _: None)
 
     async def run() -> None:
@@ -422,7 +422,7 @@ def test_a_robots_link_ends_when_its_certificate_expires(tmp_path: Path) -> None
 
 def test_a_robot_leaves_a_service_whose_certificate_expires(tmp_path: Path) -> None:
     make_credentials(tmp_path, robots=["anna"])
-    short_lived(tmp_path, 4.0, services=["cloud"])
+    short_lived(tmp_path, 3.0, services=["cloud"])
 
     async def run() -> None:
         cloud = Cloud(tmp_path / "cloud")

@@ -77,12 +77,6 @@ def one(configuration: Configuration, trial: int = 0) -> TrialResult:
 
 
 class TestOneTrial:
-    def test_same_trial_decides_the_same(self, tmp_path: Path) -> None:
-        configuration = configuration_of(tmp_path)
-        first, second = one(configuration), one(configuration)
-        assert first.decisions == second.decisions
-        assert first.digest == second.digest
-
     def test_an_environment_may_say_that_the_task_failed(self, tmp_path: Path) -> None:
         configuration = configuration_of(tmp_path)
         problem, simulator = configuration.problem, configuration.simulator
@@ -174,15 +168,6 @@ class TestOneTrial:
                 environment=Blind(configuration.problem, 3, 0),
                 max_missing_in_a_row=2,
             )
-
-    def test_other_trials_and_seeds_decide_otherwise(self, tmp_path: Path) -> None:
-        configuration = configuration_of(tmp_path)
-        digests = {
-            one(configuration, 0).digest,
-            one(configuration, 1).digest,
-            one(configuration_of(tmp_path, seed=4), 0).digest,
-        }
-        assert len(digests) == 3
 
     def test_digest_is_the_hash_of_the_decisions(self, tmp_path: Path) -> None:
         result = one(configuration_of(tmp_path))

@@ -24,7 +24,7 @@ from holdfast.planning.validation_gate import (
 from holdfast.problems.problem import ProblemBase
 
 
-@pytest.mark.parametrize("size", [1, 2, 3, 6, 20, 100, 1000])
+@pytest.mark.parametrize("size", [1, 3, 100])
 def test_the_quantile(size: int) -> None:
     exact = stats.chi2.isf(OUTSIDE_PROBABILITY, size)
     assert gate(size) == pytest.approx(exact, rel=0.01)
@@ -46,7 +46,7 @@ def test_the_distance_is_that_of_the_whole_covariance(size: int, varying: bool) 
     assert _squared_distance(observed, mean, variance, weights) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("variance", [1e-2, 1e-8, 1e-16, 1e-20])
+@pytest.mark.parametrize("variance", [1e-2, 1e-20])
 @pytest.mark.parametrize("varying", [False, True])
 def test_two_channels_that_show_the_same(variance: float, varying: bool) -> None:
     """Their mean and their difference are independent, which gives the distance exactly."""
