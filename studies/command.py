@@ -202,12 +202,11 @@ def _make_anew(studies: list[Study], source: Path, directory: Path) -> None:
 
 def _executor_of(place: str, jobs: int) -> Executor:
     from holdfast.robot.trials import available_cores
-    from studies.executors import LocalExecutor
-    from studies.ray_executor import RayExecutor
+    from studies.executors import LocalExecutor, RayExecutor
 
     if place == "local":
         return LocalExecutor(jobs or available_cores())
-    executor = RayExecutor.of(place)
+    executor = RayExecutor(place)
     if jobs:
         raise InvalidValueError(
             f"--jobs {jobs}: has no effect with --executor {place}, where the cluster's cores say "

@@ -24,9 +24,11 @@ from studies.trial_files import rounded
 
 __all__ = [
     "MEASURES",
+    "P_VALUES",
     "JudgedStudy",
     "Trials",
     "compared",
+    "compared_together",
     "outcome_cells",
     "over_problems",
     "shown_as",
@@ -49,6 +51,8 @@ _KEPT = (
 MEASURES = ("steps_ratio", "success_gain")
 """What is compared: the ratio of steps (geometric mean; a failure counts as the limit), and the
 difference of success rates."""
+
+P_VALUES = ("success_p_value", "steps_p_value")
 
 Trials: TypeAlias = tuple[FloatArray, FloatArray]
 """The logarithm of steps and the success of each trial."""
@@ -121,7 +125,7 @@ class JudgedStudy(TrialStudy):
         whole, few = (
             {
                 (purpose, *self.names(cell)): (purpose, cell)
-                for purpose in (CHOICE, CLAIM)
+                for purpose in self.num_trials
                 for cell in self._cells_for(purpose, Scale(quick=quick))
             }
             for quick in (False, True)
@@ -131,7 +135,7 @@ class JudgedStudy(TrialStudy):
             if (key in expected) != (key in found):
                 what = "there are no trials" if key in expected else "knows nothing"
                 raise InvalidValueError(f"{self.name}: {what} of {', '.join(map(str, key))}")
-        tables: dict[str, dict[Any, pd.DataFrame]] = {CHOICE: {}, CLAIM: {}}
+        tables: dict[str, dict[Any, pd.DataFrame]] = {purpose: {} for purpose in self.num_trials}
         for key, (purpose, cell) in expected.items():
             tables[purpose][cell] = found[key]
         return tables
@@ -172,6 +176,23 @@ def compared(own: Trials, other: Trials) -> dict[str, Cell]:
         **cells_of("success_gain", success),
         "success_p_value": success_p_value,
     }
+
+
+def compared_together(
+    tables: Mapping[tuple[str, Any], pd.DataFrame], own: Any, other: Any
+) -> dict[str, Cell]:
+    """Return the cells of a comparison over all problems, each with the same weight.
+
+    Tables are by problem and way. The number of a trial is the mean over the problems, of the
+    trials that all have.
+    """
+    fewest = min(map(len, tables.values()))
+    problems = dict.fromkeys(problem for problem, _ in tables)
+    found = (
+        steps_and_success(*(tables[problem, way][:fewest] for problem in problems))
+        for way in (own, other)
+    )
+    return {"trials": fewest, **compared(*found)}
 
 
 def over_problems(

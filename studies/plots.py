@@ -39,6 +39,7 @@ __all__ = [
     "mark",
     "milliseconds",
     "ratio_axes",
+    "ratio_grid",
     "save",
     "stacked_panels",
 ]
@@ -229,6 +230,36 @@ def ratio_axes(panels: Iterable[Axes]) -> None:
         panel.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         panel.minorticks_off()
         panel.axvline(1.0, color="black", linewidth=0.8)
+
+
+def ratio_grid(
+    rows_of: Mapping[str, pd.DataFrame],
+    labels: pd.Series,
+    *,
+    columns: int,
+    title: str,
+    width: float,
+    row_height: float = 2.5,
+    label: str,
+) -> Figure:
+    """Return a figure with a panel of ratios of steps for each table.
+
+    ``labels`` are those of rows, by the index of the tables.
+    """
+    figure, panels = grid_of_panels(
+        list(rows_of),
+        columns=columns,
+        title=title,
+        width=width,
+        row_height=row_height,
+        same_rows=True,
+    )
+    for panel, rows in zip(panels.values(), rows_of.values(), strict=True):
+        dot_rows(panel, labels[rows.index].tolist(), [dots_of("", rows, "steps_ratio")])
+    ratio_axes(panels.values())
+    label_grid(figure, panels, "", "")
+    figure.supxlabel(label)
+    return figure
 
 
 def milliseconds(panel: Axes, label: str, *, upright: bool = True) -> None:

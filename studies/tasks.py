@@ -32,7 +32,6 @@ __all__ = ["Task", "code_of", "run_task", "task_key"]
 _FUNCTIONS: Mapping[str, str] = {
     "trials": "studies.trial_batches:run_trials_of",
     "cloud_trials": "studies.cloud_trials:run_cloud_trials",
-    "estimates": "studies.estimate_candidates:run_estimates",
     "emulation_2017": "studies.emulation_2017:run_emulation",
     "vdp_tag": "studies.published_worlds:run_vdp_tag",
     "exchange_times": "studies.exchange_times:measure_exchange",

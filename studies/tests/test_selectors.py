@@ -201,7 +201,7 @@ def test_all_follows_from_the_file_of_trials(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    monkeypatch.setattr(type(study), "num_trials", {CHOICE: 3, CLAIM: 6})
+    monkeypatch.setattr(type(study), "num_trials", dict.fromkeys(type(study).num_trials, 6))
 
     def trial(task: Task, number: int) -> tuple[bool, int, float]:
         chance = noise(task, number, ["problem", "model", "seed", "planning"])
