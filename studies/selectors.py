@@ -168,7 +168,7 @@ class Selectors(JudgedStudy):
     def report_of(self, tables: Mapping[str, pd.DataFrame]) -> Report:
         """Return the report on all trials; InvalidValueError if they are not of this study."""
         choosing, cells = self.by_cell(tables[TRIALS]).values()
-        chosen_by, places = _over_intervals(choosing), _over_intervals(cells)
+        places = _over_intervals(cells)
         summary, costs = _summary(cells), _costs(choosing, cells)
         rivals = {measure: _rivals(places, measure, _pairs()) for measure in MEASURES}
         relative_steps = _rivals(
@@ -182,8 +182,7 @@ class Selectors(JudgedStudy):
                 "rivals": rivals["steps_ratio"],
                 "rivals_in_success": rivals["success_gain"],
                 "over_problems": _over_problems(places),
-                "chosen_ways": _chosen_ways(chosen_by, places),
-                "default_candidates": _default_candidates(chosen_by, cells),
+                "default_candidates": _default_candidates(_over_intervals(choosing), cells),
                 "stuck": _stuck(cells),
                 "costs_of_looks": costs,
             },
@@ -321,45 +320,14 @@ def _over_problems(places: _Places) -> pd.DataFrame:
     )
 
 
-def _fewest_steps(chosen_by: _Places, place: str, ways: Iterable[str]) -> str:
-    """Return the way with the fewest steps on the trials for choosing."""
-    return min(ways, key=lambda way: float(np.nanmean(chosen_by[place, way][0])))
-
-
-def _chosen_ways(chosen_by: _Places, places: _Places) -> pd.DataFrame:
-    """Return the way that the trials for choosing choose, compared on the others.
-
-    For each problem and group, against the baseline and the default.
-    """
-    rows: list[dict[str, Cell]] = []
-    for place in (*_CASES, *GROUPS):
-        way = _fewest_steps(chosen_by, place, WAYS)
-        for rival in (BASELINE, DEFAULT):
-            when_chosen = compared(chosen_by[place, way], chosen_by[place, rival])
-            rows.append(
-                {
-                    "problem": place,
-                    "chosen": way,
-                    "rival": rival,
-                    "steps_ratio_when_chosen": when_chosen["steps_ratio"],
-                    "trials": places[place, way][0].size,
-                    **compared(places[place, way], places[place, rival]),
-                }
-            )
-    table = pd.DataFrame(rows)
-    statistics.add_adjusted(
-        table, "steps_p_value", "success_p_value", compared=table["chosen"] != table["rival"]
-    )
-    return table
-
-
 def _default_candidates(chosen_by: _Places, cells: _Cells) -> pd.DataFrame:
     """Return the comparisons that decide whether a candidate becomes the default.
 
     It does not if a rival beats it beyond noise, in steps or success, in any row. The p-values of a
     candidate are adjusted for all its comparisons of both measures.
     """
-    chosen = _fewest_steps(chosen_by, next(iter(GROUPS)), _CANDIDATES)
+    everywhere = next(iter(GROUPS))
+    chosen = min(_CANDIDATES, key=lambda way: float(chosen_by[everywhere, way][0].mean()))
     return pd.concat(
         [_candidate(way, cells).assign(chosen=way == chosen) for way in _CANDIDATES],
         ignore_index=True,

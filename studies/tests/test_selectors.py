@@ -164,12 +164,6 @@ def test_what_decides_about_the_default(decided: Report) -> None:
 
 
 def test_what_is_chosen_on_one_seed_is_judged_on_another(decided: Report) -> None:
-    for row in decided.summary["chosen_ways"].to_dict("records"):
-        assert row["problem"] == "busy room" or row["chosen"] == PATH
-        if row["rival"] == selectors.BASELINE and row["problem"] in ("peg in hole", "all problems"):
-            assert row["steps_ratio"] == pytest.approx(0.8, rel=0.04)
-            assert row["steps_ratio_when_chosen"] == pytest.approx(0.8, rel=0.04)
-            assert row["steps_ratio"] != row["steps_ratio_when_chosen"]
     # The best interval for choosing earns nothing on the other trials.
     for row in decided.summary["costs_of_looks"].to_dict("records"):
         if row["cost_of_a_look"] == 0.0:
