@@ -69,15 +69,6 @@ class Curve(NamedTuple):
         )
         return np.asarray(np.exp(inside))
 
-    def beyond(self, particles: FloatArray) -> FloatArray:
-        """Return the values, outside of what was measured by the last two points: for figures."""
-        values = self.at(particles)
-        (first, last), (low, high) = np.log(self.particles[-2:]), np.log(self.values[-2:])
-        larger = particles > self.particles[-1]
-        slope = (high - low) / (last - first)
-        values[larger] = np.exp(high + slope * (np.log(particles[larger]) - last))
-        return values
-
 
 class Scaling(NamedTuple):
     """What was measured of decisions of one kind, over numbers of particles.

@@ -1,22 +1,21 @@
 """What it costs to ask a service, beside what it computes and the path to it.
 
 A robot's questions are put to a real service: ``holdfast serve`` as a process of its own, over TCP
-on this machine, and the same service inside this process. Of the time until each part of an answer
-has come, the service itself says how much it computed; the rest is the exchange: encoding, two
-processes woken, digests, the answer decoded. A path adds its round trip to that.
+on this machine. Of the time until each part of an answer has come, the service itself says how much
+it computed; the rest is the exchange: encoding, two processes woken, digests, the answer decoded. A
+path adds its round trip to that.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import sys
 import tempfile
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import msgspec
 import pandas as pd
@@ -40,14 +39,10 @@ from holdfast.protocol.messages import (
     encode,
     encode_floats,
 )
-from holdfast.protocol.service import Service
-from holdfast.runtime.events import BoundedEventLog
-from holdfast.service.shell import ServiceShell
 from holdfast.transport.contract import RobotTransport
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast_lab.errors import NoProgressError, ProcessEndedError
 from holdfast_lab.testbed.driver import Testbed
-from holdfast_lab.testbed.in_process import InProcessNetwork
 from holdfast_lab.testbed.processes import free_port
 from studies.errors import TaskError
 from studies.sensing_times import Sensed, history_of
@@ -56,7 +51,7 @@ from studies.trial_batches import problem_of
 
 __all__ = ["COLUMNS", "Exchange", "measure_exchange"]
 
-COLUMNS = ("way", "trial", "step", "task_ms", "task_computed_ms", "sensing_ms", "computed_ms")
+COLUMNS = ("trial", "step", "task_ms", "task_computed_ms", "sensing_ms", "computed_ms")
 """Of the table: a row for each question. ``task_ms`` and ``sensing_ms`` are the times until the
 task actions and until the sensing action had come, ``computed_ms`` what the service computed for
 both."""
@@ -64,18 +59,15 @@ both."""
 _PATIENCE_S = 20.0
 _SWITCH_INTERVAL_S = 0.0005
 
-_IN_PROCESS = "in process"
-
 _LEASE_MS = 30_000.0
 """Of both ends: a machine that stands still for a moment does not end the study."""
 
 
 class Exchange(msgspec.Struct, frozen=True, kw_only=True):
-    """What is asked: all questions of some trials, by ``tcp`` or ``in_process``."""
+    """What is asked: all questions of some trials."""
 
     problem: str
     particles: int = 100
-    way: str = "tcp"
     num_trials: int = 3
     seed: int = 0
 
@@ -99,12 +91,6 @@ def measure_exchange(**exchange: Any) -> pd.DataFrame:
     else than what the same question comes to in this process.
     """
     wanted = msgspec.convert(exchange, Exchange)
-    ways: dict[str, Callable[[Exchange], _Service]] = {
-        "tcp": _over_tcp,
-        "in_process": _in_process,
-    }
-    if wanted.way not in ways:
-        raise TaskError(f"way {wanted.way!r}: there are {', '.join(ways)}")
     settings = PlanningSettings(
         particle_filter=ParticleFilterSettings(num_particles=wanted.particles),
         selector=SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
@@ -120,27 +106,36 @@ def measure_exchange(**exchange: Any) -> pd.DataFrame:
     switch_interval_s = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_INTERVAL_S)  # as a robot's process does
     try:
-        rows = asyncio.run(
-            _asked(ways[wanted.way](wanted), wanted.way, turns, session_configuration)
-        )
+        with (
+            tempfile.TemporaryDirectory(prefix="holdfast-") as directory,
+            Testbed(Path(directory)) as testbed,
+        ):
+            options = ("--lease-ms", str(_LEASE_MS), "--problem", wanted.problem)
+            service = testbed.add_service(f"tcp/127.0.0.1:{free_port()}", *options)
+            testbed.start_services()
+            rows = asyncio.run(_asked(service.endpoint, turns, session_configuration))
+    except (NoProgressError, ProcessEndedError) as error:
+        raise TaskError(str(error)) from error
     finally:
         sys.setswitchinterval(switch_interval_s)
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
 async def _asked(
-    service: _Service, way: str, turns: list[_Turn], session_configuration: SessionConfiguration
+    service: str, turns: list[_Turn], session_configuration: SessionConfiguration
 ) -> list[tuple[Cell, ...]]:
     """Return a row for each question but the first: for that, the problem is loaded."""
     rows: list[tuple[Cell, ...]] = []
-    async with service as (name, transport):
-        asking = _Asking(name, transport)
+    transport = StreamRobotTransport({service: service}, lease_ms=_LEASE_MS)
+    try:
+        asking = _Asking(service, transport)
         await asking.start()
         for number, turn in enumerate(turns, 1):
             row = await asking.ask(number, turn, session_configuration if number == 1 else None)
-            if number > 1:
-                rows.append((way, turn.trial, turn.step, *row))
-    return rows
+            rows.append((turn.trial, turn.step, *row))
+    finally:
+        await transport.close()
+    return rows[1:]
 
 
 def _turns(wanted: Exchange, settings: PlanningSettings, trial: int) -> Iterator[_Turn]:
@@ -166,9 +161,6 @@ def _turns(wanted: Exchange, settings: PlanningSettings, trial: int) -> Iterator
         last = (Observed(state.step, event.sensing_action, encode_floats(event.observation)),)
         state, _ = planner.observe(state, *event)
         asked = state
-
-
-_Service: TypeAlias = contextlib.AbstractAsyncContextManager[tuple[str, RobotTransport]]
 
 
 class _Asking:
@@ -234,41 +226,3 @@ class _Asking:
                 return await self._events.get()
         except TimeoutError:
             raise TaskError(f"the service has not answered for {_PATIENCE_S:g} s") from None
-
-
-@contextlib.asynccontextmanager
-async def _in_process(wanted: Exchange) -> AsyncIterator[tuple[str, RobotTransport]]:
-    problem = problem_of(wanted.problem)
-    network = InProcessNetwork()
-    shell = ServiceShell(
-        Service(lambda _: problem, workers=1),
-        network.service(_IN_PROCESS, "0"),
-        events=BoundedEventLog(),
-    )
-    robot = network.robot([_IN_PROCESS])
-    await shell.start()
-    try:
-        yield _IN_PROCESS, robot
-    finally:
-        await robot.close()
-        await shell.close()
-
-
-@contextlib.asynccontextmanager
-async def _over_tcp(wanted: Exchange) -> AsyncIterator[tuple[str, RobotTransport]]:
-    with (
-        tempfile.TemporaryDirectory(prefix="holdfast-") as directory,
-        Testbed(Path(directory)) as testbed,
-    ):
-        options = ("--lease-ms", str(_LEASE_MS), "--problem", wanted.problem)
-        service = testbed.add_service(f"tcp/127.0.0.1:{free_port()}", *options)
-        try:
-            testbed.start_services()
-        except (NoProgressError, ProcessEndedError) as error:
-            raise TaskError(str(error)) from error
-        addresses = {service.endpoint: service.endpoint}
-        transport = StreamRobotTransport(addresses, lease_ms=_LEASE_MS)
-        try:
-            yield service.endpoint, transport
-        finally:
-            await transport.close()

@@ -34,7 +34,6 @@ from studies.sensing_times import Measurement
 from studies.statistics import (
     Interval,
     cells_of,
-    exactly,
     interval_in,
     median_interval,
 )
@@ -122,10 +121,8 @@ class OffloadBreakEven(Study):
 
     def parts(self, scale: Scale) -> Iterator[Part]:
         """Yield exchanges, and decisions of each kind."""
-        for way in ("tcp", "in_process"):
-            for particles in _EXCHANGE_PARTICLES:
-                names: dict[str, Cell] = {"way": way, "particles": particles}
-                yield Part(names, [_exchange_task(way, particles, scale)], "exchange")
+        for particles in _EXCHANGE_PARTICLES:
+            yield Part({"particles": particles}, [_exchange_task(particles, scale)], "exchange")
         for kind in _kinds(scale):
             yield Part(kind._asdict(), [_sensing_task(kind, scale)], "sensing_times")
 
@@ -145,9 +142,7 @@ class OffloadBreakEven(Study):
             },
             figures={
                 "sensing_time": drawn("offload_figures:sensing_time", scalings, exchange_ms),
-                "break_even_map": drawn("offload_figures:break_even_map", scalings, exchange_ms),
                 "break_even": drawn("offload_figures:break_even_lines", lines),
-                "waiting": drawn("offload_figures:waiting", scalings, exchange_ms),
             },
             numbers=numbers_of(times, exchange, lines),
         )
@@ -212,10 +207,10 @@ def _threads() -> tuple[int, ...]:
     return tuple(2**power for power in range(most.bit_length()) if 2**power <= most)
 
 
-def _exchange_task(way: str, particles: int, scale: Scale) -> Task:
+def _exchange_task(particles: int, scale: Scale) -> Task:
     trials = 1 if scale.quick else 3
     exchange = Exchange(
-        problem=SHOWN.problem, particles=particles, way=way, num_trials=trials, seed=scale.seed
+        problem=SHOWN.problem, particles=particles, num_trials=trials, seed=scale.seed
     )
     return _task_of("exchange_times", exchange, trials)
 
@@ -242,8 +237,6 @@ def times_table(measured: pd.DataFrame) -> pd.DataFrame:
                 "repetitions": int(those["repetitions"].iloc[0]),
                 **cells_of("ms", median_interval(those["median_ms"])),
                 **cells_of("divided_share", share),
-                "mapping_share": float((those["mapping_ms"] / those["median_ms"]).median()),
-                "others_cores": float(those["others_cores"].iloc[0]),
             }
             for threads, those in here.groupby("threads")
         ]
@@ -278,20 +271,16 @@ def _intervals(rows: pd.DataFrame, name: str) -> FloatArray:
 
 def _exchange_table(asked: pd.DataFrame) -> pd.DataFrame:
     """Return the time of an exchange beside the computation and the path."""
+    both = asked["sensing_ms"] - asked["computed_ms"]
+    asked = asked.assign(
+        task_exchange_ms=asked["task_ms"] - asked["task_computed_ms"], sensing_exchange_ms=both
+    )
+    columns = ("task_exchange_ms", "sensing_exchange_ms", "task_computed_ms")
     rows: list[dict[str, Cell]] = []
-    for (way, particles), table in asked.groupby(["way", "particles"], sort=False):
-        task = table["task_ms"] - table["task_computed_ms"]
-        both = table["sensing_ms"] - table["computed_ms"]
-        rows.append(
-            {
-                "way": way,
-                "particles": particles,
-                "questions": len(table),
-                **cells_of("task_exchange_ms", median_interval(task)),
-                **cells_of("sensing_exchange_ms", median_interval(both)),
-                **cells_of("task_computed_ms", median_interval(table["task_computed_ms"])),
-            }
-        )
+    for particles, table in asked.groupby("particles", sort=False):
+        rows.append({"particles": particles, "questions": len(table)})
+        for name in columns:
+            rows[-1] |= cells_of(name, median_interval(table[name]))
     return pd.DataFrame(rows)
 
 
@@ -300,61 +289,37 @@ def exchange_ms_of(exchange: pd.DataFrame) -> float:
 
     It grows a little with the particles, because of their digest; the largest counts for all.
     """
-    return float(exchange.loc[exchange["way"] == "tcp", "sensing_exchange_ms"].max())
+    return float(exchange["sensing_exchange_ms"].max())
 
 
 def _growth_table(measured: pd.DataFrame) -> pd.DataFrame:
-    """Return the exponents of the time on one thread, in particles, M, J and H."""
-    one = measured[measured["threads"] == 1]
-    cells: list[dict[str, Cell]] = []
-    for _, rows in one.groupby(list(Kind._fields), sort=False):
-        for start in (100, _STEADY_FROM):
-            larger = rows[rows["particles"] >= start]
-            cells += _exponents("particles", larger, f"from {start:,} on")
-    for changed in ("samples", "sensing_actions", "horizon"):
-        others = [name for name in Kind._fields if name != changed]
-        for _, family in one.groupby(others, sort=False):
-            tried = family.groupby("particles")[changed].nunique()
-            common = tried.index[(tried == family[changed].nunique()) & (tried > 1)]
-            common = common[common <= _STEADY_FROM]
-            if len(common):
-                here = family[family["particles"] == common.max()]
-                cells += _exponents(changed, here, f"at {common.max():,} particles")
-    return pd.DataFrame(cells)
+    """Return the exponents with which the time on one thread grows with the particles.
 
-
-def _exponents(what: str, rows: pd.DataFrame, where: str) -> list[dict[str, Cell]]:
-    """Return a row with the median exponent over the beliefs, each fitted alone; none if few."""
+    Power laws, by least squares of logarithms: the median over the beliefs, each fitted alone.
+    """
     from scipy import stats
 
-    beliefs = [(own[what].to_numpy(float), own["median_ms"]) for _, own in rows.groupby("belief")]
-    most = max((sizes.size for sizes, _ in beliefs), default=0)
-    if most < 2:
-        return []
-    # Power laws, by least squares of logarithms.
-    whole = [(sizes, times) for sizes, times in beliefs if sizes.size == most]
-    slopes = [stats.linregress(np.log(sizes), np.log(times)).slope for sizes, times in whole]
-    smallest, largest = int(whole[0][0].min()), int(whole[0][0].max())
-    names = rows[list(Kind._fields)].iloc[0].to_dict()
-    if what != "particles":
-        names[what] = None
-    return [
-        {
-            "grows_with": what,
-            **names,
-            "where": where,
-            "smallest": smallest,
-            "largest": largest,
-            "beliefs": len(slopes),
-            **cells_of("exponent", median_interval(slopes)),
-            "n_log_n": _exponent_of_n_log_n(smallest, largest) if what == "particles" else math.nan,
-        }
-    ]
-
-
-def _exponent_of_n_log_n(smallest: int, largest: int) -> float:
-    """Return the exponent that n log n would have between two sizes."""
-    return 1.0 + math.log(math.log(largest) / math.log(smallest)) / math.log(largest / smallest)
+    one = measured[measured["threads"] == 1]
+    cells: list[dict[str, Cell]] = []
+    for kind, rows in one.groupby(list(Kind._fields), sort=False):
+        for start in (100, _STEADY_FROM):
+            logs = rows[rows["particles"] >= start].pivot_table("median_ms", "belief", "particles")
+            # Where there was no time for all beliefs, those that have all numbers.
+            logs = np.log(logs.dropna())
+            if logs.shape[1] < 2:
+                continue
+            sizes = np.log(logs.columns.to_numpy(float))
+            slopes = [stats.linregress(sizes, own).slope for own in logs.to_numpy()]
+            cells.append(
+                {
+                    **dict(zip(Kind._fields, kind, strict=True)),
+                    "smallest": logs.columns.min(),
+                    "largest": logs.columns.max(),
+                    "beliefs": len(slopes),
+                    **cells_of("exponent", median_interval(slopes)),
+                }
+            )
+    return pd.DataFrame(cells)
 
 
 class Line(NamedTuple):
@@ -459,13 +424,11 @@ def numbers_of(times: pd.DataFrame, exchange: pd.DataFrame, lines: pd.DataFrame)
         numbers.append(Number(name, range_, "% of the time on one thread", len(rows)))
     numbers += [
         Number(
-            f"exchange beside computation and path, {row['way']}, {row['particles']:,} particles",
+            f"exchange beside computation and path, tcp, {row['particles']:,} particles",
             interval_in(row, "sensing_exchange_ms"),
             "ms",
             row["questions"],
         )
         for row in exchange.to_dict("records")
     ]
-    # Where others kept a quarter of a core busy, the shares are lower bounds.
-    others = times["others_cores"].median()
-    return [*numbers, Number("cores that other processes kept busy", exactly(others))]
+    return numbers

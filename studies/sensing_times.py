@@ -7,15 +7,12 @@ approximate the same posteriors; only their size differs.
 
 Numbers of threads are timed in turns, so that other load on the machine meets all of them. The time
 that a thread waited for a core is subtracted; the system counts it. A second thread that comes late
-cannot be corrected for, so the gain of threads is read from the fastest repetitions, and the load
-of other processes is recorded.
+cannot be corrected for, so the gain of threads is read from the fastest repetitions.
 """
 
 from __future__ import annotations
 
 import gc
-import math
-import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -34,7 +31,6 @@ from holdfast.planning.settings import (
     PlanningSettings,
     SelectorSettings,
 )
-from holdfast.problems import checked
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import SimulatedEnvironment
 from studies.cost_model import parallel_share
@@ -118,9 +114,7 @@ def measure_sensing(**measurement: Any) -> pd.DataFrame:
         A row for each belief and number of threads. ``median_ms`` and ``fastest_ms`` are those of
         so many ``repetitions``, less what they waited for cores that others had. ``share`` is the
         part that is divided among threads, of the fastest ones: whatever else the machine does
-        delays several threads sooner than one. ``mapping_ms`` is what the policy and the predicted
-        observations of all particles take, which one thread does, and ``others_cores`` how many
-        cores other processes kept busy meanwhile.
+        delays several threads sooner than one.
     """
     wanted = msgspec.convert(measurement, Measurement)
     problem = problem_of(wanted.problem)
@@ -141,12 +135,11 @@ def measure_sensing(**measurement: Any) -> pd.DataFrame:
             state_in(problem, deciding.settings[1], wanted.seed, trial, history)
             for trial, history in enumerate(histories)
         ]
-        load = _Load()
         states = deciding.few_enough(states)
         if not states:
             break
         timed, round_s = deciding.timed(states)
-        tables.append(timed.assign(particles=particles, others_cores=load.of_others()))
+        tables.append(timed.assign(particles=particles))
         taken.append((particles, round_s))
     if not taken:
         raise InvalidValueError(
@@ -279,19 +272,12 @@ class _Deciding:
                 "median_ms": 1e3 * float(np.median(seconds)),
                 "fastest_ms": 1e3 * min(seconds),
                 "repetitions": repetitions,
+                "share": parallel_share({each: min(found) for each, found in times.items()}),
             }
             for belief, (state, times) in enumerate(zip(states, taken, strict=True))
             for threads, seconds in times.items()
         ]
-        of_beliefs = [
-            {
-                "belief": belief,
-                "share": parallel_share({each: min(seconds) for each, seconds in times.items()}),
-                "mapping_ms": 1e3 * _mapping_s(self._problem, state),
-            }
-            for belief, (state, times) in enumerate(zip(states, taken, strict=True))
-        ]
-        return pd.DataFrame(rows).merge(pd.DataFrame(of_beliefs), on="belief"), round_s
+        return pd.DataFrame(rows), round_s
 
     def _decision_s(self, threads: int, state: PlanningState) -> float:
         """Return what a decision takes, less what its thread waited for a core others had."""
@@ -308,43 +294,3 @@ def _delayed_ns() -> int:
         return int(_SCHEDULING.read_bytes().split()[1])
     except (OSError, IndexError, ValueError):
         return 0
-
-
-def _mapping_s(problem: Problem, state: PlanningState) -> float:
-    """Return what mapping all particles to actions and to expected observations takes."""
-    states = state.belief.states
-    seconds = []
-    for _ in range(3):
-        start = time.perf_counter()
-        checked.policy(problem, states, state.stage)
-        for sensing_action in range(len(problem.sensing_actions)):
-            checked.prediction(problem, states, sensing_action)
-        seconds.append(time.perf_counter() - start)
-    return float(np.median(seconds))
-
-
-class _Load:
-    """How busy other processes keep this machine, from now on (Linux)."""
-
-    _STATISTICS = Path("/proc/stat")
-
-    def __init__(self) -> None:
-        self._began = self._now()
-
-    def of_others(self) -> float:
-        """Return how many cores they kept busy on average; NaN if it cannot be known."""
-        began, now = self._began, self._now()
-        if began is None or now is None or now[0] <= began[0]:
-            return math.nan
-        return max(0.0, (now[1] - began[1]) / (now[0] - began[0]))
-
-    def _now(self) -> tuple[float, float] | None:
-        try:
-            fields = self._STATISTICS.read_text().split("\n", 1)[0].split()[1:]
-        except OSError:
-            return None
-        user, nice, system, _, _, interrupts, soft_interrupts, stolen = map(int, fields[:8])
-        ticks = user + nice + system + interrupts + soft_interrupts + stolen
-        own = os.times()
-        busy = ticks / os.sysconf("SC_CLK_TCK") - own.user - own.system
-        return time.monotonic(), busy
