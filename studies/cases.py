@@ -48,12 +48,10 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
         num_trials: int,
         active_sensing: ActiveSensingSettings | None = None,
         particle_filter: ParticleFilterSettings | None = None,
-        continued_trials: int = 0,
     ) -> TrialSeries:
         """Return the trials of one way of sensing, with this case's number of particles.
 
-        ``num_trials`` is that of a problem whose share is 1. Of these the first
-        ``continued_trials`` are continued if they are cut off.
+        ``num_trials`` is that of a problem whose share is 1.
         """
         if (
             self.state_resolution is not None
@@ -77,7 +75,6 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
             max_steps=self.max_steps,
             seed=seed,
             num_trials=max(2, round(self.share * num_trials)),
-            continued_trials=continued_trials,
         )
 
 

@@ -38,15 +38,7 @@ __all__ = [
 _TRIALS_IN_EACH = 20
 
 _PURPOSE = ("purpose", "seed")
-_KEPT = (
-    "trial",
-    "success",
-    "steps",
-    "reward",
-    "sensing_decisions",
-    "step_limit",
-    "steps_to_goal",
-)
+_KEPT = ("trial", "success", "steps", "reward", "sensing_decisions")
 
 MEASURES = ("steps_ratio", "success_gain")
 """What is compared: the ratio of steps (geometric mean; a failure counts as the limit), and the
@@ -105,7 +97,6 @@ class JudgedStudy(TrialStudy):
         medians = times.groupby([trials[name] for name in names]).transform("median")
         return trials[[*names, *_KEPT]].assign(
             reward=rounded(trials["reward"]),
-            steps_to_goal=trials["steps_to_goal"].astype(np.float64),
             median_sensing_ms=rounded(medians),
         )
 

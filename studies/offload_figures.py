@@ -53,9 +53,7 @@ def _lines(scaling: Scaling, cost_ms: float) -> list[tuple[list[float], plots.Do
     particles, (value, low, high) = scaling.particles.tolist(), scaling.times
     known = np.isfinite(low) & np.isfinite(high)
     ends = (np.where(known, end, value).tolist() for end in (low, high))
-    lines = [
-        (particles, plots.Dots("robot: 1 core (over beliefs)", value.tolist(), *ends))
-    ]
+    lines = [(particles, plots.Dots("robot: 1 core (over beliefs)", value.tolist(), *ends))]
     for cores in TIMES_THE_CORES:
         middle, (least, most) = scaling.on_cores(cores), scaling.band(cores)
         times = ((cost_ms + curve.values).tolist() for curve in (middle, least, most))

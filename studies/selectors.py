@@ -5,9 +5,6 @@ sensed. So ways are compared trial by trial: by success, by steps (a failure cou
 and by reward. Steps are compared as ratios, so that a tenth fewer counts the same where a task
 takes fifty or five hundred.
 
-Some trials are cut off at the limit. Those of the main ways are continued, to tell the slow from
-the stuck.
-
 The mean over these eight problems says nothing about a ninth. For that, the problems are taken as a
 sample of all problems (a random effect).
 """
@@ -20,7 +17,6 @@ from typing import ClassVar
 import numpy as np
 import pandas as pd
 
-from holdfast.numerics.arrays import BoolArray, FloatArray
 from holdfast.planning.settings import Estimator, Method, SelectorSettings
 from studies import statistics
 from studies.cases import CASES, Case
@@ -34,12 +30,12 @@ from studies.judged_study import (
     shown_as,
     steps_and_success,
 )
-from studies.statistics import Interval, cells_of, interval_in
+from studies.statistics import cells_of, interval_in
 from studies.study import CHOICE, CLAIM, TRIALS, Number, Report, Scale, drawn
 from studies.tables import Cell
 from studies.trial_batches import TrialSeries, problem_of
 
-__all__ = ["COSTS", "GROUPS", "INTERVALS", "SHOWN", "WAYS", "Selectors"]
+__all__ = ["GROUPS", "INTERVALS", "SHOWN", "WAYS", "Selectors"]
 
 INTERVALS = (0, 4, 8, 14)
 """Steps between two sensing steps."""
@@ -111,15 +107,6 @@ SHOWN = {
 }
 """Ways in the first figures, with their labels there."""
 
-_CONTINUED = tuple(way for way in SHOWN if way != "fixed")
-"""Ways whose trials are continued where they are cut off."""
-
-_CONTINUED_TRIALS = 60
-"""Of these, at each interval: a stuck trial takes twenty times as long as one that is cut off."""
-
-COSTS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
-"""Of a sensing action, in units of reward (the length of the way, in most problems)."""
-
 _CASES: Mapping[str, Case] = {case.name: case for case in CASES}
 
 _EACH_AND_ALL: tuple[tuple[Cell, tuple[int, ...]], ...] = (
@@ -162,14 +149,13 @@ class Selectors(JudgedStudy):
             interval,
             seed=scale.seed_of(purpose),
             num_trials=num_trials,
-            continued_trials=_CONTINUED_TRIALS if purpose == CLAIM and way in _CONTINUED else 0,
         )
 
     def report_of(self, tables: Mapping[str, pd.DataFrame]) -> Report:
         """Return the report on all trials; InvalidValueError if they are not of this study."""
         choosing, cells = self.by_cell(tables[TRIALS]).values()
         places = _over_intervals(cells)
-        summary, costs = _summary(cells), _costs(choosing, cells)
+        summary = _summary(cells)
         rivals = {measure: _rivals(places, measure, _pairs()) for measure in MEASURES}
         relative_steps = _rivals(
             places, "steps_ratio", [(way, BASELINE) for way in WAYS if way != BASELINE]
@@ -183,13 +169,10 @@ class Selectors(JudgedStudy):
                 "rivals_in_success": rivals["success_gain"],
                 "over_problems": _over_problems(places),
                 "default_candidates": _default_candidates(_over_intervals(choosing), cells),
-                "stuck": _stuck(cells),
-                "costs_of_looks": costs,
             },
             figures={
                 "choice_of_sensing": drawn("selectors_figures:choice_of_sensing", summary),
                 "selectors": drawn("selectors_figures:selectors", relative_steps),
-                "costs_of_looks": drawn("selectors_figures:costs_of_looks", costs),
             },
             numbers=_numbers(rivals),
         )
@@ -362,102 +345,6 @@ def _candidate(candidate: str, cells: _Cells) -> pd.DataFrame:
         for a, b in zip(slower, worse, strict=True)
     ]
     return table
-
-
-def _stuck(cells: _Cells) -> pd.DataFrame:
-    """Return how many trials were cut off, and how many of these never reached the goal."""
-    rows: list[dict[str, Cell]] = []
-    for name, case in _CASES.items():
-        for label, intervals in _EACH_AND_ALL:
-            found = {
-                way: [_continued(cells[name, each, way]) for each in intervals]
-                for way in _CONTINUED
-            }
-            stuck = {
-                way: np.array([table["steps_to_goal"].isna() for table in tables])
-                for way, tables in found.items()
-            }
-            for way, own in stuck.items():
-                cut = np.array([~table["success"].to_numpy(bool) for table in found[way]])
-                if len(intervals) == 1:
-                    beyond, p_value = statistics.paired_rates(own[0], stuck[BASELINE][0])
-                else:
-                    beyond, p_value = statistics.paired_difference(
-                        own.mean(axis=0), stuck[BASELINE].mean(axis=0)
-                    )
-                rows.append(
-                    {
-                        "problem": name,
-                        "sensing_interval": label,
-                        "way": way,
-                        "trials": own.size,
-                        "max_steps": case.max_steps,
-                        "cut_off": int(cut.sum()),
-                        "continued_to": int(found[way][0]["step_limit"].iloc[0]),
-                        "stuck": int(own.sum()),
-                        **cells_of("cut_off_share", _share(cut)),
-                        **cells_of("stuck_share", _share(own)),
-                        **cells_of("stuck_beyond_random", beyond),
-                        "p_value": p_value,
-                    }
-                )
-    table = pd.DataFrame(rows)
-    statistics.add_adjusted(table, "p_value", compared=table["way"] != BASELINE)
-    return table
-
-
-def _share(trials: BoolArray) -> Interval:
-    """Return the share of trials, shape (intervals, worlds), in which something is so.
-
-    The trials of one world are not independent: over several intervals the interval is Student's,
-    of the worlds' shares; and Wilson's where these are all 0 or all 1, which do not scatter.
-    """
-    whole = trials.all() or not trials.any()
-    if trials.shape[0] > 1 and not whole:
-        value, low, high = statistics.mean_interval(trials.mean(axis=0))
-        return Interval(value, max(low, 0.0), min(high, 1.0))
-    return statistics.rate_interval(int(trials[0].sum()), trials.shape[1])
-
-
-def _continued(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the trials that are continued if they are cut off: those with the highest limit."""
-    return table[table["step_limit"] == table["step_limit"].max()]
-
-
-def _costs(choosing: _Cells, cells: _Cells) -> pd.DataFrame:
-    """Return the net reward where sensing has a price, at the interval that is best then.
-
-    The trials for choosing choose the interval.
-    """
-    rows: list[dict[str, Cell]] = []
-    for case in _CASES:
-        for cost in COSTS:
-            nets: dict[str, FloatArray] = {}
-            for way in SHOWN:
-                chosen_by = {each: _net(choosing[case, each, way], cost) for each in INTERVALS}
-                best = max(chosen_by, key=lambda each: float(chosen_by[each].mean()))
-                net = nets[way] = _net(cells[case, best, way], cost)
-                gain, p_value = statistics.paired_difference(net, nets[BASELINE])
-                rows.append(
-                    {
-                        "problem": case,
-                        "way": way,
-                        "cost_of_a_look": cost,
-                        "best_interval": best,
-                        "trials": net.size,
-                        **cells_of("net_reward", statistics.mean_interval(net)),
-                        **cells_of("gain", gain),
-                        "p_value": p_value,
-                    }
-                )
-    table = pd.DataFrame(rows)
-    statistics.add_adjusted(table, "p_value", compared=table["way"] != BASELINE)
-    return table
-
-
-def _net(table: pd.DataFrame, cost: float) -> FloatArray:
-    """Return the reward of each trial less the price of its sensing."""
-    return np.asarray(table["reward"] - cost * table["sensing_decisions"])
 
 
 def _numbers(rivals: Mapping[str, pd.DataFrame]) -> list[Number]:
