@@ -7,7 +7,7 @@ sensing actions, the horizon, the estimator.
 
 Times are measured on this machine with as many threads as it has cores. For more cores they are
 extrapolated by Amdahl's law, within stated bounds (:mod:`~.cost_model`). The paths are numbers, 20
-and 87 ms; the rest of an exchange is measured.
+and 87 ms; what an exchange takes besides is known from the study of the thesis's chapter 6.
 
 Two robots are compared. The thesis's robot *waits for each decision*. Ours *decides ahead*: the
 sensing action is computed while the robot moves, so it waits only for the excess, besides one round
@@ -28,8 +28,7 @@ import pandas as pd
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.settings import PlanningSettings
 from holdfast.robot.trials import available_cores
-from studies.cost_model import BreakEven, Scaling, break_even
-from studies.exchange_times import Exchange
+from studies.cost_model import Scaling, break_even
 from studies.sensing_times import Measurement
 from studies.statistics import (
     Interval,
@@ -43,18 +42,16 @@ from studies.tasks import Task
 from studies.trial_batches import problem_of
 
 __all__ = [
+    "EXCHANGE_MS",
     "PATHS_MS",
-    "RATES_HZ",
     "SAMPLES_DRAWN",
     "SHOWN",
     "TIMES_THE_CORES",
     "Kind",
     "OffloadBreakEven",
-    "ahead_ms_of",
+    "ahead_table",
     "break_even_table",
-    "exchange_ms_of",
     "kind_of",
-    "line_of",
     "numbers_of",
     "scalings_of",
     "times_table",
@@ -76,9 +73,13 @@ _QUICK_PARTICLES = (100, 1000, 2000, 5000, 10_000, 20_000)
 TIMES_THE_CORES = (8, 36)
 _ROBOT_CORES = (1, 4)
 PATHS_MS = (20.0, 87.0)
-RATES_HZ = (10.0, 50.0)
+_RATES_HZ = (10.0, 50.0)
 _SENSING_INTERVAL = PlanningSettings().sensing_interval
-_EXCHANGE_PARTICLES = (100, 10_000)
+
+EXCHANGE_MS = 1.52
+"""Of asking over TCP, beside path and computation: "round trip without computation, cloud, same
+machine" of the study ``thesis_chapter_6``, with 100 to 500 particles. With 10,000, of which both
+ends take a digest, it was 1 ms more than with 100: less than the bounds of a break-even."""
 
 _STEADY_FROM = 1000
 """From so many particles on the growth is fitted; below, what every decision costs is seen."""
@@ -120,31 +121,28 @@ class OffloadBreakEven(Study):
     title = "When is asking a service worth it? Sensing time, cores and the path to them"
 
     def parts(self, scale: Scale) -> Iterator[Part]:
-        """Yield exchanges, and decisions of each kind."""
-        for particles in _EXCHANGE_PARTICLES:
-            yield Part({"particles": particles}, [_exchange_task(particles, scale)], "exchange")
+        """Yield decisions of each kind."""
         for kind in _kinds(scale):
             yield Part(kind._asdict(), [_sensing_task(kind, scale)], "sensing_times")
 
     def report_of(self, tables: Mapping[str, pd.DataFrame]) -> Report:
         """Return the report on the rows of all parts."""
         measured = tables["sensing_times"]
-        times, exchange = times_table(measured), _exchange_table(tables["exchange"])
-        scalings, exchange_ms = scalings_of(times), exchange_ms_of(exchange)
-        lines = break_even_table(scalings, exchange_ms)
+        times = times_table(measured)
+        scalings = scalings_of(times)
+        lines = break_even_table(scalings)
         return Report(
             summary={
                 "sensing_times": times,
-                "exchange": exchange,
                 "growth": _growth_table(measured),
                 "break_even": lines,
-                "break_even_ahead": _ahead_table(scalings, exchange_ms),
+                "break_even_ahead": ahead_table(scalings),
             },
             figures={
-                "sensing_time": drawn("offload_figures:sensing_time", scalings, exchange_ms),
+                "sensing_time": drawn("offload_figures:sensing_time", scalings),
                 "break_even": drawn("offload_figures:break_even_lines", lines),
             },
-            numbers=numbers_of(times, exchange, lines),
+            numbers=numbers_of(times, lines),
         )
 
 
@@ -198,26 +196,18 @@ def _sensing_task(kind: Kind, scale: Scale) -> Task:
         least_repetitions=1 if scale.quick else 3,
         limit_s=2.0 if scale.quick else 8.0,
     )
-    return _task_of("sensing_times", measurement, len(measurement.particles))
+    return Task(
+        kind="sensing_times",
+        parameters=msgspec.to_builtins(measurement),
+        units=len(measurement.particles),
+        exclusive=True,
+    )
 
 
 def _threads() -> tuple[int, ...]:
     """Return 1, 2, 4 and so on, as far as this machine has cores, and 2 in any case."""
     most = max(2, available_cores())
     return tuple(2**power for power in range(most.bit_length()) if 2**power <= most)
-
-
-def _exchange_task(particles: int, scale: Scale) -> Task:
-    trials = 1 if scale.quick else 3
-    exchange = Exchange(
-        problem=SHOWN.problem, particles=particles, num_trials=trials, seed=scale.seed
-    )
-    return _task_of("exchange_times", exchange, trials)
-
-
-def _task_of(kind: str, measured: Measurement | Exchange, units: int) -> Task:
-    parameters = msgspec.to_builtins(measured)
-    return Task(kind=kind, parameters=parameters, units=units, exclusive=True)
 
 
 # -- tables ------------------------------------------------------------------------------------
@@ -269,29 +259,6 @@ def _intervals(rows: pd.DataFrame, name: str) -> FloatArray:
     return np.asarray(rows[list(ends)].fillna(ends).to_numpy(float).T)
 
 
-def _exchange_table(asked: pd.DataFrame) -> pd.DataFrame:
-    """Return the time of an exchange beside the computation and the path."""
-    both = asked["sensing_ms"] - asked["computed_ms"]
-    asked = asked.assign(
-        task_exchange_ms=asked["task_ms"] - asked["task_computed_ms"], sensing_exchange_ms=both
-    )
-    columns = ("task_exchange_ms", "sensing_exchange_ms", "task_computed_ms")
-    rows: list[dict[str, Cell]] = []
-    for particles, table in asked.groupby("particles", sort=False):
-        rows.append({"particles": particles, "questions": len(table)})
-        for name in columns:
-            rows[-1] |= cells_of(name, median_interval(table[name]))
-    return pd.DataFrame(rows)
-
-
-def exchange_ms_of(exchange: pd.DataFrame) -> float:
-    """Return the time of an exchange over TCP beside its computation, without a path.
-
-    It grows a little with the particles, because of their digest; the largest counts for all.
-    """
-    return float(exchange["sensing_exchange_ms"].max())
-
-
 def _growth_table(measured: pd.DataFrame) -> pd.DataFrame:
     """Return the exponents with which the time on one thread grows with the particles.
 
@@ -322,59 +289,28 @@ def _growth_table(measured: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(cells)
 
 
-class Line(NamedTuple):
-    """A break-even with its bounds: favourable to few cores, to many, and divided evenly."""
-
-    value: BreakEven
-    last: BreakEven
-    first: BreakEven
-    even: BreakEven
-
-
-def line_of(
-    scaling: Scaling, robot_cores: int, cores: int, cost_ms: float, ahead_ms: float = 0.0
-) -> Line:
-    """Return the break-even of a service, with its bounds."""
-    found = [
-        break_even(each.saved_ms(robot_cores, cores, ahead_ms), cost_ms)
-        for each in (scaling, *scaling.bounds())
-    ]
-    return Line(*found)
-
-
 def _line_cells(
-    scaling: Scaling,
-    robot_cores: int,
-    cores: int,
-    path_ms: float,
-    exchange_ms: float,
-    ahead_ms: float = 0.0,
+    scaling: Scaling, robot_cores: int, cores: int, path_ms: float, ahead_ms: float = 0.0
 ) -> dict[str, Cell]:
-    line = line_of(scaling, robot_cores, cores, path_ms + exchange_ms, ahead_ms)
+    """Return the break-even of a service, with its bounds: favourable to many cores, and to few."""
+    few, many = scaling.bounds()
+    value, low, high = (
+        break_even(each.saved_ms(robot_cores, cores, ahead_ms), path_ms + EXCHANGE_MS)
+        for each in (scaling, many, few)
+    )
     return {
         "robot_cores": robot_cores,
         "service_cores": cores,
         "path_ms": path_ms,
-        "particles": _whole(line.value),
-        "particles_low": _whole(line.first),
-        "particles_high": _whole(line.last),
-        "particles_if_divided_evenly": _whole(line.even),
-        "words": line.value.words,
+        **cells_of("particles", Interval(*np.round([value, low, high]).tolist())),
         "measured_to": int(scaling.particles[-1]),
     }
 
 
-def _whole(found: BreakEven) -> Cell:
-    return math.nan if found.particles is None else round(found.particles)
-
-
-def break_even_table(scalings: Mapping[Kind, Scaling], exchange_ms: float) -> pd.DataFrame:
+def break_even_table(scalings: Mapping[Kind, Scaling]) -> pd.DataFrame:
     """Return the break-even of a robot that waits for each decision."""
     return pd.DataFrame(
-        {
-            **kind._asdict(),
-            **_line_cells(scaling, robot_cores, times * robot_cores, path_ms, exchange_ms),
-        }
+        {**kind._asdict(), **_line_cells(scaling, robot_cores, times * robot_cores, path_ms)}
         for kind, scaling in scalings.items()
         for robot_cores in _ROBOT_CORES
         for times in TIMES_THE_CORES
@@ -382,29 +318,28 @@ def break_even_table(scalings: Mapping[Kind, Scaling], exchange_ms: float) -> pd
     )
 
 
-def _ahead_table(scalings: Mapping[Kind, Scaling], exchange_ms: float) -> pd.DataFrame:
-    """Return the break-even of a robot that decides ahead, by its rate."""
+def ahead_table(scalings: Mapping[Kind, Scaling]) -> pd.DataFrame:
+    """Return the break-even of a robot that decides ahead, by its rate.
+
+    It moves for ``ahead_ms`` between two sensing steps.
+    """
     return pd.DataFrame(
         {
             **kind._asdict(),
             "rate_hz": rate_hz,
-            "ahead_ms": ahead_ms_of(rate_hz),
-            **_line_cells(scaling, 1, cores, path_ms, exchange_ms, ahead_ms_of(rate_hz)),
+            "ahead_ms": ahead_ms,
+            **_line_cells(scaling, 1, cores, path_ms, ahead_ms),
         }
         for kind, scaling in scalings.items()
-        for rate_hz in RATES_HZ
+        for rate_hz in _RATES_HZ
+        for ahead_ms in (1e3 * _SENSING_INTERVAL / rate_hz,)
         for cores in TIMES_THE_CORES
         for path_ms in PATHS_MS
     )
 
 
-def ahead_ms_of(rate_hz: float) -> float:
-    """Return how long a robot moves between two sensing steps."""
-    return 1e3 * _SENSING_INTERVAL / rate_hz
-
-
-def numbers_of(times: pd.DataFrame, exchange: pd.DataFrame, lines: pd.DataFrame) -> list[Number]:
-    """Return the break-even of the thesis's settings, the divided shares, and the exchange."""
+def numbers_of(times: pd.DataFrame, lines: pd.DataFrame) -> list[Number]:
+    """Return the break-even of the thesis's settings, and the divided shares."""
     numbers = []
     of_shown = (lines[list(Kind._fields)] == pd.Series(SHOWN._asdict())).all(axis=1)
     for row in lines[of_shown & (lines["robot_cores"] == 1)].to_dict("records"):
@@ -422,13 +357,4 @@ def numbers_of(times: pd.DataFrame, exchange: pd.DataFrame, lines: pd.DataFrame)
         range_ = Interval(shares.median(), shares.min(), shares.max())
         name = f"share divided among threads, {steps} (median, least and most of the settings)"
         numbers.append(Number(name, range_, "% of the time on one thread", len(rows)))
-    numbers += [
-        Number(
-            f"exchange beside computation and path, tcp, {row['particles']:,} particles",
-            interval_in(row, "sensing_exchange_ms"),
-            "ms",
-            row["questions"],
-        )
-        for row in exchange.to_dict("records")
-    ]
     return numbers

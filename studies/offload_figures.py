@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from studies import plots
 from studies.cost_model import Scaling
 from studies.offload_break_even import (
+    EXCHANGE_MS,
     PATHS_MS,
     SAMPLES_DRAWN,
     SHOWN,
@@ -25,11 +26,11 @@ from studies.offload_break_even import (
 __all__ = ["break_even_lines", "sensing_time"]
 
 
-def sensing_time(scalings: Mapping[Kind, Scaling], exchange_ms: float) -> Figure:
+def sensing_time(scalings: Mapping[Kind, Scaling]) -> Figure:
     """Draw time against particles: here, and on more cores further away."""
     kinds = [SHOWN._replace(samples=samples) for samples in SAMPLES_DRAWN]
     lines = {
-        f"{kind.label}, path of {path_ms:g} ms": _lines(scalings[kind], path_ms + exchange_ms)
+        f"{kind.label}, path of {path_ms:g} ms": _lines(scalings[kind], path_ms + EXCHANGE_MS)
         for kind in kinds
         if kind in scalings
         for path_ms in PATHS_MS

@@ -34,12 +34,11 @@ _FUNCTIONS: Mapping[str, str] = {
     "cloud_trials": "studies.cloud_trials:run_cloud_trials",
     "emulation_2017": "studies.emulation_2017:run_emulation",
     "vdp_tag": "studies.published_worlds:run_vdp_tag",
-    "exchange_times": "studies.exchange_times:measure_exchange",
     "sensing_times": "studies.sensing_times:measure_sensing",
 }
 """Where the function of each kind of task is; imported when it is needed."""
 
-_OF_PROCESSES = frozenset({"exchange_times", "cloud_trials"})
+_OF_PROCESSES = frozenset({"cloud_trials"})
 """Kinds that start processes of the whole program, whose sources no import leads to."""
 
 _PLACE = re.compile(r"\w+(\.\w+)+:\w+")

@@ -80,7 +80,6 @@ ELSEWHERE = {
         "cases": "studies/tests/test_selectors.py",
         "cloud_trials": "studies/tests/test_thesis_chapter_6.py",
         "errors": TASKS,
-        "exchange_times": "studies/tests/test_offload_break_even.py",
         "executors": TASKS,
         "judged_study": "studies/tests/test_selectors.py",
         "light_dark": "tests/contracts/test_problem_contract.py",
