@@ -71,19 +71,11 @@ class Curve(NamedTuple):
 
 
 class Scaling(NamedTuple):
-    """What was measured of decisions of one kind, over numbers of particles.
+    """What was measured of decisions of one kind, over rising numbers of particles, shape (n,).
 
-    Attributes
-    ----------
-    particles : array of shape (n,)
-        Rising.
-    times : array of shape (3, n)
-        On one thread, in milliseconds; with the ends of their intervals, infinite where there is
-        none.
-    shares : array of shape (3, n)
-        Of that, what is divided among threads, from 0 to 1.
-    pieces : int
-        Into which the divided part falls.
+    Times on one thread in milliseconds, and the shares of these that are divided among threads, in
+    so many pieces; both of shape (3, n), with the ends of their intervals, infinite where there is
+    none.
     """
 
     particles: FloatArray
@@ -124,15 +116,8 @@ class Scaling(NamedTuple):
     def saved_ms(self, robot_cores: int, cores: int, ahead_ms: float = 0.0) -> Curve | None:
         """Return how much less a robot waits for some cores than for its own, but for the path.
 
-        From the number of particles on above which something is saved; None if nothing is.
-
-        Parameters
-        ----------
-        robot_cores, cores : int
-            The robot's own, and those elsewhere.
-        ahead_ms : float
-            How long before it is needed a decision is begun. Only what it takes longer is waited
-            for, by whomever it is made.
+        From the number of particles on above which something is saved; None if nothing is. A
+        decision is begun ``ahead_ms`` before it is needed: only what it takes longer is waited for.
         """
         first, last = self.particles[0], self.particles[-1]
         # Both are straight between what was measured; the difference of the waits is not.

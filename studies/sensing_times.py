@@ -49,51 +49,27 @@ beliefs are independent."""
 
 _SCHEDULING = Path("/proc/thread-self/schedstat")
 
-_STEEPER_BY = 0.2
-"""A larger number of particles may cost this much more, as an exponent, than the last ones did."""
-
-_FIRST_EXPONENT = 1.0
-
 _FEWER = 2.0 / 3.0
 """Of the beliefs, where there is no time for all: of nine six are left, enough for an interval."""
 
 
 class Measurement(msgspec.Struct, frozen=True, kw_only=True):
-    """What is timed: decisions of one kind, over numbers of particles.
-
-    Attributes
-    ----------
-    num_sensing_actions : int
-        J: the first so many of the problem's sensing actions.
-    num_observation_samples, horizon : int
-        M and H.
-    particles : tuple of int
-        Rising. It ends earlier if a number would take too long.
-    threads : tuple of int
-        Numbers of threads, 1 and at least one more.
-    num_trials : int
-        From each comes one belief.
-    repeat_s : float
-        Decisions of one number of particles are repeated for about this long.
-    least_repetitions : int
-        Of each decision, however long it takes.
-    limit_s : float
-        If so many take longer than this, fewer beliefs are taken; if that does not help, the number
-        of particles is left out, and all above it.
-    """
+    """What is timed: decisions of one kind, over numbers of particles."""
 
     problem: str
-    num_sensing_actions: int
+    num_sensing_actions: int  # J: the first so many of the problem's
     estimator: str = "nearest_neighbor"
-    num_observation_samples: int = 10
+    num_observation_samples: int = 10  # M
     horizon: int = 1
-    particles: tuple[int, ...] = (100, 300, 1000)
-    threads: tuple[int, ...] = (1, 2)
-    num_trials: int = 9
+    particles: tuple[int, ...] = (100, 300, 1000)  # rising
+    threads: tuple[int, ...] = (1, 2)  # 1 and at least one more
+    num_trials: int = 9  # from each comes one belief
     seed: int = 0
-    repeat_s: float = 0.5
-    least_repetitions: int = 3
+    repeat_s: float = 0.5  # for about so long decisions of one number of particles are repeated
+    least_repetitions: int = 3  # of each decision, however long it takes
     limit_s: float = 8.0
+    """If these take longer, fewer beliefs are taken; if that does not help, this number of
+    particles is left out, and all above it."""
 
 
 class Sensed(NamedTuple):
@@ -123,12 +99,11 @@ def measure_sensing(**measurement: Any) -> pd.DataFrame:
         history_of(problem, _settings(wanted, _HISTORY_PARTICLES, 0), wanted.seed, trial)
         for trial in range(wanted.num_trials)
     ]
-    tables = []
-    taken: list[tuple[int, float]] = []
-    for particles in wanted.particles:
-        # Of fewer beliefs, if need be.
-        expected_s = _FEWER * wanted.least_repetitions * _expected_s(taken, particles)
-        if expected_s > wanted.limit_s:
+    tables: list[pd.DataFrame] = []
+    fewest_s = 0.0
+    for last, particles in zip((1, *wanted.particles), wanted.particles, strict=False):
+        # A decision takes at least as much longer as there are more particles.
+        if wanted.least_repetitions * fewest_s * particles / last > wanted.limit_s:
             break
         deciding = _Deciding(problem, wanted, particles)
         states = [
@@ -140,8 +115,8 @@ def measure_sensing(**measurement: Any) -> pd.DataFrame:
             break
         timed, round_s = deciding.timed(states)
         tables.append(timed.assign(particles=particles))
-        taken.append((particles, round_s))
-    if not taken:
+        fewest_s = _FEWER * round_s
+    if not tables:
         raise InvalidValueError(
             f"particles {wanted.particles[0]}: a round of decisions takes longer than limit_s "
             f"{wanted.limit_s:g}"
@@ -209,18 +184,6 @@ def _settings(wanted: Measurement, particles: int, threads: int) -> PlanningSett
             {"method": "action_entropy", "estimator": wanted.estimator}, SelectorSettings
         ),
     )
-
-
-def _expected_s(taken: Sequence[tuple[int, float]], particles: int) -> float:
-    """Return about how long a round will take, from those before; 0 if there were none."""
-    if not taken:
-        return 0.0
-    last, seconds = taken[-1]
-    exponent = _FIRST_EXPONENT
-    if len(taken) > 1:
-        before, earlier = taken[-2]
-        exponent = max(1.0, np.log(seconds / earlier) / np.log(last / before)) + _STEEPER_BY
-    return float(seconds * (particles / last) ** exponent)
 
 
 class _Deciding:

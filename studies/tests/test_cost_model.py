@@ -8,7 +8,7 @@ import pytest
 from studies.cost_model import Curve, Scaling, break_even, busy_cores, parallel_share
 
 
-def scaling(share: float = 0.9, pieces: int | 9 = None) -> Scaling:
+def scaling(share: float = 0.9, pieces: int = 9) -> Scaling:
     """Return times of N / 1,000 ms, with 10 % to each side, of which a share is divided."""
     particles = np.array([100.0, 1000.0, 10_000.0, 100_000.0])
     shares = np.array([share, share - 0.1, min(share + 0.1, 1.0)])
