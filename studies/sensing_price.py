@@ -176,7 +176,6 @@ class SensingPrice(JudgedStudy):
                 "when_to_sense": when,
                 "when_alone": alone,
                 "weak_sensor": weak,
-                "cells": _all_cells(cells),
             },
             figures={
                 "when_to_sense": drawn("sensing_price_figures:when_to_sense", when),
@@ -301,21 +300,6 @@ def _weak_sensor(cells: _Cells) -> pd.DataFrame:
     found = pd.DataFrame(rows)
     statistics.add_adjusted(found, "p_value", compared=found["way"] != _RANDOM)
     return found
-
-
-def _all_cells(cells: _Cells) -> pd.DataFrame:
-    """Return steps and looks of every cell: what each interval and each gain leads to."""
-    return pd.DataFrame(
-        {
-            **cell._asdict(),
-            "trials": len(table),
-            "success": float(table["success"].mean()),
-            "mean_steps": float(table["steps"].mean()),
-            "mean_looks": float(table["sensing_decisions"].mean()),
-            "median_sensing_ms": float(table["median_sensing_ms"].iloc[0]),
-        }
-        for cell, table in cells.items()
-    )
 
 
 def _numbers_of_when(when: pd.DataFrame) -> Sequence[Number]:

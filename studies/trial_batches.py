@@ -42,15 +42,7 @@ _DIGEST_CHARACTERS = 16
 
 
 class TrialSeries(msgspec.Struct, frozen=True, kw_only=True):
-    """Trials that differ in their number alone.
-
-    Attributes
-    ----------
-    problem : str
-        Its name.
-    model : dict
-        Its section; what is left out has its default.
-    """
+    """Trials that differ in their number alone; ``model`` is the problem's section."""
 
     problem: str
     model: dict[str, Any] = msgspec.field(default_factory=dict)
@@ -63,13 +55,8 @@ class TrialSeries(msgspec.Struct, frozen=True, kw_only=True):
 def trial_tasks(series: TrialSeries, trials_in_each: int, kind: str = "trials") -> Iterator[Task]:
     """Yield the tasks of a series, in the order of its trials.
 
-    Parameters
-    ----------
-    trials_in_each : int
-        Trials of a task: what is lost when a process is killed, and what is done twice when a
-        series is made longer.
-    kind : str
-        Of a function with the parameters of :func:`run_trials_of`.
+    ``trials_in_each`` is lost when a process is killed, and done twice when a series is made
+    longer. ``kind`` is that of a function with the parameters of :func:`run_trials_of`.
     """
     common = msgspec.to_builtins(series)
     del common["num_trials"]
