@@ -49,27 +49,10 @@ __all__ = [
 ]
 
 COLUMNS = (
-    "run",
-    "what",
-    "at_s",
-    "trial",
-    "step",
-    "service",
-    "status",
-    "waited_ms",
-    "round_trip_ms",
-    "computed_ms",
-    "found_ms",
-    "first_local_ms",
-    "launch_ms",
-    "away_ms",
-    "failback_ms",
-    "identical",
-    "emulated_by",
-    "load",
-    "rate_hz",
-    "carried_bytes",
-)
+    "run", "what", "at_s", "trial", "step", "service", "status", "waited_ms", "round_trip_ms",
+    "computed_ms", "found_ms", "first_local_ms", "launch_ms", "away_ms", "failback_ms",
+    "identical", "emulated_by", "load", "rate_hz", "carried_bytes",
+)  # fmt: skip
 """Of the table of such trials: a row for each decision, each kill and, if wanted, each task action.
 
 ``at_s`` counts from the run's first decision. A decision has what the robot's ``timings.csv`` has.

@@ -192,14 +192,9 @@ def over_problems(
     """Return how ways differ over these problems, and over all problems like them.
 
     Columns: ``mean``, over these problems, of the trials that all have; ``expected``, over all such
-    problems; ``new_problem``, in one more; ``deviation_between_problems`` as a difference.
-
-    Parameters
-    ----------
-    pairs : sequence of (dict, sequence)
-        The names of a comparison, and in each problem the trials of one way and of the other.
-    least_success : float
-        The smallest difference of two trials' successes; that of steps is one in a hundred.
+    problems; ``new_problem``, in one more; ``deviation_between_problems`` as a difference. Each of
+    ``pairs`` names a comparison, with the trials of one way and of the other in each problem;
+    ``least_success`` is the smallest difference of two trials' successes.
     """
     rows: list[dict[str, Cell]] = []
     for part, (measure, least) in enumerate(zip(MEASURES, (0.01, least_success), strict=True)):

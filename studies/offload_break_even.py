@@ -62,7 +62,7 @@ _ESTIMATORS = ("nearest_neighbor", "gaussian_mixture_upper")
 _PARTICLES = (100, 300, 1000, 2000, 4000, 8000, 16_000, 32_000, 64_000, 100_000)
 _SAMPLES = (10, 30, 100, 300)
 SAMPLES_DRAWN = (10, 100)
-"""In the figures; the tables and the map have all."""
+"""In the figures; the tables have all."""
 
 # Moving 4,096 particles or more uses all cores whatever it is told: beyond, one thread would not
 # be one.
@@ -142,7 +142,7 @@ class OffloadBreakEven(Study):
                 "sensing_time": drawn("offload_figures:sensing_time", scalings),
                 "break_even": drawn("offload_figures:break_even_lines", lines),
             },
-            numbers=numbers_of(times, lines),
+            numbers=numbers_of(lines),
         )
 
 
@@ -338,8 +338,8 @@ def ahead_table(scalings: Mapping[Kind, Scaling]) -> pd.DataFrame:
     )
 
 
-def numbers_of(times: pd.DataFrame, lines: pd.DataFrame) -> list[Number]:
-    """Return the break-even of the thesis's settings, and the divided shares."""
+def numbers_of(lines: pd.DataFrame) -> list[Number]:
+    """Return the break-even of the thesis's settings."""
     numbers = []
     of_shown = (lines[list(Kind._fields)] == pd.Series(SHOWN._asdict())).all(axis=1)
     for row in lines[of_shown & (lines["robot_cores"] == 1)].to_dict("records"):
@@ -347,14 +347,4 @@ def numbers_of(times: pd.DataFrame, lines: pd.DataFrame) -> list[Number]:
             f"a service with {row['service_cores']} cores at {row['path_ms']:g} ms is faster from"
         )
         numbers.append(Number(name, interval_in(row, "particles"), "particles"))
-    long = times[(times["threads"] == 1) & (times["ms"] >= 5.0)]
-    for steps, rows in (
-        ("one step", long[long["horizon"] == 1]),
-        ("several steps", long[long["horizon"] > 1]),
-    ):
-        # The settings share beliefs: a range, and not an interval.
-        shares = 100.0 * rows["divided_share"]
-        range_ = Interval(shares.median(), shares.min(), shares.max())
-        name = f"share divided among threads, {steps} (median, least and most of the settings)"
-        numbers.append(Number(name, range_, "% of the time on one thread", len(rows)))
     return numbers

@@ -72,24 +72,15 @@ _RANDOM: Way = "random"
 
 
 class Variant(NamedTuple):
-    """Settings of which one differs from those of the way's reference.
+    """Settings of which one differs from those of the way's reference."""
 
-    Attributes
-    ----------
-    parameter, value : str
-        What differs, and how; empty for the reference itself.
-    resolution : float, optional
-        In units of the problem's own; None for that, and for a mixture the motion noise.
-    times_the_particles : float
-        As many as the problem has.
-    """
-
-    parameter: str = ""
+    parameter: str = ""  # what differs, and how; empty for the reference itself
     value: str = ""
     way: Way = _FIRST
     active_sensing: ActiveSensingSettings = ActiveSensingSettings()
     particle_filter: ParticleFilterSettings = ParticleFilterSettings()
     resolution: float | None = None
+    """In units of the problem's own; None for that, and for a mixture the motion noise."""
     times_the_particles: float = 1.0
 
     def names(self) -> dict[str, Cell]:

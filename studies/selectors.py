@@ -12,7 +12,7 @@ sample of all problems (a random effect).
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -35,16 +35,16 @@ from studies.study import CHOICE, CLAIM, TRIALS, Number, Report, Scale, drawn
 from studies.tables import Cell
 from studies.trial_batches import TrialSeries, problem_of
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 __all__ = ["GROUPS", "INTERVALS", "SHOWN", "WAYS", "Selectors"]
 
 INTERVALS = (0, 4, 8, 14)
 """Steps between two sensing steps."""
 
-LEVEL = 0.01
-"""Of a family of tests: the probability of claiming any difference where there is none."""
-
 LEVEL_OF_VERDICT = 0.05
-"""Of the tests whether a candidate is beaten: less strict, to the candidate's disadvantage."""
+"""Of the tests whether a candidate is beaten."""
 
 
 def _by(method: Method, estimator: Estimator | None = None) -> SelectorSettings:
@@ -171,8 +171,8 @@ class Selectors(JudgedStudy):
                 "default_candidates": _default_candidates(_over_intervals(choosing), cells),
             },
             figures={
-                "choice_of_sensing": drawn("selectors_figures:choice_of_sensing", summary),
-                "selectors": drawn("selectors_figures:selectors", relative_steps),
+                "choice_of_sensing": drawn("selectors:choice_of_sensing", summary),
+                "selectors": drawn("selectors:selectors", relative_steps),
             },
             numbers=_numbers(rivals),
         )
@@ -361,3 +361,46 @@ def _numbers(rivals: Mapping[str, pd.DataFrame]) -> list[Number]:
         for row in rivals[measure].to_dict("records")
         if (row["way"], row["rival"]) == (DEFAULT, BASELINE)
     ]
+
+
+def choice_of_sensing(summary: pd.DataFrame) -> Figure:
+    """Draw steps by the interval between two sensing actions."""
+    from studies import plots
+
+    rows = dict(list(summary.groupby(["problem", "way"])))
+    lines = {
+        case: [
+            (INTERVALS, plots.dots_of(label, rows[case, way], "mean_steps"))
+            for way, label in SHOWN.items()
+        ]
+        for case in _CASES
+    }
+    figure, panels = plots.line_grid(
+        lines,
+        columns=4,
+        title="What choosing the sensing action gains (means, 95 % intervals)",
+        labels=(
+            "steps between two sensing actions",
+            "steps (mean; failures count as the limit)",
+        ),
+        offset=0.2,
+    )
+    for panel in panels.values():
+        panel.set_xticks(INTERVALS)
+        panel.set_ylim(0.0, 1.1 * panel.dataLim.y1)
+    return figure
+
+
+def selectors(relative_steps: pd.DataFrame) -> Figure:
+    """Draw the steps of all ways, relative to random sensing."""
+    from studies import plots
+
+    problem = relative_steps["problem"]
+    return plots.ratio_grid(
+        {name: relative_steps[problem == name] for name in (*_CASES, *GROUPS)},
+        relative_steps["way"],
+        columns=5,
+        title="Steps relative to random sensing (geometric mean, 95 % intervals)",
+        width=12.0,
+        label="steps, relative to random",
+    )

@@ -74,37 +74,19 @@ PATHS = (
 )
 """Of a full run; all with all numbers of particles."""
 
-
 _TIMES = (
-    "at_s",
-    "waited_ms",
-    "round_trip_ms",
-    "computed_ms",
-    "found_ms",
-    "first_local_ms",
-    "launch_ms",
-    "failback_ms",
-    "load",
-    "rate_hz",
-)
+    "at_s", "waited_ms", "round_trip_ms", "computed_ms", "found_ms", "first_local_ms", "launch_ms",
+    "failback_ms", "load", "rate_hz",
+)  # fmt: skip
 
 
 def measured(table: pd.DataFrame) -> pd.DataFrame:
     """Return rows of cloud trials with columns for what they are grouped by, and with round trips.
 
-    Parameters
-    ----------
-    table : DataFrame
-        Columns of :data:`~studies.cloud_trials.COLUMNS` and those that say which runs
-        they are: ``condition``, ``particles``, ``transport``, ``path_round_trip_ms`` and ``loss``.
-
-    Returns
-    -------
-    DataFrame
-        With ``whole_run``, a number for each run; ``path``, its label, in the order of
-        :data:`PATHS`; and ``trip_ms``, the round trip of an answer with task actions, without what
-        the service computed. A sensing action comes as the second part of an answer, whose first
-        part was computed and sent meanwhile; so its own time holds more than one round trip.
+    These are ``whole_run``, a number for each run; ``path``, its label, in the order of
+    :data:`PATHS`; and ``trip_ms``, the round trip of an answer with task actions, without what the
+    service computed. A sensing action comes as the second part of an answer, whose first part was
+    computed and sent meanwhile; so its own time holds more than one round trip.
     """
     rows = table.astype(dict.fromkeys(_TIMES, float))
     ends = zip(rows["transport"], rows["path_round_trip_ms"], rows["loss"], strict=True)

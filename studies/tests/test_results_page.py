@@ -168,7 +168,7 @@ def test_the_break_even_follows_from_the_committed_times() -> None:
     lines = offload_break_even.break_even_table(scalings)
     compare("offload_break_even", "break_even", lines)
     compare("offload_break_even", "break_even_ahead", offload_break_even.ahead_table(scalings))
-    report = Report(numbers=offload_break_even.numbers_of(times, lines))
+    report = Report(numbers=offload_break_even.numbers_of(lines))
     compare("offload_break_even", "numbers", report.tables["numbers"])
     rows = {row["name"]: row["value"] for row in table_of("thesis_chapter_6", "numbers")}
     measured = rows["round trip without computation, cloud, same machine"]

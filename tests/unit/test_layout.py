@@ -89,8 +89,6 @@ ELSEWHERE = {
         "plots": "studies/tests/test_results_page.py",
         "priced_problems": "studies/tests/test_sensing_price.py",
         "published_2017": "tests/oracles/test_published_2017.py",
-        "selectors_figures": FIGURES,
-        "sensing_price_figures": FIGURES,
         "sensing_times": "studies/tests/test_offload_break_even.py",
         "study": TASKS,
         "tasks": TASKS,
