@@ -8,6 +8,7 @@ brings the digest of the code that it wants. One with other code refuses.
 from __future__ import annotations
 
 import contextlib
+import logging
 import re
 import socket
 import traceback
@@ -140,7 +141,7 @@ class RayExecutor:
                 "--executor ray needs Ray, which cannot be imported: pip install 'ray[client]'"
             ) from error
         try:
-            ray.init(address=self._address, logging_level="ERROR", log_to_driver=False)
+            ray.init(address=self._address, logging_level=logging.ERROR, log_to_driver=False)
         except Exception as error:
             raise HoldfastError(f"{self.description} cannot be joined: {error}") from error
         remote = ray.remote(num_cpus=1, max_retries=_MOST_RETRIES)(compute_encoded)

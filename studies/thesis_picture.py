@@ -201,8 +201,15 @@ def _draw_moments(panels: Sequence[Axes], kill: _Kill) -> None:
     for at_s, text, color, marker, side in moments:
         for panel in panels:
             panel.axvline(at_s, color=color, linewidth=1.2, zorder=2)
-            looks = {"marker": marker, "color": color, "markersize": 9.0, "zorder": 6}
-            top = panel.get_xaxis_transform()
-            panel.plot([at_s], [0.0], clip_on=False, transform=top, **looks)
+            panel.plot(
+                [at_s],
+                [0.0],
+                marker=marker,
+                color=color,
+                markersize=9.0,
+                clip_on=False,
+                zorder=6,
+                transform=panel.get_xaxis_transform(),
+            )
         across, aside = ("right", -5) if side == "left" else ("left", 5)
         _note(panels[0], text, (at_s, 0.97), (aside, 0), across, "top", _TOP, color=color)
