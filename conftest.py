@@ -51,7 +51,6 @@ REAL = (
     "contracts/test_service_end.py",
     "contracts/test_transport_contract.py",
     "contracts/test_transport_links.py",
-    "studies/tests/test_offload_break_even.py::test_asking_a_service_over_tcp",
     "studies/tests/test_offload_break_even.py::test_the_whole_study",
     "studies/tests/test_command.py::test_interrupted_and_gone_on_with",
     "studies/tests/test_ray.py",

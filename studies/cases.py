@@ -18,18 +18,7 @@ __all__ = ["CASES", "Case"]
 
 
 class Case(msgspec.Struct, frozen=True, kw_only=True):
-    """A problem as it is posed in an experiment.
-
-    Attributes
-    ----------
-    model : dict
-        Differences from the problem's defaults.
-    share : float
-        Of a study's trials that are run here: a problem that takes ten times as long has fewer.
-    state_resolution : float, optional
-        Standard deviation of the noise by which states are blurred for the entropy of a mixture,
-        where the problem's motion noise has not as many coordinates as its states.
-    """
+    """A problem as it is posed in an experiment."""
 
     name: str
     problem: str
@@ -37,7 +26,10 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
     num_particles: int = 100
     max_steps: int = 500
     share: float = 1.0
+    """Of a study's trials that are run here: a problem that takes ten times as long has fewer."""
     state_resolution: float | None = None
+    """Standard deviation of the noise by which states are blurred for the entropy of a mixture,
+    where the problem's motion noise has not as many coordinates as its states."""
 
     def series(
         self,
@@ -48,12 +40,10 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
         num_trials: int,
         active_sensing: ActiveSensingSettings | None = None,
         particle_filter: ParticleFilterSettings | None = None,
-        continued_trials: int = 0,
     ) -> TrialSeries:
         """Return the trials of one way of sensing, with this case's number of particles.
 
-        ``num_trials`` is that of a problem whose share is 1. Of these the first
-        ``continued_trials`` are continued if they are cut off.
+        ``num_trials`` is that of a problem whose share is 1.
         """
         if (
             self.state_resolution is not None
@@ -77,7 +67,6 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
             max_steps=self.max_steps,
             seed=seed,
             num_trials=max(2, round(self.share * num_trials)),
-            continued_trials=continued_trials,
         )
 
 

@@ -49,27 +49,10 @@ __all__ = [
 ]
 
 COLUMNS = (
-    "run",
-    "what",
-    "at_s",
-    "trial",
-    "step",
-    "service",
-    "status",
-    "waited_ms",
-    "round_trip_ms",
-    "computed_ms",
-    "found_ms",
-    "first_local_ms",
-    "launch_ms",
-    "away_ms",
-    "failback_ms",
-    "identical",
-    "emulated_by",
-    "load",
-    "rate_hz",
-    "carried_bytes",
-)
+    "run", "what", "at_s", "trial", "step", "service", "status", "waited_ms", "round_trip_ms",
+    "computed_ms", "found_ms", "first_local_ms", "launch_ms", "away_ms", "failback_ms",
+    "identical", "emulated_by", "load", "rate_hz", "carried_bytes",
+)  # fmt: skip
 """Of the table of such trials: a row for each decision, each kill and, if wanted, each task action.
 
 ``at_s`` counts from the run's first decision. A decision has what the robot's ``timings.csv`` has.
@@ -103,43 +86,22 @@ _STALL_S = 60.0
 
 
 class CloudTrials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Runs of one robot each, with the same settings.
-
-    Attributes
-    ----------
-    round_trip_ms : float
-        Of the emulated path; 0 is the machine's own loopback.
-    loss : float
-        Share of packets that the path loses, each way.
-    first_run, runs : int
-        Their numbers; each has worlds of its own.
-    min_steps : int
-        Trials are added to a run until it has as many task actions.
-    rate_hz : float
-        Task actions a second. On a machine where services start slowly it is less, down to a third,
-        or the run would be over before all has happened.
-    local_decisions : int
-        Sensing actions that the local service chooses before the cloud is started again.
-    packets : bool
-        Whether the path may be one for packets; see :mod:`holdfast_lab.testbed.wide_area`.
-    actions : bool
-        Whether there is a row for each task action that was performed, too.
-    kills : bool
-        Whether the cloud is killed.
-    """
+    """Runs of one robot each, with the same settings."""
 
     particles: int
     transport: Transport = "tcp"
-    round_trip_ms: float = 0.0
-    loss: float = 0.0
+    round_trip_ms: float = 0.0  # of the emulated path; 0 is the machine's own loopback
+    loss: float = 0.0  # share of packets that the path loses, each way
     first_run: int = 0
-    runs: int = 1
+    runs: int = 1  # each has worlds of its own
     seed: int = 0
-    min_steps: int = 400
+    min_steps: int = 400  # trials are added to a run until it has as many task actions
     rate_hz: float = 100.0
-    local_decisions: int = 8
-    packets: bool = True
-    actions: bool = False
+    """Task actions a second. On a machine where services start slowly it is less, down to a third,
+    or the run would be over before all has happened."""
+    local_decisions: int = 8  # by the local service before the cloud is started again
+    packets: bool = True  # a path for packets, if possible: holdfast_lab.testbed.wide_area
+    actions: bool = False  # a row for each task action that was performed, too
     kills: bool = True
 
 
@@ -179,14 +141,7 @@ def rows_of_run(
 ) -> pd.DataFrame:
     """Return the rows of a run: its decisions, its kill, if there was one, and its actions.
 
-    Parameters
-    ----------
-    killed_at : float or None
-        When the cloud was killed, in seconds since the epoch.
-    performed : iterable of Performance
-        Task actions to be listed.
-    **of_all
-        Columns that are the same in all rows.
+    ``killed_at`` in seconds since the epoch. The columns ``of_all`` are the same in all rows.
     """
     began = table.rows[0].at
     rows: list[dict[str, Cell]] = [

@@ -50,8 +50,6 @@ _STUDIES: Mapping[str, str] = {
 }
 """Where each is; imported when it is needed."""
 
-_RENAMED: Mapping[str, str] = {"cloud_worth": "offload_break_even"}
-
 _DEFAULT_DIRECTORY = Path("runs") / "experiments"
 
 _MOST_NUMBERS = 20
@@ -124,19 +122,12 @@ def study_names() -> list[str]:
 def studies_of(names: Sequence[str]) -> list[Study]:
     """Return the studies of some names, each once, in the order of :func:`study_names`.
 
-    ``all`` stands for all of them.
-
-    Raises
-    ------
-    InvalidValueError
-        If there is no study of a name.
-    HoldfastError
-        If a package is missing that studies need.
+    ``all`` stands for all of them. InvalidValueError if there is no study of a name; HoldfastError
+    if a package is missing that studies need.
     """
     for name in names:
         if name != _ALL and name not in _STUDIES:
-            renamed = [_RENAMED[name]] if name in _RENAMED else []
-            hint = did_you_mean(name, [_ALL, *_STUDIES], sure=renamed)
+            hint = did_you_mean(name, [_ALL, *_STUDIES])
             raise InvalidValueError(
                 f"study {name!r}: there are {', '.join(_STUDIES)} and {_ALL}{hint}"
             )
@@ -202,12 +193,11 @@ def _make_anew(studies: list[Study], source: Path, directory: Path) -> None:
 
 def _executor_of(place: str, jobs: int) -> Executor:
     from holdfast.robot.trials import available_cores
-    from studies.executors import LocalExecutor
-    from studies.ray_executor import RayExecutor
+    from studies.executors import LocalExecutor, RayExecutor
 
     if place == "local":
         return LocalExecutor(jobs or available_cores())
-    executor = RayExecutor.of(place)
+    executor = RayExecutor(place)
     if jobs:
         raise InvalidValueError(
             f"--jobs {jobs}: has no effect with --executor {place}, where the cluster's cores say "
@@ -219,12 +209,23 @@ def _executor_of(place: str, jobs: int) -> Executor:
 def _run(
     studies: list[Study], scale: Scale, directory: Path, executor: Executor, again: str
 ) -> None:
-    from studies.running import Workload
+    from holdfast.cli.terminal import counted, progress_line
+    from studies.running import Workload, compute
 
     workload: Workload | None = None
     try:
         workload = Workload(studies, scale, directory)
-        _compute(workload, directory, executor)
+        if workload.pending:
+            line = progress_line(workload.units, quiet=False)
+            title = f"{counted(workload.units, 'trial')} in {executor.description}"
+            if workload.finished_units:
+                title += f", {workload.finished_units:,} known before"
+            line.start(f"{title}; results in {directory}", workload.finished_units, _NOTE)
+            try:
+                compute(workload, executor, lambda finished: line.show(finished, _NOTE))
+            finally:
+                with contextlib.suppress(OSError):
+                    line.stop()
         for study in studies:
             report = study.report(scale, workload.result_of)
             _show(study, scale, report, directory / study.name)
@@ -238,24 +239,6 @@ def _run(
         raise
     except HoldfastError as error:
         raise RunError(error, again) from error
-
-
-def _compute(workload: Workload, directory: Path, executor: Executor) -> None:
-    from holdfast.cli.terminal import counted, progress_line
-    from studies.running import compute
-
-    if not workload.pending:
-        return
-    line = progress_line(workload.units, quiet=False)
-    title = f"{counted(workload.units, 'trial')} in {executor.description}"
-    if workload.finished_units:
-        title += f", {workload.finished_units:,} known before"
-    line.start(f"{title}; results in {directory}", workload.finished_units, _NOTE)
-    try:
-        compute(workload, executor, lambda finished: line.show(finished, _NOTE))
-    finally:
-        with contextlib.suppress(OSError):
-            line.stop()
 
 
 def _show(

@@ -26,7 +26,7 @@ import numpy as np
 
 from holdfast.numerics.arrays import FloatArray
 
-__all__ = ["BreakEven", "Curve", "Scaling", "break_even", "busy_cores", "parallel_share"]
+__all__ = ["Curve", "Scaling", "break_even", "busy_cores", "parallel_share"]
 
 
 def parallel_share(times: Mapping[int, float]) -> float:
@@ -41,12 +41,12 @@ def parallel_share(times: Mapping[int, float]) -> float:
     return float(np.clip(gained @ possible / (possible @ possible), 0.0, 1.0))
 
 
-def busy_cores(cores: int, pieces: int | None) -> float:
+def busy_cores(cores: int, pieces: int) -> float:
     """Return how many of some cores equal pieces of work keep busy on average.
 
     Nine pieces on eight cores take two turns, as sixteen would: 4.5 cores' worth.
     """
-    return float(cores) if pieces is None else pieces / math.ceil(pieces / cores)
+    return pieces / math.ceil(pieces / cores)
 
 
 class Curve(NamedTuple):
@@ -69,36 +69,19 @@ class Curve(NamedTuple):
         )
         return np.asarray(np.exp(inside))
 
-    def beyond(self, particles: FloatArray) -> FloatArray:
-        """Return the values, outside of what was measured by the last two points: for figures."""
-        values = self.at(particles)
-        (first, last), (low, high) = np.log(self.particles[-2:]), np.log(self.values[-2:])
-        larger = particles > self.particles[-1]
-        slope = (high - low) / (last - first)
-        values[larger] = np.exp(high + slope * (np.log(particles[larger]) - last))
-        return values
-
 
 class Scaling(NamedTuple):
-    """What was measured of decisions of one kind, over numbers of particles.
+    """What was measured of decisions of one kind, over rising numbers of particles, shape (n,).
 
-    Attributes
-    ----------
-    particles : array of shape (n,)
-        Rising.
-    times : array of shape (3, n)
-        On one thread, in milliseconds; with the ends of their intervals, infinite where there is
-        none.
-    shares : array of shape (3, n)
-        Of that, what is divided among threads, from 0 to 1.
-    pieces : int or None
-        Into which the divided part falls; None for as many as one likes.
+    Times on one thread in milliseconds, and the shares of these that are divided among threads, in
+    so many pieces; both of shape (3, n), with the ends of their intervals, infinite where there is
+    none.
     """
 
     particles: FloatArray
     times: FloatArray
     shares: FloatArray
-    pieces: int | None
+    pieces: int
 
     def on_cores(self, cores: int) -> Curve:
         """Return the time on some cores, as extrapolated from what was measured."""
@@ -117,11 +100,10 @@ class Scaling(NamedTuple):
         most = self._times_on(cores, self.shares[1].clip(0.0, 1.0))
         return Curve(self.particles, self.times[0] / cores), Curve(self.particles, most)
 
-    def bounds(self) -> tuple[Scaling, Scaling, Scaling]:
-        """Return what is favourable to few cores, favourable to many, and divided evenly.
+    def bounds(self) -> tuple[Scaling, Scaling]:
+        """Return what is favourable to few cores, and favourable to many.
 
-        The first has the low ends of both intervals, the second their high ends, and the third the
-        medians with all of the work divided, in as many pieces as one likes.
+        The first has the low ends of both intervals, the second their high ends.
         """
         value, low, high = self.times
         _, least, most = self.shares.clip(0.0, 1.0)
@@ -129,21 +111,13 @@ class Scaling(NamedTuple):
         return (
             self._replace(times=_always(np.maximum(low, 1e-9)), shares=_always(least)),
             self._replace(times=_always(slow), shares=_always(most)),
-            self._replace(shares=np.ones_like(self.shares), pieces=None),
         )
 
     def saved_ms(self, robot_cores: int, cores: int, ahead_ms: float = 0.0) -> Curve | None:
         """Return how much less a robot waits for some cores than for its own, but for the path.
 
-        From the number of particles on above which something is saved; None if nothing is.
-
-        Parameters
-        ----------
-        robot_cores, cores : int
-            The robot's own, and those elsewhere.
-        ahead_ms : float
-            How long before it is needed a decision is begun. Only what it takes longer is waited
-            for, by whomever it is made.
+        From the number of particles on above which something is saved; None if nothing is. A
+        decision is begun ``ahead_ms`` before it is needed: only what it takes longer is waited for.
         """
         first, last = self.particles[0], self.particles[-1]
         # Both are straight between what was measured; the difference of the waits is not.
@@ -165,41 +139,19 @@ def _always(values: FloatArray) -> FloatArray:
     return np.tile(values, (3, 1))
 
 
-class BreakEven(NamedTuple):
-    """From how many particles on a service is faster; None if that is not within what was measured.
+def break_even(saved_ms: Curve | None, cost_ms: float) -> float:
+    """Return the number of particles from which on more is saved (None: nothing) than it costs.
 
-    With words for it.
+    NaN if that is not within what was measured. If the curve crosses the cost several times, the
+    last time counts: beyond it the service stays faster as far as was measured.
     """
-
-    particles: float | None
-    words: str
-
-
-def break_even(saved_ms: Curve | None, cost_ms: float) -> BreakEven:
-    """Return from where on what is saved (None: nothing) is more than what it costs.
-
-    If the curve crosses the cost several times, the last time counts: beyond it the service stays
-    faster as far as was measured.
-    """
-    if saved_ms is None:
-        return BreakEven(None, "not within what was measured: nothing is saved there")
-    particles, values = map(np.asarray, saved_ms)
-    if values[-1] <= cost_ms:
-        return BreakEven(
-            None,
-            f"not up to {particles[-1]:,.0f} particles, where {values[-1]:.3g} ms are saved "
-            f"and {cost_ms:.3g} ms paid",
-        )
+    if saved_ms is None or saved_ms.values[-1] <= cost_ms:
+        return math.nan
+    particles, values = saved_ms
     too_little = np.flatnonzero(values <= cost_ms)
     if too_little.size == 0:
         # The curve begins where it was measured first, or where the first time is saved.
-        first = float(particles[0])
-        return BreakEven(first, f"at {_rounded(first)} particles or fewer")
+        return float(particles[0])
     around = slice(too_little[-1], too_little[-1] + 2)
-    found = np.exp(np.interp(math.log(cost_ms), np.log(values[around]), np.log(particles[around])))
-    return BreakEven(float(found), f"from {_rounded(found)} particles on")
-
-
-def _rounded(particles: float) -> str:
-    digits = max(0, math.floor(math.log10(particles)) - 1)
-    return f"{round(float(particles), -digits):,.0f}"
+    found = np.interp(math.log(cost_ms), np.log(values[around]), np.log(particles[around]))
+    return float(np.exp(found))

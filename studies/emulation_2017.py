@@ -214,14 +214,9 @@ def entropy_of_neighborhoods(
 ) -> FloatArray:
     """Return the entropies (trials, samples) that the implementation of 2017 estimated.
 
-    Parameters
-    ----------
-    weights : array of shape (trials, samples, num_particles)
-        Each row sums to 1, or is not a number where no particle was likely.
-    indices : array of shape (trials, num_particles, k)
-        The nearest points of each, itself among them.
-    log_volumes : array of shape (trials, num_particles)
-        Logarithm of the volume of the ball that holds them.
+    Weights of shape (trials, samples, num_particles): each row sums to 1, or is not a number where
+    no particle was likely. Indices (trials, num_particles, k) of the nearest points of each, itself
+    among them; logarithms (trials, num_particles) of the volumes of the balls that hold them.
     """
     neighbors = indices.shape[-1]
     trials, samples, count = weights.shape
@@ -240,12 +235,8 @@ def entropy_of_neighborhoods(
 def least_of(entropies: FloatArray, drawn: FloatArray) -> IntArray:
     """Return the column of the least entropy in each row, as the implementation of 2017 did.
 
-    Parameters
-    ----------
-    entropies : array of shape (trials, sensing actions)
-        No number loses against any; minus infinity wins, the first one of several.
-    drawn : array of shape (trials,)
-        Uniform on [0, 1): decides where all entropies are minus infinity or no numbers.
+    No number loses against any; minus infinity wins, the first one of several. Where all are one or
+    the other, what was ``drawn`` decides: a number on [0, 1) for each row.
     """
     numbers = np.where(np.isnan(entropies), np.inf, entropies)
     chosen = np.argmin(numbers, axis=1)
@@ -285,8 +276,7 @@ def likelihoods(
     """Return the densities of one observation per world in each of its particles.
 
     Of shape (trials, num_particles). Plain densities: far from the observation they underflow to
-    zero, as they did in 2017. ``noise`` of shape (trials, observation_size) are standard normal
-    numbers, from which the observations are made.
+    zero, as they did in 2017. The observations are made of standard normal ``noise``.
     """
     variance = problem.observation_variance(world, action)
     observed = problem.observation_mean(world, action) + np.sqrt(variance) * noise
@@ -298,12 +288,8 @@ def likelihoods(
 def drawn_particle(weights: FloatArray, offsets: FloatArray) -> IntArray:
     """Return the particle of each trial that all its particles become.
 
-    Parameters
-    ----------
-    weights : array of shape (trials, num_particles)
-        Need not sum to 1; where all are zero, particle 0 is returned.
-    offsets : array of shape (trials,)
-        Uniform on [0, 1); from 0 to 1 they go through the particles in proportion to the weights.
+    Weights (trials, num_particles) need not sum to 1; where all are zero, it is particle 0. Offsets
+    from 0 to 1 go through the particles in proportion to the weights.
     """
     cumulative = np.cumsum(weights, axis=1)
     reached = cumulative >= (offsets * cumulative[:, -1])[:, None]

@@ -1,7 +1,7 @@
 """Which state should stand for a belief, and when its particles are drawn anew.
 
 The policy is asked for one state. The mean is the best one where the belief is a heap about the
-truth, and a bad one where it has several modes. So candidates are tried on problems of both kinds.
+truth, and a bad one where it has several modes. So estimates are tried on problems of both kinds.
 Those that are left after the trials for choosing are judged by more trials of another seed. One of
 them becomes the default if it is better than the mean beyond noise over all problems together, and
 worse in none.
@@ -15,12 +15,14 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import pandas as pd
 
-from holdfast.planning.settings import ParticleFilterSettings, SelectorSettings
+from holdfast.planning.settings import Estimate, ParticleFilterSettings, SelectorSettings
 from studies import statistics
 from studies.cases import CASES, Case
 from studies.judged_study import (
+    P_VALUES,
     JudgedStudy,
     compared,
+    compared_together,
     outcome_cells,
     steps_and_success,
 )
@@ -32,7 +34,7 @@ from studies.trial_batches import TrialSeries
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Estimates", "Variant", "variants"]
+__all__ = ["Estimates", "Variant"]
 
 _INTERVALS: Mapping[str, int] = {
     "peg in hole": 8,
@@ -45,9 +47,9 @@ _INTERVALS: Mapping[str, int] = {
 """Steps between two sensing actions, in problems of the other studies."""
 
 _OTHERS = (
-    (1, Case(name="corridor", problem="studies.corridor:Corridor",
+    (1, Case(name="corridor", problem="studies.two_ends:Corridor", model={"start": (0.0, 20.0)},
              num_particles=300, max_steps=300)),
-    (4, Case(name="westward", problem="studies.westward:Westward",
+    (4, Case(name="westward", problem="studies.two_ends:Westward",
              num_particles=200, max_steps=200)),
 )  # fmt: skip
 """The same of two more: one with several modes, one with an angle that wraps."""
@@ -57,36 +59,12 @@ _CASES: Mapping[str, tuple[int, Case]] = {
     **{case.name: (interval, case) for interval, case in _OTHERS},
 }
 
-_TOGETHER = "all problems (mean)"
-
 
 class Variant(NamedTuple):
-    """A candidate, and the effective size at which particles are drawn anew, as a share of them."""
+    """An estimate, and the effective size at which particles are drawn anew, as a share of them."""
 
-    estimate: str = "mean"
+    estimate: Estimate = "mean"
     resampling: float = 1.0
-
-
-def variants() -> list[Variant]:
-    """Return all that is tried; the first one is the reference, the defaults of holdfast."""
-    # By name: the candidates import the core, which the command should not.
-    candidates = (
-        "mean",
-        "most_likely",
-        "nearest_particle",
-        "medoid",
-        "densest_particle",
-        "heaviest_mode",
-        "action_medoid",
-        "action_vote",
-    )
-    return [
-        *(Variant(candidate) for candidate in candidates),
-        Variant("mean", 0.5),
-        Variant("most_likely", 0.5),
-        Variant("heaviest_mode", 0.5),
-        Variant("mean", 0.0),
-    ]
 
 
 _REFERENCE = Variant()
@@ -97,18 +75,19 @@ _JUDGED = (
     Variant("most_likely"),
     Variant("mean", 0.5),
 )
-"""What is left, the other estimate that holdfast had, and the usual threshold."""
+
+_VARIANTS = (
+    _REFERENCE,
+    Variant("most_likely"),
+    Variant("heaviest_mode"),
+    *(Variant(estimate, 0.5) for estimate in ("mean", "most_likely", "heaviest_mode")),
+    Variant("mean", 0.0),
+)
 
 _Cell = tuple[str, Variant]
 """The name of a case, and a variant."""
 
 _Tables = Mapping[_Cell, pd.DataFrame]
-
-
-class EstimateSeries(TrialSeries, frozen=True, kw_only=True):
-    """Trials with a candidate."""
-
-    candidate: str = "mean"
 
 
 class Estimates(JudgedStudy):
@@ -117,22 +96,17 @@ class Estimates(JudgedStudy):
     name = "estimates"
     title = "Which state stands for a belief, and when particles are drawn anew"
     columns = ("problem", "sensing_interval", "estimate", "resampling")
-    kind = "estimates"
     num_trials: ClassVar = {CHOICE: 20, CLAIM: 100}
 
     def cells(self, scale: Scale) -> Iterator[_Cell]:
         """Return all cells, in the order of the tables."""
         del scale
-        for case in _CASES:
-            for variant in variants():
-                yield case, variant
+        return ((case, variant) for case in _CASES for variant in _VARIANTS)
 
     def judged_cells(self, scale: Scale) -> Iterator[_Cell]:
         """Return the cells of what is judged."""
         del scale
-        for case in _CASES:
-            for variant in _JUDGED:
-                yield case, variant
+        return ((case, variant) for case in _CASES for variant in _JUDGED)
 
     def names(self, cell: _Cell) -> tuple[Cell, ...]:
         """Return a cell's values of the columns."""
@@ -143,15 +117,15 @@ class Estimates(JudgedStudy):
         """Return the trials of a cell for a purpose."""
         name, variant = cell
         interval, case = _CASES[name]
-        series = case.series(
+        return case.series(
             SelectorSettings(),
             interval,
             seed=scale.seed_of(purpose),
             num_trials=num_trials,
-            particle_filter=ParticleFilterSettings(resampling_threshold=variant.resampling),
+            particle_filter=ParticleFilterSettings(
+                estimate=variant.estimate, resampling_threshold=variant.resampling
+            ),
         )
-        fields = {field: getattr(series, field) for field in series.__struct_fields__}
-        return EstimateSeries(**fields, candidate=variant.estimate)
 
     def report_of(self, tables: Mapping[str, pd.DataFrame]) -> Report:
         """Return the report on all trials; InvalidValueError if they are not of this study."""
@@ -169,9 +143,6 @@ class Estimates(JudgedStudy):
         )
 
 
-_P_VALUES = ("success_p_value", "steps_p_value")
-
-
 def _alone(tables: _Tables) -> pd.DataFrame:
     """Return how each variant differs from the reference in each problem."""
     summary = pd.DataFrame(
@@ -183,35 +154,19 @@ def _alone(tables: _Tables) -> pd.DataFrame:
         }
         for (case, variant), table in tables.items()
     )
-    others = (summary["estimate"] != _REFERENCE.estimate) | (
-        summary["resampling"] != _REFERENCE.resampling
-    )
-    statistics.add_adjusted(summary, *_P_VALUES, compared=others)
+    others = [variant != _REFERENCE for _, variant in tables]
+    statistics.add_adjusted(summary, *P_VALUES, compared=others)
     return summary
-
-
-def _paired(tables: _Tables, variant: Variant) -> dict[str, Cell]:
-    """Return how a variant differs from the reference over all problems, of the same weight each.
-
-    The number of a trial is the mean over the problems, of the trials that all have.
-    """
-    fewest = min(map(len, tables.values()))
-    own, other = (
-        steps_and_success(*(tables[case, each][:fewest] for case in _CASES))
-        for each in (variant, _REFERENCE)
-    )
-    return {"trials": fewest, **compared(own, other)}
 
 
 def _together(tables: _Tables) -> pd.DataFrame:
     """Return how variants differ over all problems."""
-    varied = dict.fromkeys(variant for _, variant in tables)
     table = pd.DataFrame(
-        {**variant._asdict(), **_paired(tables, variant)}
-        for variant in varied
+        {**variant._asdict(), **compared_together(tables, variant, _REFERENCE)}
+        for variant in dict.fromkeys(variant for _, variant in tables)
         if variant != _REFERENCE
     )
-    statistics.add_adjusted(table, *_P_VALUES)
+    statistics.add_adjusted(table, *P_VALUES)
     return table
 
 
@@ -234,22 +189,14 @@ def _numbers(together: pd.DataFrame) -> list[Number]:
 def _draw(summary: pd.DataFrame) -> Figure:
     from studies import plots
 
-    figure, panels = plots.grid_of_panels(
-        list(_CASES),
+    others = summary.drop(index=summary.groupby("problem").head(1).index)
+    how = others["estimate"].str.replace("_", " ") + others["resampling"].map(", at {:g} N".format)
+    return plots.ratio_grid(
+        {case: others[others["problem"] == case] for case in _CASES},
+        how,
         columns=len(_CASES) // 2,
         title="Steps, against the mean (95 % intervals)",
         width=11.0,
         row_height=3.2,
-        same_rows=True,
+        label="steps, relative to the mean",
     )
-    for name, panel in panels.items():
-        rows = summary[summary["problem"] == name].iloc[1:]
-        labels = [
-            f"{row['estimate'].replace('_', ' ')}, at {row['resampling']:g} N"
-            for row in rows.to_dict("records")
-        ]
-        plots.dot_rows(panel, labels, [plots.dots_of("", rows, "steps_ratio")])
-    plots.ratio_axes(panels.values())
-    plots.label_grid(figure, panels, "", "")
-    figure.supxlabel("steps, relative to the mean")
-    return figure

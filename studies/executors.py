@@ -1,24 +1,24 @@
-"""Where tasks are computed: in this process, or in others.
+"""Where tasks are computed: in processes of this machine, or on a Ray cluster.
 
 All places give the same results, since a task is a function of its parameters; only times differ.
-The tasks of a killed process are computed again elsewhere. A task is given up when its process has
-died several times. Only plain data travels, never code: another process must have the same
-holdfast installed, and a request names the code that it wants.
+Only plain data travels, never code: another process must have the same clone, and each request
+brings the digest of the code that it wants. One with other code refuses.
 """
 
 from __future__ import annotations
 
+import contextlib
+import logging
+import re
 import socket
 import traceback
-from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, wait
-from typing import Protocol
+from typing import Any, Protocol
 
 import msgspec
 import pandas as pd
 
-from holdfast import __version__
 from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.runtime.command_line import MAX_JOBS
 from holdfast.runtime.workers import WorkerProcess, end_workers
@@ -26,32 +26,28 @@ from studies.errors import TaskCrashError, TaskError
 from studies.tables import Columns, columns_of
 from studies.tasks import Task, code_of, run_task
 
-__all__ = [
-    "MOST_ATTEMPTS",
-    "Executor",
-    "LocalExecutor",
-    "compute_encoded",
-    "encode_task",
-    "table_of",
-]
+__all__ = ["Executor", "LocalExecutor", "RayExecutor", "compute_encoded", "encode_task", "table_of"]
 
-MOST_ATTEMPTS = 3
-"""A task that is lost with its process this often is given up."""
+_MOST_RETRIES = 2
+_AT_A_TIME = 256
+"""Tasks that a cluster is given at a time."""
+
+_LONGEST_WAIT_S = 1.0
+"""Ctrl-C is heard within it."""
+
+_OnResult = Callable[[Task, pd.DataFrame], None]
 
 
 class Executor(Protocol):
-    """Computes tasks somewhere."""
+    """Computes tasks somewhere; ``description`` says where, for people."""
 
-    @property
-    def description(self) -> str:
-        """Where, for people."""
-        ...
+    description: str
 
-    def run(self, tasks: Sequence[Task], on_result: Callable[[Task, pd.DataFrame], None]) -> None:
+    def run(self, tasks: Sequence[Task], on_result: _OnResult) -> None:
         """Compute tasks, begun in this order; pass each with its result, in any order.
 
         However it ends, everything that it started has been ended. TaskError if a task cannot be
-        computed, or was lost with its process several times.
+        computed, or was lost with its process.
         """
         ...
 
@@ -63,61 +59,48 @@ class LocalExecutor:
         if not 1 <= processes <= MAX_JOBS:
             raise InvalidValueError(f"--jobs {processes}: must be from 1 to {MAX_JOBS}")
         self._processes = processes
+        self.description = "this process" if processes == 1 else f"{processes} processes"
 
-    @property
-    def description(self) -> str:
-        """Where, for people."""
-        return "this process" if self._processes == 1 else f"{self._processes} processes"
-
-    def run(self, tasks: Sequence[Task], on_result: Callable[[Task, pd.DataFrame], None]) -> None:
+    def run(self, tasks: Sequence[Task], on_result: _OnResult) -> None:
         """Compute tasks; see :meth:`Executor.run`."""
         if self._processes == 1 or len(tasks) <= 1:
             for task in tasks:
                 on_result(task, run_task(task))
             return
-        pending = deque(enumerate(tasks))
-        losses: Counter[int] = Counter()
-        workers: list[_Worker] = []
+        pending = iter(tasks)
+        # One thread each: there are enough of them.
+        workers = [
+            WorkerProcess("holdfast-study", _work, (), 1)
+            for _ in range(min(self._processes, len(tasks)))
+        ]
+        given: dict[Connection, tuple[WorkerProcess, Task]] = {}
+
+        def give(worker: WorkerProcess) -> None:
+            task = next(pending, None)
+            if task is not None:
+                worker.send(encode_task(task))
+                given[worker.connection] = worker, task
+
         try:
-            while pending or workers:
-                while pending and len(workers) < self._processes:
-                    workers.append(_Worker())
-                    workers[-1].start()
-                    workers[-1].give(*pending.popleft())
-                for worker in _ready(workers):
-                    number, task = worker.number, worker.task
+            for worker in workers:
+                worker.start()
+                give(worker)
+            while given:
+                for connection in wait(list(given)):
+                    assert isinstance(connection, Connection)
+                    worker, task = given.pop(connection)
                     answer = worker.receive()
                     if answer is None:
-                        losses[number] += 1
-                        if losses[number] == MOST_ATTEMPTS:
-                            raise _given_up(worker)
-                        pending.appendleft((number, task))
-                    if answer is None or not pending:
-                        end_workers([worker])
-                        workers.remove(worker)
-                    else:
-                        # Before its answer is dealt with, so that it is never idle.
-                        worker.give(*pending.popleft())
-                    if answer is not None:
-                        on_result(task, table_of(answer))
+                        how, killed = worker.how_it_ended()
+                        advice = "; often the machine is out of memory: use fewer --jobs"
+                        raise TaskError(
+                            f"a process {how} with {task.kind} {task.parameters}"
+                            f"{advice if killed else ''}"
+                        )
+                    give(worker)  # before its answer is dealt with, so that it is never idle
+                    on_result(task, table_of(answer))
         finally:
             end_workers(workers)
-
-
-class _Worker(WorkerProcess):
-    """A worker, and the task that it has."""
-
-    number: int
-    task: Task
-
-    def __init__(self) -> None:
-        # One thread each: there are enough of them.
-        super().__init__("holdfast-study", _work, (), 1)
-
-    def give(self, number: int, task: Task) -> None:
-        self.number, self.task = number, task
-        # A worker imports what is on the disk by then: somebody may have edited it.
-        self.send(encode_task(task, code_of(task)))
 
 
 def _work(connection: Connection) -> None:
@@ -126,19 +109,61 @@ def _work(connection: Connection) -> None:
         connection.send_bytes(compute_encoded(connection.recv_bytes()))
 
 
-def _ready(workers: Sequence[_Worker]) -> list[_Worker]:
-    """Wait until there are workers that have answered or ended, and return them."""
-    ready = wait([worker.connection for worker in workers])
-    return [worker for worker in workers if worker.connection in ready]
+class RayExecutor:
+    """Computes tasks on a Ray cluster, whose nodes have the clone's root in PYTHONPATH.
 
+    Ray computes again what a killed process or node had.
 
-def _given_up(worker: _Worker) -> TaskError:
-    how, killed = worker.how_it_ended()
-    advice = "; often the machine is out of memory: fewer processes (--jobs) need less"
-    return TaskError(
-        f"{MOST_ATTEMPTS} processes were lost with {worker.task.kind} {worker.task.parameters}, "
-        f"and the last one {how}{advice if killed else ''}"
-    )
+    Parameters
+    ----------
+    place : str
+        ``ray``: the cluster of this machine, or the one that ``RAY_ADDRESS`` names;
+        ``ray://HOST:PORT``: the cluster whose client server listens there.
+    """
+
+    def __init__(self, place: str) -> None:
+        if not re.fullmatch(r"ray|ray://\S+:[0-9]+", place):
+            raise InvalidValueError(
+                f"--executor {place}: must be local, ray (the cluster of this machine) or "
+                "ray://HOST:PORT"
+            )
+        self._address = "auto" if place == "ray" else place
+        self.description = f"the Ray cluster at {place}"
+
+    def run(self, tasks: Sequence[Task], on_result: _OnResult) -> None:
+        """Compute tasks; see :meth:`Executor.run`. HoldfastError if no cluster can be joined."""
+        if not tasks:
+            return
+        try:
+            import ray
+        except ImportError as error:
+            raise HoldfastError(
+                "--executor ray needs Ray, which cannot be imported: pip install 'ray[client]'"
+            ) from error
+        try:
+            ray.init(address=self._address, logging_level=logging.ERROR, log_to_driver=False)
+        except Exception as error:
+            raise HoldfastError(f"{self.description} cannot be joined: {error}") from error
+        remote = ray.remote(num_cpus=1, max_retries=_MOST_RETRIES)(compute_encoded)
+        pending = iter(tasks)
+        running: dict[Any, Task] = {}
+        try:
+            while True:
+                while len(running) < _AT_A_TIME and (task := next(pending, None)) is not None:
+                    running[remote.remote(encode_task(task))] = task
+                if not running:
+                    return
+                for done in ray.wait(list(running), timeout=_LONGEST_WAIT_S)[0]:
+                    task = running.pop(done)
+                    on_result(task, table_of(ray.get(done)))
+        except ray.exceptions.RayError as error:
+            raise TaskError(f"{self.description} cannot compute a task: {error}") from error
+        finally:
+            # Nobody waits for what is still computed there.
+            for reference in running:
+                with contextlib.suppress(Exception):
+                    ray.cancel(reference, force=True)
+            ray.shutdown()
 
 
 # -- tasks and results as bytes --------------------------------------------------------------------
@@ -158,13 +183,9 @@ class _Failed(msgspec.Struct, tag="failed"):
     crashed: bool
 
 
-_REQUEST_DECODER = msgspec.msgpack.Decoder(_Request)
-_ANSWER_DECODER = msgspec.msgpack.Decoder(_Computed | _Failed)
-
-
-def encode_task(task: Task, code: str) -> bytes:
+def encode_task(task: Task) -> bytes:
     """Return a task as bytes, with the digest of the code that may compute it."""
-    return msgspec.msgpack.encode(_Request(task, code))
+    return msgspec.msgpack.encode(_Request(task, code_of(task)))
 
 
 def compute_encoded(request: bytes) -> bytes:
@@ -174,7 +195,7 @@ def compute_encoded(request: bytes) -> bytes:
     """
     answer: _Computed | _Failed
     try:
-        asked = _REQUEST_DECODER.decode(request)
+        asked = msgspec.msgpack.decode(request, type=_Request)
         _check_code(asked)
         table = run_task(asked.task)
         # Modules were imported on the way, and may have been edited just before.
@@ -192,23 +213,19 @@ def _check_code(asked: _Request) -> None:
     if own != asked.code:
         raise TaskError(
             f"a process on {socket.gethostname()} has other code for tasks of the kind "
-            f"{asked.task.kind!r} (digest {own}, of holdfast {__version__}) than the one that asks "
-            f"(digest {asked.code}), so the results would not belong together: install the same "
-            "holdfast on every node, and edit nothing meanwhile"
+            f"{asked.task.kind!r} (digest {own}) than the one that asks (digest {asked.code}), so "
+            "the results would not belong together: every node needs the same clone; edit nothing "
+            "meanwhile"
         )
 
 
 def table_of(answer: bytes) -> pd.DataFrame:
     """Return a task's result, from what :func:`compute_encoded` answered.
 
-    Raises
-    ------
-    TaskError
-        If its function refused the parameters, or the code is another.
-    TaskCrashError
-        If anything else went wrong there.
+    TaskError if its function refused the parameters, or the code is another; TaskCrashError if
+    anything else went wrong there.
     """
-    found = _ANSWER_DECODER.decode(answer)
+    found = msgspec.msgpack.decode(answer, type=_Computed | _Failed)
     if isinstance(found, _Computed):
         return pd.DataFrame(found.table)
     if found.crashed:

@@ -24,9 +24,11 @@ from studies.trial_files import rounded
 
 __all__ = [
     "MEASURES",
+    "P_VALUES",
     "JudgedStudy",
     "Trials",
     "compared",
+    "compared_together",
     "outcome_cells",
     "over_problems",
     "shown_as",
@@ -36,19 +38,13 @@ __all__ = [
 _TRIALS_IN_EACH = 20
 
 _PURPOSE = ("purpose", "seed")
-_KEPT = (
-    "trial",
-    "success",
-    "steps",
-    "reward",
-    "sensing_decisions",
-    "step_limit",
-    "steps_to_goal",
-)
+_KEPT = ("trial", "success", "steps", "reward", "sensing_decisions")
 
 MEASURES = ("steps_ratio", "success_gain")
 """What is compared: the ratio of steps (geometric mean; a failure counts as the limit), and the
 difference of success rates."""
+
+P_VALUES = ("success_p_value", "steps_p_value")
 
 Trials: TypeAlias = tuple[FloatArray, FloatArray]
 """The logarithm of steps and the success of each trial."""
@@ -101,7 +97,6 @@ class JudgedStudy(TrialStudy):
         medians = times.groupby([trials[name] for name in names]).transform("median")
         return trials[[*names, *_KEPT]].assign(
             reward=rounded(trials["reward"]),
-            steps_to_goal=trials["steps_to_goal"].astype(np.float64),
             median_sensing_ms=rounded(medians),
         )
 
@@ -121,7 +116,7 @@ class JudgedStudy(TrialStudy):
         whole, few = (
             {
                 (purpose, *self.names(cell)): (purpose, cell)
-                for purpose in (CHOICE, CLAIM)
+                for purpose in self.num_trials
                 for cell in self._cells_for(purpose, Scale(quick=quick))
             }
             for quick in (False, True)
@@ -131,7 +126,7 @@ class JudgedStudy(TrialStudy):
             if (key in expected) != (key in found):
                 what = "there are no trials" if key in expected else "knows nothing"
                 raise InvalidValueError(f"{self.name}: {what} of {', '.join(map(str, key))}")
-        tables: dict[str, dict[Any, pd.DataFrame]] = {CHOICE: {}, CLAIM: {}}
+        tables: dict[str, dict[Any, pd.DataFrame]] = {purpose: {} for purpose in self.num_trials}
         for key, (purpose, cell) in expected.items():
             tables[purpose][cell] = found[key]
         return tables
@@ -174,20 +169,32 @@ def compared(own: Trials, other: Trials) -> dict[str, Cell]:
     }
 
 
+def compared_together(
+    tables: Mapping[tuple[str, Any], pd.DataFrame], own: Any, other: Any
+) -> dict[str, Cell]:
+    """Return the cells of a comparison over all problems, each with the same weight.
+
+    Tables are by problem and way. The number of a trial is the mean over the problems, of the
+    trials that all have.
+    """
+    fewest = min(map(len, tables.values()))
+    problems = dict.fromkeys(problem for problem, _ in tables)
+    found = (
+        steps_and_success(*(tables[problem, way][:fewest] for problem in problems))
+        for way in (own, other)
+    )
+    return {"trials": fewest, **compared(*found)}
+
+
 def over_problems(
     pairs: Sequence[tuple[dict[str, Cell], Sequence[tuple[Trials, Trials]]]], least_success: float
 ) -> pd.DataFrame:
     """Return how ways differ over these problems, and over all problems like them.
 
     Columns: ``mean``, over these problems, of the trials that all have; ``expected``, over all such
-    problems; ``new_problem``, in one more; ``deviation_between_problems`` as a difference.
-
-    Parameters
-    ----------
-    pairs : sequence of (dict, sequence)
-        The names of a comparison, and in each problem the trials of one way and of the other.
-    least_success : float
-        The smallest difference of two trials' successes; that of steps is one in a hundred.
+    problems; ``new_problem``, in one more; ``deviation_between_problems`` as a difference. Each of
+    ``pairs`` names a comparison, with the trials of one way and of the other in each problem;
+    ``least_success`` is the smallest difference of two trials' successes.
     """
     rows: list[dict[str, Cell]] = []
     for part, (measure, least) in enumerate(zip(MEASURES, (0.01, least_success), strict=True)):

@@ -7,7 +7,7 @@ sensing actions, the horizon, the estimator.
 
 Times are measured on this machine with as many threads as it has cores. For more cores they are
 extrapolated by Amdahl's law, within stated bounds (:mod:`~.cost_model`). The paths are numbers, 20
-and 87 ms; the rest of an exchange is measured.
+and 87 ms; what an exchange takes besides is known from the study of the thesis's chapter 6.
 
 Two robots are compared. The thesis's robot *waits for each decision*. Ours *decides ahead*: the
 sensing action is computed while the robot moves, so it waits only for the excess, besides one round
@@ -28,13 +28,11 @@ import pandas as pd
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.settings import PlanningSettings
 from holdfast.robot.trials import available_cores
-from studies.cost_model import BreakEven, Scaling, break_even
-from studies.exchange_times import Exchange
+from studies.cost_model import Scaling, break_even
 from studies.sensing_times import Measurement
 from studies.statistics import (
     Interval,
     cells_of,
-    exactly,
     interval_in,
     median_interval,
 )
@@ -44,18 +42,16 @@ from studies.tasks import Task
 from studies.trial_batches import problem_of
 
 __all__ = [
+    "EXCHANGE_MS",
     "PATHS_MS",
-    "RATES_HZ",
     "SAMPLES_DRAWN",
     "SHOWN",
     "TIMES_THE_CORES",
     "Kind",
     "OffloadBreakEven",
-    "ahead_ms_of",
+    "ahead_table",
     "break_even_table",
-    "exchange_ms_of",
     "kind_of",
-    "line_of",
     "numbers_of",
     "scalings_of",
     "times_table",
@@ -66,7 +62,7 @@ _ESTIMATORS = ("nearest_neighbor", "gaussian_mixture_upper")
 _PARTICLES = (100, 300, 1000, 2000, 4000, 8000, 16_000, 32_000, 64_000, 100_000)
 _SAMPLES = (10, 30, 100, 300)
 SAMPLES_DRAWN = (10, 100)
-"""In the figures; the tables and the map have all."""
+"""In the figures; the tables have all."""
 
 # Moving 4,096 particles or more uses all cores whatever it is told: beyond, one thread would not
 # be one.
@@ -77,9 +73,13 @@ _QUICK_PARTICLES = (100, 1000, 2000, 5000, 10_000, 20_000)
 TIMES_THE_CORES = (8, 36)
 _ROBOT_CORES = (1, 4)
 PATHS_MS = (20.0, 87.0)
-RATES_HZ = (10.0, 50.0)
+_RATES_HZ = (10.0, 50.0)
 _SENSING_INTERVAL = PlanningSettings().sensing_interval
-_EXCHANGE_PARTICLES = (100, 10_000)
+
+EXCHANGE_MS = 1.52
+"""Of asking over TCP, beside path and computation: "round trip without computation, cloud, same
+machine" of the study ``thesis_chapter_6``, with 100 to 500 particles. With 10,000, of which both
+ends take a digest, it was 1 ms more than with 100: less than the bounds of a break-even."""
 
 _STEADY_FROM = 1000
 """From so many particles on the growth is fitted; below, what every decision costs is seen."""
@@ -121,35 +121,28 @@ class OffloadBreakEven(Study):
     title = "When is asking a service worth it? Sensing time, cores and the path to them"
 
     def parts(self, scale: Scale) -> Iterator[Part]:
-        """Yield exchanges, and decisions of each kind."""
-        for way in ("tcp", "in_process"):
-            for particles in _EXCHANGE_PARTICLES:
-                names: dict[str, Cell] = {"way": way, "particles": particles}
-                yield Part(names, [_exchange_task(way, particles, scale)], "exchange")
+        """Yield decisions of each kind."""
         for kind in _kinds(scale):
             yield Part(kind._asdict(), [_sensing_task(kind, scale)], "sensing_times")
 
     def report_of(self, tables: Mapping[str, pd.DataFrame]) -> Report:
         """Return the report on the rows of all parts."""
         measured = tables["sensing_times"]
-        times, exchange = times_table(measured), _exchange_table(tables["exchange"])
-        scalings, exchange_ms = scalings_of(times), exchange_ms_of(exchange)
-        lines = break_even_table(scalings, exchange_ms)
+        times = times_table(measured)
+        scalings = scalings_of(times)
+        lines = break_even_table(scalings)
         return Report(
             summary={
                 "sensing_times": times,
-                "exchange": exchange,
                 "growth": _growth_table(measured),
                 "break_even": lines,
-                "break_even_ahead": _ahead_table(scalings, exchange_ms),
+                "break_even_ahead": ahead_table(scalings),
             },
             figures={
-                "sensing_time": drawn("offload_figures:sensing_time", scalings, exchange_ms),
-                "break_even_map": drawn("offload_figures:break_even_map", scalings, exchange_ms),
+                "sensing_time": drawn("offload_figures:sensing_time", scalings),
                 "break_even": drawn("offload_figures:break_even_lines", lines),
-                "waiting": drawn("offload_figures:waiting", scalings, exchange_ms),
             },
-            numbers=numbers_of(times, exchange, lines),
+            numbers=numbers_of(lines),
         )
 
 
@@ -203,26 +196,18 @@ def _sensing_task(kind: Kind, scale: Scale) -> Task:
         least_repetitions=1 if scale.quick else 3,
         limit_s=2.0 if scale.quick else 8.0,
     )
-    return _task_of("sensing_times", measurement, len(measurement.particles))
+    return Task(
+        kind="sensing_times",
+        parameters=msgspec.to_builtins(measurement),
+        units=len(measurement.particles),
+        exclusive=True,
+    )
 
 
 def _threads() -> tuple[int, ...]:
     """Return 1, 2, 4 and so on, as far as this machine has cores, and 2 in any case."""
     most = max(2, available_cores())
     return tuple(2**power for power in range(most.bit_length()) if 2**power <= most)
-
-
-def _exchange_task(way: str, particles: int, scale: Scale) -> Task:
-    trials = 1 if scale.quick else 3
-    exchange = Exchange(
-        problem=SHOWN.problem, particles=particles, way=way, num_trials=trials, seed=scale.seed
-    )
-    return _task_of("exchange_times", exchange, trials)
-
-
-def _task_of(kind: str, measured: Measurement | Exchange, units: int) -> Task:
-    parameters = msgspec.to_builtins(measured)
-    return Task(kind=kind, parameters=parameters, units=units, exclusive=True)
 
 
 # -- tables ------------------------------------------------------------------------------------
@@ -242,8 +227,6 @@ def times_table(measured: pd.DataFrame) -> pd.DataFrame:
                 "repetitions": int(those["repetitions"].iloc[0]),
                 **cells_of("ms", median_interval(those["median_ms"])),
                 **cells_of("divided_share", share),
-                "mapping_share": float((those["mapping_ms"] / those["median_ms"]).median()),
-                "others_cores": float(those["others_cores"].iloc[0]),
             }
             for threads, those in here.groupby("threads")
         ]
@@ -276,140 +259,58 @@ def _intervals(rows: pd.DataFrame, name: str) -> FloatArray:
     return np.asarray(rows[list(ends)].fillna(ends).to_numpy(float).T)
 
 
-def _exchange_table(asked: pd.DataFrame) -> pd.DataFrame:
-    """Return the time of an exchange beside the computation and the path."""
-    rows: list[dict[str, Cell]] = []
-    for (way, particles), table in asked.groupby(["way", "particles"], sort=False):
-        task = table["task_ms"] - table["task_computed_ms"]
-        both = table["sensing_ms"] - table["computed_ms"]
-        rows.append(
-            {
-                "way": way,
-                "particles": particles,
-                "questions": len(table),
-                **cells_of("task_exchange_ms", median_interval(task)),
-                **cells_of("sensing_exchange_ms", median_interval(both)),
-                **cells_of("task_computed_ms", median_interval(table["task_computed_ms"])),
-            }
-        )
-    return pd.DataFrame(rows)
-
-
-def exchange_ms_of(exchange: pd.DataFrame) -> float:
-    """Return the time of an exchange over TCP beside its computation, without a path.
-
-    It grows a little with the particles, because of their digest; the largest counts for all.
-    """
-    return float(exchange.loc[exchange["way"] == "tcp", "sensing_exchange_ms"].max())
-
-
 def _growth_table(measured: pd.DataFrame) -> pd.DataFrame:
-    """Return the exponents of the time on one thread, in particles, M, J and H."""
+    """Return the exponents with which the time on one thread grows with the particles.
+
+    Power laws, by least squares of logarithms: the median over the beliefs, each fitted alone.
+    """
+    from scipy import stats
+
     one = measured[measured["threads"] == 1]
     cells: list[dict[str, Cell]] = []
-    for _, rows in one.groupby(list(Kind._fields), sort=False):
+    for kind, rows in one.groupby(list(Kind._fields), sort=False):
         for start in (100, _STEADY_FROM):
-            larger = rows[rows["particles"] >= start]
-            cells += _exponents("particles", larger, f"from {start:,} on")
-    for changed in ("samples", "sensing_actions", "horizon"):
-        others = [name for name in Kind._fields if name != changed]
-        for _, family in one.groupby(others, sort=False):
-            tried = family.groupby("particles")[changed].nunique()
-            common = tried.index[(tried == family[changed].nunique()) & (tried > 1)]
-            common = common[common <= _STEADY_FROM]
-            if len(common):
-                here = family[family["particles"] == common.max()]
-                cells += _exponents(changed, here, f"at {common.max():,} particles")
+            logs = rows[rows["particles"] >= start].pivot_table("median_ms", "belief", "particles")
+            # Where there was no time for all beliefs, those that have all numbers.
+            logs = np.log(logs.dropna())
+            if logs.shape[1] < 2:
+                continue
+            sizes = np.log(logs.columns.to_numpy(float))
+            slopes = [stats.linregress(sizes, own).slope for own in logs.to_numpy()]
+            cells.append(
+                {
+                    **dict(zip(Kind._fields, kind, strict=True)),
+                    "smallest": logs.columns.min(),
+                    "largest": logs.columns.max(),
+                    "beliefs": len(slopes),
+                    **cells_of("exponent", median_interval(slopes)),
+                }
+            )
     return pd.DataFrame(cells)
 
 
-def _exponents(what: str, rows: pd.DataFrame, where: str) -> list[dict[str, Cell]]:
-    """Return a row with the median exponent over the beliefs, each fitted alone; none if few."""
-    from scipy import stats
-
-    beliefs = [(own[what].to_numpy(float), own["median_ms"]) for _, own in rows.groupby("belief")]
-    most = max((sizes.size for sizes, _ in beliefs), default=0)
-    if most < 2:
-        return []
-    # Power laws, by least squares of logarithms.
-    whole = [(sizes, times) for sizes, times in beliefs if sizes.size == most]
-    slopes = [stats.linregress(np.log(sizes), np.log(times)).slope for sizes, times in whole]
-    smallest, largest = int(whole[0][0].min()), int(whole[0][0].max())
-    names = rows[list(Kind._fields)].iloc[0].to_dict()
-    if what != "particles":
-        names[what] = None
-    return [
-        {
-            "grows_with": what,
-            **names,
-            "where": where,
-            "smallest": smallest,
-            "largest": largest,
-            "beliefs": len(slopes),
-            **cells_of("exponent", median_interval(slopes)),
-            "n_log_n": _exponent_of_n_log_n(smallest, largest) if what == "particles" else math.nan,
-        }
-    ]
-
-
-def _exponent_of_n_log_n(smallest: int, largest: int) -> float:
-    """Return the exponent that n log n would have between two sizes."""
-    return 1.0 + math.log(math.log(largest) / math.log(smallest)) / math.log(largest / smallest)
-
-
-class Line(NamedTuple):
-    """A break-even with its bounds: favourable to few cores, to many, and divided evenly."""
-
-    value: BreakEven
-    last: BreakEven
-    first: BreakEven
-    even: BreakEven
-
-
-def line_of(
-    scaling: Scaling, robot_cores: int, cores: int, cost_ms: float, ahead_ms: float = 0.0
-) -> Line:
-    """Return the break-even of a service, with its bounds."""
-    found = [
-        break_even(each.saved_ms(robot_cores, cores, ahead_ms), cost_ms)
-        for each in (scaling, *scaling.bounds())
-    ]
-    return Line(*found)
-
-
 def _line_cells(
-    scaling: Scaling,
-    robot_cores: int,
-    cores: int,
-    path_ms: float,
-    exchange_ms: float,
-    ahead_ms: float = 0.0,
+    scaling: Scaling, robot_cores: int, cores: int, path_ms: float, ahead_ms: float = 0.0
 ) -> dict[str, Cell]:
-    line = line_of(scaling, robot_cores, cores, path_ms + exchange_ms, ahead_ms)
+    """Return the break-even of a service, with its bounds: favourable to many cores, and to few."""
+    few, many = scaling.bounds()
+    value, low, high = (
+        break_even(each.saved_ms(robot_cores, cores, ahead_ms), path_ms + EXCHANGE_MS)
+        for each in (scaling, many, few)
+    )
     return {
         "robot_cores": robot_cores,
         "service_cores": cores,
         "path_ms": path_ms,
-        "particles": _whole(line.value),
-        "particles_low": _whole(line.first),
-        "particles_high": _whole(line.last),
-        "particles_if_divided_evenly": _whole(line.even),
-        "words": line.value.words,
+        **cells_of("particles", Interval(*np.round([value, low, high]).tolist())),
         "measured_to": int(scaling.particles[-1]),
     }
 
 
-def _whole(found: BreakEven) -> Cell:
-    return math.nan if found.particles is None else round(found.particles)
-
-
-def break_even_table(scalings: Mapping[Kind, Scaling], exchange_ms: float) -> pd.DataFrame:
+def break_even_table(scalings: Mapping[Kind, Scaling]) -> pd.DataFrame:
     """Return the break-even of a robot that waits for each decision."""
     return pd.DataFrame(
-        {
-            **kind._asdict(),
-            **_line_cells(scaling, robot_cores, times * robot_cores, path_ms, exchange_ms),
-        }
+        {**kind._asdict(), **_line_cells(scaling, robot_cores, times * robot_cores, path_ms)}
         for kind, scaling in scalings.items()
         for robot_cores in _ROBOT_CORES
         for times in TIMES_THE_CORES
@@ -417,29 +318,28 @@ def break_even_table(scalings: Mapping[Kind, Scaling], exchange_ms: float) -> pd
     )
 
 
-def _ahead_table(scalings: Mapping[Kind, Scaling], exchange_ms: float) -> pd.DataFrame:
-    """Return the break-even of a robot that decides ahead, by its rate."""
+def ahead_table(scalings: Mapping[Kind, Scaling]) -> pd.DataFrame:
+    """Return the break-even of a robot that decides ahead, by its rate.
+
+    It moves for ``ahead_ms`` between two sensing steps.
+    """
     return pd.DataFrame(
         {
             **kind._asdict(),
             "rate_hz": rate_hz,
-            "ahead_ms": ahead_ms_of(rate_hz),
-            **_line_cells(scaling, 1, cores, path_ms, exchange_ms, ahead_ms_of(rate_hz)),
+            "ahead_ms": ahead_ms,
+            **_line_cells(scaling, 1, cores, path_ms, ahead_ms),
         }
         for kind, scaling in scalings.items()
-        for rate_hz in RATES_HZ
+        for rate_hz in _RATES_HZ
+        for ahead_ms in (1e3 * _SENSING_INTERVAL / rate_hz,)
         for cores in TIMES_THE_CORES
         for path_ms in PATHS_MS
     )
 
 
-def ahead_ms_of(rate_hz: float) -> float:
-    """Return how long a robot moves between two sensing steps."""
-    return 1e3 * _SENSING_INTERVAL / rate_hz
-
-
-def numbers_of(times: pd.DataFrame, exchange: pd.DataFrame, lines: pd.DataFrame) -> list[Number]:
-    """Return the break-even of the thesis's settings, the divided shares, and the exchange."""
+def numbers_of(lines: pd.DataFrame) -> list[Number]:
+    """Return the break-even of the thesis's settings."""
     numbers = []
     of_shown = (lines[list(Kind._fields)] == pd.Series(SHOWN._asdict())).all(axis=1)
     for row in lines[of_shown & (lines["robot_cores"] == 1)].to_dict("records"):
@@ -447,25 +347,4 @@ def numbers_of(times: pd.DataFrame, exchange: pd.DataFrame, lines: pd.DataFrame)
             f"a service with {row['service_cores']} cores at {row['path_ms']:g} ms is faster from"
         )
         numbers.append(Number(name, interval_in(row, "particles"), "particles"))
-    long = times[(times["threads"] == 1) & (times["ms"] >= 5.0)]
-    for steps, rows in (
-        ("one step", long[long["horizon"] == 1]),
-        ("several steps", long[long["horizon"] > 1]),
-    ):
-        # The settings share beliefs: a range, and not an interval.
-        shares = 100.0 * rows["divided_share"]
-        range_ = Interval(shares.median(), shares.min(), shares.max())
-        name = f"share divided among threads, {steps} (median, least and most of the settings)"
-        numbers.append(Number(name, range_, "% of the time on one thread", len(rows)))
-    numbers += [
-        Number(
-            f"exchange beside computation and path, {row['way']}, {row['particles']:,} particles",
-            interval_in(row, "sensing_exchange_ms"),
-            "ms",
-            row["questions"],
-        )
-        for row in exchange.to_dict("records")
-    ]
-    # Where others kept a quarter of a core busy, the shares are lower bounds.
-    others = times["others_cores"].median()
-    return [*numbers, Number("cores that other processes kept busy", exactly(others))]
+    return numbers

@@ -23,14 +23,15 @@ from holdfast.planning.settings import (
 from studies import statistics
 from studies.cases import CASES
 from studies.judged_study import (
+    P_VALUES,
     JudgedStudy,
     compared,
+    compared_together,
     outcome_cells,
-    over_problems,
     steps_and_success,
 )
 from studies.statistics import interval_in
-from studies.study import CHOICE, CLAIM, TRIALS, Number, Report, Scale
+from studies.study import CLAIM, TRIALS, Number, Report, Scale
 from studies.tables import Cell
 from studies.trial_batches import TrialSeries, problem_of
 
@@ -71,24 +72,15 @@ _RANDOM: Way = "random"
 
 
 class Variant(NamedTuple):
-    """Settings of which one differs from those of the way's reference.
+    """Settings of which one differs from those of the way's reference."""
 
-    Attributes
-    ----------
-    parameter, value : str
-        What differs, and how; empty for the reference itself.
-    resolution : float, optional
-        In units of the problem's own; None for that, and for a mixture the motion noise.
-    times_the_particles : float
-        As many as the problem has.
-    """
-
-    parameter: str = ""
+    parameter: str = ""  # what differs, and how; empty for the reference itself
     value: str = ""
     way: Way = _FIRST
     active_sensing: ActiveSensingSettings = ActiveSensingSettings()
     particle_filter: ParticleFilterSettings = ParticleFilterSettings()
     resolution: float | None = None
+    """In units of the problem's own; None for that, and for a mixture the motion noise."""
     times_the_particles: float = 1.0
 
     def names(self) -> dict[str, Cell]:
@@ -164,7 +156,8 @@ class Parameters(JudgedStudy):
     name = "parameters"
     title = "What the parameters do: particles, M, k, resolution, horizon, estimate, resampling"
     columns = ("problem", "sensing_interval", "way", "parameter", "value")
-    num_trials: ClassVar = {CHOICE: 10, CLAIM: 60}
+    num_trials: ClassVar = {CLAIM: 60}
+    quick_trials: ClassVar = {CLAIM: 4}
 
     def cells(self, scale: Scale) -> Iterator[_Cell]:
         """Return all cells, in the order of the tables."""
@@ -203,27 +196,21 @@ class Parameters(JudgedStudy):
 
     def report_of(self, tables: Mapping[str, pd.DataFrame]) -> Report:
         """Return the report on all trials; InvalidValueError if they are not of this study."""
-        choosing, claim = self.by_cell(tables[TRIALS]).values()
+        claim = self.by_cell(tables[TRIALS])[CLAIM]
         summary, together = _alone(claim), _together(claim)
         return Report(
             summary={
                 "parameters": summary,
                 "together": together,
                 "more_particles": _more_particles(claim),
-                "over_problems": _over_problems(claim),
-                "chosen_values": _chosen_values(choosing, claim),
             },
             figures={"parameters": partial(_draw, summary, together)},
             numbers=_numbers(together),
         )
 
 
-_P_VALUES = ("success_p_value", "steps_p_value")
-
 _OVER_RANDOM = "_over_random"
 """Ends the names of columns of a comparison with random."""
-
-_AS_IT_IS = "as it is"
 
 
 def _varied(tables: _Tables) -> list[Variant]:
@@ -241,19 +228,6 @@ def _paired(table: pd.DataFrame, reference: pd.DataFrame) -> dict[str, Cell]:
     return compared(steps_and_success(table), steps_and_success(reference))
 
 
-def _paired_together(tables: _Tables, variant: Variant, reference: Variant) -> dict[str, Cell]:
-    """Return how a variant differs from another over all problems, each with the same weight.
-
-    The number of a trial is the mean over the problems, of the trials that all have.
-    """
-    fewest = min(map(len, tables.values()))
-    own, other = (
-        steps_and_success(*(tables[case, each][:fewest] for case in _CASES))
-        for each in (variant, reference)
-    )
-    return {"trials": fewest, **compared(own, other)}
-
-
 def _alone(tables: _Tables) -> pd.DataFrame:
     """Return how each variant differs from its way's reference and from random, in each problem."""
     rows: list[dict[str, Cell]] = []
@@ -269,8 +243,8 @@ def _alone(tables: _Tables) -> pd.DataFrame:
             }
         )
     summary = pd.DataFrame(rows)
-    statistics.add_adjusted(summary, *_P_VALUES, compared=summary["parameter"] != "")
-    over_random = (f"{name}{_OVER_RANDOM}" for name in _P_VALUES)
+    statistics.add_adjusted(summary, *P_VALUES, compared=summary["parameter"] != "")
+    over_random = (f"{name}{_OVER_RANDOM}" for name in P_VALUES)
     statistics.add_adjusted(summary, *over_random, compared=summary["way"] != _RANDOM)
     return summary
 
@@ -297,59 +271,11 @@ def _together(tables: _Tables) -> pd.DataFrame:
         {
             **variant.names(),
             "reference": rival.way,
-            **_paired_together(tables, variant, rival),
+            **compared_together(tables, variant, rival),
         }
         for variant, rival in _pairs(tables)
     )
-    statistics.add_adjusted(table, *_P_VALUES)
-    return table
-
-
-def _over_problems(tables: _Tables) -> pd.DataFrame:
-    """Return how variants differ over these problems, and over all problems like them."""
-    trials = {cell: steps_and_success(table) for cell, table in tables.items()}
-    return over_problems(
-        [
-            (
-                {**variant.names(), "reference": rival.way},
-                [(trials[case, variant], trials[case, rival]) for case in _CASES],
-            )
-            for variant, rival in _pairs(tables)
-        ],
-        least_success=1.0,
-    )
-
-
-def _chosen_values(choosing: _Tables, tables: _Tables) -> pd.DataFrame:
-    """Return the value of each parameter that the trials for choosing choose.
-
-    It takes the fewest steps over all problems; the reference has a value, too. It is judged by the
-    other trials, against the reference and against random.
-    """
-    rows: list[dict[str, Cell]] = []
-    varied = _varied(tables)
-    for way, parameter in dict.fromkeys((v.way, v.parameter) for v in varied if v.parameter):
-        reference = Variant(way=way)
-        values = [each for each in varied if (each.way, each.parameter) == (way, parameter)]
-        ratios = {
-            each: _paired_together(choosing, each, reference)["steps_ratio"]
-            for each in (reference, *values)
-        }
-        best = min(ratios, key=lambda each: float(ratios[each] or 0.0))
-        rows += [
-            {
-                "way": way,
-                "parameter": parameter,
-                "chosen": best.value or _AS_IT_IS,
-                "reference": rival.way,
-                "steps_ratio_when_chosen": _paired_together(choosing, best, rival)["steps_ratio"],
-                **_paired_together(tables, best, rival),
-            }
-            for rival in dict.fromkeys((reference, _random_rival(best)))
-        ]
-    table = pd.DataFrame(rows)
-    changed = (table["chosen"] != _AS_IT_IS) | (table["reference"] != table["way"])
-    statistics.add_adjusted(table, *_P_VALUES, compared=changed)
+    statistics.add_adjusted(table, *P_VALUES)
     return table
 
 
@@ -381,9 +307,9 @@ def _more_particles(tables: _Tables) -> pd.DataFrame:
             }
             for case in _CASES
         ]
-        rows.append({"problem": _TOGETHER, **names, **_paired_together(tables, more, fewer)})
+        rows.append({"problem": _TOGETHER, **names, **compared_together(tables, more, fewer)})
     table = pd.DataFrame(rows)
-    statistics.add_adjusted(table, *_P_VALUES)
+    statistics.add_adjusted(table, *P_VALUES)
     return table
 
 
@@ -405,22 +331,17 @@ def _numbers(together: pd.DataFrame) -> list[Number]:
 def _draw(summary: pd.DataFrame, together: pd.DataFrame) -> Figure:
     from studies import plots
 
-    figure, panels = plots.grid_of_panels(
-        [*_CASES, _TOGETHER],
-        columns=len(_CASES) + 1,
+    changed = summary[summary["parameter"] != ""]
+    mean = together[together["reference"] == together["way"]]
+    rows = {case: changed[changed["problem"] == case] for case in _CASES}
+    rows["mean of all five"] = mean.set_index(mean.index + len(summary))
+    every = pd.concat(rows.values())
+    return plots.ratio_grid(
+        rows,
+        every["way"] + ": " + every["parameter"] + " " + every["value"],
+        columns=len(rows),
         title="Steps, against each way's reference (95 % intervals)",
         width=12.0,
         row_height=9.2,
-        same_rows=True,
+        label="steps, relative to the reference",
     )
-    for name, panel in panels.items():
-        rows = summary[(summary["problem"] == name) & (summary["parameter"] != "")]
-        if name == _TOGETHER:
-            rows = together[(together["reference"] == together["way"])]
-        labels = (rows["way"] + ": " + rows["parameter"] + " " + rows["value"]).tolist()
-        plots.dot_rows(panel, labels, [plots.dots_of("", rows, "steps_ratio")])
-    plots.ratio_axes(panels.values())
-    panels[_TOGETHER].set_title("mean of all five", loc="left")
-    plots.label_grid(figure, panels, "", "")
-    figure.supxlabel("steps, relative to the reference")
-    return figure

@@ -34,11 +34,12 @@ __all__ = [
     "grid_of_panels",
     "label_grid",
     "legend_below",
-    "line_with_intervals",
+    "line_grid",
     "make_legible",
     "mark",
     "milliseconds",
     "ratio_axes",
+    "ratio_grid",
     "save",
     "stacked_panels",
 ]
@@ -146,7 +147,8 @@ def label_grid(figure: Figure, panels: Mapping[str, Axes], x_label: str, y_label
     first = next(iter(panels.values()))
     labels = first.get_legend_handles_labels()[1]
     if any(labels):
-        legend_below(figure, first, len(labels), fontsize=9.0)
+        in_rows = -(-len(labels) // 5)
+        legend_below(figure, first, -(-len(labels) // in_rows), fontsize=9.0)
 
 
 def legend_below(figure: Figure, panel: Axes, columns: int, **looks: Any) -> None:
@@ -155,7 +157,7 @@ def legend_below(figure: Figure, panel: Axes, columns: int, **looks: Any) -> Non
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, **looks)
 
 
-def line_with_intervals(
+def _line(
     panel: Axes, places: Sequence[float], line: Dots, *, number: int, offset: float = 0.0
 ) -> None:
     """Draw values over places, joined, each with its interval.
@@ -175,6 +177,31 @@ def line_with_intervals(
         label=line.label,
     )
     panel.grid(axis="y")
+
+
+def line_grid(
+    lines: Mapping[str, Sequence[tuple[Sequence[float], Dots]]],
+    *,
+    columns: int,
+    title: str,
+    labels: tuple[str, str],
+    width: float = 11.0,
+    row_height: float = 2.5,
+    offset: float = 0.0,
+) -> tuple[Figure, dict[str, Axes]]:
+    """Return a figure with a panel for each name, with lines of values over places.
+
+    ``labels`` are those of the two axes; by ``offset`` each line is further right than the last.
+    """
+    figure, panels = grid_of_panels(
+        list(lines), columns=columns, title=title, width=width, row_height=row_height
+    )
+    for panel, own in zip(panels.values(), lines.values(), strict=True):
+        for number, (places, line) in enumerate(own):
+            shift = offset * (number - 0.5 * (len(own) - 1))
+            _line(panel, places, line, number=number, offset=shift)
+    label_grid(figure, panels, *labels)
+    return figure, panels
 
 
 def dot_rows(
@@ -229,6 +256,36 @@ def ratio_axes(panels: Iterable[Axes]) -> None:
         panel.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         panel.minorticks_off()
         panel.axvline(1.0, color="black", linewidth=0.8)
+
+
+def ratio_grid(
+    rows_of: Mapping[str, pd.DataFrame],
+    labels: pd.Series,
+    *,
+    columns: int,
+    title: str,
+    width: float,
+    row_height: float = 2.5,
+    label: str,
+) -> Figure:
+    """Return a figure with a panel of ratios of steps for each table.
+
+    ``labels`` are those of rows, by the index of the tables.
+    """
+    figure, panels = grid_of_panels(
+        list(rows_of),
+        columns=columns,
+        title=title,
+        width=width,
+        row_height=row_height,
+        same_rows=True,
+    )
+    for panel, rows in zip(panels.values(), rows_of.values(), strict=True):
+        dot_rows(panel, labels[rows.index].tolist(), [dots_of("", rows, "steps_ratio")])
+    ratio_axes(panels.values())
+    label_grid(figure, panels, "", "")
+    figure.supxlabel(label)
+    return figure
 
 
 def milliseconds(panel: Axes, label: str, *, upright: bool = True) -> None:

@@ -7,7 +7,7 @@ import re
 import tempfile
 import time
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -64,7 +64,7 @@ class ResultCache:
             kept = self._decoder.decode(payload)
         except msgspec.DecodeError:
             return None
-        return pd.DataFrame(kept.table) if _plain(kept.task) == _plain(task) else None
+        return pd.DataFrame(kept.table) if task_key(kept.task) == task_key(task) else None
 
     def store(self, task: Task, table: pd.DataFrame) -> None:
         """Keep a task's result."""
@@ -82,36 +82,25 @@ def _checksum(payload: bytes) -> bytes:
     return zlib.crc32(payload).to_bytes(_CHECKSUM_BYTES, "little")
 
 
-def _plain(task: Task) -> bytes:
-    return msgspec.json.encode(task, order="sorted")
-
-
 def _make(directory: Path) -> None:
+    """Make a directory in which something can be kept."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=directory).close()
     except OSError as error:
-        raise OutputError(f"{directory}: cannot be made: {error.strerror}") from error
+        raise OutputError(f"{directory}: cannot be written in: {error.strerror}") from error
 
 
 class Workload:
-    """The tasks of some studies, with the results that are known already.
+    """The tasks of some studies, each once, with the results that are known already.
 
-    Attributes
-    ----------
-    tasks : list of Task
-        Each once, although several studies may have it.
-    pending : list of Task
-        Of these, those that are still to be computed.
-    units, finished_units : int
-        How much work they are, and how much of it is done.
+    ``pending`` are those still to be computed; ``units`` is how much work all are, and
+    ``finished_units`` how much of it is done.
     """
 
     def __init__(self, studies: Sequence[Study], scale: Scale, directory: Path) -> None:
         self._cache = ResultCache(directory / _CACHE)
-        # Only where this program alone writes: the directory itself may have other files.
-        _remove_unfinished((directory / _CACHE).rglob(".*.tmp"))
-        for study in studies:
-            _remove_unfinished((directory / study.name).glob(".*.tmp"))
+        _remove_unfinished(directory / _CACHE)
         tasks = {task_key(task): task for study in studies for task in study.tasks(scale)}
         loaded = {key: self._cache.load(task) for key, task in tasks.items()}
         self._tables = {key: table for key, table in loaded.items() if table is not None}
@@ -121,17 +110,12 @@ class Workload:
         self.units = sum(task.units for task in self.tasks)
         self.finished_units = self.units - sum(task.units for task in self.pending)
         if self.pending:
-            _check_room(directory)
+            _make(directory)
 
     def keep(self, task: Task, table: pd.DataFrame) -> None:
         """Keep the result of a task.
 
-        Raises
-        ------
-        TaskError
-            If its code was edited since this was made: it came of one or the other.
-        OutputError
-            If it cannot be kept.
+        TaskError if its code was edited since this was made: it came of one or the other.
         """
         key = task_key(task)
         if key not in self._keys:
@@ -190,10 +174,7 @@ def write_report(
     """
     _make(directory)
     origin_path = directory / "origin.json"
-    try:
-        origin_path.unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(f"{origin_path}: cannot be replaced: {error.strerror}") from error
+    origin_path.unlink(missing_ok=True)
     machine = describe() if machine is None else machine
     raw = {f"{name}_trials": table for name, table in report.raw.items()}
     files = {f"{name}.csv": to_csv(table).encode() for name, table in (report.tables | raw).items()}
@@ -223,19 +204,10 @@ def write_report(
     return [*names, "origin.json"]
 
 
-def _remove_unfinished(files: Iterable[Path]) -> None:
+def _remove_unfinished(directory: Path) -> None:
     """Remove temporary files of killed writers; a young one may belong to a running writer."""
     latest = time.time() - _LONGEST_WRITE_S
-    for path in files:
+    for path in directory.rglob(".*.tmp"):
         with contextlib.suppress(OSError):
             if re.fullmatch(r"\..+\.\d+\.tmp", path.name) and path.stat().st_mtime < latest:
                 path.unlink()
-
-
-def _check_room(directory: Path) -> None:
-    """Make sure that results can be kept, before there are any."""
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=directory).close()
-    except OSError as error:
-        raise OutputError(f"{directory}: cannot be written in: {error.strerror}") from error

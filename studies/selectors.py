@@ -5,9 +5,6 @@ sensed. So ways are compared trial by trial: by success, by steps (a failure cou
 and by reward. Steps are compared as ratios, so that a tenth fewer counts the same where a task
 takes fifty or five hundred.
 
-Some trials are cut off at the limit. Those of the main ways are continued, to tell the slow from
-the stuck.
-
 The mean over these eight problems says nothing about a ninth. For that, the problems are taken as a
 sample of all problems (a random effect).
 """
@@ -15,12 +12,11 @@ sample of all problems (a random effect).
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import pandas as pd
 
-from holdfast.numerics.arrays import BoolArray, FloatArray
 from holdfast.planning.settings import Estimator, Method, SelectorSettings
 from studies import statistics
 from studies.cases import CASES, Case
@@ -34,21 +30,21 @@ from studies.judged_study import (
     shown_as,
     steps_and_success,
 )
-from studies.statistics import Interval, cells_of, interval_in
+from studies.statistics import cells_of, interval_in
 from studies.study import CHOICE, CLAIM, TRIALS, Number, Report, Scale, drawn
 from studies.tables import Cell
 from studies.trial_batches import TrialSeries, problem_of
 
-__all__ = ["COSTS", "GROUPS", "INTERVALS", "SHOWN", "WAYS", "Selectors"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["GROUPS", "INTERVALS", "SHOWN", "WAYS", "Selectors"]
 
 INTERVALS = (0, 4, 8, 14)
 """Steps between two sensing steps."""
 
-LEVEL = 0.01
-"""Of a family of tests: the probability of claiming any difference where there is none."""
-
 LEVEL_OF_VERDICT = 0.05
-"""Of the tests whether a candidate is beaten: less strict, to the candidate's disadvantage."""
+"""Of the tests whether a candidate is beaten."""
 
 
 def _by(method: Method, estimator: Estimator | None = None) -> SelectorSettings:
@@ -111,15 +107,6 @@ SHOWN = {
 }
 """Ways in the first figures, with their labels there."""
 
-_CONTINUED = tuple(way for way in SHOWN if way != "fixed")
-"""Ways whose trials are continued where they are cut off."""
-
-_CONTINUED_TRIALS = 60
-"""Of these, at each interval: a stuck trial takes twenty times as long as one that is cut off."""
-
-COSTS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
-"""Of a sensing action, in units of reward (the length of the way, in most problems)."""
-
 _CASES: Mapping[str, Case] = {case.name: case for case in CASES}
 
 _EACH_AND_ALL: tuple[tuple[Cell, tuple[int, ...]], ...] = (
@@ -162,14 +149,13 @@ class Selectors(JudgedStudy):
             interval,
             seed=scale.seed_of(purpose),
             num_trials=num_trials,
-            continued_trials=_CONTINUED_TRIALS if purpose == CLAIM and way in _CONTINUED else 0,
         )
 
     def report_of(self, tables: Mapping[str, pd.DataFrame]) -> Report:
         """Return the report on all trials; InvalidValueError if they are not of this study."""
         choosing, cells = self.by_cell(tables[TRIALS]).values()
-        chosen_by, places = _over_intervals(choosing), _over_intervals(cells)
-        summary, costs = _summary(cells), _costs(choosing, cells)
+        places = _over_intervals(cells)
+        summary = _summary(cells)
         rivals = {measure: _rivals(places, measure, _pairs()) for measure in MEASURES}
         relative_steps = _rivals(
             places, "steps_ratio", [(way, BASELINE) for way in WAYS if way != BASELINE]
@@ -182,15 +168,11 @@ class Selectors(JudgedStudy):
                 "rivals": rivals["steps_ratio"],
                 "rivals_in_success": rivals["success_gain"],
                 "over_problems": _over_problems(places),
-                "chosen_ways": _chosen_ways(chosen_by, places),
-                "default_candidates": _default_candidates(chosen_by, cells),
-                "stuck": _stuck(cells),
-                "costs_of_looks": costs,
+                "default_candidates": _default_candidates(_over_intervals(choosing), cells),
             },
             figures={
-                "choice_of_sensing": drawn("selectors_figures:choice_of_sensing", summary),
-                "selectors": drawn("selectors_figures:selectors", relative_steps),
-                "costs_of_looks": drawn("selectors_figures:costs_of_looks", costs),
+                "choice_of_sensing": drawn("selectors:choice_of_sensing", summary),
+                "selectors": drawn("selectors:selectors", relative_steps),
             },
             numbers=_numbers(rivals),
         )
@@ -321,45 +303,14 @@ def _over_problems(places: _Places) -> pd.DataFrame:
     )
 
 
-def _fewest_steps(chosen_by: _Places, place: str, ways: Iterable[str]) -> str:
-    """Return the way with the fewest steps on the trials for choosing."""
-    return min(ways, key=lambda way: float(np.nanmean(chosen_by[place, way][0])))
-
-
-def _chosen_ways(chosen_by: _Places, places: _Places) -> pd.DataFrame:
-    """Return the way that the trials for choosing choose, compared on the others.
-
-    For each problem and group, against the baseline and the default.
-    """
-    rows: list[dict[str, Cell]] = []
-    for place in (*_CASES, *GROUPS):
-        way = _fewest_steps(chosen_by, place, WAYS)
-        for rival in (BASELINE, DEFAULT):
-            when_chosen = compared(chosen_by[place, way], chosen_by[place, rival])
-            rows.append(
-                {
-                    "problem": place,
-                    "chosen": way,
-                    "rival": rival,
-                    "steps_ratio_when_chosen": when_chosen["steps_ratio"],
-                    "trials": places[place, way][0].size,
-                    **compared(places[place, way], places[place, rival]),
-                }
-            )
-    table = pd.DataFrame(rows)
-    statistics.add_adjusted(
-        table, "steps_p_value", "success_p_value", compared=table["chosen"] != table["rival"]
-    )
-    return table
-
-
 def _default_candidates(chosen_by: _Places, cells: _Cells) -> pd.DataFrame:
     """Return the comparisons that decide whether a candidate becomes the default.
 
     It does not if a rival beats it beyond noise, in steps or success, in any row. The p-values of a
     candidate are adjusted for all its comparisons of both measures.
     """
-    chosen = _fewest_steps(chosen_by, next(iter(GROUPS)), _CANDIDATES)
+    everywhere = next(iter(GROUPS))
+    chosen = min(_CANDIDATES, key=lambda way: float(chosen_by[everywhere, way][0].mean()))
     return pd.concat(
         [_candidate(way, cells).assign(chosen=way == chosen) for way in _CANDIDATES],
         ignore_index=True,
@@ -396,102 +347,6 @@ def _candidate(candidate: str, cells: _Cells) -> pd.DataFrame:
     return table
 
 
-def _stuck(cells: _Cells) -> pd.DataFrame:
-    """Return how many trials were cut off, and how many of these never reached the goal."""
-    rows: list[dict[str, Cell]] = []
-    for name, case in _CASES.items():
-        for label, intervals in _EACH_AND_ALL:
-            found = {
-                way: [_continued(cells[name, each, way]) for each in intervals]
-                for way in _CONTINUED
-            }
-            stuck = {
-                way: np.array([table["steps_to_goal"].isna() for table in tables])
-                for way, tables in found.items()
-            }
-            for way, own in stuck.items():
-                cut = np.array([~table["success"].to_numpy(bool) for table in found[way]])
-                if len(intervals) == 1:
-                    beyond, p_value = statistics.paired_rates(own[0], stuck[BASELINE][0])
-                else:
-                    beyond, p_value = statistics.paired_difference(
-                        own.mean(axis=0), stuck[BASELINE].mean(axis=0)
-                    )
-                rows.append(
-                    {
-                        "problem": name,
-                        "sensing_interval": label,
-                        "way": way,
-                        "trials": own.size,
-                        "max_steps": case.max_steps,
-                        "cut_off": int(cut.sum()),
-                        "continued_to": int(found[way][0]["step_limit"].iloc[0]),
-                        "stuck": int(own.sum()),
-                        **cells_of("cut_off_share", _share(cut)),
-                        **cells_of("stuck_share", _share(own)),
-                        **cells_of("stuck_beyond_random", beyond),
-                        "p_value": p_value,
-                    }
-                )
-    table = pd.DataFrame(rows)
-    statistics.add_adjusted(table, "p_value", compared=table["way"] != BASELINE)
-    return table
-
-
-def _share(trials: BoolArray) -> Interval:
-    """Return the share of trials, shape (intervals, worlds), in which something is so.
-
-    The trials of one world are not independent: over several intervals the interval is Student's,
-    of the worlds' shares; and Wilson's where these are all 0 or all 1, which do not scatter.
-    """
-    whole = trials.all() or not trials.any()
-    if trials.shape[0] > 1 and not whole:
-        value, low, high = statistics.mean_interval(trials.mean(axis=0))
-        return Interval(value, max(low, 0.0), min(high, 1.0))
-    return statistics.rate_interval(int(trials[0].sum()), trials.shape[1])
-
-
-def _continued(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the trials that are continued if they are cut off: those with the highest limit."""
-    return table[table["step_limit"] == table["step_limit"].max()]
-
-
-def _costs(choosing: _Cells, cells: _Cells) -> pd.DataFrame:
-    """Return the net reward where sensing has a price, at the interval that is best then.
-
-    The trials for choosing choose the interval.
-    """
-    rows: list[dict[str, Cell]] = []
-    for case in _CASES:
-        for cost in COSTS:
-            nets: dict[str, FloatArray] = {}
-            for way in SHOWN:
-                chosen_by = {each: _net(choosing[case, each, way], cost) for each in INTERVALS}
-                best = max(chosen_by, key=lambda each: float(chosen_by[each].mean()))
-                net = nets[way] = _net(cells[case, best, way], cost)
-                gain, p_value = statistics.paired_difference(net, nets[BASELINE])
-                rows.append(
-                    {
-                        "problem": case,
-                        "way": way,
-                        "cost_of_a_look": cost,
-                        "best_interval": best,
-                        "trials": net.size,
-                        **cells_of("net_reward", statistics.mean_interval(net)),
-                        **cells_of("gain", gain),
-                        "p_value": p_value,
-                    }
-                )
-    table = pd.DataFrame(rows)
-    statistics.add_adjusted(table, "p_value", compared=table["way"] != BASELINE)
-    return table
-
-
-def _net(table: pd.DataFrame, cost: float) -> FloatArray:
-    """Return the reward of each trial less the price of its sensing."""
-    return np.asarray(table["reward"] - cost * table["sensing_decisions"])
-
-
 def _numbers(rivals: Mapping[str, pd.DataFrame]) -> list[Number]:
     """Return how the default compares with random sensing, everywhere."""
     units = {"steps_ratio": (1.0, "times the steps"), "success_gain": (100.0, "points of success")}
@@ -506,3 +361,46 @@ def _numbers(rivals: Mapping[str, pd.DataFrame]) -> list[Number]:
         for row in rivals[measure].to_dict("records")
         if (row["way"], row["rival"]) == (DEFAULT, BASELINE)
     ]
+
+
+def choice_of_sensing(summary: pd.DataFrame) -> Figure:
+    """Draw steps by the interval between two sensing actions."""
+    from studies import plots
+
+    rows = dict(list(summary.groupby(["problem", "way"])))
+    lines = {
+        case: [
+            (INTERVALS, plots.dots_of(label, rows[case, way], "mean_steps"))
+            for way, label in SHOWN.items()
+        ]
+        for case in _CASES
+    }
+    figure, panels = plots.line_grid(
+        lines,
+        columns=4,
+        title="What choosing the sensing action gains (means, 95 % intervals)",
+        labels=(
+            "steps between two sensing actions",
+            "steps (mean; failures count as the limit)",
+        ),
+        offset=0.2,
+    )
+    for panel in panels.values():
+        panel.set_xticks(INTERVALS)
+        panel.set_ylim(0.0, 1.1 * panel.dataLim.y1)
+    return figure
+
+
+def selectors(relative_steps: pd.DataFrame) -> Figure:
+    """Draw the steps of all ways, relative to random sensing."""
+    from studies import plots
+
+    problem = relative_steps["problem"]
+    return plots.ratio_grid(
+        {name: relative_steps[problem == name] for name in (*_CASES, *GROUPS)},
+        relative_steps["way"],
+        columns=5,
+        title="Steps relative to random sensing (geometric mean, 95 % intervals)",
+        width=12.0,
+        label="steps, relative to random",
+    )

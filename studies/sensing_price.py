@@ -15,7 +15,7 @@ the GPS. The resolution says below which distance that is of no use.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import msgspec
 import numpy as np
@@ -35,6 +35,9 @@ from studies.statistics import cells_of, interval_in
 from studies.study import CHOICE, CLAIM, TRIALS, Number, Report, Scale, drawn
 from studies.tables import Cell
 from studies.trial_batches import TrialSeries
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["NATS", "PRICES", "PROBLEMS", "RESOLUTIONS", "WAYS", "SensingPrice"]
 
@@ -176,11 +179,10 @@ class SensingPrice(JudgedStudy):
                 "when_to_sense": when,
                 "when_alone": alone,
                 "weak_sensor": weak,
-                "cells": _all_cells(cells),
             },
             figures={
-                "when_to_sense": drawn("sensing_price_figures:when_to_sense", when),
-                "weak_sensor": drawn("sensing_price_figures:weak_sensor", weak),
+                "when_to_sense": drawn("sensing_price:when_to_sense", when),
+                "weak_sensor": drawn("sensing_price:weak_sensor", weak),
             },
             numbers=[*_numbers_of_when(when), *_numbers_of_weak(weak)],
         )
@@ -303,21 +305,6 @@ def _weak_sensor(cells: _Cells) -> pd.DataFrame:
     return found
 
 
-def _all_cells(cells: _Cells) -> pd.DataFrame:
-    """Return steps and looks of every cell: what each interval and each gain leads to."""
-    return pd.DataFrame(
-        {
-            **cell._asdict(),
-            "trials": len(table),
-            "success": float(table["success"].mean()),
-            "mean_steps": float(table["steps"].mean()),
-            "mean_looks": float(table["sensing_decisions"].mean()),
-            "median_sensing_ms": float(table["median_sensing_ms"].iloc[0]),
-        }
-        for cell, table in cells.items()
-    )
-
-
 def _numbers_of_when(when: pd.DataFrame) -> Sequence[Number]:
     return [
         Number(
@@ -343,3 +330,49 @@ def _numbers_of_weak(weak: pd.DataFrame) -> Sequence[Number]:
         for row in weak.to_dict("records")
         if row["way"] != _RANDOM
     ]
+
+
+def when_to_sense(when: pd.DataFrame) -> Figure:
+    """Draw the steps that each way saves against fixed intervals, at each price."""
+    from studies import plots
+
+    problems = list(dict.fromkeys(when["problem"]))
+    figure, panels = plots.grid_of_panels(
+        problems,
+        columns=len(problems),
+        title="Choosing when to look, against the best fixed interval (means, 95 % intervals)",
+        width=10.0,
+    )
+    ways = [way for way in WAYS if way != FIXED]
+    for number, (problem, panel) in enumerate(panels.items()):
+        rows = when[when["problem"] == problem].set_index(["price", "way"])
+        places = pd.MultiIndex.from_product([PRICES, ways])
+        rows = rows.reindex(places).reset_index(names=["price", "way"])
+        kinds = [
+            plots.dots_of(f"a look costs {price:g}", rows[rows["price"] == price], "saved")
+            for price in PRICES
+        ]
+        plots.dot_rows(panel, ways, kinds, legend=False)
+        if number > 0:
+            panel.set_yticks(range(len(ways)), [""] * len(ways))
+        panel.axvline(0.0, color="black", linewidth=0.8)
+    plots.label_grid(figure, panels, "cost saved in a trial (steps)", "")
+    return figure
+
+
+def weak_sensor(weak: pd.DataFrame) -> Figure:
+    """Draw the boat's success by way and resolution."""
+    from studies import plots
+
+    figure, (panel,) = plots.stacked_panels(
+        [len(weak)],
+        title="A sharp range finder beside a weak GPS: success (95 % intervals)",
+        width=7.0,
+    )
+    labels = [
+        f"{row['way']}, {row['resolution']:g} m" if row["by_resolution"] else str(row["way"])
+        for row in weak.to_dict("records")
+    ]
+    plots.dot_rows(panel, labels, [plots.dots_of("", weak, "success", 100.0)])
+    panel.set_xlabel("trials in which the boat reaches the harbour within 80 steps (%)")
+    return figure

@@ -7,15 +7,12 @@ approximate the same posteriors; only their size differs.
 
 Numbers of threads are timed in turns, so that other load on the machine meets all of them. The time
 that a thread waited for a core is subtracted; the system counts it. A second thread that comes late
-cannot be corrected for, so the gain of threads is read from the fastest repetitions, and the load
-of other processes is recorded.
+cannot be corrected for, so the gain of threads is read from the fastest repetitions.
 """
 
 from __future__ import annotations
 
 import gc
-import math
-import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -34,7 +31,6 @@ from holdfast.planning.settings import (
     PlanningSettings,
     SelectorSettings,
 )
-from holdfast.problems import checked
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import SimulatedEnvironment
 from studies.cost_model import parallel_share
@@ -53,51 +49,27 @@ beliefs are independent."""
 
 _SCHEDULING = Path("/proc/thread-self/schedstat")
 
-_STEEPER_BY = 0.2
-"""A larger number of particles may cost this much more, as an exponent, than the last ones did."""
-
-_FIRST_EXPONENT = 1.0
-
 _FEWER = 2.0 / 3.0
 """Of the beliefs, where there is no time for all: of nine six are left, enough for an interval."""
 
 
 class Measurement(msgspec.Struct, frozen=True, kw_only=True):
-    """What is timed: decisions of one kind, over numbers of particles.
-
-    Attributes
-    ----------
-    num_sensing_actions : int
-        J: the first so many of the problem's sensing actions.
-    num_observation_samples, horizon : int
-        M and H.
-    particles : tuple of int
-        Rising. It ends earlier if a number would take too long.
-    threads : tuple of int
-        Numbers of threads, 1 and at least one more.
-    num_trials : int
-        From each comes one belief.
-    repeat_s : float
-        Decisions of one number of particles are repeated for about this long.
-    least_repetitions : int
-        Of each decision, however long it takes.
-    limit_s : float
-        If so many take longer than this, fewer beliefs are taken; if that does not help, the number
-        of particles is left out, and all above it.
-    """
+    """What is timed: decisions of one kind, over numbers of particles."""
 
     problem: str
-    num_sensing_actions: int
+    num_sensing_actions: int  # J: the first so many of the problem's
     estimator: str = "nearest_neighbor"
-    num_observation_samples: int = 10
+    num_observation_samples: int = 10  # M
     horizon: int = 1
-    particles: tuple[int, ...] = (100, 300, 1000)
-    threads: tuple[int, ...] = (1, 2)
-    num_trials: int = 9
+    particles: tuple[int, ...] = (100, 300, 1000)  # rising
+    threads: tuple[int, ...] = (1, 2)  # 1 and at least one more
+    num_trials: int = 9  # from each comes one belief
     seed: int = 0
-    repeat_s: float = 0.5
-    least_repetitions: int = 3
+    repeat_s: float = 0.5  # for about so long decisions of one number of particles are repeated
+    least_repetitions: int = 3  # of each decision, however long it takes
     limit_s: float = 8.0
+    """If these take longer, fewer beliefs are taken; if that does not help, this number of
+    particles is left out, and all above it."""
 
 
 class Sensed(NamedTuple):
@@ -118,9 +90,7 @@ def measure_sensing(**measurement: Any) -> pd.DataFrame:
         A row for each belief and number of threads. ``median_ms`` and ``fastest_ms`` are those of
         so many ``repetitions``, less what they waited for cores that others had. ``share`` is the
         part that is divided among threads, of the fastest ones: whatever else the machine does
-        delays several threads sooner than one. ``mapping_ms`` is what the policy and the predicted
-        observations of all particles take, which one thread does, and ``others_cores`` how many
-        cores other processes kept busy meanwhile.
+        delays several threads sooner than one.
     """
     wanted = msgspec.convert(measurement, Measurement)
     problem = problem_of(wanted.problem)
@@ -129,26 +99,24 @@ def measure_sensing(**measurement: Any) -> pd.DataFrame:
         history_of(problem, _settings(wanted, _HISTORY_PARTICLES, 0), wanted.seed, trial)
         for trial in range(wanted.num_trials)
     ]
-    tables = []
-    taken: list[tuple[int, float]] = []
-    for particles in wanted.particles:
-        # Of fewer beliefs, if need be.
-        expected_s = _FEWER * wanted.least_repetitions * _expected_s(taken, particles)
-        if expected_s > wanted.limit_s:
+    tables: list[pd.DataFrame] = []
+    fewest_s = 0.0
+    for last, particles in zip((1, *wanted.particles), wanted.particles, strict=False):
+        # A decision takes at least as much longer as there are more particles.
+        if wanted.least_repetitions * fewest_s * particles / last > wanted.limit_s:
             break
         deciding = _Deciding(problem, wanted, particles)
         states = [
             state_in(problem, deciding.settings[1], wanted.seed, trial, history)
             for trial, history in enumerate(histories)
         ]
-        load = _Load()
         states = deciding.few_enough(states)
         if not states:
             break
         timed, round_s = deciding.timed(states)
-        tables.append(timed.assign(particles=particles, others_cores=load.of_others()))
-        taken.append((particles, round_s))
-    if not taken:
+        tables.append(timed.assign(particles=particles))
+        fewest_s = _FEWER * round_s
+    if not tables:
         raise InvalidValueError(
             f"particles {wanted.particles[0]}: a round of decisions takes longer than limit_s "
             f"{wanted.limit_s:g}"
@@ -218,18 +186,6 @@ def _settings(wanted: Measurement, particles: int, threads: int) -> PlanningSett
     )
 
 
-def _expected_s(taken: Sequence[tuple[int, float]], particles: int) -> float:
-    """Return about how long a round will take, from those before; 0 if there were none."""
-    if not taken:
-        return 0.0
-    last, seconds = taken[-1]
-    exponent = _FIRST_EXPONENT
-    if len(taken) > 1:
-        before, earlier = taken[-2]
-        exponent = max(1.0, np.log(seconds / earlier) / np.log(last / before)) + _STEEPER_BY
-    return float(seconds * (particles / last) ** exponent)
-
-
 class _Deciding:
     """Decisions with one number of particles, on each number of threads."""
 
@@ -279,19 +235,12 @@ class _Deciding:
                 "median_ms": 1e3 * float(np.median(seconds)),
                 "fastest_ms": 1e3 * min(seconds),
                 "repetitions": repetitions,
+                "share": parallel_share({each: min(found) for each, found in times.items()}),
             }
             for belief, (state, times) in enumerate(zip(states, taken, strict=True))
             for threads, seconds in times.items()
         ]
-        of_beliefs = [
-            {
-                "belief": belief,
-                "share": parallel_share({each: min(seconds) for each, seconds in times.items()}),
-                "mapping_ms": 1e3 * _mapping_s(self._problem, state),
-            }
-            for belief, (state, times) in enumerate(zip(states, taken, strict=True))
-        ]
-        return pd.DataFrame(rows).merge(pd.DataFrame(of_beliefs), on="belief"), round_s
+        return pd.DataFrame(rows), round_s
 
     def _decision_s(self, threads: int, state: PlanningState) -> float:
         """Return what a decision takes, less what its thread waited for a core others had."""
@@ -308,43 +257,3 @@ def _delayed_ns() -> int:
         return int(_SCHEDULING.read_bytes().split()[1])
     except (OSError, IndexError, ValueError):
         return 0
-
-
-def _mapping_s(problem: Problem, state: PlanningState) -> float:
-    """Return what mapping all particles to actions and to expected observations takes."""
-    states = state.belief.states
-    seconds = []
-    for _ in range(3):
-        start = time.perf_counter()
-        checked.policy(problem, states, state.stage)
-        for sensing_action in range(len(problem.sensing_actions)):
-            checked.prediction(problem, states, sensing_action)
-        seconds.append(time.perf_counter() - start)
-    return float(np.median(seconds))
-
-
-class _Load:
-    """How busy other processes keep this machine, from now on (Linux)."""
-
-    _STATISTICS = Path("/proc/stat")
-
-    def __init__(self) -> None:
-        self._began = self._now()
-
-    def of_others(self) -> float:
-        """Return how many cores they kept busy on average; NaN if it cannot be known."""
-        began, now = self._began, self._now()
-        if began is None or now is None or now[0] <= began[0]:
-            return math.nan
-        return max(0.0, (now[1] - began[1]) / (now[0] - began[0]))
-
-    def _now(self) -> tuple[float, float] | None:
-        try:
-            fields = self._STATISTICS.read_text().split("\n", 1)[0].split()[1:]
-        except OSError:
-            return None
-        user, nice, system, _, _, interrupts, soft_interrupts, stolen = map(int, fields[:8])
-        ticks = user + nice + system + interrupts + soft_interrupts + stolen
-        own = os.times()
-        busy = ticks / os.sysconf("SC_CLK_TCK") - own.user - own.system
-        return time.monotonic(), busy

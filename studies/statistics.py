@@ -55,7 +55,6 @@ __all__ = [
 _LEVEL = 0.95
 _LARGEST_EXPONENT = 700.0
 _RESAMPLES = 1000
-_LARGEST_ARRAY = 2_000_000
 _FEWEST_CLUSTERS = 10
 """With fewer there are too few distinct resamples, and the interval is too short."""
 
@@ -116,24 +115,10 @@ def log_steps(steps: FloatArray) -> FloatArray:
 def paired_difference(first: FloatArray, second: FloatArray) -> tuple[Interval, float]:
     """Return the mean of ``first - second`` over the same trials, and how likely it is by chance.
 
-    Parameters
-    ----------
-    first, second : array of shape (trials,)
-        NaN in both for a trial that is left out.
-
-    Returns
-    -------
-    Interval
-        NaN if no trial is left.
-    p_value : float
-        Of Student's paired test, two-sided; 1 if all differences are zero, NaN for a single pair
-        or none. If all are equal otherwise, they say nothing about how they scatter: that of the
-        sign test.
-
-    Raises
-    ------
-    InvalidValueError
-        If they are not as many, or one of a pair alone is NaN.
+    NaN in both of a pair leaves a trial out; in one alone, or for other numbers of trials, it is an
+    InvalidValueError. The p-value is that of Student's paired test, two-sided; 1 if all differences
+    are zero, NaN for a single pair or none. If all are equal otherwise, they say nothing about how
+    they scatter: that of the sign test.
     """
     from scipy import stats
 
@@ -225,24 +210,16 @@ def ratio_of(difference: Interval) -> Interval:
 
 
 class RandomEffects(NamedTuple):
-    """What an effect is over problems of which those that were tried are a sample.
-
-    Attributes
-    ----------
-    mean : Interval
-        Mean of the effects over all such problems.
-    p_value : float
-        That this mean is zero.
-    deviation : float
-        Standard deviation of the effects between problems.
-    new_problem : Interval
-        The mean with the interval in which the effect of one more problem lies.
-    """
+    """What an effect is over problems of which those that were tried are a sample."""
 
     mean: Interval
+    """Of the effects over all such problems."""
     p_value: float
+    """That this mean is zero."""
     deviation: float
+    """Standard deviation of the effects between problems."""
     new_problem: Interval
+    """The mean with the interval in which the effect of one more problem lies."""
 
 
 def random_effects(effects: FloatArray, errors: FloatArray) -> RandomEffects:
@@ -263,12 +240,8 @@ def random_effects(effects: FloatArray, errors: FloatArray) -> RandomEffects:
 
     statsmodels' ``combine_effects`` gives the same where it converges, but takes the variance for
     zero where its iteration overshoots, as it does for 5 of the 110 comparisons of ``selectors``.
-    So the equation is solved here, by bracketing.
-
-    Parameters
-    ----------
-    effects, errors : array of shape (problems,)
-        At least three effects with their standard errors, above zero; else InvalidValueError.
+    So the equation is solved here, by bracketing. InvalidValueError for fewer than three effects,
+    or standard errors that are not above zero.
     """
     from scipy import optimize, stats
 
@@ -302,17 +275,12 @@ def random_effects(effects: FloatArray, errors: FloatArray) -> RandomEffects:
 def across_problems(
     pairs: Sequence[tuple[FloatArray, FloatArray]], least_difference: float
 ) -> RandomEffects:
-    """Return how two ways differ over problems, from their trials in some of them.
+    """Return how two ways differ over problems, from a number of each trial in some of them.
 
-    Parameters
-    ----------
-    pairs : sequence of (array, array)
-        Of each problem: a number of each trial, of one way and of the other; NaN in both for a
-        trial that is left out.
-    least_difference : float
-        By which two trials can differ. Where no trial differs, the error is that of Agresti and
-        Min's estimate ("Simple improved confidence intervals for comparing matched proportions",
-        2005), which adds half a pair that differs in either direction; no error is below that.
+    NaN in both of a pair leaves a trial out. ``least_difference`` is that by which two trials can
+    differ. Where no trial differs, the error is that of Agresti and Min's estimate ("Simple
+    improved confidence intervals for comparing matched proportions", 2005), which adds half a pair
+    that differs in either direction; no error is below that.
     """
     differences = [(first - second)[~np.isnan(first)] for first, second in pairs]
     errors = [
@@ -353,14 +321,9 @@ def holm(p_values: npt.ArrayLike) -> FloatArray:
 
 
 def add_adjusted(table: pd.DataFrame, *columns: str, compared: Any = None) -> None:
-    """Add Holm-adjusted p-values to a table.
+    """Add Holm-adjusted p-values to a table; ``steps_p_value`` gives ``steps_adjusted_p_value``.
 
-    Parameters
-    ----------
-    *columns : str
-        Columns of p-values; ``steps_p_value`` gives ``steps_adjusted_p_value``.
-    compared : array of bool of shape (rows,), optional
-        Which rows are comparisons; the others get 1. Default: all.
+    ``compared`` says which rows are comparisons (default: all); the others get 1.
     """
     rows = np.ones(len(table), dtype=np.bool_) if compared is None else np.asarray(compared)
     for column in columns:
@@ -392,52 +355,19 @@ def median_interval(values: npt.ArrayLike) -> Interval:
 def clustered_median_interval(values: FloatArray, clusters: FloatArray) -> Interval:
     """Return the median of values in clusters, with the percentile interval of the bootstrap.
 
-    The decisions of one run are not independent, so whole runs are resampled. SciPy draws the
-    clusters, from a fixed seed; it has no cluster bootstrap, so the median of a resample is
-    computed here, from how often each value occurs in it.
-
-    Parameters
-    ----------
-    values : array of shape (n,)
-        NaN is left out.
-    clusters : array of shape (n,)
-        Equal for values of the same cluster.
-
-    Returns
-    -------
-    Interval
-        NaN without values; without bounds for fewer than ten clusters.
+    The decisions of one run are not independent, so whole runs are resampled, from a fixed seed.
+    Values and clusters of shape (n,); NaN is left out. NaN without values; without bounds for fewer
+    than ten clusters.
     """
-    from scipy import stats
-
     known = ~np.isnan(values)
     values, clusters = values[known], clusters[known]
-    if values.size == 0:
-        return exactly(math.nan)
-    middle = float(np.median(values))
-    names, numbers = np.unique(clusters, return_inverse=True)
-    if names.size < _FEWEST_CLUSTERS:
+    groups = [values[clusters == name] for name in np.unique(clusters)]
+    middle = float(np.median(values)) if values.size else math.nan
+    if not groups:
+        return exactly(middle)
+    if len(groups) < _FEWEST_CLUSTERS:
         return Interval(middle, -math.inf, math.inf)
-    order = np.argsort(values, kind="stable")
-    ordered, numbers = values[order], numbers[order]
-
-    def medians(drawn: npt.NDArray[np.int64], axis: int) -> FloatArray:
-        del axis  # the last one
-        rows = np.atleast_2d(drawn)
-        times = np.zeros((rows.shape[0], names.size), dtype=np.int64)
-        np.add.at(times, (np.arange(rows.shape[0])[:, np.newaxis], rows), 1)
-        reached = np.cumsum(times[:, numbers], axis=1)
-        found = ordered[np.argmax(2 * reached >= reached[:, -1:], axis=1)]
-        return np.asarray(found.reshape(drawn.shape[:-1]))
-
-    found = stats.bootstrap(
-        (np.arange(names.size),),
-        medians,
-        n_resamples=_RESAMPLES,
-        batch=max(1, _LARGEST_ARRAY // values.size),
-        vectorized=True,
-        confidence_level=_LEVEL,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    ).confidence_interval
-    return Interval(middle, float(found.low), float(found.high))
+    drawn = np.random.default_rng(0).integers(len(groups), size=(_RESAMPLES, len(groups)))
+    medians = [np.median(np.concatenate([groups[each] for each in row])) for row in drawn]
+    low, high = np.percentile(medians, [50.0 * (1.0 - _LEVEL), 50.0 * (1.0 + _LEVEL)])
+    return Interval(middle, float(low), float(high))

@@ -42,18 +42,12 @@ TRIALS = "trials"
 
 
 class Scale(msgspec.Struct, frozen=True, kw_only=True):
-    """How much of a study is run.
-
-    Attributes
-    ----------
-    quick : bool
-        Few trials, to see that everything works; the results are no evidence.
-    seed : int
-        Of all trials, or of those by which something is chosen.
-    """
+    """How much of a study is run."""
 
     quick: bool = False
+    """Few trials, to see that everything works; the results are no evidence."""
     seed: int = 0
+    """Of all trials, or of those by which something is chosen."""
 
     @property
     def claim_seed(self) -> int:
@@ -66,13 +60,7 @@ class Scale(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Part(NamedTuple):
-    """Tasks whose rows belong together, and the columns that tell them from others.
-
-    Attributes
-    ----------
-    table : str
-        Which table they are part of.
-    """
+    """Tasks whose rows belong together in a table, and the columns that tell them from others."""
 
     names: Mapping[str, Cell]
     tasks: Iterable[Task]
@@ -95,27 +83,18 @@ class Number(NamedTuple):
 
 
 class Report(msgspec.Struct, kw_only=True):
-    """The result of a study.
-
-    Attributes
-    ----------
-    summary : dict of str to DataFrame
-        Small tables by name, to be committed and shown.
-    raw : dict of str to DataFrame
-        Every row that was computed, by table; not to be committed.
-    trials : DataFrame, optional
-        Every trial, from which all else can be made again; small enough to be committed.
-    figures : dict of str to callable
-        Draw them; called only where matplotlib is installed.
-    numbers : list of Number
-        The main results, as the command prints them.
-    """
+    """The result of a study."""
 
     summary: dict[str, pd.DataFrame] = msgspec.field(default_factory=dict)
+    """Small tables by name, to be committed and shown."""
     raw: dict[str, pd.DataFrame] = msgspec.field(default_factory=dict)
+    """Every row that was computed, by table; not to be committed."""
     trials: pd.DataFrame | None = None
+    """Every trial, from which all else can be made again; small enough to be committed."""
     figures: Mapping[str, Callable[[], Figure]] = msgspec.field(default_factory=dict)
+    """Draw them."""
     numbers: list[Number] = msgspec.field(default_factory=list)
+    """The main results, as the command prints them."""
 
     @property
     def tables(self) -> dict[str, pd.DataFrame]:

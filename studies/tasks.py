@@ -14,7 +14,7 @@ import importlib.util
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -32,15 +32,13 @@ __all__ = ["Task", "code_of", "run_task", "task_key"]
 _FUNCTIONS: Mapping[str, str] = {
     "trials": "studies.trial_batches:run_trials_of",
     "cloud_trials": "studies.cloud_trials:run_cloud_trials",
-    "estimates": "studies.estimate_candidates:run_estimates",
     "emulation_2017": "studies.emulation_2017:run_emulation",
     "vdp_tag": "studies.published_worlds:run_vdp_tag",
-    "exchange_times": "studies.exchange_times:measure_exchange",
     "sensing_times": "studies.sensing_times:measure_sensing",
 }
 """Where the function of each kind of task is; imported when it is needed."""
 
-_OF_PROCESSES = frozenset({"exchange_times", "cloud_trials"})
+_OF_PROCESSES = frozenset({"cloud_trials"})
 """Kinds that start processes of the whole program, whose sources no import leads to."""
 
 _PLACE = re.compile(r"\w+(\.\w+)+:\w+")
@@ -56,21 +54,14 @@ _OF_THE_DAY = ("date", "holdfast")
 
 
 class Task(msgspec.Struct, frozen=True, kw_only=True):
-    """A piece of work: a kind of function, and its arguments as JSON has them.
-
-    Attributes
-    ----------
-    units : int
-        How much work it is, in trials: for progress and for the time left.
-    exclusive : bool
-        Whether it measures times, so that nothing else may run meanwhile; it is computed on this
-        machine, after all others.
-    """
+    """A piece of work: a kind of function, and its arguments as JSON has them."""
 
     kind: str
     parameters: dict[str, Any]
     units: int = 1
+    """How much work it is, in trials: for progress and for the time left."""
     exclusive: bool = False
+    """Whether it measures times: it is computed on this machine, alone, after all others."""
 
 
 def task_key(task: Task) -> str:
@@ -100,22 +91,15 @@ def code_of(task: Task) -> str:
     return hashlib.blake2b("".join(digests).encode(), digest_size=_KEY_SIZE).hexdigest()
 
 
-class _Hashed(NamedTuple):
-    """A digest, and the times and sizes of the files that it covers."""
-
-    digest: str
-    files: tuple[Path, ...]
-    stats: tuple[tuple[int, int], ...]
-
-
-_HASHED: dict[tuple[str, bool], _Hashed] = {}
+_HASHED: dict[tuple[str, bool], tuple[str, list[Path], list[tuple[int, int]]]] = {}
+"""Digests, with the files that they cover and their times and sizes, which an edit changes."""
 
 
 def _digest_behind(place: str, whole_program: bool = False) -> str:
-    known = _HASHED.get((place, whole_program))
     try:
-        if known is not None and known.stats == _stats_of(known.files):
-            return known.digest
+        known, files, stats = _HASHED.get((place, whole_program), ("", [], []))
+        if known and stats == _stats_of(files):
+            return known
         sources = _sources_behind(place.partition(":")[0])
         if whole_program:
             for folder in map(_folder, _PROGRAM):
@@ -123,15 +107,15 @@ def _digest_behind(place: str, whole_program: bool = False) -> str:
                     sources[str(path.relative_to(folder.parent))] = path
         if _kernel.__file__:
             sources["kernel"] = Path(_kernel.__file__)
-        stats = _stats_of(sources.values())
+        files = list(sources.values())
+        stats = _stats_of(files)
         digest = hashlib.blake2b(holdfast.__version__.encode(), digest_size=_KEY_SIZE)
         for name, path in sorted(sources.items()):
             digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
     except OSError as error:
         raise TaskError(f"{error.filename}: cannot be read: {error.strerror}") from error
-    found = _Hashed(digest.hexdigest(), tuple(sources.values()), stats)
-    _HASHED[place, whole_program] = found
-    return found.digest
+    _HASHED[place, whole_program] = digest.hexdigest(), files, stats
+    return digest.hexdigest()
 
 
 @functools.cache
@@ -143,9 +127,8 @@ def _folder(package: str) -> Path:
     return Path(spec.origin).parent
 
 
-def _stats_of(files: Iterable[Path]) -> tuple[tuple[int, int], ...]:
-    """Return the time and size of each file, which change when it is edited."""
-    return tuple((stat.st_mtime_ns, stat.st_size) for stat in (path.stat() for path in files))
+def _stats_of(files: Iterable[Path]) -> list[tuple[int, int]]:
+    return [(stat.st_mtime_ns, stat.st_size) for stat in (path.stat() for path in files)]
 
 
 def run_task(task: Task) -> pd.DataFrame:

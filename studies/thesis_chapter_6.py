@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -141,19 +140,16 @@ class ThesisChapter6(Study):
     def report_of(self, tables: Mapping[str, pd.DataFrame]) -> Report:
         """Return the report on the rows of all parts."""
         picture, known = tables["cloud_dies"], measured(tables["cloud"])
-        successes = _successes(tables["in_process"])
+        decisions, faults = _decisions(known), _faults(known)
         return Report(
             summary={
-                "decisions": _decisions(known),
-                "faults": _faults(known),
-                "successes": successes,
+                "decisions": decisions,
+                "faults": faults,
+                "successes": _successes(tables["in_process"]),
             },
             figures={
-                "fig09_10_11_sensing_time": drawn("thesis_figures:sensing_times", known),
-                "fig12_round_trip": drawn("thesis_figures:round_trips", known),
-                "fig13_successes": drawn("thesis_figures:successes", successes),
-                "fig14_launch": drawn("thesis_figures:launches", known),
-                "fig15_failback": drawn("thesis_figures:failbacks", known),
+                "times": drawn("thesis_figures:times", decisions),
+                "recovery": drawn("thesis_figures:recovery", faults),
                 "cloud_dies": drawn("thesis_picture:cloud_dies", picture),
             },
             numbers=_numbers(known, picture),
@@ -210,54 +206,44 @@ def _task_of(trials: CloudTrials) -> Task:
 
 def _decisions(rows: pd.DataFrame) -> pd.DataFrame:
     """Return a row for each path, number of particles and service that decided."""
-    cells: list[dict[str, Cell]] = []
     groups = rows.groupby(["path", "particles", "service"], observed=True)
-    for (_, particles, service), here in groups:
-        sensing = select(here, what="sensing")
-        if sensing.empty:
-            continue
-        cells.append(
-            {
-                **_names(here),
-                "particles": particles,
-                "service": service,
-                "runs": here["whole_run"].nunique(),
-                "sensing_decisions": len(sensing),
-                **cells_of("computed_ms", clustered_median(sensing, "computed_ms")),
-                **cells_of("answered_ms", clustered_median(sensing, "round_trip_ms")),
-                **cells_of("round_trip_ms", clustered_median(here, "trip_ms")),
-                "round_trip_p95_ms": _p95(here["trip_ms"]),
-                **cells_of("waited_ms", clustered_median(sensing, "waited_ms")),
-            }
-        )
-    return pd.DataFrame(cells)
+    return pd.DataFrame(
+        {
+            **_names(here),
+            "particles": particles,
+            "service": service,
+            "runs": here["whole_run"].nunique(),
+            "sensing_decisions": len(sensing),
+            **cells_of("computed_ms", clustered_median(sensing, "computed_ms")),
+            **cells_of("answered_ms", clustered_median(sensing, "round_trip_ms")),
+            **cells_of("round_trip_ms", clustered_median(here, "trip_ms")),
+            "round_trip_p95_ms": _p95(here["trip_ms"]),
+            **cells_of("waited_ms", clustered_median(sensing, "waited_ms")),
+        }
+        for (_, particles, service), here in groups
+        if len(sensing := select(here, what="sensing"))
+    )
 
 
 def _faults(rows: pd.DataFrame) -> pd.DataFrame:
     """Return a row for each path and number of particles."""
-    cells: list[dict[str, Cell]] = []
-    for (_, particles), here in rows.groupby(["path", "particles"], observed=True):
-        kills = select(here, what="kill")
-        if kills.empty:
-            continue
-        cold = kills[kills["launch_ms"].notna()]
-        runs = here["whole_run"].nunique()
-        cells.append(
-            {
-                **_names(here),
-                "particles": particles,
-                "runs": runs,
-                "runs_as_their_references": runs - _diverged(here),
-                "kills": len(kills),
-                **cells_of("found_ms", median_interval(kills["found_ms"])),
-                "launches": len(cold),
-                **cells_of("launch_ms", median_interval(cold["launch_ms"])),
-                **cells_of("first_local_ms", median_interval(cold["first_local_ms"])),
-                **cells_of("failback_ms", median_interval(kills["failback_ms"])),
-                **cells_of("longest_wait_ms", median_interval(kills["waited_ms"])),
-            }
-        )
-    return pd.DataFrame(cells)
+    return pd.DataFrame(
+        {
+            **_names(here),
+            "particles": particles,
+            "runs": (runs := here["whole_run"].nunique()),
+            "runs_as_their_references": runs - _diverged(here),
+            "kills": len(kills),
+            **cells_of("found_ms", median_interval(kills["found_ms"])),
+            "launches": len(cold := kills[kills["launch_ms"].notna()]),
+            **cells_of("launch_ms", median_interval(cold["launch_ms"])),
+            **cells_of("first_local_ms", median_interval(cold["first_local_ms"])),
+            **cells_of("failback_ms", median_interval(kills["failback_ms"])),
+            **cells_of("longest_wait_ms", median_interval(kills["waited_ms"])),
+        }
+        for (_, particles), here in rows.groupby(["path", "particles"], observed=True)
+        if len(kills := select(here, what="kill"))
+    )
 
 
 def _diverged(rows: pd.DataFrame) -> int:
@@ -276,123 +262,112 @@ def _p95(values: pd.Series) -> float | None:
 
 
 def _successes(trials: pd.DataFrame) -> pd.DataFrame:
-    cells: list[dict[str, Cell]] = []
-    for count in PARTICLES:
-        here = trials["success"][trials["particles"] == count]
-        for part in (here[:THESIS_TRIALS], here):
-            found = int(part.sum())
-            cells.append(
-                {
-                    "particles": count,
-                    "trials": int(part.size),
-                    "successes": found,
-                    **cells_of("success", rate_interval(found, part.size)),
-                    "success_thesis": THESIS_SUCCESS_ABOVE_300 if count > 300 else THESIS_SUCCESS,
-                }
-            )
-    return pd.DataFrame(cells)
+    return pd.DataFrame(
+        {
+            "particles": count,
+            "trials": part.size,
+            "successes": (found := int(part.sum())),
+            **cells_of("success", rate_interval(found, part.size)),
+            "success_thesis": THESIS_SUCCESS_ABOVE_300 if count > 300 else THESIS_SUCCESS,
+        }
+        for count in PARTICLES
+        for part in (
+            trials["success"][trials["particles"] == count][:THESIS_TRIALS],
+            trials["success"][trials["particles"] == count],
+        )
+    )
 
 
 def _numbers(rows: pd.DataFrame, picture: pd.DataFrame) -> list[Number]:
     """Return what is pooled over the numbers of particles; the picture's run counts as well."""
     runs = rows["whole_run"].nunique() + 1
     same = runs - _diverged(rows) - int(not picture["identical"].all())
+    identical = rate_interval(same, runs, 100)
     kills, sensing = (
         len(select(rows, what=what)) + len(select(picture, what=what))
         for what in ("kill", "sensing")
     )
+    loads = rows.drop_duplicates("whole_run")["load"]
+    load = Interval(loads.median(), loads.min(), loads.max())
     return [
-        Number(
-            "disturbed runs identical to their reference runs",
-            rate_interval(same, runs, 100),
-            "%",
-            runs,
-        ),
+        Number("disturbed runs identical to their reference runs", identical, "%", runs),
         Number("kills of the cloud service", exactly(kills)),
         Number("sensing decisions", exactly(sensing)),
         *_numbers_of_times(rows),
         *_numbers_of_faults(rows),
         *_numbers_of_loss(rows),
-        *_numbers_of_load(rows),
+        # How busy the machine was when runs began.
+        Number("processes that wanted a core (median, least and most)", load, "", len(loads)),
+        Number("rate of the slowest robot", exactly(float(rows["rate_hz"].min())), "Hz"),
     ]
 
 
 def _numbers_of_times(rows: pd.DataFrame) -> Iterator[Number]:
     """Yield medians of what was asked, by service."""
-
-    def median(name: str, column: str, **cells: Any) -> Iterator[Number]:
-        here = select(rows, **cells)
-        if len(here):
+    trip, clean = "round trip without computation", _clean_paths(rows)
+    far = f"cloud, {FAR.label}"
+    wanted: list[tuple[str, str, dict[str, object]]] = [
+        (
+            f"computing a sensing action, {service}, {count} particles",
+            "computed_ms",
+            {"what": "sensing", "service": service, "particles": count},
+        )
+        for service in ("cloud", "local")
+        for count in (PARTICLES[0], PARTICLES[-1])
+    ]
+    wanted.append((f"{trip}, local", "trip_ms", {"what": "task", "service": "local"}))
+    wanted += [
+        (f"{trip}, cloud, {each.label}", "trip_ms",
+         {"what": "task", "service": "cloud", "path": each}) for each in clean
+    ]  # fmt: skip
+    wanted += [
+        (f"waiting for {asked}, {place}", "waited_ms", {"what": what, **cells})
+        for place, cells in (
+            (far, {"service": "cloud", "path": FAR}),
+            ("local", {"service": "local"}),
+        )
+        for what, asked in (("sensing", "a sensing action"), ("task", "task actions"))
+    ]
+    for name, column, cells in wanted:
+        if len(here := select(rows, **cells)):
             yield Number(name, clustered_median(here, column), "ms", len(here))
-
-    for service in ("cloud", "local"):
-        for count in (PARTICLES[0], PARTICLES[-1]):
-            name = f"computing a sensing action, {service}, {count} particles"
-            yield from median(name, "computed_ms", what="sensing", service=service, particles=count)
-    name = "round trip without computation"
-    yield from median(f"{name}, local", "trip_ms", what="task", service="local")
-    for path in _clean_paths(rows):
-        where = f"cloud, {path.label}"
-        yield from median(f"{name}, {where}", "trip_ms", what="task", service="cloud", path=path)
-    places: dict[str, dict[str, object]] = {
-        f"cloud, {FAR.label}": {"service": "cloud", "path": FAR},
-        "local": {"service": "local"},
-    }
-    for place, cells in places.items():
-        for what, asked in (("sensing", "a sensing action"), ("task", "task actions")):
-            yield from median(f"waiting for {asked}, {place}", "waited_ms", what=what, **cells)
 
 
 def _clean_paths(rows: pd.DataFrame) -> list[NetworkPath]:
     return [path for path in paths_of(rows) if path.loss == 0.0]
 
 
-def _numbers_of_faults(rows: pd.DataFrame) -> list[Number]:
-    """Return the times from kill to local recovery and back, and how many beat the thesis's."""
+def _numbers_of_faults(rows: pd.DataFrame) -> Iterator[Number]:
+    """Yield the times from kill to local recovery and back, and how many beat the thesis's."""
     kills = select(rows, what="kill")
     clean = {path.label: select(kills, path=path) for path in _clean_paths(rows)}
-    numbers = [
-        Number(
-            f"from the kill until the robot detects it, {label}",
-            median_interval(here["found_ms"]),
-            "ms",
-            len(here),
-        )
-        for label, here in clean.items()
-        if len(here)
-    ]
-    numbers += _times_and_share(
-        "from detection to the first decision of a launched local service",
-        kills.loc[kills["launch_ms"].notna(), "first_local_ms"],
-        THESIS_LAUNCH_MS,
-    )
     for label, here in clean.items():
-        numbers += _times_and_share(
-            f"from the ready line of the restarted cloud to its first decision, {label}",
-            here["failback_ms"],
-            THESIS_FAILBACK_MS,
-        )
-    return numbers
+        if len(here):
+            found = median_interval(here["found_ms"])
+            name = f"from the kill until the robot detects it, {label}"
+            yield Number(name, found, "ms", len(here))
+    cold = kills.loc[kills["launch_ms"].notna(), "first_local_ms"]
+    name = "from detection to the first decision of a launched local service"
+    yield from _times_and_share(name, cold, THESIS_LAUNCH_MS)
+    for label, here in clean.items():
+        name = f"from the ready line of the restarted cloud to its first decision, {label}"
+        yield from _times_and_share(name, here["failback_ms"], THESIS_FAILBACK_MS)
 
 
-def _times_and_share(name: str, times: pd.Series, limit_ms: float) -> list[Number]:
-    """Return the median of times, and the share below a limit; NaN, of a run that ended, is not."""
+def _times_and_share(name: str, times: pd.Series, limit_ms: float) -> Iterator[Number]:
+    """Yield the median of times, and the share below a limit; NaN, of a run that ended, is not."""
     known = times.dropna()
-    if known.empty:
-        return []
-    below = rate_interval(int((known < limit_ms).sum()), times.size, 100)
-    return [
-        Number(name, median_interval(known), "ms", known.size),
-        Number(f"{name}, share below the thesis's {limit_ms:g} ms", below, "%", times.size),
-    ]
+    if len(known):
+        below = rate_interval(int((known < limit_ms).sum()), times.size, 100)
+        yield Number(name, median_interval(known), "ms", known.size)
+        yield Number(f"{name}, share below the thesis's {limit_ms:g} ms", below, "%", times.size)
 
 
-def _numbers_of_loss(rows: pd.DataFrame) -> list[Number]:
-    """Return what lost packets do to round trips, and how often the local service answered."""
+def _numbers_of_loss(rows: pd.DataFrame) -> Iterator[Number]:
+    """Yield what lost packets do to round trips, and how often the local service answered."""
     tasks = select(rows, what="task")
     killed_s = select(rows, what="kill").set_index("whole_run")["at_s"]
     before = tasks[tasks["at_s"] < tasks["whole_run"].map(killed_s).fillna(math.inf)]
-    numbers = []
     for path in paths_of(rows):
         far = select(tasks, path=path, service="cloud")
         p95_ms = _p95(far["trip_ms"])
@@ -400,22 +375,7 @@ def _numbers_of_loss(rows: pd.DataFrame) -> list[Number]:
             continue
         asked = select(before, path=path)
         local = rate_interval(len(select(asked, service="local")), len(asked), 100)
-        label = path.label
-        numbers += [
-            Number(f"95th percentile of round trips, {label}", exactly(p95_ms), "ms", len(far)),
-            Number(
-                f"answers of the local service before the kill, {label}", local, "%", len(asked)
-            ),
-        ]
-    return numbers
-
-
-def _numbers_of_load(rows: pd.DataFrame) -> list[Number]:
-    """Return how busy the machine was when runs began, and how slow the slowest robot was."""
-    runs = rows.drop_duplicates("whole_run")
-    loads = runs["load"]
-    load = Interval(loads.median(), loads.min(), loads.max())
-    return [
-        Number("processes that wanted a core (median, least and most)", load, "", len(runs)),
-        Number("rate of the slowest robot", exactly(float(runs["rate_hz"].min())), "Hz"),
-    ]
+        where = path.label
+        yield Number(f"95th percentile of round trips, {where}", exactly(p95_ms), "ms", len(far))
+        name = f"answers of the local service before the kill, {where}"
+        yield Number(name, local, "%", len(asked))

@@ -6,7 +6,7 @@ This module imports matplotlib; import it only where a figure is wanted.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import matplotlib as mpl
 import numpy as np
@@ -41,27 +41,19 @@ def cloud_dies(table: pd.DataFrame) -> Figure:
     table : DataFrame
         Of the task kind ``cloud_trials``, of one run, with its actions.
     """
-    kill = _kill_of(table)
+    rows = table.loc[table["what"] == "kill", ["at_s", "found_ms", "away_ms"]]
+    kill: _Kill = {} if rows.empty else rows.iloc[0].dropna().astype(float).to_dict()
     bands = _status_bands(table, kill)
     verdict = "and no decision changes" if table["identical"].all() else "BUT DECISIONS CHANGE"
     figure = figure_of(9.6, 5.6, f"The cloud dies, the robot goes on, {verdict}")
     with mpl.rc_context(STYLE):
         motion, answers = figure.subplots(2, 1, sharex=True, height_ratios=(1.0, 1.15))
-        for panel in (motion, answers):
-            for begin, end, status in bands:
-                panel.axvspan(begin, end, color=_STATUS_LOOKS[status][0], linewidth=0, zorder=0)
         for begin, end, status in bands:
+            color, words = _STATUS_LOOKS[status]
+            for panel in (motion, answers):
+                panel.axvspan(begin, end, color=color, linewidth=0, zorder=0)
             if end - begin > 0.12 * (bands[-1][1] - bands[0][0]):
-                motion.annotate(
-                    _STATUS_LOOKS[status][1],
-                    (0.5 * (begin + end), 1.0),
-                    xycoords=("data", "axes fraction"),
-                    xytext=(0, 4),
-                    textcoords="offset points",
-                    ha="center",
-                    va="bottom",
-                    fontsize=8.5,
-                )
+                _note(motion, words, (0.5 * (begin + end), 1.0), (0, 4), "center", "bottom", _TOP)
         _draw_motion(motion, table["at_s"][table["what"] == "action"].to_numpy(float))
         _draw_answers(answers, table)
         _draw_moments((motion, answers), kill)
@@ -71,9 +63,30 @@ def cloud_dies(table: pd.DataFrame) -> Figure:
     return figure
 
 
-def _kill_of(table: pd.DataFrame) -> _Kill:
-    rows = table.loc[table["what"] == "kill", ["at_s", "found_ms", "away_ms"]]
-    return {} if rows.empty else rows.iloc[0].dropna().astype(float).to_dict()
+_TOP = ("data", "axes fraction")
+
+
+def _note(
+    panel: Axes,
+    text: str,
+    place: tuple[float, float],
+    offset: tuple[float, float],
+    across: str,
+    up: str,
+    coordinates: Any = "data",
+    **looks: Any,
+) -> None:
+    panel.annotate(
+        text,
+        place,
+        offset,
+        coordinates,
+        "offset points",
+        ha=across,
+        va=up,
+        fontsize=8.5,
+        **looks,
+    )
 
 
 def _status_bands(table: pd.DataFrame, kill: _Kill) -> list[tuple[float, float, str]]:
@@ -107,16 +120,13 @@ def _draw_motion(panel: Axes, moments: FloatArray) -> None:
     if pauses.size:
         longest = int(pauses.argmax())
         early = longest < 0.5 * ordered.size
-        panel.annotate(
-            f"the longest time between two actions: {1e3 * pauses[longest]:.0f} ms",
-            (ordered[longest + 1], done[longest]),
-            xytext=(30 if early else -30, -4 if early else 4),
-            textcoords="offset points",
-            arrowprops={"arrowstyle": "-", "linewidth": 0.8, "color": "#4A4F57"},
-            fontsize=8.5,
-            ha="left" if early else "right",
-            va="top" if early else "bottom",
-        )
+        text = f"the longest time between two actions: {1e3 * pauses[longest]:.0f} ms"
+        place = float(ordered[longest + 1]), float(done[longest])
+        looks = {"arrowstyle": "-", "linewidth": 0.8, "color": "#4A4F57"}
+        if early:
+            _note(panel, text, place, (30, -4), "left", "top", arrowprops=looks)
+        else:
+            _note(panel, text, place, (-30, 4), "right", "bottom", arrowprops=looks)
 
 
 def _draw_answers(panel: Axes, table: pd.DataFrame) -> None:
@@ -145,14 +155,14 @@ def _draw_answers(panel: Axes, table: pd.DataFrame) -> None:
             first = float(at_s[chosen].min())
             below = name == "cloud"
             height = took_ms[chosen].min() if below else took_ms[chosen].max()
-            panel.annotate(
+            _note(
+                panel,
                 text,
                 (first, float(height)),
-                xytext=(4, -8 if below else 8),
-                textcoords="offset points",
-                va="top" if below else "bottom",
+                (4, -8 if below else 8),
+                "left",
+                "top" if below else "bottom",
                 color=COLORS[number] if below else "#8A5A00",
-                fontsize=8.5,
                 bbox={"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 1.0},
                 zorder=5,
             )
@@ -191,7 +201,6 @@ def _draw_moments(panels: Sequence[Axes], kill: _Kill) -> None:
     for at_s, text, color, marker, side in moments:
         for panel in panels:
             panel.axvline(at_s, color=color, linewidth=1.2, zorder=2)
-        for panel in panels:
             panel.plot(
                 [at_s],
                 [0.0],
@@ -202,14 +211,5 @@ def _draw_moments(panels: Sequence[Axes], kill: _Kill) -> None:
                 zorder=6,
                 transform=panel.get_xaxis_transform(),
             )
-        panels[0].annotate(
-            text,
-            (at_s, 0.97),
-            xycoords=("data", "axes fraction"),
-            xytext=(-5 if side == "left" else 5, 0),
-            textcoords="offset points",
-            ha="right" if side == "left" else "left",
-            va="top",
-            color=color,
-            fontsize=8.5,
-        )
+        across, aside = ("right", -5) if side == "left" else ("left", 5)
+        _note(panels[0], text, (at_s, 0.97), (aside, 0), across, "top", _TOP, color=color)

@@ -10,7 +10,6 @@ import msgspec
 from holdfast.config.problem_builder import build_problem
 from holdfast.config.registry import problem_class
 from holdfast.errors import HoldfastError
-from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
@@ -32,14 +31,10 @@ COLUMNS = (
     "mean_sensing_ms",
     "unexplained_observations",
     "digest",
-    "step_limit",
-    "steps_to_goal",
 )
 """Of the table of a batch: a row for each trial.
 
-The ``steps`` of a trial that fails are its limit, whenever that was. ``step_limit`` is the limit of
-a trial with which it is continued, if it is, and ``steps_to_goal`` the steps that it took within
-that limit; None if it did not reach the goal.
+The ``steps`` of a trial that fails are its limit, whenever that was.
 """
 
 _DIGEST_CHARACTERS = 16
@@ -47,20 +42,7 @@ _DIGEST_CHARACTERS = 16
 
 
 class TrialSeries(msgspec.Struct, frozen=True, kw_only=True):
-    """Trials that differ in their number alone.
-
-    Attributes
-    ----------
-    problem : str
-        Its name.
-    model : dict
-        Its section; what is left out has its default.
-    continued_trials : int
-        The first ones, which are continued where they are cut off at ``max_steps``, to see whether
-        they are slow or stuck. Nothing but ``steps_to_goal`` depends on it.
-    continued_to : int
-        Up to how many steps.
-    """
+    """Trials that differ in their number alone; ``model`` is the problem's section."""
 
     problem: str
     model: dict[str, Any] = msgspec.field(default_factory=dict)
@@ -68,20 +50,13 @@ class TrialSeries(msgspec.Struct, frozen=True, kw_only=True):
     max_steps: int = 500
     seed: int = 0
     num_trials: int = 1000
-    continued_trials: int = 0
-    continued_to: int = 10_000
 
 
 def trial_tasks(series: TrialSeries, trials_in_each: int, kind: str = "trials") -> Iterator[Task]:
     """Yield the tasks of a series, in the order of its trials.
 
-    Parameters
-    ----------
-    trials_in_each : int
-        Trials of a task: what is lost when a process is killed, and what is done twice when a
-        series is made longer.
-    kind : str
-        Of a function with the parameters of :func:`run_trials_of`.
+    ``trials_in_each`` is lost when a process is killed, and done twice when a series is made
+    longer. ``kind`` is that of a function with the parameters of :func:`run_trials_of`.
     """
     common = msgspec.to_builtins(series)
     del common["num_trials"]
@@ -91,9 +66,7 @@ def trial_tasks(series: TrialSeries, trials_in_each: int, kind: str = "trials") 
         yield Task(kind=kind, parameters=parameters, units=count)
 
 
-def run_trials_of(
-    first_trial: int, planner_class: type[Planner] = Planner, **series: Any
-) -> pd.DataFrame:
+def run_trials_of(first_trial: int, **series: Any) -> pd.DataFrame:
     """Run some trials of a series in this process; the function of tasks of the kind ``trials``.
 
     It gets the fields of :class:`TrialSeries`, and returns a table with the columns of
@@ -103,25 +76,15 @@ def run_trials_of(
 
     wanted = msgspec.convert(series, TrialSeries)
     problem = problem_of(wanted.problem, wanted.model)
-    longest = max(wanted.continued_to, wanted.max_steps)
-
-    def run(trial: int, max_steps: int) -> TrialResult:
+    rows = []
+    for trial in range(first_trial, first_trial + wanted.num_trials):
         try:
-            planner = planner_class(problem, wanted.planning)
-            return run_trial(planner, wanted.seed, trial, max_steps=max_steps)
+            planner = Planner(problem, wanted.planning)
+            result = run_trial(planner, wanted.seed, trial, max_steps=wanted.max_steps)
         except HoldfastError as error:
             raise TaskError(
                 f"trial {trial} (seed {wanted.seed}) of {wanted.problem}: {error}"
             ) from error
-
-    rows = []
-    for trial in range(first_trial, first_trial + wanted.num_trials):
-        result = whole = run(trial, wanted.max_steps)
-        continued = trial < wanted.continued_trials
-        if continued and not result.success and not result.failed:
-            # From its beginning: every random draw is named by its step, so the trial goes through
-            # the same states as before.
-            whole = run(trial, longest)
         rows.append(
             (
                 trial,
@@ -132,8 +95,6 @@ def run_trials_of(
                 result.mean_sensing_ms,
                 result.unexplained_observations,
                 result.digest[:_DIGEST_CHARACTERS],
-                longest if continued else wanted.max_steps,
-                whole.steps if whole.success else None,
             )
         )
     return pd.DataFrame(rows, columns=list(COLUMNS))

@@ -56,39 +56,17 @@ __all__ = [
 
 
 class PursuitSettings(NamedTuple):
-    """How much a decision computes, and what it takes for granted.
+    """How much a decision computes, and what it takes for granted."""
 
-    Attributes
-    ----------
-    num_particles : int
-        Of the belief, that stand for it.
-    num_places : int
-        Of these, whose targets' places are those of plans.
-    horizon : int
-        Steps of the longest plan.
-    num_directions : int
-        Directions all around; those that lead to some of the particles come on top.
-    num_candidates : int
-        Of the directions, for which a look is imagined.
-    num_second_directions : int
-        Of the step after which the next look may come.
-    num_observations : int
-        Hypothetical observations of a look.
-    value_of_failure : float
-        What is left when a plan fails.
-    residual : float
-        What uncertainty costs after the next look but one.
-    """
-
-    num_particles: int = 128
-    num_places: int = 32
-    horizon: int = 16
-    num_directions: int = 24
-    num_candidates: int = 6
-    num_second_directions: int = 16
-    num_observations: int = 16
-    value_of_failure: float = 10.0
-    residual: float = 6.0
+    num_particles: int = 128  # of the belief, that stand for it
+    num_places: int = 32  # of these, whose targets' places are those of plans
+    horizon: int = 16  # steps of the longest plan
+    num_directions: int = 24  # all around; those to some of the particles come on top
+    num_candidates: int = 6  # of the directions, for which a look is imagined
+    num_second_directions: int = 16  # of the step after which the next look may come
+    num_observations: int = 16  # hypothetical ones of a look
+    value_of_failure: float = 10.0  # what is left when a plan fails
+    residual: float = 6.0  # what uncertainty costs after the next look but one
 
 
 LookRule: TypeAlias = Callable[[VdpTag, Belief, Stream], bool]

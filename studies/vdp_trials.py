@@ -109,15 +109,10 @@ def run_vdp_tag_trials(
     the first step. A look in the step that tags is paid as well. All policies see the same target
     and the same noise in the beams of a trial.
 
-    Parameters
-    ----------
-    num_particles : int
-        Of the particle filter, which resamples after each reading.
-    misses_at_once : bool
-        Whether the filter drops a particle whose target would have been tagged before the next
-        decision. That of the published figures drops it one step later.
-    known_state : bool
-        Whether the policy is told the true state instead: what no filter can give, for a bound.
+    The particle filter resamples after each reading. With ``misses_at_once`` it drops a particle
+    whose target would have been tagged before the next decision; that of the published figures
+    drops it one step later. With ``known_state`` the policy is told the true state instead: what no
+    filter can give, for a bound.
     """
     runs = [_Run(seed, trial, num_particles) for trial in trials]
     if known_state:

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
-import numpy as np
 import pandas as pd
 import pytest
 
@@ -23,9 +22,9 @@ from studies.errors import TrialFileError
 from studies.running import write_report
 from studies.study import CHOICE, CLAIM, TRIALS, Report, Scale, Study
 from studies.tables import to_csv
-from studies.tasks import Task, run_task
+from studies.tasks import Task
 from studies.tests.made_up import noise, report_on
-from studies.trial_batches import TrialSeries, run_trials_of, trial_tasks
+from studies.trial_batches import run_trials_of
 from studies.trial_files import read_trials
 
 SCALE = Scale(seed=5)
@@ -49,18 +48,13 @@ def selector_of(task: Task) -> dict[str, object]:
     return found
 
 
-UNLIKE = ("planning", "continued_trials")
-"""Parameters that may differ between trials that are compared: how much is known of one that fails
-has no part in its world."""
-
-
 @pytest.mark.parametrize("study", [selectors.Selectors(), parameters.Parameters()])
 def test_whatever_is_compared_meets_the_same_worlds(study: Study) -> None:
     """Trials are compared pair by pair: of one problem they differ in how it is planned alone."""
     runs: dict[str, set[tuple[str, str]]] = {}
     for task in study.tasks(SCALE):
         assert task.parameters["seed"] in (SCALE.seed, SCALE.claim_seed)
-        posed = {name: value for name, value in task.parameters.items() if name not in UNLIKE}
+        posed = {name: value for name, value in task.parameters.items() if name != "planning"}
         problem = str((posed["problem"], posed["model"]))
         runs.setdefault(problem, set()).add((str(task.parameters["planning"]), str(posed)))
     assert len(runs) > 1
@@ -86,7 +80,7 @@ def test_the_trials_of_every_way_begin_in_the_same_states(monkeypatch: pytest.Mo
         if tuple(task.parameters[name] for name in ("problem", "first_trial", "seed")) != first:
             continue
         began.clear()
-        run_trials_of(**{**task.parameters, "num_trials": 3, "max_steps": 1, "continued_trials": 0})
+        run_trials_of(**{**task.parameters, "num_trials": 3, "max_steps": 1})
         worlds[str(task.parameters)] = tuple(began)
     # Two cases are this problem.
     assert len(worlds) == 2 * len(selectors.WAYS) * len(selectors.INTERVALS)
@@ -120,8 +114,7 @@ def decided() -> Iterator[Report]:
     """The path takes four fifths, but in the busy room at interval 14 it is slow.
 
     It reaches the goal of the tight hole always, where the default and random fail in every other
-    trial; of these that fail, those of random are slow and those of the default are stuck. The path
-    by neighbours of the posteriors is slow on the trials for choosing alone.
+    trial. The path by neighbours of the posteriors is slow on the trials for choosing alone.
     """
 
     def trial(task: Task, number: int) -> tuple[bool, int, float]:
@@ -163,33 +156,6 @@ def test_what_decides_about_the_default(decided: Report) -> None:
         assert row["candidate"] != PATH or better == (float(row["success_adjusted_p_value"]) < 0.05)
 
 
-def test_what_is_chosen_on_one_seed_is_judged_on_another(decided: Report) -> None:
-    for row in decided.summary["chosen_ways"].to_dict("records"):
-        assert row["problem"] == "busy room" or row["chosen"] == PATH
-        if row["rival"] == selectors.BASELINE and row["problem"] in ("peg in hole", "all problems"):
-            assert row["steps_ratio"] == pytest.approx(0.8, rel=0.04)
-            assert row["steps_ratio_when_chosen"] == pytest.approx(0.8, rel=0.04)
-            assert row["steps_ratio"] != row["steps_ratio_when_chosen"]
-    # The best interval for choosing earns nothing on the other trials.
-    for row in decided.summary["costs_of_looks"].to_dict("records"):
-        if row["cost_of_a_look"] == 0.0:
-            assert (row["best_interval"], row["net_reward"]) == (4, 0.0)
-
-
-def test_who_is_stuck_for_good(decided: Report) -> None:
-    rows = list(decided.summary["stuck"].to_dict("records"))
-    assert len(rows) == len(CASES) * (len(selectors.INTERVALS) + 1) * 4
-    for row in rows:
-        fails = row["problem"] == "tight hole" and row["way"] in ("random", selectors.BEFORE)
-        trials = float(row["trials"])
-        assert row["cut_off"] == row["stuck"] == (trials / 2 if fails else 0)
-        assert row["cut_off_share"] == row["stuck_share"] == (0.5 if fails else 0.0)
-        assert row["continued_to"] == 10**6
-        assert float(row["stuck_share_low"]) <= float(row["stuck_share"])
-        path = row["problem"] == "tight hole" and row["way"] == PATH
-        assert row["stuck_beyond_random"] == (-0.5 if path else 0.0) or not fails
-
-
 def columns_of(report: Report) -> dict[str, str]:
     return {name: to_csv(table) for name, table in report.tables.items()}
 
@@ -201,7 +167,7 @@ def test_all_follows_from_the_file_of_trials(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    monkeypatch.setattr(type(study), "num_trials", {CHOICE: 3, CLAIM: 6})
+    monkeypatch.setattr(type(study), "num_trials", dict.fromkeys(type(study).num_trials, 6))
 
     def trial(task: Task, number: int) -> tuple[bool, int, float]:
         chance = noise(task, number, ["problem", "model", "seed", "planning"])
@@ -223,8 +189,8 @@ def test_all_follows_from_the_file_of_trials(
     short = kept.trials.iloc[:-6]
     with pytest.raises(InvalidValueError, match=f"{study.name}: there are no trials of claim, "):
         study.report_of({TRIALS: short})
-    with pytest.raises(InvalidValueError, match="without the columns steps_to_goal"):
-        study.report_of({TRIALS: short.drop(columns="steps_to_goal")})
+    with pytest.raises(InvalidValueError, match="without the columns reward"):
+        study.report_of({TRIALS: short.drop(columns="reward")})
     other = "parameters" if study.name == "selectors" else "selectors"
     with pytest.raises(InvalidValueError, match=f"has the trials of {study.name}, not of {other}"):
         source = out / "trials.parquet"
@@ -238,24 +204,3 @@ def test_what_is_no_file_of_trials_is_said(tmp_path: Path) -> None:
     path.write_text("words")
     with pytest.raises(TrialFileError, match="is no file of trials of a study"):
         read_trials(path)
-
-
-def test_a_trial_that_is_cut_off_is_continued() -> None:
-    """It goes on as it began; that it is continued changes nothing else."""
-    series = TrialSeries(problem=PEG_IN_HOLE, max_steps=90, seed=2, num_trials=8)
-    (task,) = trial_tasks(series, 100)
-    (plain,) = trial_tasks(msgspec.structs.replace(series, max_steps=300), 100)
-    (longer,) = trial_tasks(
-        msgspec.structs.replace(series, continued_trials=6, continued_to=300), 100
-    )
-    first, whole, continued = (run_task(each) for each in (task, plain, longer))
-    cut = np.flatnonzero(~first["success"])
-    assert 2 < len(cut) < 8
-    assert cut[-1] >= 6
-    same = first.columns.difference(["mean_sensing_ms", "step_limit", "steps_to_goal"])
-    pd.testing.assert_frame_equal(first[same], continued[same])
-    assert first["step_limit"].tolist() == [90] * 8
-    assert continued["step_limit"].tolist() == [300] * 6 + [90] * 2
-    expected = [*whole["steps_to_goal"][:6], *first["steps_to_goal"][6:]]
-    np.testing.assert_array_equal(continued["steps_to_goal"], expected)
-    assert first["steps_to_goal"][cut].isna().all()

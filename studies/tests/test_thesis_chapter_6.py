@@ -232,12 +232,9 @@ class TestReport:
         assert number_of(report, local).n == 11
         assert all("nan" not in str(each) for each in report.numbers)
 
-    @pytest.mark.slow
     def test_every_figure_is_drawn(self, report: Any, tmp_path: Path) -> None:
         names = write_report(ThesisChapter6(), Scale(quick=True, seed=3), report, tmp_path)
-        for number in ("09_10_11", "12", "13", "14", "15"):
-            assert sum(f"fig{number}" in name for name in names) == 2
-        assert "cloud_dies.png" in names
+        assert {"times.png", "recovery.png", "cloud_dies.png"} < set(names)
 
 
 def test_rows_are_found_by_what_they_say() -> None:

@@ -80,10 +80,7 @@ ELSEWHERE = {
         "busy_room": "tests/contracts/test_problem_contract.py",
         "cases": "studies/tests/test_selectors.py",
         "cloud_trials": "studies/tests/test_thesis_chapter_6.py",
-        "corridor": "studies/tests/test_estimates.py",
         "errors": TASKS,
-        "estimate_candidates": "studies/tests/test_estimates.py",
-        "exchange_times": "studies/tests/test_offload_break_even.py",
         "executors": TASKS,
         "judged_study": "studies/tests/test_selectors.py",
         "light_dark": "tests/contracts/test_problem_contract.py",
@@ -93,9 +90,6 @@ ELSEWHERE = {
         "plots": "studies/tests/test_results_page.py",
         "priced_problems": "studies/tests/test_sensing_price.py",
         "published_2017": "tests/oracles/test_published_2017.py",
-        "ray_executor": "studies/tests/test_ray.py",
-        "selectors_figures": FIGURES,
-        "sensing_price_figures": FIGURES,
         "sensing_times": "studies/tests/test_offload_break_even.py",
         "study": TASKS,
         "tasks": TASKS,
@@ -106,7 +100,6 @@ ELSEWHERE = {
         "trial_files": "studies/tests/test_selectors.py",
         "two_ends": "studies/tests/test_myopic.py",
         "vdp_trials": "studies/tests/test_vdp_tag.py",
-        "westward": "studies/tests/test_estimates.py",
     },
 }
 """Modules beside the product that another test tries, as a part of something."""
