@@ -191,8 +191,11 @@ def run(way: str, seed: int, trial: int) -> Mapping[str, Any]:
                 stream(seed, trial, step, Purpose.SELECTION),
             )
             (generator,) = radar.actions(now)
-            angle = numerics.wrapped(np.array([2.0 * np.pi * index / DIRECTIONS]))[0]
-            actions = [generator.action_from_value(Angle(angle))]
+            # Its action_from_value rounds down, at times to the direction before.
+            target = 2.0 * np.pi * index / DIRECTIONS
+            offers = list(generator)
+            turns = np.array([float(each.target_value) for each in offers])
+            actions = [offers[int(np.argmin(np.abs(numerics.wrapped(turns - target))))]]
         seconds += time.process_time() - began
         radar.add_actions(actions)
         radar.act(now)
