@@ -9,7 +9,8 @@ from the predicted tracks. The policy is to tell where the targets are. ::
     pip install stonesoup==1.9.1
     python -m benchmarks.sensor_management --out docs/results/other_worlds/sensor_management.csv
 
-A row has the mean distance of the tracks from their targets over all targets and steps.
+A row has the mean distance of the tracks from their targets over all targets and steps. Trials of
+seed 2026 judge; nothing was chosen.
 """
 
 from __future__ import annotations
