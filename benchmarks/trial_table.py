@@ -19,7 +19,7 @@ import pandas as pd
 from studies import statistics
 from studies.statistics import Interval
 
-__all__ = ["Cell", "compare", "main", "rate", "read", "run", "shown"]
+__all__ = ["Cell", "compare", "main", "ranked", "rate", "read", "run", "shown"]
 
 
 class Cell(NamedTuple):
@@ -128,3 +128,28 @@ def shown(interval: Interval, digits: int) -> str:
     """Return an interval as tables show it."""
     value, low, high = (f"{end:.{digits}f}" for end in interval)
     return f"{value} [{low}, {high}]"
+
+
+def ranked(path: Path, column: str, others: Sequence[str], first: str = "default") -> str:
+    """Write a summary of cells that have one name beside the trials, and return it in Markdown.
+
+    It has the mean of a column and of others; and, trial by trial, the first cell less each.
+    """
+    cells = {name: rows for (name,), rows in read(path, ("way",)).items()}
+    rows: list[dict[str, Any]] = []
+    lines = [
+        f"| way | trials | {column} | {' | '.join(others)} | {first} less this |",
+        "|---|---|---|" + "---|" * (len(others) + 1),
+    ]
+    for name, own in cells.items():
+        pairs = own.merge(cells[first], on=["seed", "trial"], suffixes=("", "_first"))
+        values, its = (pairs[key].to_numpy(float) for key in (column, f"{column}_first"))
+        gain, _ = statistics.paired_difference(its, values)
+        mean = statistics.mean_interval(own[column].to_numpy(float))
+        means = {other: float(own[other].mean()) for other in others}
+        row = {"way": name, "trials": len(own), **statistics.cells_of(column, mean), **means}
+        rows.append(row | statistics.cells_of("default_less_this", gain))
+        words = [name, str(len(own)), shown(mean, 2), *(f"{each:.3g}" for each in means.values())]
+        lines.append(f"| {' | '.join(words)} | {'' if name == first else shown(gain, 2)} |")
+    pd.DataFrame(rows).to_csv(path.with_name(f"{path.stem}_summary.csv"), index=False)
+    return "\n".join(lines)
