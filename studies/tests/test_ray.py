@@ -8,12 +8,8 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
-import secrets
-import shutil
 import signal
-import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from importlib.util import find_spec
@@ -23,9 +19,9 @@ from typing import ParamSpec, TypeVar
 
 import pandas as pd
 import pytest
+from tests.ray_node import PATIENCE_S, ray_node
 
 from holdfast.errors import HoldfastError, InvalidValueError
-from holdfast.runtime.parent_death import parent_death_prefix
 from holdfast_lab.testbed.processes import free_port
 from studies import executors
 from studies.executors import LocalExecutor, RayExecutor
@@ -34,8 +30,6 @@ from studies.trial_batches import TrialSeries, trial_tasks
 
 P = ParamSpec("P")
 R = TypeVar("R")
-
-PATIENCE_S = 180.0
 
 Outcome = dict[str, list[list[object]]]
 
@@ -50,36 +44,8 @@ def with_ray(test: Callable[P, R]) -> Callable[P, R]:
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
     """A node with two cores."""
-    port = free_port()
-    # The paths of its sockets have little room.
-    directory = Path(tempfile.mkdtemp(prefix="hf-ray-"))
-    command = [*parent_death_prefix(), sys.executable, "-m", "ray.scripts.scripts", "start"]
-    command += ["--head", "--block", "--num-cpus", "2", "--include-dashboard=false"]
-    command += ["--port", str(free_port()), "--ray-client-server-port", str(port)]
-    command += ["--node-ip-address", "127.0.0.1"]
-    command += ["--min-worker-port", "0", "--max-worker-port", "0"]
-    command += ["--object-store-memory", "80000000", "--temp-dir", str(directory / "r")]
-    with pytest.MonkeyPatch.context() as patch:
-        # Whoever reaches a cluster can run code on it, and its ports are open to the network.
-        patch.setenv("RAY_AUTH_MODE", "token")
-        patch.setenv("RAY_AUTH_TOKEN", secrets.token_hex())
-        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        patch.setenv("RAY_raylet_start_wait_time_s", "120")
-        patch.setenv("GRPC_ENABLE_FORK_SUPPORT", "0")  # its server forks between gRPC's threads
-        patch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
-        log = directory / "log"
-        with log.open("wb") as output:
-            node = subprocess.Popen(command, stdout=output, stderr=output, start_new_session=True)
-        try:
-            began = monotonic()
-            while b"runtime started" not in log.read_bytes():
-                assert node.poll() is None and monotonic() < began + PATIENCE_S, log.read_text()
-                sleep(0.1)
-            yield f"ray://127.0.0.1:{port}"
-        finally:
-            node.terminate()
-            node.wait(PATIENCE_S)
-            shutil.rmtree(directory, ignore_errors=True)
+    with ray_node(2) as (_, client_address):
+        yield client_address
 
 
 def busy(command: bytes) -> list[int]:

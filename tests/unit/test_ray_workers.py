@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import secrets
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -14,12 +13,12 @@ from typing import Any
 
 import pytest
 from tests.processes.faults import holdfast
+from tests.ray_node import ray_node
 from tests.unit.test_tuning_tune import MEAN, OF_MEAN, RUN, tuned
 
 from holdfast.errors import InvalidValueError
 from holdfast.runtime.ray_workers import RayCluster
 from holdfast_lab.testbed.processes import free_port
-from studies.tests.ray_cluster import RayCluster as StartedCluster
 
 absent = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
 
@@ -84,9 +83,7 @@ def test_a_lost_actor_costs_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_it_finds_the_same_and_outlives_its_actors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Whoever reaches a cluster can run code on it, and its ports are open to the network.
-    monkeypatch.setenv("RAY_AUTH_MODE", "token")
-    monkeypatch.setenv("RAY_AUTH_TOKEN", secrets.token_hex())
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))  # of what mean.py imports
     (tmp_path / "mean.py").write_text(MEAN)
     (tmp_path / "run.yaml").write_text(OF_MEAN)
     words = ("tune", "run.yaml", "--vary", "particles", "--no-check", "--trials", "20")
@@ -94,8 +91,8 @@ def test_it_finds_the_same_and_outlives_its_actors(
     said = holdfast(tmp_path, *words, "--ray", nobody)
     assert f"error: no Ray cluster can be used at {nobody}: " in said.stderr
     kept: list[dict[tuple[str, ...], tuple[str, ...]]] = []
-    with StartedCluster(1) as cluster:
-        for place in (("--jobs", "1"), ("--ray", cluster.native_address)):
+    with ray_node(1) as (address, _):
+        for place in (("--jobs", "1"), ("--ray", address)):
             (tmp_path / "flag").unlink(missing_ok=True)
             out = f"out{len(kept)}"
             said = holdfast(tmp_path, *words, *place, "--budget", "120s", "--out", out)
