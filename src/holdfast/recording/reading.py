@@ -120,7 +120,7 @@ class RunArrays:
         Raises
         ------
         OutputError
-            If there is no such trial, or the run is damaged or in use.
+            If there is no such trial, or the run is damaged.
         HoldfastError
             If a trial is decided otherwise now.
         """
@@ -147,7 +147,7 @@ def open_run(path: str | Path, *, problem_directory: str | Path | None = None) -
     Raises
     ------
     OutputError
-        If it is no run, damaged, or in use.
+        If it is no run, or damaged.
     UntrustedCodeError
         If its problem is ``module:Class``, and there is no ``problem_directory``.
     HoldfastError
