@@ -9,7 +9,7 @@ import signal
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -165,20 +165,6 @@ class TestSteps:
             unfinished = journal.unfinished()
             assert unfinished is not None
             assert unfinished.records == records_of(0)
-
-    def test_a_listener_gets_records_that_are_written(self, path: Path) -> None:
-        with Journal.create(path, {}) as journal:
-
-            def listen(trial: int, records: Sequence[Record]) -> None:
-                unfinished = journal.unfinished()
-                assert unfinished is not None
-                assert (unfinished.trial, unfinished.records[-len(records) :]) == (trial, records)
-                told.append(trial)
-
-            told: list[int] = []
-            journal.on_append = listen
-            journal.append(TRIAL, records_of(0))
-            assert told == [TRIAL]
 
     def test_a_journal_with_steps_is_not_empty(self, path: Path) -> None:
         with Journal.create(path, {}) as journal:

@@ -17,7 +17,7 @@ from holdfast.protocol.records import (
     replay,
 )
 from holdfast.recording.journal import Journal
-from holdfast.recording.journal_file import Finished, Notes, Steps
+from holdfast.recording.journal_file import Finished, Notes, Steps, packed
 from holdfast.recording.journal_reader import JournalReader
 from holdfast.robot.trial import run_trial
 
@@ -27,7 +27,8 @@ BEFORE_OUTCOMES = Path(__file__).parent / "data" / "journal_before_outcomes.sqli
 
 def finished(trial: int) -> Finished:
     result = result_of(trial)
-    return Finished(trial, without_decisions(result), result.decisions, keeps_steps=False)
+    outcome = packed(without_decisions(result))
+    return Finished(trial, outcome, packed(result.decisions), keeps_steps=False)
 
 
 class TestJournal:
@@ -52,7 +53,7 @@ class TestJournal:
         assert blob[:1] == b"\xde"  # one field more, which no reader knows
         blob = b"\xde" + (int.from_bytes(blob[1:3]) + 1).to_bytes(2) + blob[3:]
         blob += b"\xa1x" + b"\x91" * 5000 + b"\x90"
-        entry = Finished(0, msgspec.Raw(blob), result_of(0).decisions, keeps_steps=False)
+        entry = Finished(0, msgspec.Raw(blob), packed(result_of(0).decisions), keeps_steps=False)
         with pytest.raises(OutputError, match="recursion"):
             Journal.create_from(path, [entry])
 
@@ -109,9 +110,12 @@ class TestJournal:
     @pytest.mark.parametrize(
         ("entries", "named"),
         [
-            ([Steps(0, []), Steps(1, [])], "after record -1 of the unfinished trial 0"),
+            (
+                [Steps(0, packed([])), Steps(1, packed([]))],
+                "after record -1 of the unfinished trial 0",
+            ),
             ([finished(0), finished(0)], "after the result of trial 0"),
-            ([finished(0), Steps(0, [])], "after the result of trial 0"),
+            ([finished(0), Steps(0, packed([]))], "after the result of trial 0"),
         ],
     )
     def test_trials_that_cannot_follow_each_other_are_damage(

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -31,6 +31,8 @@ from holdfast.recording.journal_file import (
     Survives,
     boot_id,
     damaged,
+    encode,
+    packed,
     synchronize_directory,
 )
 from holdfast.recording.journal_reader import SESSION_SIZE, JournalReader
@@ -49,15 +51,11 @@ class Journal(JournalReader):
     ----------
     survives : {"process_crash", "power_cut"}
         What each appended step survives.
-    on_append : callable or None
-        Gets the trial and the records of each :meth:`append`, once they are written.
     """
 
     def __init__(self, path: Path, file: JournalFile) -> None:
         super().__init__(path, file)
         self.survives: Survives = "process_crash"
-        self.on_append: Callable[[int, Sequence[Record]], None] | None = None
-        self._encode = msgspec.msgpack.Encoder().encode
         self._on_disk = 0
         self._appending: int | None = None
         self._broken: OutputError | None = None
@@ -161,7 +159,7 @@ class Journal(JournalReader):
             raise self._broken
         file = self._file
         try:
-            end = file.append(self._end, [self._encode(entry) for entry in entries])
+            end = file.append(self._end, list(map(encode, entries)))
             if synchronize:
                 os.fdatasync(file.descriptor)
                 self._on_disk = end.offset
@@ -174,7 +172,8 @@ class Journal(JournalReader):
             raise self._broken from error
         file.require_in_place()
         if not isinstance(entries[0], Steps):
-            self._read_on()
+            for _ in self.read_on():
+                pass
         self._end = end
 
     def set_meta(self, **rows: str) -> None:
@@ -218,7 +217,7 @@ class Journal(JournalReader):
         """
         if not records:
             return
-        steps, on_disk = Steps(trial, records), self.survives == "power_cut"
+        steps, on_disk = Steps(trial, packed(records)), self.survives == "power_cut"
         if self._appending == trial:
             self._write(steps, synchronize=on_disk)
         else:
@@ -226,8 +225,6 @@ class Journal(JournalReader):
             boot = {"steps_boot": boot_id() or "", "steps_on_disk": str(int(on_disk))}
             self._write(Notes(boot), steps)
             self._appending = trial
-        if self.on_append is not None:
-            self.on_append(trial, records)
 
     def _require_may_begin(self, trial: int) -> None:
         begun = self.unfinished_trial()
@@ -254,7 +251,7 @@ class Journal(JournalReader):
         if trial in self._results:
             raise OutputError(f"{self.path}: trial {trial} is in the journal already")
         outcome = msgspec.structs.replace(result, decisions=None)
-        self._write(Finished(trial, outcome, decisions, keep_steps))
+        self._write(Finished(trial, packed(outcome), packed(decisions), keep_steps))
         if self._appending == trial:
             self._appending = None
 

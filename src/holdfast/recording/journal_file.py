@@ -26,9 +26,9 @@ import hashlib
 import os
 import struct
 import weakref
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import msgspec
 
@@ -78,37 +78,30 @@ class Notes(msgspec.Struct, array_like=True, frozen=True, tag=0):
 
 
 class Steps(msgspec.Struct, array_like=True, frozen=True, tag=1):
-    """Records of the unfinished trial."""
+    """Records of the unfinished trial, packed."""
 
     trial: int
-    records: Any
-
-
-class Finished(msgspec.Struct, array_like=True, frozen=True, tag=2):
-    """The end of a trial: its result and decisions, and whether its records are of further use."""
-
-    trial: int
-    result: Any
-    decisions: Any
-    keeps_steps: bool
-
-
-class ReadSteps(Steps, array_like=True, frozen=True, tag=1):
-    """Records that are not decoded yet."""
-
     records: msgspec.Raw
 
 
-class ReadFinished(Finished, array_like=True, frozen=True, tag=2):
-    """A result that is not decoded yet."""
+class Finished(msgspec.Struct, array_like=True, frozen=True, tag=2):
+    """The end of a trial: its result and decisions, packed; whether its records are still used."""
 
+    trial: int
     result: msgspec.Raw
     decisions: msgspec.Raw
+    keeps_steps: bool
 
 
 Entry: TypeAlias = Notes | Steps | Finished
 
-decode_entry = msgspec.msgpack.Decoder(Notes | ReadSteps | ReadFinished).decode
+encode = msgspec.msgpack.Encoder().encode
+decode_entry: Callable[[bytes], Entry] = msgspec.msgpack.Decoder(Notes | Steps | Finished).decode
+
+
+def packed(value: object) -> msgspec.Raw:
+    """Pack a part of an entry."""
+    return msgspec.Raw(encode(value))
 
 
 def _checksum(data: bytes) -> bytes:

@@ -22,14 +22,16 @@ from holdfast.protocol.records import Record
 from holdfast.recording.journal_file import (
     SQLITE_MAGIC,
     START,
+    Entry,
+    Finished,
     JournalFile,
     Notes,
     Position,
-    ReadFinished,
-    ReadSteps,
+    Steps,
     boot_id,
     damaged,
     decode_entry,
+    encode,
     find_journal,
 )
 
@@ -131,26 +133,29 @@ class JournalReader:
 
     def _read_all(self) -> None:
         promised, _ = self._file.promised()
-        self._read_on()
+        for _ in self.read_on():
+            pass
         if self._end.offset < promised:
             raise damaged(self.path, f"{self._last()}, a frame is missing or not whole")
 
-    def _read_on(self) -> None:
-        """Take in what follows in the file."""
+    def read_on(self) -> Iterator[Entry]:
+        """Take in what was written since, and yield it."""
         with _errors(self.path):
             for payload, end in self._file.frames(self._end):
-                self._take(decode_entry(payload), self._end)
+                entry = decode_entry(payload)
+                self._take(entry, self._end)
                 self._end = end
+                yield entry
 
-    def _take(self, entry: Notes | ReadSteps | ReadFinished, position: Position) -> None:
+    def _take(self, entry: Entry, position: Position) -> None:
         if isinstance(entry, Notes):
             self._notes = {**({} if entry.anew else self._notes), **entry.notes}
             return
         trial, begun = entry.trial, self._begun
         is_begun = begun is not None and begun[0] == trial
-        if trial in self._results or (isinstance(entry, ReadSteps) and begun and not is_begun):
+        if trial in self._results or (isinstance(entry, Steps) and begun and not is_begun):
             raise damaged(self.path, f"{self._last()}, trial {trial} comes where it cannot")
-        if isinstance(entry, ReadSteps):
+        if isinstance(entry, Steps):
             self._begun = begun or (trial, position)
             return
         self._results[trial] = position
@@ -168,9 +173,9 @@ class JournalReader:
             what = f"the result of trial {next(reversed(self._results))}"
         return f"after {what}, at byte {self._end.offset}"
 
-    def _result_of(self, trial: int) -> ReadFinished:
+    def _result_of(self, trial: int) -> Finished:
         for payload, _ in self._file.frames(self._results[trial], 4096):
-            if isinstance(entry := decode_entry(payload), ReadFinished):
+            if isinstance(entry := decode_entry(payload), Finished):
                 return entry
         raise damaged(self.path, f"the result of trial {trial} has changed since it was read")
 
@@ -178,10 +183,10 @@ class JournalReader:
         records: list[Record] = []
         for payload, end in self._file.frames(position):
             entry = decode_entry(payload)
-            if isinstance(entry, ReadSteps) and entry.trial == trial:
+            if isinstance(entry, Steps) and entry.trial == trial:
                 records += _decode_records(entry.records)
             if end.offset >= self._end.offset or (
-                isinstance(entry, ReadFinished) and entry.trial == trial
+                isinstance(entry, Finished) and entry.trial == trial
             ):
                 break
         return records
@@ -281,7 +286,7 @@ def _converted(path: Path) -> JournalFile:
         file = JournalFile(path, os.O_RDWR, Path(named.name))
     try:
         file.begin()
-        end = file.append(START, list(map(msgspec.msgpack.encode, old_entries(path))))
+        end = file.append(START, list(map(encode, old_entries(path))))
         file.mark(end.offset, end.offset)
     except BaseException:
         file.close()

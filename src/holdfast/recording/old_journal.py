@@ -28,6 +28,7 @@ from holdfast.recording.journal_file import (
     Notes,
     Steps,
     damaged,
+    packed,
 )
 
 _SCHEMA_VERSION = "3"
@@ -123,11 +124,11 @@ class _Rows:
             self._require("trial", trial, 0, result, result_sum, f"result of trial {trial}")
             self._require("trial", trial, 1, decisions, decisions_sum, f"decisions of {trial}")
             if (steps := kept.get(trial)) is not None:
-                yield Steps(trial, steps)
+                yield Steps(trial, packed(steps))
             raw = msgspec.Raw(result), msgspec.Raw(decisions)
             yield Finished(trial, *raw, keeps_steps=steps is not None)
         if records:
-            yield Steps(records[0][0], [record for _, record in records])
+            yield Steps(records[0][0], packed([record for _, record in records]))
 
     def _steps(self) -> Iterator[tuple[int, msgspec.Raw]]:
         rows = self._ask("SELECT * FROM steps ORDER BY sequence")
