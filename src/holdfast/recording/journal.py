@@ -27,12 +27,14 @@ from holdfast.recording.journal_file import (
     Finished,
     JournalFile,
     Notes,
+    Position,
     Steps,
     Survives,
     boot_id,
     damaged,
     encode,
     packed,
+    steps_payload,
     synchronize_directory,
 )
 from holdfast.recording.journal_reader import SESSION_SIZE, JournalReader
@@ -142,7 +144,7 @@ class Journal(JournalReader):
         journal.survives = survives
         try:
             _, journal._on_disk = journal._file.promised()
-            # The rest is of a write that was cut short. It must not follow what is appended.
+            # The rest was never whole, or a power cut has taken a part before it.
             os.ftruncate(journal._file.descriptor, journal._end.offset)
         except BaseException as error:
             journal.close()
@@ -153,13 +155,19 @@ class Journal(JournalReader):
 
     # -- writing -------------------------------------------------------------------------------
 
-    def _write(self, *entries: Entry, synchronize: bool = True) -> None:
-        """Append entries, all or none; those that are synchronised are on the disk then."""
+    def _write(self, *entries: Entry) -> None:
+        """Append entries, all or none; when this returns, they are on the disk."""
+        end = self._append(list(map(encode, entries)), synchronize=True)
+        for _ in self.read_on():
+            pass
+        self._end = end
+
+    def _append(self, payloads: Sequence[bytes], *, synchronize: bool) -> Position:
         if self._broken is not None:
             raise self._broken
         file = self._file
         try:
-            end = file.append(self._end, list(map(encode, entries)))
+            end = file.append(self._end, payloads)
             if synchronize:
                 os.fdatasync(file.descriptor)
                 self._on_disk = end.offset
@@ -171,10 +179,7 @@ class Journal(JournalReader):
                 os.ftruncate(file.descriptor, self._end.offset)
             raise self._broken from error
         file.require_in_place()
-        if not isinstance(entries[0], Steps):
-            for _ in self.read_on():
-                pass
-        self._end = end
+        return end
 
     def set_meta(self, **rows: str) -> None:
         """Write notes about the run, all or none."""
@@ -217,13 +222,13 @@ class Journal(JournalReader):
         """
         if not records:
             return
-        steps, on_disk = Steps(trial, packed(records)), self.survives == "power_cut"
+        on_disk = self.survives == "power_cut"
         if self._appending == trial:
-            self._write(steps, synchronize=on_disk)
+            self._end = self._append([steps_payload(trial, records)], synchronize=on_disk)
         else:
             self._require_may_begin(trial)
             boot = {"steps_boot": boot_id() or "", "steps_on_disk": str(int(on_disk))}
-            self._write(Notes(boot), steps)
+            self._write(Notes(boot), Steps(trial, packed(records)))
             self._appending = trial
 
     def _require_may_begin(self, trial: int) -> None:

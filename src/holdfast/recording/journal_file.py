@@ -99,6 +99,11 @@ encode = msgspec.msgpack.Encoder().encode
 decode_entry: Callable[[bytes], Entry] = msgspec.msgpack.Decoder(Notes | Steps | Finished).decode
 
 
+def steps_payload(trial: int, records: Sequence[object]) -> bytes:
+    """Encode ``Steps(trial, packed(records))`` in one go."""
+    return encode((1, trial, records))
+
+
 def packed(value: object) -> msgspec.Raw:
     """Pack a part of an entry."""
     return msgspec.Raw(encode(value))
@@ -168,14 +173,14 @@ class JournalFile:
 
     def append(self, position: Position, payloads: Sequence[bytes]) -> Position:
         """Write frames, and return where they end; nobody may be told before :meth:`mark`."""
-        data: list[bytes] = []
+        parts = []
         offset, checksum = position
         for payload in payloads:
             checksum = _checksum(checksum + payload)
-            data += (_FRAME.pack(len(payload), checksum), payload)
-            offset += _FRAME.size + len(payload)
-        self._write(b"".join(data), position.offset)
-        return Position(offset, checksum)
+            parts.append(_FRAME.pack(len(payload), checksum) + payload)
+        data = b"".join(parts)
+        self._write(data, offset)
+        return Position(offset + len(data), checksum)
 
     def _write(self, data: bytes, offset: int) -> None:
         while (written := os.pwrite(self.descriptor, data, offset)) < len(data):
