@@ -20,12 +20,9 @@ class TestFinding:
         assert find_journal(tmp_path, "compare") == find_journal(journal, "compare") == journal
 
     def test_what_is_no_run(self, tmp_path: Path) -> None:
-        table = tmp_path / "trials.csv"
-        table.write_text("trial,seed\n")
         for run, message in (
             (tmp_path, "holds no journal.bin, so no run to compare"),
             (tmp_path / "missing", "no such directory or journal, so no run to compare"),
-            (table, "is not a journal; name the directory of a run"),
             (Path("/dev/null"), "is a pipe or device"),
         ):
             with pytest.raises(OutputError, match=message):
@@ -57,7 +54,7 @@ def test_another_form_is_refused(tmp_path: Path) -> None:
     data = path.read_bytes()
     for header, message in (
         (b"", "is empty"),
-        (b"no journal at all", "not a usable journal"),
+        (b"no journal at all", "is not a journal"),
         (data[:17] + b"55" + data[19:], "journal version '55'; this holdfast reads version 4"),
     ):
         path.write_bytes(header)

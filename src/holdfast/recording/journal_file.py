@@ -164,7 +164,9 @@ class JournalFile:
         if not header:
             raise OutputError(f"{self.path}: is empty, so no journal of a run; {START_ANEW}")
         if not header.startswith(_MAGIC):
-            raise OutputError(f"{self.path}: not a usable journal; {START_ANEW}")
+            raise OutputError(
+                f"{self.path}: is not a journal; name the directory of a run, or its {JOURNAL_NAME}"
+            )
         version = header[len(_MAGIC) :].rstrip(b"\n\0").decode("ascii", "replace")
         raise OutputError(
             f"{self.path}: journal version {version!r}; this holdfast reads version {_VERSION}; go "
@@ -270,15 +272,6 @@ def find_journal(run: Path, purpose: str) -> Path:
         raise OutputError(f"{run}: there is no such directory or journal, so no run to {purpose}")
     if not run.is_file():
         raise OutputError(f"{run}: is a pipe or device, not a journal")
-    try:
-        with run.open("rb") as file:
-            start = file.read(len(_MAGIC))
-    except OSError as error:
-        raise OutputError(f"{run}: cannot be read: {error.strerror}") from error
-    if start and start != _MAGIC and not start.startswith(SQLITE_MAGIC):
-        raise OutputError(
-            f"{run}: is not a journal; name the directory of a run, or its {JOURNAL_NAME}"
-        )
     return run
 
 

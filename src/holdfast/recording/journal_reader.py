@@ -51,22 +51,14 @@ class UnfinishedTrial(NamedTuple):
     ----------
     records : list of Record
         In the order in which they were appended.
-    same_boot : bool
-        Whether the machine has not been rebooted since the last of them was written; False if that
-        is not known.
-    on_disk : bool
-        Whether each of them was on the disk before it was acted on (``survives="power_cut"``).
+    is_complete : bool
+        Whether none can have been lost: the machine is known not to have been rebooted since, or
+        each was on the disk before it was acted on (``survives="power_cut"``).
     """
 
     trial: int
     records: list[Record]
-    same_boot: bool
-    on_disk: bool
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether no record can have been lost."""
-        return self.same_boot or self.on_disk
+    is_complete: bool
 
 
 class JournalReader:
@@ -221,13 +213,9 @@ class JournalReader:
             return None
         with _errors(self.path):
             records = self._steps(*self._begun)
-        boot = boot_id()
-        return UnfinishedTrial(
-            trial=self._begun[0],
-            records=records,
-            same_boot=boot is not None and self._notes.get("steps_boot") == boot,
-            on_disk=self._notes.get("steps_on_disk") == "1",
-        )
+        on_disk, boot = self._notes.get("steps_on_disk") == "1", boot_id()
+        is_complete = on_disk or (boot is not None and self._notes.get("steps_boot") == boot)
+        return UnfinishedTrial(self._begun[0], records, is_complete)
 
     # -- finished trials -----------------------------------------------------------------------
 

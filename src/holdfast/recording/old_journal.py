@@ -33,22 +33,6 @@ from holdfast.recording.journal_file import (
 
 _SCHEMA_VERSION = "3"
 _NUMBERS = struct.Struct("<qq")
-_MAX_ROW_BYTES = 2**29
-
-# SQLite locks these bytes of the file, which it never writes; the range is that of shared locks.
-_SHARED_LOCK_START = 0x40000002
-_SHARED_LOCK_SIZE = 510
-
-_TABLES = {
-    "meta": "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, checksum BLOB NOT NULL) "
-    "WITHOUT ROWID",
-    "trials": "CREATE TABLE trials (trial INTEGER PRIMARY KEY, result BLOB NOT NULL, "
-    "result_checksum BLOB NOT NULL, decisions BLOB NOT NULL, decisions_checksum BLOB NOT NULL)",
-    "steps": "CREATE TABLE steps (sequence INTEGER PRIMARY KEY, trial INTEGER NOT NULL, "
-    "record BLOB NOT NULL, checksum BLOB NOT NULL)",
-    "kept_steps": "CREATE TABLE kept_steps "
-    "(trial INTEGER PRIMARY KEY, records BLOB NOT NULL, checksum BLOB NOT NULL)",
-}
 
 
 def files_of(path: Path) -> list[Path]:
@@ -68,19 +52,20 @@ def old_entries(path: Path) -> Iterator[Entry]:
     with contextlib.ExitStack() as stack:
         try:
             file = stack.enter_context(path.open("rb"))
-            # Held to the end: then nobody can begin to write.
-            fcntl.lockf(file, fcntl.LOCK_SH | fcntl.LOCK_NB, _SHARED_LOCK_SIZE, _SHARED_LOCK_START)
+            try:
+                # Held to the end, so that nobody begins to write: SQLite's range of shared locks.
+                fcntl.lockf(file, fcntl.LOCK_SH | fcntl.LOCK_NB, 510, 0x40000002)
+            except (BlockingIOError, PermissionError):
+                raise OutputError(f"{path}: another process is using this run") from None
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="holdfast-")))
             for source in files_of(path):
                 shutil.copyfile(source, folder / source.name)
-        except (BlockingIOError, PermissionError) as error:
-            raise OutputError(f"{path}: another process is using this run") from error
         except OSError as error:
             raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
         try:
             connection = sqlite3.connect(folder / path.name, isolation_level=None)
             stack.enter_context(contextlib.closing(connection))
-            connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MAX_ROW_BYTES)
+            connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 2**29)
             yield from _Rows(path, connection).entries()
         except (sqlite3.Error, ValueError, TypeError, struct.error, msgspec.DecodeError) as error:
             raise damaged(path, str(error)) from error
@@ -95,16 +80,15 @@ class _Rows:
         # In somebody else's file a name may stand for a view, a trigger may write, and a column may
         # be computed, without end. Nothing is asked of it before this.
         for name, sql in self._ask("SELECT name, sql FROM sqlite_schema"):
-            if sql != _TABLES.get(name, ""):
+            if not str(sql).startswith(f"CREATE TABLE {name} (") or " AS " in sql:
                 raise damaged(self._path, f"{name!r:.80} in it is no table of a journal")
         (found,) = self._ask("PRAGMA quick_check(1)").fetchone()
         if found != "ok":
             raise damaged(self._path, str(found).strip().splitlines()[-1])
         notes = {}
         for key, value, checksum in self._ask("SELECT * FROM meta"):
-            self._require(
-                "meta", len(key), len(value), f"{key}={value}".encode(), checksum, f"note {key!r}"
-            )
+            data = f"{key}={value}".encode()
+            self._require("meta", len(key), len(value), data, checksum, f"note {key!r}")
             notes[key] = value
         version = notes.pop("schema_version", None)
         if version != _SCHEMA_VERSION:
@@ -159,9 +143,6 @@ class _Rows:
         self, table: str, first: int, second: int, data: Any, checksum: Any, what: str
     ) -> None:
         """Raise OutputError unless a row has its checksum; SQLite has a type for each value."""
-        person = f"holdfast-{table}".encode()
-        hashed = hashlib.blake2b(
-            _NUMBERS.pack(first, second) + data, digest_size=8, person=person
-        ).digest()
-        if hashed != checksum:
+        row, person = _NUMBERS.pack(first, second) + data, f"holdfast-{table}".encode()
+        if hashlib.blake2b(row, digest_size=8, person=person).digest() != checksum:
             raise damaged(self._path, f"the {what} has a wrong checksum")
