@@ -190,7 +190,7 @@ def test_damaged_entries(examples: int, written: bytes, folder: Path) -> None:
             damage_entries(chance, payloads)
         path.unlink(missing_ok=True)
         with contextlib.closing(JournalFile(path, os.O_RDWR | os.O_CREAT)) as file:
-            file.begin()
+            file.fill([])
             file.mark(file.append(START, payloads).offset, 0)
         look(path, read=chance.random() < 0.5, is_ours=False)
 

@@ -32,7 +32,7 @@ class TestFinding:
 @pytest.mark.parametrize("sizes", [(0, 1, 12), (1 << 18, 5, (1 << 18) - 12, 3), (700_000,) * 2])
 def test_frames_of_any_size_come_back(tmp_path: Path, sizes: tuple[int, ...]) -> None:
     file = JournalFile(tmp_path / "journal.bin", os.O_RDWR | os.O_CREAT)
-    file.begin()
+    file.fill([])
     payloads = [bytes([number]) * size for number, size in enumerate(sizes)]
     end = file.append(START, payloads[:1])
     end = file.append(end, payloads[1:])
@@ -40,7 +40,7 @@ def test_frames_of_any_size_come_back(tmp_path: Path, sizes: tuple[int, ...]) ->
         found = list(file.frames(START, chunk_bytes))
         assert [payload for payload, _ in found] == payloads
         assert found[-1][1] == end
-    assert file.promised() == (START.offset, 0)
+    assert file.promised() == (START.offset, START.offset)
     file.mark(end.offset, 64)
     assert file.promised() == (end.offset, 64)
     file.close()

@@ -79,10 +79,7 @@ class Journal(JournalReader):
 
     @classmethod
     def create_from(
-        cls,
-        path: Path,
-        entries: Iterable[Entry],
-        survives: Survives = "process_crash",
+        cls, path: Path, entries: Iterable[Entry], survives: Survives = "process_crash"
     ) -> Self:
         """Create a journal of its entries; see :meth:`create`."""
         # It is made under another name and then linked to its own, which fails if that is taken:
@@ -93,8 +90,8 @@ class Journal(JournalReader):
         journal = cls(path, JournalFile(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, unfinished))
         journal.survives = survives
         try:
-            journal._file.begin()
-            journal._write(*entries)
+            journal._on_disk = journal._file.fill(entries)
+            journal._read_all()
             os.link(unfinished, path)
             synchronize_directory(path.parent)
         except BaseException as error:
@@ -145,7 +142,8 @@ class Journal(JournalReader):
         try:
             _, journal._on_disk = journal._file.promised()
             # The rest was never whole, or a power cut has taken a part before it.
-            os.ftruncate(journal._file.descriptor, journal._end.offset)
+            if os.fstat(journal._file.descriptor).st_size > journal._end.offset:
+                os.ftruncate(journal._file.descriptor, journal._end.offset)
         except BaseException as error:
             journal.close()
             if isinstance(error, OSError):

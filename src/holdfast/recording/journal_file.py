@@ -26,7 +26,7 @@ import hashlib
 import os
 import struct
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -151,10 +151,16 @@ class JournalFile:
             os.close(self.descriptor)
             self.descriptor = -1
 
-    def begin(self) -> None:
-        """Make a journal of an empty file."""
+    def fill(self, entries: Iterable[Entry]) -> int:
+        """Make a journal of an empty file, on the disk; return its size."""
         self._write(_HEADER, 0)
         self.mark(START.offset, 0)
+        end = START
+        for entry in entries:
+            end = self.append(end, [encode(entry)])
+        os.fdatasync(self.descriptor)
+        self.mark(end.offset, end.offset)
+        return end.offset
 
     def require_journal(self) -> None:
         """Raise OutputError if it is no journal, or one of another version."""
@@ -165,7 +171,8 @@ class JournalFile:
             raise OutputError(f"{self.path}: is empty, so no journal of a run; {START_ANEW}")
         if not header.startswith(_MAGIC):
             raise OutputError(
-                f"{self.path}: is not a journal; name the directory of a run, or its {JOURNAL_NAME}"
+                f"{self.path}: is not a journal; name the directory of a run, or its "
+                f"{JOURNAL_NAME}, or {START_ANEW}"
             )
         version = header[len(_MAGIC) :].rstrip(b"\n\0").decode("ascii", "replace")
         raise OutputError(

@@ -31,7 +31,6 @@ from holdfast.recording.journal_file import (
     boot_id,
     damaged,
     decode_entry,
-    encode,
     find_journal,
 )
 
@@ -95,7 +94,8 @@ class JournalReader:
         file = JournalFile(path, flags)
         try:
             with _errors(path):
-                if os.pread(file.descriptor, len(SQLITE_MAGIC), 0) == SQLITE_MAGIC:
+                start = os.pread(file.descriptor, len(SQLITE_MAGIC), 0)
+                if start == SQLITE_MAGIC and flags == os.O_RDONLY:
                     file.close()
                     file = _converted(path)
                 file.require_journal()
@@ -273,9 +273,7 @@ def _converted(path: Path) -> JournalFile:
     with tempfile.NamedTemporaryFile(prefix="holdfast-journal-") as named:
         file = JournalFile(path, os.O_RDWR, Path(named.name))
     try:
-        file.begin()
-        end = file.append(START, list(map(encode, old_entries(path))))
-        file.mark(end.offset, end.offset)
+        file.fill(old_entries(path))
     except BaseException:
         file.close()
         raise
