@@ -159,7 +159,9 @@ def open_run(path: str | Path, *, problem_directory: str | Path | None = None) -
         configuration, trials = recorded.configuration, recorded.trials
     with JournalReader.read_run(run, "open") as journal:
         rows = [
-            [getattr(result, column) for column in TRIAL_COLUMNS] for result in journal.results()
+            [getattr(result, column) for column in TRIAL_COLUMNS]
+            for result in journal.results()
+            if result.trial in trials  # the run may have gone on
         ]
     columns = zip(*rows, strict=True) if rows else ([] for _ in TRIAL_COLUMNS)
     results = {
