@@ -331,7 +331,7 @@ def _journal_rows(directory: Path, number: int) -> list[list[str]]:
     rows = []
     kinds: tuple[Literal["process_crash", "power_cut"], ...] = ("process_crash", "power_cut")
     for survives in kinds:
-        path = directory / f"{survives}.sqlite"
+        path = directory / f"{survives}.bin"
         seconds = []
         with Journal.create(path, {}, survives=survives) as journal:
             for step in range(number if survives == "process_crash" else number // 10):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -11,6 +13,8 @@ from holdfast.config.loader import Configuration, load
 from holdfast.planning.outcome import Decisions, TrialResult
 from holdfast.planning.planner import Planner, digest
 from holdfast.protocol.records import ActingRecord, ObservedRecord, PerformedRecord, Record
+from holdfast.recording.journal import Journal
+from holdfast.recording.journal_file import START, Finished, decode_entry
 from holdfast.recording.recorder import Recorder
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 
@@ -65,6 +69,21 @@ def robot_configuration(tmp_path: Path, *, num_trials: int) -> Configuration:
         f"simulator: {{num_trials: {num_trials}, max_steps: 60, sensing_intervals: 8, seed: 3}}\n"
     )
     return load(path)
+
+
+def rewrite(path: Path, change: Callable[[Any], Any]) -> None:
+    """Write a journal again, each of its entries changed; None leaves it out."""
+    with Journal.read(path) as journal:
+        payloads = [payload for payload, _ in journal._file.frames(START)]
+    path.unlink()
+    entries = [change(decode_entry(payload)) for payload in payloads]
+    Journal.create_from(path, [entry for entry in entries if entry is not None]).close()
+
+
+def forget_steps(entry: Any) -> Any:
+    """Keep no steps of a finished trial, as runs of early versions."""
+    kept = isinstance(entry, Finished)
+    return msgspec.structs.replace(entry, keeps_steps=False) if kept else entry
 
 
 def failed(result: TrialResult) -> TrialResult:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import shutil
-import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -78,9 +76,10 @@ def test_the_journals_are_believed(directory: Path) -> None:
 
 
 def test_a_damaged_journal_has_failed(directory: Path) -> None:
-    path = directory / "undisturbed" / "journal.sqlite"
-    with contextlib.closing(sqlite3.connect(path)) as journal, journal:
-        journal.execute("UPDATE meta SET value = value || ' ' WHERE key = 'configuration'")
+    path = directory / "undisturbed" / "journal.bin"
+    data = bytearray(path.read_bytes())
+    data[100] ^= 1
+    path.write_bytes(data)
     verdict, reason, _ = compare_with_reference(directory)
     assert verdict == "failed"
-    assert "journal.sqlite: the journal is damaged" in reason
+    assert "journal.bin: the journal is damaged" in reason

@@ -218,7 +218,7 @@ def test_a_robot_that_dies_goes_on_but_no_engine_starts_one(site: Site, engine: 
     site.compose("robot", "stop", "--timeout", "60")
 
     # Nor does it after a reboot of the machine, which whoever starts it may not know of.
-    reboot(site.directory / "runs/run/journal.sqlite")
+    reboot(site.directory / "runs/run/journal.bin")
     site.compose("robot", "up", "-d")
     engine.docker("wait", site.container("robot"))
     assert site.state("robot")["ExitCode"] == 5

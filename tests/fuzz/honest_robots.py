@@ -95,7 +95,7 @@ class HonestRobots:
         trials = decisions = 0
         for file, out in self.runs:
             configuration = load(file)
-            with Journal.read(out / "journal.sqlite") as journal:
+            with Journal.read(out / "journal.bin") as journal:
                 for result in journal.results(with_decisions=True):
                     expected = run_trial(
                         Planner(configuration.problem, configuration.planning),

@@ -43,7 +43,7 @@ def _compare(file: Path, out: Path, most: int = 200) -> tuple[int, list[str]]:
     """Compare the last trials of a run with the planner by itself; return how many, and which."""
     configuration = load(file)
     findings = []
-    with Journal.read(out / "journal.sqlite") as journal:
+    with Journal.read(out / "journal.bin") as journal:
         results = list(journal.results())[-most:]
     for result in results:
         expected = run_trial(
@@ -88,7 +88,7 @@ class _Passers:
                 robot.process.kill()
                 robot.wait()
                 self.killed += 1
-                if self._chance.random() < 0.5 or not (robot.out / "journal.sqlite").exists():
+                if self._chance.random() < 0.5 or not (robot.out / "journal.bin").exists():
                     continue
                 robot = self._start(file, service, count, resume=True)
             if robot.wait() != 0:

@@ -466,7 +466,7 @@ def assert_identical(run: Path, reference: Path) -> None:
     assert found.identical, found.describe()
     assert found.task_actions > 0
     assert found.sensing_actions > 0
-    with Journal.read(run / "journal.sqlite") as journal:
+    with Journal.read(run / "journal.bin") as journal:
         for result in journal.results(with_decisions=True):
             assert result.decisions is not None
             steps = [each.step for each in result.decisions if isinstance(each, TaskDecision)]
@@ -475,7 +475,7 @@ def assert_identical(run: Path, reference: Path) -> None:
 
 def unfinished_steps(run: Path) -> list[int]:
     """Return the steps whose actions the journal of a killed run has of its unfinished trial."""
-    with Journal.read(run / "journal.sqlite") as journal:
+    with Journal.read(run / "journal.bin") as journal:
         unfinished = journal.unfinished()
     records = [] if unfinished is None else unfinished.records
     return [record.step for record in records if isinstance(record, ActingRecord)]

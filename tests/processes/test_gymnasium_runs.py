@@ -62,7 +62,7 @@ def test_a_crash_is_a_failure_in_every_table_and_truncated_is_neither(tmp_path: 
     assert refused.returncode == 2
     assert "env_arguments.max_episode_steps is not given here and 20 there" in refused.stderr
     # As if both had had the same world.
-    journals = [Journal.open(tmp_path / name / "journal.sqlite") for name in ("cut", "crash")]
+    journals = [Journal.open(tmp_path / name / "journal.bin") for name in ("cut", "crash")]
     journals[0].set_meta(configuration=journals[1].meta()["configuration"])
     for journal in journals:
         journal.close()

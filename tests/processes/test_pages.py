@@ -173,7 +173,7 @@ def test_commands_and_programs(page: Page, smaller: dict[str, str], clone: Path)
         assert done.returncode == 0, done.stderr
         assert done.stdout.strip()
     if page is README:
-        for name in ("trials.csv", "summary.json", "config.yaml", "journal.sqlite", "trial.png"):
+        for name in ("trials.csv", "summary.json", "config.yaml", "journal.bin", "trial.png"):
             assert (clone / "runs" / "first" / name).stat().st_size > 0
 
 

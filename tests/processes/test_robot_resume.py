@@ -76,7 +76,7 @@ class TestKilled:
         assert ended
         site.wait_for_nobody()
         # What the first of the two processes did counts in the tables too.
-        with Journal.read(story.running.out / "journal.sqlite") as journal:
+        with Journal.read(story.running.out / "journal.bin") as journal:
             (result,) = journal.results()
         assert result.recoveries == 2
         assert len(result.sensing_ms) == result.sensing_decisions == len(sensing_steps(document))
@@ -239,7 +239,7 @@ class TestEpoch:
             assert older is not None
             # Its journal is copied as it is, and somebody goes on with the copy.
             shutil.copytree(older.out, site.directory / "newer")
-            with Journal.open(site.directory / "newer" / "journal.sqlite") as journal:
+            with Journal.open(site.directory / "newer" / "journal.bin") as journal:
                 # For the journal it is the same world, although the test reaches it elsewhere.
                 text = journal.meta()["configuration"]
                 here, there = f"{{port: {world.port}}}", f"{{port: {other.port}}}"

@@ -159,7 +159,7 @@ class TestOutput:
             "trials.csv",
             "summary.json",
             "config.yaml",
-            "journal.sqlite",
+            "journal.bin",
             "trial.png",
         }
         assert all(name in done.stdout for name in names)

@@ -143,10 +143,9 @@ def test_a_run_from_before_trials_could_fail_goes_on(tmp_path: Path) -> None:
     """Its journal was made by that code; the digest is what that code came to, undisturbed."""
     out = tmp_path / "run"
     out.mkdir()
-    shutil.copyfile(BEFORE_OUTCOMES, out / "journal.sqlite")
-    with Journal.open(out / "journal.sqlite") as journal:
+    with Journal.read(BEFORE_OUTCOMES) as journal:
         (tmp_path / "old.yaml").write_text(journal.meta()["configuration"])
-        journal.set_meta(holdfast_version="0.0.1")
+    shutil.copyfile(BEFORE_OUTCOMES, out / "journal.sqlite")
     # It does not know the boot in which its robot moved.
     options = ("--rate=1000", "--out=run", "--resume", "--after-reboot")
     ended = holdfast(tmp_path, "run", "old.yaml", *options)

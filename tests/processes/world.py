@@ -94,7 +94,7 @@ class World:
     def assert_each_once(self, reference: Path) -> None:
         """Compare with a run without faults: every action was performed once, in its order."""
         assert not self.wrongs
-        with Journal.read(reference / "journal.sqlite") as journal:
+        with Journal.read(reference / "journal.bin") as journal:
             for trial in sorted(journal.finished()):
                 expected = [
                     np.array(decision.action).tobytes()

@@ -374,7 +374,7 @@ class TestReadBack:
 
     def test_decisions_in_the_tables_are_those_of_the_journal(self, built_in: Any) -> None:
         configuration, directory, _ = built_in
-        with Journal.read(directory / "run" / "journal.sqlite") as journal:
+        with Journal.read(directory / "run" / "journal.bin") as journal:
             results = list(journal.results(with_decisions=True))
         told = {int(row["trial"]): row for row in rows_of(directory / "tables" / "trials.csv")}
         decisions: dict[int, list[Any]] = defaultdict(list)
@@ -688,9 +688,9 @@ class TestUnfinished:
         run = place.run(PEG)
         configuration = load(tmp_path / "run.yaml")
         (seen,) = seen_in(configuration, range(1, 2))
-        with Journal.read(run / "journal.sqlite") as journal:
+        with Journal.read(run / "journal.bin") as journal:
             meta, first = journal.meta(), next(iter(journal.results(with_decisions=True)))
-        (run / "journal.sqlite").unlink()
+        (run / "journal.bin").unlink()
         from holdfast.planning.planner import digest
 
         records: list[Any] = []
@@ -701,7 +701,7 @@ class TestUnfinished:
             if step.step < 6:
                 records.append(ActingRecord(step.step, step.action.tobytes()))
         assert isinstance(records[-1], ObservedRecord) == (6 in sensed)
-        with Journal.create(run / "journal.sqlite", meta) as journal:
+        with Journal.create(run / "journal.bin", meta) as journal:
             journal.add(first)
             journal.append(1, records)
         said = place.export("--csv", "tables", "--mcap", "run.mcap")
@@ -721,7 +721,7 @@ class TestUnfinished:
         (tmp_path / "run.yaml").write_text(PEG)
         meta = {"configuration": load(tmp_path / "run.yaml").to_yaml()}
         (tmp_path / "run").mkdir()
-        Journal.create(tmp_path / "run" / "journal.sqlite", meta).close()
+        Journal.create(tmp_path / "run" / "journal.bin", meta).close()
         said = place.export("--csv", "tables", code=2)
         assert "no trial of that run is finished or begun" in said.stderr
         assert not (tmp_path / "tables").exists()
@@ -765,7 +765,7 @@ class TestRefusals:
         ("run", "message"),
         [
             ("nothing", "there is no such directory or journal, so no run to export"),
-            ("empty", "holds no journal.sqlite, so no run to export"),
+            ("empty", "holds no journal.bin, so no run to export"),
             ("run.yaml", "run.yaml: is not a journal; name the directory of a run"),
         ],
     )

@@ -1,94 +1,64 @@
-"""The file of a journal: found, counted, and its rows checked."""
+"""The file of a journal: found, of this form, and its frames as they were written."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
 from holdfast.errors import OutputError
 from holdfast.recording.journal import Journal
-from holdfast.recording.journal_file import (
-    JournalFile,
-    StepCount,
-    find_journal,
-    meta_checksum,
-    of_steps,
-    of_trials,
-)
+from holdfast.recording.journal_file import START, JournalFile, find_journal
 
 
 class TestFinding:
-    def test_a_directory_or_the_journal_itself(self, tmp_path: Path) -> None:
-        journal = tmp_path / "journal.sqlite"
+    @pytest.mark.parametrize("name", ["journal.bin", "journal.sqlite"])
+    def test_a_directory_or_the_journal_itself(self, tmp_path: Path, name: str) -> None:
+        journal = tmp_path / name
         Journal.create(journal, {}).close()
         assert find_journal(tmp_path, "compare") == find_journal(journal, "compare") == journal
 
     def test_what_is_no_run(self, tmp_path: Path) -> None:
-        table = tmp_path / "trials.csv"
-        table.write_text("trial,seed\n")
         for run, message in (
-            (tmp_path, "holds no journal.sqlite, so no run to compare"),
+            (tmp_path, "holds no journal.bin, so no run to compare"),
             (tmp_path / "missing", "no such directory or journal, so no run to compare"),
-            (table, "is not a journal; name the directory of a run"),
             (Path("/dev/null"), "is a pipe or device"),
         ):
             with pytest.raises(OutputError, match=message):
                 find_journal(run, "compare")
 
 
-class TestCount:
-    def test_it_comes_back(self, tmp_path: Path) -> None:
-        path = JournalFile(tmp_path / "journal.sqlite").count
-        assert StepCount.read(path) is None
-        count = StepCount(path, synchronous=True)
-        count.begin(3, 5)
-        count.write(3, 6)
-        count.close()
-        assert StepCount.read(path) == (3, 6)
-        path.write_bytes(path.read_bytes()[:-1])
-        assert StepCount.read(path) is None
-
-    def test_it_cannot_be_written(self, tmp_path: Path) -> None:
-        with pytest.raises(OutputError, match="count: cannot be written"):
-            StepCount(tmp_path / "missing" / "count", synchronous=False)
-
-
-class TestChecksums:
-    def test_content_key_and_table_count(self) -> None:
-        checksums = [
-            of_steps(0, 1, b"data"),
-            of_steps(1, 1, b"data"),
-            of_steps(0, 2, b"data"),
-            of_steps(0, 1, b"Data"),
-            of_trials(0, 1, b"data"),
-            meta_checksum("a", "b"),
-            meta_checksum("b", "a"),
-        ]
-        assert len(set(checksums)) == len(checksums)
-
-    @pytest.mark.parametrize("row", [("text", 0), (None, 0), (b"data", "0"), (b"other", 0)])
-    def test_a_value_of_another_type_is_not_intact(self, row: tuple[object, object]) -> None:
-        checksum = of_steps(0, 1, b"data")
-        assert of_steps.is_intact(b"data", checksum, 0, 1)
-        assert not of_steps.is_intact(row[0], checksum, row[1], 1)
+@pytest.mark.parametrize("sizes", [(0, 1, 12), (1 << 18, 5, (1 << 18) - 12, 3), (700_000,) * 2])
+def test_frames_of_any_size_come_back(tmp_path: Path, sizes: tuple[int, ...]) -> None:
+    file = JournalFile(tmp_path / "journal.bin", os.O_RDWR | os.O_CREAT)
+    file.fill([])
+    payloads = [bytes([number]) * size for number, size in enumerate(sizes)]
+    end = file.append(START, payloads[:1])
+    end = file.append(end, payloads[1:])
+    for chunk_bytes in (12, 4096, 1 << 18):
+        found = list(file.frames(START, chunk_bytes))
+        assert [payload for payload, _ in found] == payloads
+        assert found[-1][1] == end
+    assert file.promised() == (START.offset, START.offset)
+    file.mark(end.offset, 64)
+    assert file.promised() == (end.offset, 64)
+    file.close()
 
 
-def test_a_journal_that_is_open_here_is_writable(tmp_path: Path) -> None:
-    path = tmp_path / "journal.sqlite"
-    with Journal.create(path, {}):
-        assert JournalFile(path).log.exists()
-        JournalFile(path).require_writable()
-        with pytest.raises(OutputError, match="another process"):
-            Journal.open(path)
-    with pytest.raises(OutputError, match="cannot be written: No such file"):
-        JournalFile(tmp_path / "missing").require_writable()
-
-
-def test_a_file_that_is_replaced_is_another(tmp_path: Path) -> None:
-    first, second = tmp_path / "first", tmp_path / "second"
-    for path in (first, second):
-        path.write_text("same")
-    version = JournalFile(first).version()
-    second.replace(first)
-    assert JournalFile(first).version()[:2] != version[:2]
+def test_another_form_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "journal.bin"
+    with pytest.raises(OutputError, match="there is no journal"):
+        Journal.open(path)
+    Journal.create(path, {}).close()
+    data = path.read_bytes()
+    for header, message in (
+        (b"", "is empty"),
+        (b"no journal at all", "is not a journal"),
+        (data[:17] + b"55" + data[19:], "journal version '55'; this holdfast reads version 4"),
+    ):
+        path.write_bytes(header)
+        for opens in (Journal.open, Journal.read):
+            with pytest.raises(OutputError, match=message):
+                opens(path)
+        assert path.read_bytes() == header

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -31,15 +32,9 @@ from holdfast.recording.facts import (
     TrialBeginFact,
     TrialEndFact,
 )
-from holdfast.recording.live_follower import (
-    EndedMessage,
-    EventMessage,
-    FinishMessage,
-    Follower,
-    LostMessage,
-    RecordsMessage,
-    TimingMessage,
-)
+from holdfast.recording.journal import Journal
+from holdfast.recording.live_follower import Follower, RunFiles
+from holdfast.recording.timings import EventTable
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 
@@ -108,8 +103,8 @@ def test_the_same_facts_as_of_the_trial_itself(configuration: Configuration) -> 
     facts = Facts()
     follower = Follower(configuration, facts, clock=lambda: 0)
     for record in records[:-1]:  # the last one is in the result
-        follower.take(RecordsMessage(0, 1, (record,)))
-    follower.take(EndedMessage(0, history.result(Ending("failed", "it fell"))))
+        follower.records(1, [record], 0)
+    follower.finished(history.result(Ending("failed", "it fell")), 0)
     expected = Steps()
     run_trial(
         Planner(configuration.problem, configuration.planning),
@@ -144,47 +139,63 @@ def test_what_is_late_is_folded_and_not_shown(configuration: Configuration) -> N
     follower = Follower(configuration, facts, clock=lambda: now)
     middle = len(records) // 2
     now = 4 * SECOND
-    follower.take(RecordsMessage(SECOND // 2, 0, tuple(records[:middle])))
+    follower.records(0, records[:middle], SECOND // 2)
     assert facts.of(SensingFact) == facts.of(TaskFact) == []
     left_out = follower.left_out
     assert left_out > 0
-    follower.take(RecordsMessage(now, 0, tuple(records[middle:])))
-    follower.take(EndedMessage(now, history.result(None)))
+    follower.records(0, records[middle:], now)
+    follower.finished(history.result(None), now)
     assert follower.left_out == left_out
     assert len(facts.of(TaskFact)) == follower.steps - left_out
     assert facts.all[-1].belief.states.tobytes() == history.state.belief.states.tobytes()
 
 
-def test_who_decided(configuration: Configuration) -> None:
-    records, _ = a_trial(configuration, 0)
+def test_the_files_of_a_run_that_goes_on(configuration: Configuration, tmp_path: Path) -> None:
+    records, history = a_trial(configuration, 1)
+    events = tmp_path / "events.jsonl"
+    events.write_text('{"time":"2026-11-26T13:00:00Z","event":"before"}\n{"time":"2026-1')
     facts = Facts()
-    follower = Follower(configuration, facts, clock=lambda: 0)
-    follower.take(TimingMessage(7, Timing(0, 0, "sensing", "tcp/a:1", "standard", 1.0, 2.0, 3.0)))
-    follower.take(TimingMessage(8, Timing(0, 0, "task", "local", "local_recovery", 4.0, 5.0, 6.0)))
-    follower.take(RecordsMessage(9, 0, tuple(records)))
-    (sensed, *_), (first, second, *_) = facts.of(SensingFact), facts.of(TaskFact)
-    assert (sensed.decider.service, sensed.decided_ns, sensed.observed_ns) == ("tcp/a:1", 7, 9)
-    assert first.decider.service == "local"
-    assert second.decider == first.decider  # of the same answer
-
-
-def test_events_and_endings(configuration: Configuration) -> None:
-    records, history = a_trial(configuration, 0)
-    facts = Facts()
-    follower = Follower(configuration, facts, clock=lambda: 0)
-    follower.take(
-        EventMessage(3, '{"time":"t","component":"robot","event":"holding","reason":"r"}')
-    )
-    assert facts.all == [EventFact(3, "holding", {"component": "robot", "reason": "r"})]
-    follower.take(RecordsMessage(4, 0, tuple(records[:2])))
-    # What follows belongs to another trial, and nothing is known of this one's end.
-    follower.take(LostMessage())
-    assert facts.all[-1].result is None
-    follower.take(EndedMessage(5, history.result(None)))
-    assert [fact.trial for fact in facts.of(TrialBeginFact)] == [0, 0]
-    assert (facts.all[-1].steps, facts.all[-1].belief) == (20, None)
-    follower.take(FinishMessage())
-    assert len(facts.of(TrialEndFact)) == 2
+    follower = Follower(configuration, facts)
+    answer = ("tcp/a:1", "standard", 1.0, 2.0, 3.0)
+    with Journal.create(tmp_path / "journal.bin", {}) as journal:
+        journal.append(1, records[:2])
+        files = RunFiles(tmp_path)
+        # The robot's tables are opened later, and what a crash has cut short is removed.
+        table = EventTable(tmp_path / "timings.csv", Timing)
+        events.write_text('{"time":"2026-11-26T13:00:00Z","event":"before"}\n')
+        for _ in range(2):
+            files.tell(follower, facts, time.time_ns())
+            assert [fact.step for fact in facts.of(TaskFact)] == [0]
+        with events.open("a") as log:
+            log.write('{"time":"2026-11-26T13:00:01Z","component":"robot","eve')
+            log.flush()
+            table.add(Timing(1, 1, "task", *answer))
+            journal.append(1, records[2:4])
+            files.tell(follower, facts, time.time_ns())
+            assert facts.of(EventFact) == []
+            log.write('nt":"holding","reason":"r"}\n')
+        # The table is read after the journal, so what it says of the next trial may come early.
+        table.add(Timing(2, 0, "sensing", *answer))
+        journal.append(1, records[4:-1])
+        result = history.result(None)
+        journal.add(result)
+        files.tell(follower, facts, time.time_ns())
+        journal.append(2, a_trial(configuration, 2)[0])
+        files.tell(follower, facts, time.time_ns())
+        table.close()
+    (event,) = facts.of(EventFact)
+    assert (event.name, event.fields) == ("holding", {"component": "robot", "reason": "r"})
+    (end,) = facts.of(TrialEndFact)
+    assert end.result.digest == result.digest
+    assert end.belief.states.tobytes() == history.state.belief.states.tobytes()
+    first, second, third, *_ = facts.of(TaskFact)
+    assert first.decider is None
+    assert second.decider.service == "tcp/a:1"
+    assert third.decider == second.decider  # of the same answer
+    (sensed, *_) = (fact for fact in facts.of(SensingFact) if fact.trial == 2)
+    assert sensed.decider.service == "tcp/a:1"
+    assert sensed.decided_ns <= sensed.observed_ns
+    assert [fact.trial for fact in facts.of(TrialBeginFact)] == [1, 2]
 
 
 def test_an_observation_that_comes_late(configuration: Configuration) -> None:
@@ -205,8 +216,8 @@ def test_an_observation_that_comes_late(configuration: Configuration) -> None:
     facts = Facts()
     follower = Follower(configuration, facts, clock=lambda: 0)
     acting = ActingRecord(0, encode_floats(action))
-    follower.take(RecordsMessage(0, 0, (observed, acting, performed, late)))
-    follower.take(FinishMessage())
+    follower.records(0, [observed, acting, performed, late], 0)
+    follower.end(0)
     (sensed,) = facts.of(SensingFact)
     assert (sensed.sensing_action, sensed.observation, sensed.explained) == (1, None, True)
     (came_late,) = facts.of(LateFact)

@@ -70,7 +70,7 @@ def run_of(
         tolerance=tolerance, trials=trials or len(results), seed=seed, limit=limit
     )
     text += environment
-    with Journal.create(path / "journal.sqlite", {"configuration": text}) as journal:
+    with Journal.create(path / "journal.bin", {"configuration": text}) as journal:
         for result in results:
             journal.add(result)
     return path

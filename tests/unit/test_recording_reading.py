@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
-import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from tests.command_line import run_here
+from tests.recordings import forget_steps, rewrite
 
 import holdfast as hf
 from holdfast.errors import OutputError
@@ -134,9 +133,7 @@ def test_a_world_of_ones_own(recorded: Recorded, tmp_path: Path) -> None:
 def test_a_world_of_ones_own_that_was_forgotten(recorded: Recorded, tmp_path: Path) -> None:
     (tmp_path / "numb_robot.py").write_text(OWN_ROBOT)
     run = recorded(CONFIGURATION + "environment: {object: 'numb_robot:Robot'}\n")
-    with contextlib.closing(sqlite3.connect(tmp_path / "run" / "journal.sqlite")) as journal:
-        journal.execute("DELETE FROM kept_steps")
-        journal.commit()
+    rewrite(tmp_path / "run" / "journal.bin", forget_steps)
     with pytest.raises(OutputError, match="trial 1 cannot be computed again: this run is older"):
         run.trial(1)
 

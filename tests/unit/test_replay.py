@@ -104,7 +104,7 @@ def test_another_decision_than_the_recorded_one_is_refused(tmp_path: Path) -> No
 
 
 def test_what_is_no_run_is_refused_with_its_purpose(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match=r"holds no journal.sqlite, so no run to open"):
+    with pytest.raises(OutputError, match=r"holds no journal.bin, so no run to open"):
         RecordedRun(tmp_path, "open")
 
 

@@ -8,16 +8,17 @@ from __future__ import annotations
 import csv
 import json
 import os
-import sqlite3
-from contextlib import closing
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import pytest
 from tests.command_line import Said, run_here
+from tests.recordings import forget_steps, rewrite
 
 from holdfast.errors import HeldError
 from holdfast.recording import journal_file
-from holdfast.recording.journal import Journal
+from holdfast.recording.journal_file import Notes
 from holdfast.robot.process import RobotProcess
 
 PEG = """
@@ -123,7 +124,7 @@ class TestResumeIfBegun:
         said = workplace.runs(*self.ARGUMENTS, "--trials", "5")
         out = workplace.directory / "out"
         assert (said.stdout, said.stderr) == ("", f"note: {out}: complete, with 5 trials\n")
-        del tables[workplace.directory / "out" / "journal.sqlite"]
+        del tables[workplace.directory / "out" / "journal.bin"]
         assert {path: path.stat().st_mtime_ns for path in tables} == tables
         workplace.runs("run", "peg.yaml", "--jobs", "1", "--out", "whole", "--trials", "5")
         assert workplace.decided("out") == workplace.decided("whole")
@@ -153,15 +154,12 @@ class TestResumeIfBegun:
         workplace.runs("run", "peg.yaml", "--trials", "1", "--out", "other")
         out.mkdir()
         # Whoever made it had this process's number, as all that a container starts have.
-        for name in (f".journal.sqlite.{os.getpid()}", f".journal.sqlite.{os.getpid()}-journal"):
-            (out / name).write_bytes(b"half of it")
+        (out / f".journal.bin.{os.getpid()}").write_bytes(b"half of it")
         workplace.runs(*self.ARGUMENTS, "--trials", "1", "--seed", "7")
-        with Journal.open(out / "journal.sqlite") as journal:
-            # A journal without a trial, of another run, and no configuration beside it.
-            for table in ("trials", "steps"):
-                journal._connection.execute(f"DELETE FROM {table}")
+        # A journal without a trial, of another run, and no configuration beside it.
+        rewrite(out / "journal.bin", lambda entry: entry if isinstance(entry, Notes) else None)
         for path in out.iterdir():
-            if path.name != "journal.sqlite":
+            if path.name != "journal.bin":
                 path.unlink()
         workplace.runs(*self.ARGUMENTS, "--trials", "1")
         assert workplace.decided("out") == workplace.decided("other")
@@ -169,9 +167,9 @@ class TestResumeIfBegun:
     def test_what_is_no_journal_is_an_error(self, workplace: Workplace) -> None:
         out = workplace.directory / "out"
         out.mkdir()
-        (out / "journal.sqlite").write_bytes(b"no journal" * 100)
-        assert "journal.sqlite: " in workplace.fails(*self.ARGUMENTS)
-        (out / "journal.sqlite").unlink()
+        (out / "journal.bin").write_bytes(b"no journal" * 100)
+        assert "journal.bin: " in workplace.fails(*self.ARGUMENTS)
+        (out / "journal.bin").unlink()
         (out / "trials.csv").write_bytes(b"")
         assert "out: holds trials.csv already" in workplace.fails(*self.ARGUMENTS)
 
@@ -241,8 +239,7 @@ def test_a_world_of_ones_own_has_a_figure_of_the_belief(workplace: Workplace) ->
     assert figure.read_bytes().startswith(b"\x89PNG\r\n")
     # Runs of earlier versions have kept no observations.
     figure.unlink()
-    with closing(sqlite3.connect(workplace.directory / "out" / "journal.sqlite")) as connection:
-        connection.execute("DROP TABLE kept_steps")
+    rewrite(workplace.directory / "out" / "journal.bin", forget_steps)
     said = workplace.runs(*arguments, "--trials", "2", "--resume", figures=True)
     assert "note: no figure, because trial 0 ended in an earlier part of the run" in said.stderr
 
@@ -558,11 +555,16 @@ class TestAfterAReboot:
         self, workplace: Workplace, boot: Path
     ) -> None:
         workplace.runs(*self.ROBOT, "--trials", "1")
-        with Journal.open(workplace.directory / "out" / "journal.sqlite") as journal:
-            journal._connection.execute("DELETE FROM meta WHERE key = 'boot'")
+
+        def forget_boot(entry: Any) -> Any:
+            if isinstance(entry, Notes):
+                kept = {key: value for key, value in entry.notes.items() if key != "boot"}
+                return msgspec.structs.replace(entry, notes=kept)
+            return entry
+
+        rewrite(workplace.directory / "out" / "journal.bin", forget_boot)
         workplace.runs(*self.ROBOT, "--trials", "2", "--resume")
-        with Journal.open(workplace.directory / "out" / "journal.sqlite") as journal:
-            journal._connection.execute("DELETE FROM meta WHERE key = 'boot'")
+        rewrite(workplace.directory / "out" / "journal.bin", forget_boot)
         boot.write_text("2e\n")
         self.refused(workplace, "--trials", "3", "--resume")
 

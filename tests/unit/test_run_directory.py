@@ -64,7 +64,7 @@ class TestRunDirectory:
         with pytest.raises(OutputError, match="no such directory, so no run to resume"):
             RunDirectory.resume(tmp_path / "missing", configuration_of(tmp_path))
         (tmp_path / "empty").mkdir()
-        with pytest.raises(OutputError, match=r"holds no journal\.sqlite, so no run to resume"):
+        with pytest.raises(OutputError, match=r"holds no journal\.bin, so no run to resume"):
             RunDirectory.resume(tmp_path / "empty", configuration_of(tmp_path))
 
     def test_resuming_with_another_configuration_names_the_key(self, tmp_path: Path) -> None:
@@ -123,8 +123,7 @@ class TestRunDirectory:
             assert directory.earlier_wall_time_s == 0.0
             assert {path.name for path in out.iterdir()} == {
                 "config.yaml",
-                "journal.sqlite",
-                "journal.sqlite-wal",
+                "journal.bin",
             }
             with pytest.raises(OutputError, match="holds config"):
                 RunDirectory.create(out, other)  # in use by the run above
@@ -198,7 +197,7 @@ class TestRunDirectory:
         same = of(arguments={"id": "Moon-v0", "gravity": -10.0}, timeout_ms=20.0, directory="/srv")
         RunDirectory.resume(out, same).close()
 
-    @pytest.mark.parametrize("name", [*OUTPUT_NAMES, "recovery.log", "journal.sqlite-wal"])
+    @pytest.mark.parametrize("name", [*OUTPUT_NAMES, "recovery.log", "journal.sqlite"])
     def test_nothing_is_written_through_a_link(self, tmp_path: Path, name: str) -> None:
         configuration = configuration_of(tmp_path)
         mine = tmp_path / "mine"
@@ -223,13 +222,13 @@ class TestRunDirectory:
         configuration = configuration_of(tmp_path)
         out = tmp_path / "out"
         RunDirectory.create(out, configuration).close()
-        damaged = (out / "journal.sqlite").read_bytes()[:-4096]
-        (out / "journal.sqlite").write_bytes(damaged)
+        damaged = (out / "journal.bin").read_bytes()[:-100]
+        (out / "journal.bin").write_bytes(damaged)
         with pytest.raises(OutputError, match=r"the journal is damaged .*--out"):
             RunDirectory.resume(out, configuration)
         with pytest.raises(OutputError, match=r"holds config"):
             RunDirectory.create(out, configuration)
-        assert (out / "journal.sqlite").read_bytes() == damaged
+        assert (out / "journal.bin").read_bytes() == damaged
 
     def test_a_default_directory_without_a_finished_trial_is_taken_again(
         self, tmp_path: Path

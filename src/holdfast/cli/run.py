@@ -296,7 +296,7 @@ def _run_as_robot(
     if (target := options.view_target()) is not None:
         from holdfast.recording.live_view import LiveView
 
-        view = LiveView(configuration, target, note)
+        view = LiveView(configuration, target, directory.path, note)
     findings = RobotFindings(hint)
     sinks: list[EventSink] = [findings]
     if not options.quiet:

@@ -52,7 +52,7 @@ class RunOptions(Options):
     """Run the trials of CONFIG and write their results into a directory.
 
     DIR gets trials.csv (a row for each trial), summary.json, config.yaml (with all defaults filled
-    in; it can be run again), journal.sqlite (every decision of every trial) and trial.png (a figure
+    in; it can be run again), journal.bin (every decision of every trial) and trial.png (a figure
     of trial 0).
 
     With --service, --environment, --rate or --view the trials are run one after another, as a robot

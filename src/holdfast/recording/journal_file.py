@@ -1,79 +1,263 @@
-"""The SQLite file of a journal: how it is opened and locked, and how damage to it is found.
+r"""The file of a journal: frames that are only ever appended, and a mark of how far they go.
 
-SQLite writes ahead (WAL): a commit is one append to ``journal.sqlite-wal``, which takes some
-microseconds and survives the death of the process. A log that is removed, cut, or left behind when
-the journal is copied would take the last steps with it, and SQLite would not notice. So
-``journal.sqlite-count`` holds the number of records that were written: a journal with fewer has
-lost some. Both files are removed when the journal is closed.
+::
 
-Each row has a checksum over its content and its key, so that a damaged or misplaced row is found.
+    "holdfast journal 4\n"                                       32 bytes
+    mark: written up to, on the disk up to, boot, checksum       32 bytes
+    frame: length of the payload, checksum, payload              12 bytes and the payload
+    frame ...
+
+The checksum of a frame covers that of the frame before it: one that is missing, doubled, exchanged
+or of another file is found as a flipped bit is.
+
+A frame that is not whole was either cut short while it was written, or was whole once. The mark
+tells which: it is written after the frame, and nothing is acted on before. So what lies before the
+mark was promised, and if it is not whole the file is damaged. What lies behind it was promised to
+nobody, and is cut off. After a power cut that holds for what was on the disk; the mark itself, 32
+bytes of one sector, is there or the one before is.
+
+Readers need no lock: they read the mark first, then the frames up to it and beyond.
 """
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import hashlib
 import os
-import shutil
-import sqlite3
 import struct
-import tempfile
 import weakref
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
-from holdfast.errors import OutputError
+import msgspec
 
-__all__ = [
-    "JOURNAL_NAME",
-    "START_ANEW",
-    "FileIdentity",
-    "JournalFile",
-    "RowChecksum",
-    "StepCount",
-    "Survives",
-    "boot_id",
-    "find_journal",
-    "is_named",
-    "meta_checksum",
-    "of_steps",
-    "of_trials",
-    "open_here",
-    "synchronize_directory",
-]
+from holdfast.errors import LostJournalError, OutputError
 
-JOURNAL_NAME = "journal.sqlite"
+JOURNAL_NAME = "journal.bin"
+OLD_JOURNAL_NAME = "journal.sqlite"
+"""Of earlier versions; :mod:`holdfast.recording.old_journal` reads it."""
 
 Survives: TypeAlias = Literal["process_crash", "power_cut"]
 """What a journalled step survives; see :class:`holdfast.planning.settings.RecoverySettings`."""
 
-FileIdentity: TypeAlias = tuple[int, int]
-"""Device and inode."""
-
 START_ANEW = "start anew in another directory (--out)"
+SQLITE_MAGIC = b"SQLite format 3\0"
 
-_SQLITE_MAGIC = b"SQLite format 3\0"
+_VERSION = 4
+"""Raised whenever frames or their content change form. Up to 3 it was a database."""
+
+_MAGIC = b"holdfast journal "
+_HEADER = (_MAGIC + b"%d\n" % _VERSION).ljust(32, b"\0")
+_MARK = struct.Struct("<QQ8s")
+_FRAME = struct.Struct("<I8s")
 _CHECKSUM_SIZE = 8
-_NUMBERS = struct.Struct("<qq")
+_MAX_FRAME_BYTES = 2**29
+"""Bound on a frame, for a file of somebody else's; a trial of a million steps has a tenth of it."""
+
+_CHUNK_BYTES = 1 << 18
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-_BUSY_TIMEOUT_S = 1.0
-_MAX_ROW_BYTES = 2**29
-"""Bound on a row, for a file of somebody else's; a trial of a million steps has a tenth of it."""
+_EMPTY = hashlib.blake2b(digest_size=_CHECKSUM_SIZE, person=b"holdfast-journal")
 
-_PAGE_BYTES = 1024
-"""A step writes whole pages; larger ones take longer to write and to checksum."""
 
-# SQLite locks these bytes of the file, which it never writes; the range is that of shared locks.
-_SHARED_LOCK_START = 0x40000002
-_SHARED_LOCK_SIZE = 510
+class Position(NamedTuple):
+    """A place between two frames: its offset in the file, and the checksum of the frame before."""
 
-open_here: weakref.WeakValueDictionary[FileIdentity, object] = weakref.WeakValueDictionary()
-"""Journals that this process has open for writing.
+    offset: int
+    checksum: bytes
 
-Closing any descriptor of a file drops this process's locks on it, SQLite's too. So such a file is
-never opened a second time.
-"""
+
+START = Position(len(_HEADER) + _MARK.size + _CHECKSUM_SIZE, bytes(_CHECKSUM_SIZE))
+
+
+class Notes(msgspec.Struct, array_like=True, frozen=True, tag=0):
+    """Notes about the run; ``anew`` drops all earlier ones."""
+
+    notes: Mapping[str, str]
+    anew: bool = False
+
+
+class Steps(msgspec.Struct, array_like=True, frozen=True, tag=1):
+    """Records of the unfinished trial, packed."""
+
+    trial: int
+    records: msgspec.Raw
+
+
+class Finished(msgspec.Struct, array_like=True, frozen=True, tag=2):
+    """The end of a trial: its result and decisions, packed; whether its records are still used."""
+
+    trial: int
+    result: msgspec.Raw
+    decisions: msgspec.Raw
+    keeps_steps: bool
+
+
+Entry: TypeAlias = Notes | Steps | Finished
+
+encode = msgspec.msgpack.Encoder().encode
+decode_entry: Callable[[bytes], Entry] = msgspec.msgpack.Decoder(Notes | Steps | Finished).decode
+
+
+def steps_payload(trial: int, records: Sequence[object]) -> bytes:
+    """Encode ``Steps(trial, packed(records))`` in one go."""
+    return encode((1, trial, records))
+
+
+def packed(value: object) -> msgspec.Raw:
+    """Pack a part of an entry."""
+    return msgspec.Raw(encode(value))
+
+
+def _checksum(data: bytes) -> bytes:
+    checksum = _EMPTY.copy()  # creating one takes longer than hashing a step
+    checksum.update(data)
+    return checksum.digest()
+
+
+class JournalFile:
+    """An open journal. Its methods raise OSError if the system refuses something.
+
+    One that is open to be written (``flags`` with ``os.O_RDWR``) is locked. The lock is that of
+    this opening, so it ends with the process, and no other use of the file touches it. ``name`` is
+    the name under which it is created.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be opened, or another process is writing to it.
+    """
+
+    def __init__(self, path: Path, flags: int, name: Path | None = None) -> None:
+        self.path = path
+        self._boot = _checksum((boot_id() or os.urandom(16).hex()).encode())
+        self.descriptor = -1
+        try:
+            self.descriptor = os.open(name or path, flags | os.O_CLOEXEC, 0o666)
+            if flags & os.O_RDWR:
+                fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                _written_here.add(self)
+        except BlockingIOError:
+            self.close()
+            raise OutputError(f"{path}: another process is using this run") from None
+        except OSError as error:
+            self.close()
+            what = "written" if flags & os.O_RDWR else "read"
+            raise OutputError(f"{path}: cannot be {what}: {error.strerror}") from error
+
+    def close(self) -> None:
+        """Close the file, and give up its lock. May be repeated."""
+        if self.descriptor >= 0:
+            os.close(self.descriptor)
+            self.descriptor = -1
+
+    def fill(self, entries: Iterable[Entry]) -> int:
+        """Make a journal of an empty file, on the disk; return its size."""
+        self._write(_HEADER, 0)
+        self.mark(START.offset, 0)
+        end = START
+        for entry in entries:
+            end = self.append(end, [encode(entry)])
+        os.fdatasync(self.descriptor)
+        self.mark(end.offset, end.offset)
+        return end.offset
+
+    def require_journal(self) -> None:
+        """Raise OutputError if it is no journal, or one of another version."""
+        header = os.pread(self.descriptor, len(_HEADER), 0)
+        if header == _HEADER:
+            return
+        if not header:
+            raise OutputError(f"{self.path}: is empty, so no journal of a run; {START_ANEW}")
+        if not header.startswith(_MAGIC):
+            raise OutputError(
+                f"{self.path}: is not a journal; name the directory of a run, or its "
+                f"{JOURNAL_NAME}, or {START_ANEW}"
+            )
+        version = header[len(_MAGIC) :].rstrip(b"\n\0").decode("ascii", "replace")
+        raise OutputError(
+            f"{self.path}: journal version {version!r}; this holdfast reads version {_VERSION}; go "
+            f"on with the holdfast that made it, or {START_ANEW}"
+        )
+
+    def append(self, position: Position, payloads: Sequence[bytes]) -> Position:
+        """Write frames, and return where they end; nobody may be told before :meth:`mark`."""
+        parts = []
+        offset, checksum = position
+        for payload in payloads:
+            checksum = _checksum(checksum + payload)
+            parts.append(_FRAME.pack(len(payload), checksum) + payload)
+        data = b"".join(parts)
+        self._write(data, offset)
+        return Position(offset + len(data), checksum)
+
+    def _write(self, data: bytes, offset: int) -> None:
+        while (written := os.pwrite(self.descriptor, data, offset)) < len(data):
+            data, offset = data[written:], offset + written  # the next call says what is wrong
+
+    def mark(self, written: int, on_disk: int) -> None:
+        """Note how far the file is written, and how far it is on the disk."""
+        mark = _MARK.pack(written, on_disk, self._boot)
+        os.pwrite(self.descriptor, mark + _checksum(mark), len(_HEADER))
+
+    def promised(self) -> tuple[int, int]:
+        """Return how far the file must be whole, and how far it is known to be on the disk."""
+        for _ in range(100):  # while it is written, a part of it may be read
+            data = os.pread(self.descriptor, _MARK.size + _CHECKSUM_SIZE, len(_HEADER))
+            if _checksum(data[: _MARK.size]) == data[_MARK.size :]:
+                written, on_disk, boot = _MARK.unpack_from(data)
+                return written if boot == self._boot else on_disk, on_disk
+        raise damaged(self.path, "the mark of how far it goes has a wrong checksum")
+
+    def frames(
+        self, position: Position, chunk_bytes: int = _CHUNK_BYTES
+    ) -> Iterator[tuple[bytes, Position]]:
+        """Yield the payload and the end of each whole frame, up to the first that is not whole."""
+        offset, before = position
+        chunk, start, size = b"", 0, os.fstat(self.descriptor).st_size
+        while offset + _FRAME.size <= size:
+            if len(chunk) - start < _FRAME.size:
+                chunk, start = os.pread(self.descriptor, chunk_bytes, offset), 0
+                if len(chunk) < _FRAME.size:
+                    return
+            length, checksum = _FRAME.unpack_from(chunk, start)
+            whole = _FRAME.size + length
+            if length > _MAX_FRAME_BYTES or offset + whole > size:
+                return
+            if len(chunk) - start < whole:
+                chunk, start = os.pread(self.descriptor, max(whole, chunk_bytes), offset), 0
+            payload = chunk[start + _FRAME.size : start + whole]
+            if _checksum(before + payload) != checksum:
+                return
+            offset, start, before = offset + whole, start + whole, checksum
+            yield payload, Position(offset, before)
+
+    def require_in_place(self) -> None:
+        """Raise LostJournalError if the file was removed or replaced: nobody finds it any more."""
+        if not os.fstat(self.descriptor).st_nlink:
+            raise LostJournalError(
+                f"{self.path}: the journal is gone: it was removed or replaced while this run was "
+                "writing to it; nothing is performed that is not written down"
+            )
+
+
+_written_here: weakref.WeakSet[JournalFile] = weakref.WeakSet()
+
+
+def _close_all() -> None:
+    for file in list(_written_here):
+        file.close()
+
+
+os.register_at_fork(after_in_child=_close_all)  # a fork has the lock, too, and may outlive the run
+
+
+def damaged(path: Path, how: str) -> OutputError:
+    """Return the error of a damaged journal."""
+    return OutputError(
+        f"{path}: the journal is damaged ({how}), so the run cannot go on; restore the file, or "
+        f"{START_ANEW}"
+    )
 
 
 def find_journal(run: Path, purpose: str) -> Path:
@@ -87,158 +271,15 @@ def find_journal(run: Path, purpose: str) -> Path:
         If there is none.
     """
     if run.is_dir():
-        if not (run / JOURNAL_NAME).is_file():
-            raise OutputError(f"{run}: holds no {JOURNAL_NAME}, so no run to {purpose}")
-        return run / JOURNAL_NAME
+        for name in (JOURNAL_NAME, OLD_JOURNAL_NAME):
+            if (run / name).is_file():
+                return run / name
+        raise OutputError(f"{run}: holds no {JOURNAL_NAME}, so no run to {purpose}")
     if not run.exists():
         raise OutputError(f"{run}: there is no such directory or journal, so no run to {purpose}")
     if not run.is_file():
         raise OutputError(f"{run}: is a pipe or device, not a journal")
-    try:
-        with run.open("rb") as file:
-            start = file.read(len(_SQLITE_MAGIC))
-    except OSError as error:
-        raise OutputError(f"{run}: cannot be read: {error.strerror}") from error
-    if start not in (_SQLITE_MAGIC, b""):
-        raise OutputError(
-            f"{run}: is not a journal; name the directory of a run, or its {JOURNAL_NAME}"
-        )
     return run
-
-
-class JournalFile:
-    """A journal's file, and those beside it."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.log = path.with_name(f"{path.name}-wal")  # where SQLite writes ahead
-        self.count = path.with_name(f"{path.name}-count")
-
-    def require(self) -> None:
-        """Raise OutputError unless there is a file with content.
-
-        SQLite would take an empty file for a new database, and remove the log beside it.
-        """
-        try:
-            size = self.path.stat().st_size if self.path.is_file() else None
-        except OSError as error:
-            raise OutputError(f"{self.path}: cannot be read: {error.strerror}") from error
-        if size is None:
-            raise OutputError(f"{self.path}: there is no journal of a run")
-        if size == 0:
-            raise OutputError(f"{self.path}: is empty, so no journal of a run; {START_ANEW}")
-
-    def require_writable(self) -> None:
-        """Raise OutputError unless it can be written; SQLite's errors do not say why not."""
-        try:
-            if self.version()[:2] not in open_here:
-                os.close(os.open(self.path, os.O_WRONLY | os.O_CLOEXEC))
-        except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written: {error.strerror}") from error
-
-    def version(self) -> tuple[int, int, int, int]:
-        """Return device, inode, size and time of change.
-
-        The first two are the file's identity: no other file has them while this one is open.
-        """
-        status = self.path.stat()
-        return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
-
-    def logs(self) -> list[Path]:
-        """Return the files beside a database that hold a part of its content."""
-        logs = (self.log, self.path.with_name(f"{self.path.name}-journal"))
-        return [log for log in logs if log.is_file() and log.stat().st_size]
-
-    def damaged(self, how: str) -> OutputError:
-        """Return the error of a damaged journal."""
-        return OutputError(
-            f"{self.path}: the journal is damaged ({how}), so the run cannot go on; restore the "
-            f"file, or {START_ANEW}"
-        )
-
-    def _in_use(self) -> OutputError:
-        return OutputError(f"{self.path}: another process is using this run")
-
-    def connect(self, *, create: bool = False) -> sqlite3.Connection:
-        """Open the database for this process alone; raise OutputError if that is not possible."""
-        path = self.path
-        try:
-            connection = sqlite3.connect(
-                f"{path.absolute().as_uri()}?mode={'rwc' if create else 'rw'}",
-                uri=True,
-                timeout=_BUSY_TIMEOUT_S,
-                isolation_level=None,
-            )
-        except sqlite3.Error as error:
-            raise OutputError(f"{path}: cannot be opened: {error}") from error
-        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MAX_ROW_BYTES)
-        try:
-            if create:
-                connection.execute(f"PRAGMA page_size = {_PAGE_BYTES}")
-            # Two runs in one directory would corrupt each other, so the lock is held until the end.
-            # With it, the index of the log is in this process's memory.
-            connection.execute("PRAGMA locking_mode = EXCLUSIVE")
-            connection.execute("BEGIN EXCLUSIVE")
-            connection.execute("COMMIT")
-        except sqlite3.Error as error:
-            connection.close()
-            if is_named(error, "SQLITE_BUSY", "SQLITE_LOCKED"):
-                raise self._in_use() from error
-            if is_named(error, "SQLITE_READONLY", "SQLITE_CANTOPEN", "SQLITE_FULL"):
-                raise OutputError(f"{path}: cannot be written: {error}") from error
-            if is_named(error, "SQLITE_CORRUPT"):
-                raise self.damaged(str(error)) from error
-            raise OutputError(f"{path}: not a usable journal: {error}; {START_ANEW}") from error
-        return connection
-
-    def connect_to_read(self, close: contextlib.ExitStack) -> sqlite3.Connection:
-        """Open the database without a lock and without changing its directory.
-
-        SQLite reads a log only where it may write beside it. So if there is a log, both are copied,
-        and the copy is read; a file without a log is read in place.
-
-        Raises
-        ------
-        OutputError
-            If it is in use or cannot be read.
-        """
-        path, copy = self.path, None
-        if self.version()[:2] in open_here:
-            raise OutputError(f"{path}: this process is using this run")
-        try:
-            with path.open("rb") as file:
-                try:
-                    # Held only while it is copied: then nobody can begin to write.
-                    fcntl.lockf(
-                        file, fcntl.LOCK_SH | fcntl.LOCK_NB, _SHARED_LOCK_SIZE, _SHARED_LOCK_START
-                    )
-                except (BlockingIOError, PermissionError) as error:
-                    raise self._in_use() from error
-                if logs := self.logs():
-                    folder = tempfile.TemporaryDirectory(
-                        prefix="holdfast-journal-", ignore_cleanup_errors=True
-                    )
-                    copy = JournalFile(Path(close.enter_context(folder)) / path.name)
-                    for source in (path, *logs):
-                        shutil.copyfile(source, copy.path.with_name(source.name))
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
-        try:
-            connection = (
-                sqlite3.connect(
-                    f"{path.absolute().as_uri()}?immutable=1", uri=True, isolation_level=None
-                )
-                if copy is None
-                else copy.connect()
-            )
-        except sqlite3.Error as error:
-            raise OutputError(f"{path}: cannot be opened: {error}") from error
-        except OutputError as error:
-            assert copy is not None
-            raise OutputError(str(error).replace(str(copy.path), str(path))) from error
-        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MAX_ROW_BYTES)
-        connection.execute("PRAGMA query_only = ON")
-        return connection
 
 
 def synchronize_directory(path: Path) -> None:
@@ -256,95 +297,3 @@ def boot_id() -> str | None:
         return _BOOT_ID.read_text(encoding="ascii").strip() or None
     except (OSError, UnicodeDecodeError):
         return None
-
-
-def is_named(error: sqlite3.Error, *names: str) -> bool:
-    """Return whether an error of SQLite has one of these names or a refinement of one."""
-    # Those that Python's module raises by itself have no name.
-    return str(getattr(error, "sqlite_errorname", "")).startswith(names)
-
-
-class StepCount:
-    """How many records of the unfinished trial were written, in a file beside the journal.
-
-    If it is ``synchronous``, :meth:`begin` returns only when it is on the disk. All methods raise
-    OutputError if it cannot be written.
-    """
-
-    def __init__(self, path: Path, *, synchronous: bool) -> None:
-        self._path = path
-        self._synchronous = synchronous
-        try:
-            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        except OSError as error:
-            raise self._cannot_be_written(error) from error
-
-    def _cannot_be_written(self, error: OSError) -> OutputError:
-        return OutputError(f"{self._path}: cannot be written: {error.strerror}")
-
-    def begin(self, trial: int, number: int) -> None:
-        """Count the records of another trial, starting from those that are in the journal."""
-        self.write(trial, number)
-        if self._synchronous:
-            try:
-                os.fsync(self._descriptor)
-                synchronize_directory(self._path.parent)
-            except OSError as error:
-                raise self._cannot_be_written(error) from error
-
-    def write(self, trial: int, number: int) -> None:
-        """Write how many there are; this survives the process."""
-        try:
-            os.pwrite(self._descriptor, _NUMBERS.pack(trial, number), 0)
-        except OSError as error:
-            raise self._cannot_be_written(error) from error
-
-    def close(self) -> None:
-        """Close the file and leave it where it is."""
-        os.close(self._descriptor)
-
-    @staticmethod
-    def read(path: Path) -> tuple[int, int] | None:
-        """Return the trial and the number of its records, None if that is missing or damaged."""
-        try:
-            trial, number = _NUMBERS.unpack(path.read_bytes())
-        except (OSError, struct.error):
-            return None
-        return trial, number
-
-
-class RowChecksum:
-    """The checksums of the rows of a table, each over its content and its key."""
-
-    def __init__(self, table: bytes) -> None:
-        # Copied for each row: creating one takes longer than hashing a step.
-        self._empty = hashlib.blake2b(digest_size=_CHECKSUM_SIZE, person=table)
-
-    def __call__(self, first: int, second: int, data: bytes) -> bytes:
-        """Return the checksum of a row whose key is two numbers."""
-        checksum = self._empty.copy()
-        checksum.update(_NUMBERS.pack(first, second) + data)
-        return checksum.digest()
-
-    def is_intact(self, data: object, checksum: object, first: object, second: object) -> bool:
-        """Return whether a row has the right types and checksum; SQLite has a type a value."""
-        return (
-            isinstance(data, bytes)
-            and isinstance(first, int)
-            and isinstance(second, int)
-            and self(first, second, data) == checksum
-        )
-
-
-of_steps = RowChecksum(b"holdfast-step")
-"""By the record's number and its trial."""
-
-of_trials = RowChecksum(b"holdfast-trial")
-"""By the trial, and 0 for its result, 1 for its decisions, 2 for its kept steps."""
-
-_of_meta = RowChecksum(b"holdfast-meta")
-
-
-def meta_checksum(key: str, value: str) -> bytes:
-    """Return the checksum of a note about the run."""
-    return _of_meta(len(key), len(value), f"{key}={value}".encode())

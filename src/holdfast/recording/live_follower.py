@@ -1,21 +1,18 @@
-"""The process that shows a run while it goes on: it folds the robot's records, and draws them.
+"""The process that shows a run while it goes on: it reads the run's files, and draws them.
 
-A belief is a function of the records, so this process comes to the robot's own beliefs without
-being sent any. To fold a record costs little. To compute the entropies of the alternatives again
-and to draw a step costs more, so both are left out for a record that is older than three seconds.
-
-Messages come through a pipe, each after its length. The robot's end never waits, so it writes what
-the pipe takes and keeps the rest.
+A belief is a function of the journal's records, so this process comes to the robot's own beliefs.
+To fold a record costs little. To compute the entropies of the alternatives again and to draw a step
+costs more, so both are left out for what was read more than three seconds ago.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import Any, BinaryIO, TypeAlias
+from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -25,7 +22,6 @@ from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.tracking import Trial
-from holdfast.protocol.events import Timing
 from holdfast.protocol.messages import decode_floats, numbers_of
 from holdfast.protocol.records import (
     ActingRecord,
@@ -37,7 +33,6 @@ from holdfast.protocol.records import (
 )
 from holdfast.recording.facts import (
     Decider,
-    EventFact,
     FactSink,
     LateFact,
     SensingFact,
@@ -45,73 +40,23 @@ from holdfast.recording.facts import (
     TrialBeginFact,
     TrialEndFact,
 )
+from holdfast.recording.journal_file import JOURNAL_NAME, Finished, Steps
+from holdfast.recording.journal_reader import JournalReader
+from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME
+from holdfast.recording.step_times import events_of
+from holdfast.recording.timings import TimingRow, timings_of
 from holdfast.recording.view_target import ViewTarget
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import LateStep, SensingStep
 
-__all__ = [
-    "HEADER_BYTES",
-    "EndedMessage",
-    "EventMessage",
-    "FinishMessage",
-    "Follower",
-    "FollowerReport",
-    "LostMessage",
-    "RecordsMessage",
-    "TimingMessage",
-    "ViewMessage",
-    "follow",
-]
+__all__ = ["Follower", "FollowerReport", "RunFiles", "follow"]
 
 _LATE_NS = 3_000_000_000
-"""A step that is older than this is not drawn."""
+"""A step that was read longer ago is not drawn."""
 
 _NICENESS = 10
 
-HEADER_BYTES = 4
-"""Size of a message's length, little-endian."""
-
-
-class RecordsMessage(msgspec.Struct, array_like=True, frozen=True, tag=1):
-    """Records of a trial, once they are journalled; times are in nanoseconds since 1970."""
-
-    time_ns: int
-    trial: int
-    records: tuple[Record, ...]
-
-
-class TimingMessage(msgspec.Struct, array_like=True, frozen=True, tag=2):
-    """Who decided; it comes before the record of that decision."""
-
-    time_ns: int
-    timing: Timing
-
-
-class EndedMessage(msgspec.Struct, array_like=True, frozen=True, tag=3):
-    """A trial has ended, with the action of its last record."""
-
-    time_ns: int
-    result: TrialResult
-
-
-class EventMessage(msgspec.Struct, array_like=True, frozen=True, tag=4):
-    """An event, as a line of ``events.jsonl``."""
-
-    time_ns: int
-    line: str
-
-
-class LostMessage(msgspec.Struct, array_like=True, frozen=True, tag=5):
-    """What waited was too much and is lost: the next records are of another trial."""
-
-
-class FinishMessage(msgspec.Struct, array_like=True, frozen=True, tag=6):
-    """The run is over."""
-
-
-ViewMessage: TypeAlias = (
-    RecordsMessage | TimingMessage | EndedMessage | EventMessage | LostMessage | FinishMessage
-)
+_POLL_S = 0.02
 
 
 class FollowerReport(msgspec.Struct, array_like=True, frozen=True):
@@ -131,7 +76,7 @@ class FollowerReport(msgspec.Struct, array_like=True, frozen=True):
 
 
 class Follower:
-    """Makes facts of a robot's messages.
+    """Makes facts of what a run writes; times are in nanoseconds since 1970.
 
     Attributes
     ----------
@@ -149,32 +94,22 @@ class Follower:
         self._trial: Trial | None = None
         self._simulated: SimulatedEnvironment | None = None
         self._pending: FloatArray | None = None
-        self._deciders: dict[tuple[int, str], tuple[int, Decider]] = {}
+        self._deciders: dict[tuple[int, int, str], tuple[int, Decider]] = {}
         self._answered: Decider | None = None
         self.steps = self.left_out = 0
 
-    def take(self, message: ViewMessage) -> None:
-        """Pass on what a message says."""
-        if isinstance(message, RecordsMessage):
-            trial = self._trial
-            if trial is None or trial.state.trial != message.trial:
-                self._end(message.time_ns)
-                trial = self._begin(message.trial, message.time_ns)
-            for record in message.records:
-                self._fold(trial, record, message.time_ns)
-        elif isinstance(message, TimingMessage):
-            timing = message.timing
-            self._deciders[timing.step, timing.kind] = message.time_ns, Decider.of(timing)
-        elif isinstance(message, EndedMessage):
-            self._finish(message)
-        elif isinstance(message, EventMessage):
-            self._happened(message.time_ns, **json.loads(message.line))
-        else:
-            self._end(self._clock())
+    def timing(self, row: TimingRow) -> None:
+        """Take who decided, before the record of that decision."""
+        self._deciders[row.trial, row.step, row.kind] = row.time_ns, Decider.of(row)
 
-    def _happened(self, time_ns: int, /, event: str, **fields: object) -> None:
-        fields.pop("time", None)
-        self._sink.happened(EventFact(time_ns, event, fields))
+    def records(self, number: int, records: list[Record], time_ns: int) -> None:
+        """Take what was journalled of a trial, in order and from its beginning on."""
+        trial = self._trial
+        if trial is None or trial.state.trial != number:
+            self.end(time_ns)
+            trial = self._begin(number, time_ns)
+        for record in records:
+            self._fold(trial, record, time_ns)
 
     def _begin(self, number: int, time_ns: int) -> Trial:
         seed = self._configuration.simulator.seed
@@ -185,37 +120,34 @@ class Follower:
         self._sink.trial_begins(TrialBeginFact(number, time_ns))
         return trial
 
-    def _finish(self, message: EndedMessage) -> None:
-        result = message.result
-        trial = self._trial
-        if trial is None or trial.state.trial != result.trial:
-            self._end(message.time_ns)
-            trial = self._begin(result.trial, message.time_ns)
+    def finished(self, result: TrialResult, time_ns: int) -> None:
+        """Take the result of a trial, and with it that its last action was performed."""
+        self.records(result.trial, [], time_ns)
+        assert self._trial is not None
         if self._pending is not None:
-            self._fold(trial, PerformedRecord(trial.state.step, None), message.time_ns)
-        self._end(message.time_ns, message)
+            self._fold(self._trial, PerformedRecord(self._trial.state.step, None), time_ns)
+        self.end(time_ns, result)
 
-    def _end(self, time_ns: int, message: EndedMessage | None = None) -> None:
+    def end(self, time_ns: int, result: TrialResult | None = None) -> None:
         """End the trial, as far as its records go."""
         if self._trial is None:
             return
         state = self._trial.state
-        fact = TrialEndFact(
-            trial=state.trial,
-            time_ns=time_ns,
-            steps=state.step,
-            result=None if message is None else message.result,
-            belief=state.belief,
-            estimate=self._planner.estimate(state),
-            true_state=self._true_state,
+        self._sink.trial_ends(
+            TrialEndFact(
+                trial=state.trial,
+                time_ns=time_ns,
+                steps=state.step,
+                result=result,
+                belief=state.belief,
+                estimate=self._planner.estimate(state),
+                true_state=self._true_state,
+            )
         )
-        if message is not None and message.result.steps != state.step:
-            # Its records were lost.
-            steps = message.result.steps
-            fact = fact._replace(steps=steps, belief=None, estimate=None, true_state=None)
-        self._sink.trial_ends(fact)
         self._trial = self._simulated = None
-        self._deciders = {}
+        self._deciders = {
+            key: each for key, each in self._deciders.items() if key[0] != state.trial
+        }
 
     @property
     def _true_state(self) -> FloatArray | None:
@@ -253,14 +185,16 @@ class Follower:
         why = None if is_late else self._planner.choose_sensing_action(before)[1]
         observation = numbers_of(record.observation)
         info, _ = trial.observe(record.sensing_action, observation, record.sensing_ms)
-        decided_ns, decider = self._deciders.pop((before.step, "sensing"), (time_ns, None))
+        decided_ns, decider = self._deciders.pop(
+            (before.trial, before.step, "sensing"), (time_ns, None)
+        )
         if why is not None:
             step = SensingStep(before, record.sensing_action, why, observation, trial.state, info)
             self._sink.sensed(SensingFact.of(step, decided_ns, time_ns, decider))
 
     def _acting(self, state: PlanningState, action: FloatArray, time_ns: int) -> None:
         """Show an action when it is ordered: how it went shows at the next one."""
-        asked = self._deciders.pop((state.step, "task"), None)
+        asked = self._deciders.pop((state.trial, state.step, "task"), None)
         if asked is not None:
             # An answer has the task actions up to the next sensing step.
             self._answered = asked[1]
@@ -280,7 +214,60 @@ class Follower:
         )
 
 
-def follow(connection: Connection, plain: dict[str, Any], target: tuple[str | None, ...]) -> None:
+class RunFiles:
+    """The files of a run that goes on, read as far as they are written.
+
+    Of the trials that were finished when they were opened, and of the lines before, nothing comes.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._journal = JournalReader.read(directory / JOURNAL_NAME)
+        self._begun = self._journal.unfinished()
+        self._timings = _Lines(directory / TIMINGS_NAME)
+        self._events = _Lines(directory / EVENTS_NAME)
+
+    def tell(self, follower: Follower, sink: FactSink, now_ns: int) -> None:
+        """Tell what was written since the last time."""
+        # The journal first: what decided its records is in the table then.
+        entries = list(self._journal.read_on())
+        for row in timings_of(self._timings.read()):
+            follower.timing(row)
+        for event in events_of(self._events.read()):
+            sink.happened(event)
+        begun, self._begun = self._begun, None
+        if begun is not None:
+            follower.records(begun.trial, begun.records, now_ns)
+        for entry in entries:
+            if isinstance(entry, Steps):
+                records = msgspec.msgpack.decode(entry.records, type=list[Record])
+                follower.records(entry.trial, records, now_ns)
+            elif isinstance(entry, Finished):
+                result = msgspec.msgpack.decode(entry.result, type=TrialResult)
+                follower.finished(result, now_ns)
+
+
+class _Lines:
+    """The lines of a file that are added to it; it need not be there yet."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._offset = 0
+        self.read()
+
+    def read(self) -> list[str]:
+        if not self._path.is_file():
+            return []
+        with self._path.open("rb") as file:
+            file.seek(self._offset)
+            data = file.read()
+        whole = data[: data.rfind(b"\n") + 1]  # the rest is being written, or was cut short
+        self._offset += len(whole)
+        return whole.decode("utf-8", "replace").split("\n")[:-1]
+
+
+def follow(
+    connection: Connection, plain: dict[str, Any], target: tuple[str | None, ...], directory: str
+) -> None:
     """Show a run: the work of the other process."""
     # The viewer, which outlives this process, must not hold the pipe open.
     os.set_inheritable(connection.fileno(), False)
@@ -290,14 +277,14 @@ def follow(connection: Connection, plain: dict[str, Any], target: tuple[str | No
 
         configuration = Configuration.from_plain(plain)
         with RerunSink(configuration, ViewTarget(*target), has_times=True, live=True) as sink:
-            follower = Follower(configuration, sink)
+            follower, files = Follower(configuration, sink), RunFiles(Path(directory))
             _send(connection, report)
-            os.nice(_NICENESS)  # the robot waits no more
-            with os.fdopen(connection.fileno(), "rb", closefd=False) as pipe:
-                for message in _messages(pipe):
-                    follower.take(message)
-                    if not sink.streams.is_open:
-                        break
+            os.nice(_NICENESS)
+            is_over = False
+            while sink.streams.is_open and not is_over:
+                is_over = connection.poll(_POLL_S)  # the robot says so, or is gone
+                files.tell(follower, sink, time.time_ns())
+            follower.end(time.time_ns())
             report = FollowerReport(None, follower.steps, follower.left_out)
         if (lost := sink.streams.lost) is not None:
             rest = "" if target[1] is None else "; the file is complete"
@@ -314,13 +301,3 @@ def follow(connection: Connection, plain: dict[str, Any], target: tuple[str | No
 
 def _send(connection: Connection, report: FollowerReport) -> None:
     connection.send_bytes(msgspec.msgpack.encode(report))
-
-
-def _messages(file: BinaryIO) -> Iterator[ViewMessage]:
-    """Read messages up to the one that the run is over."""
-    decode = msgspec.msgpack.Decoder(ViewMessage).decode
-    while len(header := file.read(HEADER_BYTES)) == HEADER_BYTES:
-        message = decode(file.read(int.from_bytes(header, "little")))
-        yield message
-        if isinstance(message, FinishMessage):
-            return

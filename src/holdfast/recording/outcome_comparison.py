@@ -240,7 +240,7 @@ def compare_outcomes(runs: Sequence[Path], *, paired: bool = True) -> OutcomeCom
     Raises
     ------
     OutputError
-        If one is no run, is damaged or in use, or if the runs cannot be compared: their problems,
+        If one is no run or is damaged, or if the runs cannot be compared: their problems,
         limits or (if paired) seeds differ, or they have too few trials.
     """
     found = [read_outcomes(path, str(path)) for path in runs]
@@ -301,11 +301,10 @@ class ComparedRun(NamedTuple):
 
 
 def read_outcomes(path: Path, name: str) -> ComparedRun:
-    """Read what is compared of a recorded run; OutputError if it is none, is damaged or in use."""
+    """Read what is compared of a recorded run; OutputError if it is none or is damaged."""
     with JournalReader.read_run(path, "compare") as journal:
         meta = journal.meta()
         results = {result.trial: result for result in journal.results()}
-        journal.require_unchanged()
     configuration = recorded_configuration(meta.get("configuration", ""), journal.path)
     simulator = configuration["simulator"]
     environment = world_of(configuration.get("environment") or {})

@@ -120,7 +120,7 @@ class RunArrays:
         Raises
         ------
         OutputError
-            If there is no such trial, or the run is damaged or in use.
+            If there is no such trial, or the run is damaged.
         HoldfastError
             If a trial is decided otherwise now.
         """
@@ -147,7 +147,7 @@ def open_run(path: str | Path, *, problem_directory: str | Path | None = None) -
     Raises
     ------
     OutputError
-        If it is no run, damaged, or in use.
+        If it is no run, or damaged.
     UntrustedCodeError
         If its problem is ``module:Class``, and there is no ``problem_directory``.
     HoldfastError
@@ -159,7 +159,9 @@ def open_run(path: str | Path, *, problem_directory: str | Path | None = None) -
         configuration, trials = recorded.configuration, recorded.trials
     with JournalReader.read_run(run, "open") as journal:
         rows = [
-            [getattr(result, column) for column in TRIAL_COLUMNS] for result in journal.results()
+            [getattr(result, column) for column in TRIAL_COLUMNS]
+            for result in journal.results()
+            if result.trial in trials  # the run may have gone on
         ]
     columns = zip(*rows, strict=True) if rows else ([] for _ in TRIAL_COLUMNS)
     results = {

@@ -66,9 +66,9 @@ __all__ = ["RecordedRun"]
 class RecordedRun:
     """A recorded run, open to be read; to be used in a ``with`` statement.
 
-    ``run`` is its directory, or its journal. Nobody may be using it; it is not changed. A record
-    names no code that is run: where its problem is a class of a module (``module:Class``), the
-    caller says in which directory that module lies, and so that its code may run.
+    ``run`` is its directory, or its journal. It is not changed, and a run may go on meanwhile. A
+    record names no code that is run: where its problem is a class of a module (``module:Class``),
+    the caller says in which directory that module lies, and so that its code may run.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class RecordedRun:
     Raises
     ------
     OutputError
-        If it is no run, damaged, or in use.
+        If it is no run, or damaged.
     UntrustedCodeError
         If its problem is a class of a module, and nobody says where that lies.
     HoldfastError
@@ -147,10 +147,6 @@ class RecordedRun:
 
     def __exit__(self, *error: object) -> None:
         self._close.close()
-
-    def require_unchanged(self) -> None:
-        """Raise OutputError if a run has written to the journal meanwhile."""
-        self._journal.require_unchanged()
 
     def replay(self, trials: Sequence[int], sinks: Sequence[FactSink]) -> Iterator[int]:
         """Write the facts of some trials to each sink, and yield each trial's number at its end.

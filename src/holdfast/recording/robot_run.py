@@ -105,10 +105,7 @@ def perform_trials(
         log = _StampedLog(directory.path / EVENTS_NAME)
         if view is not None:
             view.start()
-            if (begun := directory.journal.unfinished()) is not None:
-                view.records(begun.trial, begun.records)
-            directory.journal.on_append = view.records
-            sinks = [*sinks, view]
+            stack.callback(view.close)  # when all is written
         events = BoundedEventLog(log, *sinks)
         stack.callback(events.close)
         if directory.before_upgrade is not None:
@@ -126,13 +123,6 @@ def perform_trials(
             timings.add(timing)
             if observer is not None:
                 observer.timing(timing)
-            if view is not None:
-                view.timing(timing)
-
-        def on_end(result: TrialResult) -> None:
-            on_result(result)
-            if view is not None:
-                view.ended(result)
 
         robot = RobotProcess(
             configuration,
@@ -140,7 +130,7 @@ def perform_trials(
             directory.journal,
             maker,
             events,
-            on_end,
+            on_result,
             on_timing,
             (lambda _: None) if verification is None else verification.add,
             rate_hz,

@@ -36,10 +36,10 @@ from holdfast.recording.fingerprint import (
 from holdfast.recording.journal import Journal
 from holdfast.recording.journal_file import (
     JOURNAL_NAME,
+    OLD_JOURNAL_NAME,
     START_ANEW,
-    JournalFile,
-    Survives,
     boot_id,
+    find_journal,
 )
 from holdfast.recording.journal_reader import JournalReader
 from holdfast.recording.tables import RunSummary, SummaryBuilder, csv_lines
@@ -87,6 +87,8 @@ OUTPUT_NAMES = (
 )
 """The last three are there only if services decided."""
 
+_TAKEN_NAMES = (*OUTPUT_NAMES, OLD_JOURNAL_NAME)
+
 _SECTIONS_WITHOUT_DECISIONS = ("offload", "recovery", "lost")
 """Sections that change no decision: what ``lost`` does to a belief is in the journal."""
 
@@ -103,6 +105,8 @@ _DECISIONS = {
 }
 
 _MAX_SUFFIX = 10_000
+_MAX_UNUSED_BYTES = 1 << 22
+"""Bound on a journal that holds a configuration and no trial."""
 
 
 class RunDirectory:
@@ -153,7 +157,7 @@ class RunDirectory:
         path = path.absolute()
         try:
             path.mkdir(parents=True, exist_ok=True)
-            taken = [name for name in OUTPUT_NAMES if (path / name).exists()]
+            taken = [name for name in _TAKEN_NAMES if (path / name).exists()]
         except FileExistsError as error:
             raise OutputError(f"{path}: is a file, not a directory") from error
         except OSError as error:
@@ -162,7 +166,7 @@ class RunDirectory:
         text = configuration.to_yaml()
         meta = {"configuration": text} | fingerprint(configuration) | dict(notes or {})
         survives = configuration.recovery.journal_survives
-        journal = _unused_journal(path, survives)
+        journal = _unused_journal(path)
         if taken and journal is None:
             raise OutputError(
                 f"{path}: holds {', '.join(taken)} already; go on with that run (--resume), or "
@@ -170,6 +174,7 @@ class RunDirectory:
             )
         try:
             if journal is not None:
+                journal.survives = survives
                 journal.restart(meta)
                 for name in OUTPUT_NAMES:
                     if name not in (CONFIGURATION_NAME, JOURNAL_NAME):
@@ -207,22 +212,23 @@ class RunDirectory:
         path = path.absolute()
         if not path.is_dir():
             raise OutputError(f"{path}: there is no such directory, so no run to resume")
-        if not (path / JOURNAL_NAME).is_file():
-            raise OutputError(f"{path}: holds no {JOURNAL_NAME}, so no run to resume")
+        file = find_journal(path, "resume")
         _require_plain_files(path)
+        survives = configuration.recovery.journal_survives
         try:
             _require_writable_directory(path)
-            JournalFile(path / JOURNAL_NAME).require_writable()
+            if (path / OLD_JOURNAL_NAME).exists():
+                Journal.convert(path / OLD_JOURNAL_NAME, path / JOURNAL_NAME)
+            journal = Journal.open(path / JOURNAL_NAME, survives=survives)
         except OutputError as error:
+            if not isinstance(error.__cause__, OSError):
+                raise
             # If the journal is damaged as well, its reader raises first.
-            JournalReader.read(path / JOURNAL_NAME).close()
+            JournalReader.read(file).close()
             raise OutputError(
                 f"{error}; its journal is whole: go on when it can be written, or with a copy of "
                 "the directory (--out)"
             ) from error
-        journal = Journal.open(
-            path / JOURNAL_NAME, survives=configuration.recovery.journal_survives
-        )
         try:
             text = configuration.to_yaml()
             meta = journal.meta()
@@ -257,9 +263,9 @@ class RunDirectory:
         """
         is_there = False
         with contextlib.suppress(OSError):  # create() reports it
-            is_there = (path / JOURNAL_NAME).exists()
+            is_there = any((path / name).exists() for name in (JOURNAL_NAME, OLD_JOURNAL_NAME))
         if is_there:
-            unused = _unused_journal(path, configuration.recovery.journal_survives)
+            unused = _unused_journal(path)
             if unused is None:
                 return cls.resume(path, configuration, on_progress)
             # Whatever repeats the command does not begin it after a reboot, either.
@@ -363,7 +369,7 @@ def claim_default_directory(configuration: Configuration, parent: Path) -> Path:
         If it cannot be made.
     """
     for path in _default_directories(configuration, parent):
-        free = _unused_journal(path, configuration.recovery.journal_survives)
+        free = _unused_journal(path)
         if free is not None:
             free.close()
             return path
@@ -405,25 +411,20 @@ def _default_directories(configuration: Configuration, parent: Path) -> Iterator
         yield parent / f"{name}-{number}"
 
 
-def _unused_journal(path: Path, survives: Survives) -> Journal | None:
+def _unused_journal(path: Path) -> Journal | None:
     """Return the open journal of a run that has done nothing yet, None if there is none."""
     # One that is absent, in use, damaged or not ours cannot be used.
-    with contextlib.suppress(OutputError):
-        # Checked only if it is to be used, for then it is small.
-        journal = Journal.open(path / JOURNAL_NAME, survives=survives, check=False)
-        try:
+    with contextlib.suppress(OutputError, OSError):
+        if (path / JOURNAL_NAME).stat().st_size < _MAX_UNUSED_BYTES:
+            journal = Journal.open(path / JOURNAL_NAME)
             if journal.is_empty():
-                journal.check()
                 return journal
-        except BaseException:
             journal.close()
-            raise
-        journal.close()
     return None
 
 
 def _require_writable_directory(path: Path) -> None:
-    """Raise OutputError unless a file can be made there; SQLite's errors do not say why not."""
+    """Raise OutputError unless a file can be made there."""
     try:
         with tempfile.TemporaryFile(dir=path):
             pass
@@ -436,9 +437,7 @@ def _require_plain_files(path: Path) -> None:
 
     A directory may be somebody else's, copied or unpacked.
     """
-    journal = JournalFile(path / JOURNAL_NAME)
-    names = {*OUTPUT_NAMES, RECOVERY_LOG_NAME, journal.log.name, journal.count.name}
-    for name in sorted(names):
+    for name in (*_TAKEN_NAMES, RECOVERY_LOG_NAME):
         with contextlib.suppress(FileNotFoundError):
             if not stat.S_ISREG((path / name).lstat().st_mode):
                 raise OutputError(

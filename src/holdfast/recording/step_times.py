@@ -27,6 +27,7 @@ __all__ = [
     "StepClock",
     "TrialTimes",
     "dated",
+    "events_of",
     "read_events",
     "trial_ends",
 ]
@@ -105,20 +106,25 @@ class StepClock:
 
 def read_events(path: Path) -> list[EventFact]:
     """Return the lines of ``events.jsonl`` as they are there, with the wall clock's times."""
-    events = []
     try:
-        for line in bounded_lines(path):
-            try:
-                fields = json.loads(line)
-                moment, name = fields.pop("time"), fields.pop("event")
-                stamp = Stamp.of(fields.pop("boot", None), fields.pop("uptime_s", None))
-                events.append(EventFact(nanoseconds(moment), str(name), fields, stamp))
-            except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-                continue  # a line that a power cut has corrupted
+        return events_of(bounded_lines(path))
     except FileNotFoundError:
         return []
     except OSError as error:
         raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def events_of(lines: Iterable[str]) -> list[EventFact]:
+    """Return what lines of ``events.jsonl`` say."""
+    events = []
+    for line in lines:
+        try:
+            fields = json.loads(line)
+            moment, name = fields.pop("time"), fields.pop("event")
+            stamp = Stamp.of(fields.pop("boot", None), fields.pop("uptime_s", None))
+            events.append(EventFact(nanoseconds(moment), str(name), fields, stamp))
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            continue  # a line that a power cut has corrupted
     return events
 
 

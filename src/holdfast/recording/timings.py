@@ -12,7 +12,7 @@ import csv
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -33,6 +33,7 @@ __all__ = [
     "nanoseconds",
     "read_timings",
     "rows_by_trial",
+    "timings_of",
 ]
 
 
@@ -130,7 +131,7 @@ def count_verified(path: Path) -> VerificationCounts | None:
     asked: set[tuple[str, str]] = set()
     answered: set[tuple[str, str]] = set()
     try:
-        for trial, step, service, _, verdict, *_ in _rows(path, 6):
+        for trial, step, service, _, verdict, *_ in _rows(bounded_lines(path), 6):
             verdicts[verdict] += 1
             if verdict in ("asked", "left_out"):
                 asked.add((trial, step))
@@ -236,7 +237,12 @@ def rows_by_trial(path: Path) -> dict[int, dict[tuple[int, str], TimingRow]]:
 
 def read_timings(path: Path) -> Iterator[TimingRow]:
     """Yield the rows of a run's ``timings.csv``, without the head and damaged rows."""
-    for trial, step, kind, service, status, waited_ms, *rest in _rows(path, 6):
+    return timings_of(bounded_lines(path))
+
+
+def timings_of(lines: Iterable[str]) -> Iterator[TimingRow]:
+    """Yield what lines of ``timings.csv`` say."""
+    for trial, step, kind, service, status, waited_ms, *rest in _rows(lines, 6):
         try:
             row = TimingRow(int(trial), int(step), kind, service, status, float(waited_ms))
         except ValueError:
@@ -267,8 +273,8 @@ def nanoseconds(moment: str) -> int:
     return 1_000_000_000 * seconds + 1000 * parsed.microsecond
 
 
-def _rows(path: Path, least: int) -> Iterator[list[str]]:
+def _rows(lines: Iterable[str], least: int) -> Iterator[list[str]]:
     """Yield the rows of a table that have enough columns."""
-    for row in csv.reader(line.replace("\0", "") for line in bounded_lines(path)):
+    for row in csv.reader(line.replace("\0", "") for line in lines):
         if len(row) >= least:
             yield row
