@@ -5,6 +5,7 @@
 // out what is wrong and raises the error that says so.
 
 #include <nanobind/stl/array.h>
+#include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
@@ -13,6 +14,7 @@
 #include <cstdint>
 #include <optional>
 #include <stdexcept>
+#include <tuple>
 #include <utility>
 #include <vector>
 
@@ -181,14 +183,17 @@ bool follow_batch(const World& world, const Policy& policy, const Input<2>& stat
     return true;
 }
 
+/// The tuple of that name in geometry.py.
+using RolloutSettings = std::tuple<std::size_t, std::size_t, std::size_t, double, double, bool>;
+
 template <class World, class Policy>
 bool roll_out_batch(
     const World& world, const Policy& policy, const Input<2>& true_states,
     const Input<3>& estimates,
     const nb::ndarray<const double, nb::ndim<4>, nb::c_contig, nb::device::cpu>& clouds,
     std::size_t stage, const Input<1>& standard_deviation, double tolerance,
-    const StreamWords& stream, const std::array<std::size_t, 3>& lengths, double discount,
-    double price, bool counts_steps, int threads, InPlace<double, 2> returns) {
+    const StreamWords& stream, const RolloutSettings& settings, int threads,
+    InPlace<double, 2> returns) {
     constexpr std::size_t d = World::dimension;
     const std::size_t actions = returns.shape(0), samples = returns.shape(1);
     const std::size_t members = clouds.shape(2);
@@ -204,7 +209,7 @@ bool roll_out_batch(
         !all_finite(clouds.data(), clouds.size())) {
         return false;
     }
-    const auto [interval, looks, steps] = lengths;
+    const auto& [interval, looks, steps, discount, price, counts_steps] = settings;
     WithoutInterpreter released;
     roll_out(world, policy,
              {actions, samples, members, true_states.data(), estimates.data(), clouds.data(), stage,
@@ -248,8 +253,7 @@ void bind_way(nb::class_<World>& world) {
               nb::arg("true_states").noconvert(), nb::arg("estimates").noconvert(),
               nb::arg("clouds").noconvert(), nb::arg("stage"),
               nb::arg("standard_deviation").noconvert(), nb::arg("tolerance"), nb::arg("stream"),
-              nb::arg("lengths"), nb::arg("discount"), nb::arg("price"), nb::arg("counts_steps"),
-              nb::arg("threads"), nb::arg("returns").noconvert(),
+              nb::arg("rollouts"), nb::arg("threads"), nb::arg("returns").noconvert(),
               nb::call_guard<StandardRounding>());
 }
 

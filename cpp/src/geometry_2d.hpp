@@ -6,6 +6,9 @@
 // on each direction and see whether the intervals overlap. A disc meets a rectangle where the
 // rectangle's point closest to the disc's centre is nearer than the radius.
 //
+// Where the shapes are further apart, or deeper in each other, than a sine of three digits can be
+// wrong by, that decides: alike, as both ways are right there.
+//
 // Shapes that touch without overlapping are free: every comparison is strict, in exact arithmetic.
 // Rounding moves the boundary by a few units in the last place of the coordinates.
 #pragma once
@@ -57,6 +60,7 @@ class RectangleWorld {
   private:
     double half_width_, half_height_;
     double bounding_radius_;
+    bool rough_;  // whether rounding is small enough to decide most tests by a rough angle
     std::vector<AxisAlignedRectangle> obstacles_;
 };
 

@@ -4,6 +4,7 @@
 #include <array>
 #include <cmath>
 #include <limits>
+#include <numeric>
 #include <vector>
 
 #include "geometry_2d.hpp"
@@ -24,7 +25,10 @@ struct StepStreams {
     Stream step, first;
 };
 
-// The noise of one sample in one step. Attempts after the first are rare, and drawn when asked for.
+// Streams that are drawn from together: as many as fill the processor's registers.
+constexpr std::size_t streams_at_once = 4;
+
+// Noise of one sample. Attempts after the first are rare, and drawn when asked for.
 template <std::size_t d>
 class StepNoise {
   public:
@@ -47,12 +51,27 @@ class StepNoise {
         std::vector<double>& own = noise_[particle];
         while (own.size() <= attempt * d) {
             check_interruption();
-            std::array<double, d> drawn;
-            const auto number = static_cast<std::uint32_t>(own.size() / d);
-            normals(substream(streams_->step, number), (first_ + particle) * d, d, drawn.data());
-            for (std::size_t c = 0; c < d; ++c) own.push_back(deviation_[c] * drawn[c]);
+            std::array<Stream, streams_at_once> streams;
+            std::array<std::uint32_t, streams_at_once> numbers;
+            for (std::size_t i = 0; i < streams_at_once; ++i) {
+                streams[i] = streams_->step;
+                numbers[i] = static_cast<std::uint32_t>(own.size() / d + i);
+            }
+            vector_kernels().substreams(streams.data(), numbers.data(), streams_at_once,
+                                        streams.data());
+            append(streams.data(), streams_at_once, particle, own);
         }
         return own.data() + attempt * d;
+    }
+
+    // Appends the noise that a particle has in each of some streams.
+    void append(const Stream* streams, std::size_t number, std::size_t particle,
+                std::vector<double>& to) const {
+        std::array<double, streams_at_once * d> drawn;
+        vector_kernels().normals_of_each(streams, number, (first_ + particle) * d, d, drawn.data());
+        for (std::size_t i = 0; i < number * d; ++i) {
+            to.push_back(deviation_[i % d] * drawn[i]);
+        }
     }
 
   private:
@@ -167,7 +186,7 @@ class Sample {
             State action;
             stage = policy_.next_stage(state.data(), stage);
             policy_.executed(state.data(), stage, action.data());
-            const State& noise = free_noise(step);
+            const double* noise = free_noise(step);
             for (std::size_t c = 0; c < d; ++c) state[c] = state[c] + action[c] + noise[c];
             value += factor * reward(state, action);
             if (policy_.is_goal(state.data())) break;
@@ -177,14 +196,15 @@ class Sample {
     }
 
     // The true state's noise where it is drawn once, for all robots of the sample.
-    const State& free_noise(std::size_t step) {
-        while (free_noise_.size() <= step) {
-            State& noise = free_noise_.emplace_back();
-            normals(streams_[free_noise_.size() - 1].first, sample_ * (1 + input_.members) * d, d,
-                    noise.data());
-            for (std::size_t c = 0; c < d; ++c) noise[c] *= input_.standard_deviation[c];
+    const double* free_noise(std::size_t step) {
+        while (free_noise_.size() <= step * d) {
+            const std::size_t from = free_noise_.size() / d;
+            const std::size_t number = std::min(streams_at_once, streams_.size() - from);
+            std::array<Stream, streams_at_once> streams;
+            for (std::size_t i = 0; i < number; ++i) streams[i] = streams_[from + i].first;
+            noise_.append(streams.data(), number, 0, free_noise_);
         }
-        return free_noise_[step];
+        return free_noise_.data() + step * d;
     }
 
     void act() {
@@ -255,7 +275,7 @@ class Sample {
     StepNoise<d> noise_;
     std::vector<State> clouds_;
     std::vector<Robot> robots_;
-    std::vector<State> free_noise_;
+    std::vector<double> free_noise_;
     double factor_ = 1.0;
 };
 
@@ -264,10 +284,15 @@ class Sample {
 template <class World, class Policy>
 void roll_out(const World& world, const Policy& policy, const RolloutInput& input,
               const Stream& stream, int threads, double* returns) {
+    std::vector<Stream> of_steps(input.steps, stream), first(input.steps);
+    std::vector<std::uint32_t> numbers(input.steps);
+    std::iota(numbers.begin(), numbers.end(), 0);
+    vector_kernels().substreams(of_steps.data(), numbers.data(), input.steps, of_steps.data());
+    std::fill(numbers.begin(), numbers.end(), 0);
+    vector_kernels().substreams(of_steps.data(), numbers.data(), input.steps, first.data());
     std::vector<StepStreams> streams(input.steps);
     for (std::size_t step = 0; step < input.steps; ++step) {
-        streams[step].step = substream(stream, static_cast<std::uint32_t>(step));
-        streams[step].first = substream(streams[step].step, 0);
+        streams[step] = {of_steps[step], first[step]};
     }
     const std::size_t moves = input.samples * input.actions * (1 + input.members) *
                               std::min(input.steps, input.looks * input.interval);
@@ -281,7 +306,12 @@ void beliefs_without_truth(std::size_t actions, std::size_t samples, std::size_t
                            std::size_t dimension, std::size_t members_each, const double* states,
                            const std::int64_t* truths, const double* at, double negligible,
                            double* weights, double* means, std::int64_t* members) {
-    std::vector<double> rest(count);
+    std::vector<double> rest(count), columns(dimension * count);
+    for (std::size_t n = 0; n < count; ++n) {
+        for (std::size_t c = 0; c < dimension; ++c) {
+            columns[c * count + n] = states[n * dimension + c];
+        }
+    }
     for (std::size_t row = 0; row < actions * samples; ++row) {
         check_interruption();
         double* own = weights + row * count;
@@ -291,7 +321,10 @@ void beliefs_without_truth(std::size_t actions, std::size_t samples, std::size_t
         if (total > negligible) {
             for (std::size_t n = 0; n < count; ++n) own[n] = rest[n] / total;
         }
-        vector_kernels().weighted_sums(own, states, count, dimension, means + row * dimension);
+        for (std::size_t c = 0; c < dimension; ++c) {
+            means[row * dimension + c] =
+                vector_kernels().weighted_sum(own, &columns[c * count], count);
+        }
         std::size_t n = 0, last = 0;
         double cumulated = 0.0;
         for (std::size_t l = 0; l < members_each; ++l) {

@@ -80,7 +80,15 @@ struct VectorKernels {
     void (*sin)(const double* in, double* out, std::size_t count);
     void (*cos)(const double* in, double* out, std::size_t count);
     void (*normals)(const Stream&, std::uint64_t first, std::size_t count, double* out);
+    /// Draws of several streams at the same place: out[stream][count].
+    void (*normals_of_each)(const Stream* streams, std::size_t number, std::uint64_t first,
+                            std::size_t count, double* out);
+    /// out[i] = substream numbers[i] of parents[i].
+    void (*substreams)(const Stream* parents, const std::uint32_t* numbers, std::size_t count,
+                       Stream* out);
     double (*sum)(const double* in, std::size_t count);
+    /// Sum of weights[i] * in[i], in the order of `sum`, as each of the next.
+    double (*weighted_sum)(const double* weights, const double* in, std::size_t count);
     void (*weighted_sums)(const double* weights, const double* rows, std::size_t count,
                           std::size_t dimension, double* out);
     /// Normalised posterior weights; returns how many are not zero, 0 if there is no posterior.

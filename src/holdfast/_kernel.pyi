@@ -150,10 +150,7 @@ class _World:
         standard_deviation: _Floats,
         tolerance: float,
         stream: _Words,
-        lengths: tuple[int, int, int],
-        discount: float,
-        price: float,
-        counts_steps: bool,
+        rollouts: tuple[int, int, int, float, float, bool],
         threads: int,
         returns: _Floats,
     ) -> bool: ...

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from holdfast.numerics.arrays import BoolArray, FloatArray
-from holdfast.numerics.geometry import BoxWorld, DiscWorld, RectangleWorld
+from holdfast.numerics.geometry import FAR, BoxWorld, DiscWorld, RectangleWorld
 from holdfast.numerics.randomness import Purpose, stream
 
 NUM_POSES = 3000
@@ -93,6 +93,39 @@ def test_rectangle() -> None:
     smaller = fcl.Box(0.6 - MARGIN, 1.4 - MARGIN, 1.0)
     larger = fcl.Box(0.6 + MARGIN, 1.4 + MARGIN, 1.0)
     compare(ours, smaller, larger, poses, flat_obstacles())
+
+
+def test_rectangle_close_to_contact() -> None:
+    # A rough sine decides most tests. Where it might err, the exact one must: along ways into the
+    # ground, whose large obstacles would enlarge any error of an angle, bisected to the contact.
+    ground = np.array([(-FAR, -FAR, -0.6, 0.0), (0.6, -FAR, FAR, 0.0), (-0.6, -FAR, 0.6, -1.1)])
+    world = RectangleWorld(1.0, 2.0, ground)
+    half = np.array([0.5, 1.0])
+
+    def gaps(states: FloatArray) -> FloatArray:
+        sine, cosine = np.sin(states[:, 2]), np.cos(states[:, 2])
+        axes = np.stack([np.ones_like(sine), 0 * sine, 0 * sine, np.ones_like(sine)], axis=1)
+        axes = np.concatenate([axes, np.stack([cosine, sine, -sine, cosine], axis=1)], axis=1)
+        axes = axes.reshape(-1, 4, 2)
+        own = np.abs(axes @ axes[:, 2:].transpose(0, 2, 1)) @ half
+        corners = ground[:, [0, 1, 0, 3, 2, 1, 2, 3]].reshape(-1, 4, 2)
+        seen = corners[np.newaxis] - states[:, np.newaxis, np.newaxis, :2]
+        along = np.einsum("noci,nai->noac", seen, axes)
+        apart = np.maximum(along.min(axis=3), -along.max(axis=3)) - own[:, np.newaxis]
+        return np.asarray(apart.max(axis=2).min(axis=1))
+
+    begin, end = fresh().substream(3).normal((2, NUM_POSES, 3)) * np.array([2.0, 2.0, 1.5])
+    begin[:, 1], end[:, 1] = 3.0, -2.0
+    free, blocked = np.zeros((NUM_POSES, 1)), np.ones((NUM_POSES, 1))
+    for _ in range(25):
+        middle = 0.5 * (free + blocked)
+        states = begin + middle * (end - begin)
+        gap, collides = gaps(states), world.collides(states)
+        clear = np.abs(gap) > 1e-8
+        np.testing.assert_array_equal(collides[clear], (gap < 0.0)[clear])
+        free = np.where(collides[:, np.newaxis], free, middle)
+        blocked = np.where(collides[:, np.newaxis], middle, blocked)
+    assert np.abs(gap).max() < 1e-5
 
 
 @pytest.mark.parametrize("angle_scale", [3.0, 0.05], ids=["any angles", "nearly parallel"])

@@ -39,6 +39,16 @@ static double sum_array(const double* in, std::size_t count) {
     return sum_of(partial);
 }
 
+static double weighted_sum(const double* weights, const double* in, std::size_t count) {
+    Lanes partial{};
+    std::size_t i = 0;
+    for (; i + lane_count <= count; i += lane_count) partial += load(weights + i) * load(in + i);
+    if (i < count) {
+        partial += load_partial(weights + i, count - i, 0.0) * load_partial(in + i, count - i, 0.0);
+    }
+    return sum_of(partial);
+}
+
 /// out[c] = sum over i of weights[i] * rows[i][c], each in the order of `sum_array`.
 static void weighted_sums(const double* weights, const double* rows, std::size_t count,
                           std::size_t dimension, double* out) {
@@ -57,28 +67,108 @@ static void weighted_sums(const double* weights, const double* rows, std::size_t
     }
 }
 
+/// Blocks of eight streams, one in each lane. Only the low halves of the words count.
+struct PhiloxLanes {
+    IntLanes words[4];
+};
+
+HOLDFAST_INLINE PhiloxLanes philox_lanes(const Stream* const (&streams)[lane_count],
+                                         const std::uint32_t (&blocks)[lane_count]) {
+    std::int64_t in[6][lane_count];
+    for (std::size_t lane = 0; lane < lane_count; ++lane) {
+        const Stream& own = *streams[lane];
+        const std::uint32_t words[6] = {blocks[lane], own.c1, own.c2, own.c3, own.key0, own.key1};
+        for (std::size_t i = 0; i < 6; ++i) in[i][lane] = words[i];
+    }
+    IntLanes c0, c1, c2, c3, k0, k1;
+    std::memcpy(&c0, in[0], sizeof c0);
+    std::memcpy(&c1, in[1], sizeof c1);
+    std::memcpy(&c2, in[2], sizeof c2);
+    std::memcpy(&c3, in[3], sizeof c3);
+    std::memcpy(&k0, in[4], sizeof k0);
+    std::memcpy(&k1, in[5], sizeof k1);
+    for (int round = 0; round < 10; ++round) {
+        const IntLanes p0 = multiply_low_halves(c0, splat_int(0xD2511F53));
+        const IntLanes p1 = multiply_low_halves(c2, splat_int(0xCD9E8D57));
+        c0 = shift_right(p1, 32) ^ c1 ^ k0;
+        c1 = p1;
+        c2 = shift_right(p0, 32) ^ c3 ^ k1;
+        c3 = p0;
+        k0 = k0 + 0x9E3779B9;
+        k1 = k1 + 0xBB67AE85;
+    }
+    return {{c0, c1, c2, c3}};
+}
+
+HOLDFAST_INLINE Lanes unit_interval(const IntLanes& high, const IntLanes& low) {
+    // 53 bits as two numbers: the upper 21 times 2^32, and the lower 32. Their sum is exact.
+    const IntLanes mantissa = shift_left(high & 0xffffffff, 21) | shift_right(low & 0xffffffff, 11);
+    const IntLanes upper = shift_right(mantissa, 32) | 0x4530000000000000;
+    const IntLanes lower = (mantissa & 0xffffffff) | 0x4330000000000000;
+    return ((detail::from_bits<Lanes>(upper) - 0x1p84) +
+            (detail::from_bits<Lanes>(lower) - 0x1p52)) *
+           0x1p-53;
+}
+
+/// Draws [first, first + count) of each of several streams, one stream below the other.
+static void normals_of_each(const Stream* streams, std::size_t number, std::uint64_t first,
+                            std::size_t count, double* out) {
+    const std::uint64_t first_block = first >> 1, end = first + count;
+    const std::size_t blocks = static_cast<std::size_t>((end + 1) / 2 - first_block);
+    for (std::size_t begin = 0; begin < number * blocks; begin += lane_count) {
+        const std::size_t left = number * blocks - begin;
+        const std::size_t used = left < lane_count ? left : lane_count;
+        const Stream* own[lane_count];
+        std::uint32_t block[lane_count];
+        std::uint64_t index[lane_count];
+        for (std::size_t lane = 0, s = begin / blocks, b = begin % blocks; lane < lane_count;
+             ++lane) {
+            own[lane] = &streams[s];
+            block[lane] = static_cast<std::uint32_t>(first_block + b);
+            index[lane] = 2 * (first_block + b);
+            if (lane + 1 < used && ++b == blocks) {
+                b = 0;
+                ++s;
+            }
+        }
+        const PhiloxLanes drawn = philox_lanes(own, block);
+        Lanes even, odd;
+        box_muller(unit_interval(drawn.words[0], drawn.words[1]),
+                   unit_interval(drawn.words[2], drawn.words[3]), even, odd);
+        for (std::size_t lane = 0; lane < used; ++lane) {
+            double* row = out + static_cast<std::size_t>(own[lane] - streams) * count;
+            if (index[lane] >= first) row[index[lane] - first] = even[lane];
+            if (index[lane] + 1 < end) row[index[lane] + 1 - first] = odd[lane];
+        }
+    }
+}
+
 static void normals_array(const Stream& stream, std::uint64_t first, std::size_t count,
                           double* out) {
-    std::uint64_t index = first;
-    const std::uint64_t end = first + count;
-    while (index < end) {
-        // Eight blocks of two deviates at a time; the first and last block may be used in part.
-        const std::uint64_t first_block = index >> 1;
-        const std::uint64_t blocks = (end + 1) / 2 - first_block;
-        const std::size_t used =
-            blocks < lane_count ? static_cast<std::size_t>(blocks) : lane_count;
-        Lanes radius_uniform{}, angle_uniform{};
-        for (std::size_t lane = 0; lane < used; ++lane) {
-            const PhiloxBlock block =
-                philox(stream, static_cast<std::uint32_t>(first_block + lane));
-            radius_uniform[lane] = unit_interval(block.words[0], block.words[1]);
-            angle_uniform[lane] = unit_interval(block.words[2], block.words[3]);
+    normals_of_each(&stream, 1, first, count, out);
+}
+
+/// out[i] = substream numbers[i] of parents[i]. `out` may be `parents`.
+static void substreams(const Stream* parents, const std::uint32_t* numbers, std::size_t count,
+                       Stream* out) {
+    for (std::size_t begin = 0; begin < count; begin += lane_count) {
+        Stream deriving[lane_count];
+        const Stream* own[lane_count];
+        std::uint32_t block[lane_count];
+        for (std::size_t lane = 0; lane < lane_count; ++lane) {
+            const std::size_t i = begin + lane < count ? begin + lane : count - 1;
+            deriving[lane] = parents[i];
+            deriving[lane].c1 |= derivation_marker;
+            own[lane] = &deriving[lane];
+            block[lane] = numbers[i];
         }
-        Lanes even, odd;
-        box_muller(radius_uniform, angle_uniform, even, odd);
-        for (std::size_t lane = 0; lane < used && index < end; ++lane) {
-            if ((index & 1) == 0) out[index++ - first] = even[lane];
-            if (index < end) out[index++ - first] = odd[lane];
+        const PhiloxLanes derived = philox_lanes(own, block);
+        std::int64_t key0[lane_count], key1[lane_count];
+        std::memcpy(key0, &derived.words[0], sizeof key0);
+        std::memcpy(key1, &derived.words[1], sizeof key1);
+        for (std::size_t lane = 0; lane < lane_count && begin + lane < count; ++lane) {
+            out[begin + lane] = {static_cast<std::uint32_t>(key0[lane]),
+                                 static_cast<std::uint32_t>(key1[lane]), 0, 0, 0};
         }
     }
 }

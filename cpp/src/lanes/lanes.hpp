@@ -121,6 +121,7 @@ HOLDFAST_LANES_OPERATOR(IntLanes, IntLanes, std::int64_t, splat_int, +)
 HOLDFAST_LANES_OPERATOR(IntLanes, IntLanes, std::int64_t, splat_int, -)
 HOLDFAST_LANES_OPERATOR(IntLanes, IntLanes, std::int64_t, splat_int, &)
 HOLDFAST_LANES_OPERATOR(IntLanes, IntLanes, std::int64_t, splat_int, |)
+HOLDFAST_LANES_OPERATOR(IntLanes, IntLanes, std::int64_t, splat_int, ^)
 HOLDFAST_LANES_OPERATOR(IntLanes, IntLanes, std::int64_t, splat_int, !=)
 #undef HOLDFAST_LANES_OPERATOR
 
@@ -157,6 +158,29 @@ HOLDFAST_INLINE IntLanes shift_right(const IntLanes& a, int by) {
 }
 HOLDFAST_INLINE std::int64_t shift_right(std::int64_t a, int by) {
     return static_cast<std::int64_t>(static_cast<std::uint64_t>(a) >> by);
+}
+
+/// The products of the low halves, without sign.
+HOLDFAST_INLINE IntLanes multiply_low_halves(const IntLanes& a, const IntLanes& b) {
+    IntLanes result;
+#if defined(__AVX512DQ__)
+    result.part[0] = reinterpret_cast<IntRegister>(_mm512_mul_epu32(
+        reinterpret_cast<__m512i>(a.part[0]), reinterpret_cast<__m512i>(b.part[0])));
+#elif defined(__AVX2__)
+    HOLDFAST_EACH_REGISTER(
+        result.part[r] = reinterpret_cast<IntRegister>(_mm256_mul_epu32(
+            reinterpret_cast<__m256i>(a.part[r]), reinterpret_cast<__m256i>(b.part[r]))))
+#elif defined(__SSE2__) && !defined(__AVX__)
+    HOLDFAST_EACH_REGISTER(
+        result.part[r] = reinterpret_cast<IntRegister>(_mm_mul_epu32(
+            reinterpret_cast<__m128i>(a.part[r]), reinterpret_cast<__m128i>(b.part[r]))))
+#else
+    constexpr std::uint64_t low = 0xffffffffu;
+    HOLDFAST_EACH_REGISTER(result.part[r] = reinterpret_cast<IntRegister>(
+                               (reinterpret_cast<UnsignedRegister>(a.part[r]) & low) *
+                               (reinterpret_cast<UnsignedRegister>(b.part[r]) & low)))
+#endif
+    return result;
 }
 
 HOLDFAST_INLINE Lanes load(const double* from) {

@@ -12,7 +12,7 @@ unbounded one, such as the ground, a large extent (:data:`FAR`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +39,7 @@ __all__ = [
     "DiscWorld",
     "KernelObject",
     "RectangleWorld",
+    "RolloutSettings",
 ]
 
 FAR = 1.0e6
@@ -57,6 +58,31 @@ class KernelObject:
 
     def __reduce__(self) -> tuple[type[KernelObject], tuple[Any, ...]]:
         return KernelObject, self._made_of
+
+
+class RolloutSettings(NamedTuple):
+    """What the rollouts of the method ``expected_return`` have in common.
+
+    Attributes
+    ----------
+    interval : int
+        Steps from one sensing step to the next.
+    looks : int
+        Later sensing steps at which the state may become known.
+    steps : int
+        Length of a rollout.
+    discount, price : float
+        Of a step's reward; of a later sensing action, in units of reward.
+    counts_steps : bool
+        Whether each step counts -1 instead of its reward.
+    """
+
+    interval: int
+    looks: int
+    steps: int
+    discount: float
+    price: float
+    counts_steps: bool
 
 
 class _World(KeepsReadOnly):
@@ -196,17 +222,13 @@ class _World(KeepsReadOnly):
         standard_deviation: FloatArray,
         tolerance: float,
         stream: Stream,
-        lengths: tuple[int, int, int],
-        discount: float,
-        price: float,
-        counts_steps: bool,
+        rollouts: RolloutSettings,
         threads: int,
     ) -> FloatArray:
         """Return the rollouts of a policy of the kernel, shape (J, M).
 
-        They are those of :func:`holdfast.planning.expected_return.rollout_returns`; ``lengths`` are
-        the steps from one sensing step to the next, the number of later sensing steps at which the
-        state may become known, and the steps of a rollout. cpp/src/rollouts.hpp has the noise.
+        They are those of :func:`holdfast.planning.expected_return.rollout_returns`;
+        cpp/src/rollouts.hpp has the noise.
         """
         returns = np.empty(estimates.shape[:2])
         rolled_out = self._kernel.own.roll_out(
@@ -218,10 +240,7 @@ class _World(KeepsReadOnly):
             standard_deviation,
             tolerance,
             stream.for_motion(),
-            lengths,
-            discount,
-            price,
-            counts_steps,
+            rollouts,
             threads,
             returns,
         )

@@ -102,8 +102,8 @@ class PriorNeighbors(NamedTuple):
 
     Without weights, divergences from distances to nearest neighbours are those of Wang, Kulkarni
     and Verdu (2009), "Divergence estimation for multidimensional densities via k-nearest-neighbor
-    distances", IEEE Transactions on Information Theory 55(5). Time and memory grow with the square
-    of the number of points, of which there may be 4,096.
+    distances", IEEE Transactions on Information Theory 55(5). Time grows with the square of the
+    number of points, of which there may be 4,096.
     """
 
     prior: FloatArray

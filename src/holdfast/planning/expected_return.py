@@ -45,6 +45,7 @@ from holdfast.errors import ProblemError
 from holdfast.numerics import reproducible as numerics
 from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
 from holdfast.numerics.circular import differences
+from holdfast.numerics.geometry import RolloutSettings
 from holdfast.numerics.randomness import Stream
 from holdfast.planning import interruption
 from holdfast.planning.belief import Belief, estimate
@@ -205,37 +206,30 @@ def rollout_returns(
     motion : Stream
         The noise of the motion, the same for all J.
     """
-    interval = settings.sensing_interval + 1
-    looks = settings.selector.rollout_looks
     costs = sensing_costs(problem, optional=settings.selector.sensing_is_optional)
     price = numerics.sum(costs) / costs.shape[0]
     own_rewards = getattr(type(problem), "reward", None) is not ProblemBase.reward
     counts_steps = settings.selector.rollout_reward == "steps" or not own_rewards
-    discount, steps = settings.active_sensing.discount, settings.selector.rollout_steps
-    if has_own_rollouts(problem):
-        return checked.rollout_returns(
-            problem,
-            true_states,
-            estimates,
-            clouds,
-            stage,
-            motion,
-            (interval, looks, steps),
-            discount,
-            price,
-            counts_steps,
-            settings.active_sensing.num_cores,
-        )
-    rollouts = _Rollouts(
-        problem, discount, counts_steps, steps, true_states, estimates, clouds, stage
+    own = RolloutSettings(
+        settings.sensing_interval + 1,
+        settings.selector.rollout_looks,
+        settings.selector.rollout_steps,
+        settings.active_sensing.discount,
+        price,
+        counts_steps,
     )
-    for step in range(steps):
+    begun = (true_states, estimates, clouds, stage)
+    if has_own_rollouts(problem):
+        threads = settings.active_sensing.num_cores
+        return checked.rollout_returns(problem, *begun, motion, own, threads)
+    rollouts = _Rollouts(problem, own, *begun)
+    for step in range(own.steps):
         interruption.check()
-        later, between = divmod(step, interval)
+        later, between = divmod(step, own.interval)
         if between == 0 and later > 0:
             rollouts.pay(price)
-            if later <= looks:
-                rollouts.fork(1.0 if later == looks else 1.0 / looks)
+            if later <= own.looks:
+                rollouts.fork(1.0 if later == own.looks else 1.0 / own.looks)
             rollouts.drop_decided()
         if not rollouts.advance(motion.substream(step)):
             break
@@ -254,9 +248,7 @@ class _Rollouts:
     def __init__(
         self,
         problem: Problem,
-        discount: float,
-        counts_steps: bool,
-        steps: int,
+        settings: RolloutSettings,
         true_states: FloatArray,
         estimates: FloatArray,
         clouds: FloatArray,
@@ -264,8 +256,8 @@ class _Rollouts:
     ) -> None:
         actions, samples, size = estimates.shape
         self._problem = problem
-        self._counts_steps = counts_steps
-        self._discount = discount
+        self._counts_steps = settings.counts_steps
+        self._discount = settings.discount
         self._factor = 1.0
         self.returns = np.zeros((actions, samples))
         self._unknown = samples
@@ -277,7 +269,7 @@ class _Rollouts:
         self._origins = np.arange(samples)
         # The probability of the branch; 0 where it has ended.
         self._shares = np.ones((actions, samples))
-        self._steps_left = steps
+        self._steps_left = settings.steps
         self._end()
 
     def pay(self, price: float) -> None:

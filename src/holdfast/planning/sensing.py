@@ -461,7 +461,7 @@ def _stratified(weights: FloatArray, samples: int, stream: Stream) -> list[int]:
     # np.cumsum adds one by one, in order, unlike np.sum.
     found = np.searchsorted(np.cumsum(weights), positions, side="right")
     last = int(np.flatnonzero(weights)[-1])
-    return [min(int(index), last) for index in found]
+    return [min(index, last) for index in found.tolist()]
 
 
 def _later_entropies(

@@ -43,8 +43,7 @@ FEW_PARTICLES = 500
 their square."""
 
 MAX_PRIOR_NEIGHBORS_POINTS = 4096
-"""Bound on the particles of ``prior_neighbors``: where all lie within the resolution of each other,
-their neighbourhoods then take 64 MB."""
+"""Bound on the particles of ``prior_neighbors``, whose time grows with their square."""
 
 MAX_PATH_STEPS = 10_000
 """Bound on the entries of ``selector.path_offsets``, and on the steps that they come to."""

@@ -27,6 +27,7 @@ from holdfast.numerics.geometry import (
     DiscWorld,
     KernelObject,
     RectangleWorld,
+    RolloutSettings,
 )
 from holdfast.numerics.randomness import NOISE_FREE, Stream
 from holdfast.problems.problem import ProblemBase
@@ -199,10 +200,7 @@ class RigidBodyProblem(KeepsReadOnly, ProblemBase):
         clouds: FloatArray,
         stage: int,
         motion: Stream,
-        lengths: tuple[int, int, int],
-        discount: float,
-        price: float,
-        counts_steps: bool,
+        rollouts: RolloutSettings,
         threads: int,
     ) -> FloatArray:
         """Return the rollouts of ``expected_return``, in the kernel.
@@ -219,10 +217,7 @@ class RigidBodyProblem(KeepsReadOnly, ProblemBase):
             self._motion_deviation,
             max(self._collision_tolerance, _ROLLOUT_TOLERANCE),
             motion,
-            lengths,
-            discount,
-            price,
-            counts_steps,
+            rollouts,
             threads,
         )
 

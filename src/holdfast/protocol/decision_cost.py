@@ -151,6 +151,7 @@ _CLOUD = 8.0
 """Particles that follow each estimate of a rollout."""
 _WEIGHTS_BYTES = 64 << 20
 _GROUP_BYTES = 400
+_GAINS_BYTES = 16 << 20
 _BLOCK = 1 << 20
 """Sizes of the kernel's batches and of :mod:`holdfast.planning.sensing`'s blocks."""
 
@@ -255,7 +256,9 @@ class _Sizes:
         together = max(particles, min(sets * particles, float(_BLOCK)))
         kept = sets * particles * (8.0 * dimension + 64.0)
         if estimator_of(self.planning.selector, int(particles)) == "prior_neighbors":
-            return 8.0 * batch * particles + kept + 4.0 * particles * particles
+            # The posteriors once more, point by point, and what they gain at each of these.
+            gains = min(8.0 * sets * batch * particles, float(_GAINS_BYTES))
+            return 8.0 * batch * particles + kept + 2.0 * gains
         return 8.0 * batch * particles + kept + 2.0 * _GROUP_BYTES * together
 
 
