@@ -81,7 +81,7 @@ REAL = (
     "unit/test_loop_thread.py",
     "unit/test_master_settings.py",
     "unit/test_probe.py",
-    "unit/test_ray_workers.py::test_it_finds",
+    "unit/test_ray_workers.py::test_it_finds_the_same_and_outlives_its_actors",
     "unit/test_recovery_launcher.py",
     "unit/test_ros1_client.py",
     "unit/test_standby.py",

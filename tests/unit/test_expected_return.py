@@ -383,8 +383,8 @@ class TestRollouts:
     @pytest.mark.parametrize(
         ("function", "own", "message"),
         [
-            ("is_goal", lambda _, s: s[..., 0], "is_goal of dock, asked of 4 states at once"),
-            ("is_failure", lambda _, s: s[..., 0], "is_failure of dock, asked"),
+            ("is_goal", lambda _, s: s[..., 0], "is_goal of dock returned float64"),
+            ("is_failure", lambda _, s: s[..., 0], "is_failure of dock returned float64"),
             ("reward", lambda *_: 0.0, "reward of dock returned float"),
             ("reward", lambda _, s, __: np.full(s.shape[:-1], np.nan), "all must be finite"),
             ("move", lambda _, s, *__: s * np.inf, "move of dock put particle 0 at"),
