@@ -226,6 +226,6 @@ def _tune(options: TuneOptions) -> int:
         line.stop()
     text = f"{found.sentence}\n" if options.quiet else tuning_tables(found)
     sys.stdout.write(printable(text))
-    if not options.quiet:
+    if found.changes and not options.quiet:
         sys.stderr.write(f"Take it: holdfast run {shown_path(out / CONFIGURATION_NAME)}\n")
     return 0

@@ -112,7 +112,9 @@ class Table:
         shown, names = self.shown(), list(self.names())
         if columns is None:
             return shown
-        for each in columns if isinstance(columns, list | tuple) else [columns]:
+        if not isinstance(columns, list | tuple):
+            columns = [columns]  # type: ignore[list-item]
+        for each in columns:
             if not isinstance(each, str) or each not in names[1:]:
                 allowed = ", ".join(names[1:])
                 raise InvalidValueError(f"columns has {each!r:.80}; allowed are {allowed}")

@@ -219,11 +219,14 @@ class _Judged(Table, msgspec.Struct, frozen=True):
 
 def tuning_tables(found: Tuning) -> str:
     """Return the finding and its two tables as Markdown."""
-    return (
-        f"{found.sentence}\n\nJudged on {found.fresh_trials:,} fresh trials in the same worlds. "
-        f"The intervals of {found.objective} hold together at {FAMILY_LEVEL:.0%}.\n\n"
-        f"{_Judged(found).to_markdown()}\n{found.to_markdown()}"
-    )
+    judged = ""
+    if found.comparisons:
+        judged = (
+            f"Judged on {found.fresh_trials:,} fresh trials in the same worlds. The intervals of "
+            f"{found.objective} hold together at {FAMILY_LEVEL:.0%}.\n\n"
+            f"{_Judged(found).to_markdown()}\n"
+        )
+    return f"{found.sentence}\n\n{judged}{found.to_markdown()}"
 
 
 # -- figure ----------------------------------------------------------------------------------------
