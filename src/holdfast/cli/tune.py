@@ -18,12 +18,7 @@ from holdfast.cli.exit_codes import (
 )
 from holdfast.cli.overrides import combined, parse_assignment
 from holdfast.cli.terminal import duration, progress_line
-from holdfast.errors import (
-    InvalidValueError,
-    OutputError,
-    RunError,
-    WorkerDiedError,
-)
+from holdfast.errors import InvalidValueError, OutputError, RunError, WorkerDiedError
 from holdfast.printable import printable
 from holdfast.runtime.command_line import (
     Options,
@@ -132,8 +127,7 @@ class TuneOptions(Options):
         help="A value instead of the file's, as YAML: simulator.max_steps=200.",
     )
     problem: str | None = option(
-        metavar="NAME",
-        help="Problem instead of the file's: a registered name or module:Class.",
+        metavar="NAME", help="Problem instead of the file's: a registered name or module:Class."
     )
     out: Path | None = option(
         "-o",

@@ -19,11 +19,7 @@ from holdfast.errors import OutputError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.outcome import TrialResult
 from holdfast.recording.journal_reader import JournalReader
-from holdfast.recording.run_directory import (
-    first_difference,
-    recorded_configuration,
-    world_of,
-)
+from holdfast.recording.run_directory import first_difference, recorded_configuration, world_of
 from holdfast.recording.table_formats import TIMES, Table, aligned, decimals
 from holdfast.recording.tables import wilson_interval
 from holdfast.robot.environment_maker import BUILT_IN

@@ -49,11 +49,7 @@ from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings, PlanningSettings
 from holdfast.problems.problem import Problem
-from holdfast.robot.trial import (
-    NULL_OBSERVER,
-    TrialObserver,
-    run_trial,
-)
+from holdfast.robot.trial import NULL_OBSERVER, TrialObserver, run_trial
 from holdfast.runtime.command_line import MAX_JOBS
 from holdfast.runtime.ray_workers import RayCluster
 from holdfast.runtime.workers import WorkerProcess, end_workers

@@ -21,11 +21,7 @@ import msgspec
 from holdfast.config.loader import Configuration
 from holdfast.errors import InvalidValueError, OutputError
 from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
-from holdfast.recording.outcome_comparison import (
-    ComparedRun,
-    OutcomeComparison,
-    compare_results,
-)
+from holdfast.recording.outcome_comparison import ComparedRun, OutcomeComparison, compare_results
 from holdfast.recording.run_directory import RunDirectory
 from holdfast.recording.table_formats import csv_rows
 from holdfast.recording.tables import trial_row

@@ -35,13 +35,7 @@ from holdfast.problems.problem import ProblemBase
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 from holdfast.tuning.contract_check import acted, check_contract
-from holdfast.tuning.findings import (
-    CheckEndedError,
-    Inspection,
-    Severity,
-    Walk,
-    spread_out,
-)
+from holdfast.tuning.findings import CheckEndedError, Inspection, Severity, Walk, spread_out
 from holdfast.tuning.verdict import mean_difference
 
 __all__ = ["check_decision_time", "check_goals", "check_method", "check_trials"]

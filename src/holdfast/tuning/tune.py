@@ -23,12 +23,7 @@ from typing import NamedTuple, get_args
 import numpy as np
 
 from holdfast.config.loader import Configuration, load
-from holdfast.errors import (
-    InvalidValueError,
-    TrialCrashError,
-    TrialError,
-    WorkerDiedError,
-)
+from holdfast.errors import InvalidValueError, TrialCrashError, TrialError, WorkerDiedError
 from holdfast.numerics.arrays import FloatArray, real_number, whole
 from holdfast.recording.fingerprint import fingerprint
 from holdfast.recording.kept_trials import FRESH, TRIALS_NAME, KeptTrials, TrialRow
@@ -293,11 +288,7 @@ class _Tuner:
         return sum(self._kept.rows[key].seconds for key in keys) / self._jobs
 
     def _race(
-        self,
-        candidates: Sequence[Candidate],
-        refused: Mapping[str, str],
-        most: int,
-        until_s: float,
+        self, candidates: Sequence[Candidate], refused: Mapping[str, str], most: int, until_s: float
     ) -> list[Standing]:
         for each in candidates:
             self._add(each)
