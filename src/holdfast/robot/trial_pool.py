@@ -25,10 +25,11 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -56,19 +57,11 @@ from holdfast.runtime.workers import WorkerProcess, end_workers
 
 __all__ = ["Arm", "FinishedTrial", "TrialPool", "available_cores"]
 
-_WORKER_START_S = 1.0
-"""About what it costs to start workers; they must save more than this."""
-
-_LOOKAHEAD_S = 0.1
-"""A worker is sent trials for about this long, so that it never waits for the next one."""
-
+_WORKER_START_S = 1.0  # about what it costs to start workers; they must save more than this
+_LOOKAHEAD_S = 0.1  # of trials that a worker is sent, so that it never waits for the next one
 _MAX_LOOKAHEAD = 16
-
-_TICK_S = 0.25
-"""Between two looks at trials that may be overdue."""
-
-_BUILD_S = 60.0
-"""For a worker to start and to build a problem, before the time of a trial begins."""
+_TICK_S = 0.25  # between two looks at trials that may be overdue
+_BUILD_S = 60.0  # for a worker to start and to build a problem, before a trial's time begins
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,10 +164,6 @@ class TrialPool:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Forget all trials and end the workers at once; may be repeated."""
         self._queue.clear()
         end_workers(self._workers)
         self._workers.clear()
@@ -183,12 +172,6 @@ class TrialPool:
     def waiting(self) -> int:
         """Trials that were submitted and are not finished."""
         return len(self._queue) + sum(len(worker.outstanding) for worker in self._workers)
-
-    @property
-    def has_room(self) -> bool:
-        """Whether further trials could keep a worker from waiting."""
-        here = self._jobs == 1 and self._overdue is None
-        return len(self._queue) < (1 if here else self._jobs * _MAX_LOOKAHEAD)
 
     def submit(self, arm: Arm, trial: int) -> None:
         """Add a trial, which :meth:`run` yields when it is finished."""
@@ -219,8 +202,10 @@ class TrialPool:
             as it is, with a note that names the trial.
         """
         more = iter(trials)
+        here = self._jobs == 1 and self._overdue is None
+        room = 1 if here else self._jobs * _MAX_LOOKAHEAD
         while True:
-            while self.has_room and (job := next(more, None)) is not None:
+            while len(self._queue) < room and (job := next(more, None)) is not None:
                 self.submit(*job)
             if self._workers:
                 self._feed()
@@ -408,22 +393,12 @@ def _with_arm(error: TrialError | TrialCrashError, arm: Arm) -> Exception:
 # -- workers ---------------------------------------------------------------------------------------
 
 
-class _NewArm(msgspec.Struct, tag="arm"):
-    """An arm, sent to a worker before its first trial there; the next number is its own."""
+class _Trial(msgspec.Struct):
+    """A trial of an arm, by the arm's number in that worker; with its first one the arm itself."""
 
-    planning: PlanningSettings
-    seed: int
-    max_steps: int
-    lost: LostSettings
-    problem_name: str
-    label: str
-    plain: dict[str, Any] | None
-    pickled: bytes
-
-
-class _Trial(msgspec.Struct, tag="trial"):
     arm: int
     trial: int
+    new: bytes = b""
 
 
 class _Finished(msgspec.Struct, tag="finished"):
@@ -440,7 +415,7 @@ class _Failed(msgspec.Struct, tag="failed"):
     expected: bool
 
 
-_REQUESTS = msgspec.msgpack.Decoder(_NewArm | _Trial)
+_REQUESTS = msgspec.msgpack.Decoder(_Trial)
 _ANSWERS = msgspec.msgpack.Decoder(_Finished | _Built | _Failed)
 _ENCODE = msgspec.msgpack.Encoder().encode
 
@@ -463,14 +438,13 @@ class _Worker(WorkerProcess):
 
     def send_trial(self, arm: Arm, trial: int, expected_s: float) -> None:
         # If it is dead, its pipe tells when it is read, where we know which trial it had.
+        new = b"" if arm in self._arms else _pickled(arm)
         if not self.outstanding:
-            self.began_s = perf_counter() + (_BUILD_S if arm not in self._arms else 0.0)
-        if arm not in self._arms:
-            self.send(_ENCODE(_new_arm(arm)))
-            self._arms[arm] = len(self._arms)
+            self.began_s = perf_counter() + (_BUILD_S if new else 0.0)
+        number = self._arms.setdefault(arm, len(self._arms))
         self.outstanding.append((arm, trial, expected_s))
         self.expected_s += expected_s
-        self.send(_ENCODE(_Trial(self._arms[arm], trial)))
+        self.send(_ENCODE(_Trial(number, trial, new)))
 
     def take_finished(self) -> tuple[Arm, int]:
         """Return the trial that an answer was about: they come in order."""
@@ -480,21 +454,7 @@ class _Worker(WorkerProcess):
         return arm, trial
 
 
-def _new_arm(arm: Arm) -> _NewArm:
-    return _NewArm(
-        arm.planning,
-        arm.seed,
-        arm.max_steps,
-        arm.lost,
-        arm.problem_name,
-        arm.label,
-        arm.plain,
-        b"" if arm.plain is not None else _pickled(arm.problem),
-    )
-
-
-_OF_THE_PROBLEM = ("problem", "problem_directory", "model", "state_space_planner")
-"""Sections of a configuration."""
+_OF_THE_PROBLEM = ("problem", "problem_directory", "model", "state_space_planner")  # sections
 
 _NEEDS_CLOUDPICKLE = (
     "a problem that a notebook or a script defines needs cloudpickle: pip install "
@@ -502,23 +462,26 @@ _NEEDS_CLOUDPICKLE = (
 )
 
 
-def _pickled(problem: Problem) -> bytes:
-    """Return a problem for the pipe; cloudpickle takes along the class that a notebook defines."""
-    try:
-        import cloudpickle as pickler
-    except ImportError:
-        import pickle as pickler
+def _pickled(arm: Arm) -> bytes:
+    """Return an arm for the pipe; its problem within, pickled too, unless ``plain`` builds it."""
+    return pickle.dumps(replace(arm, problem=None if arm.plain else _pickled_problem(arm.problem)))
 
+
+def _pickled_problem(problem: Problem) -> bytes:
+    """Return a problem; cloudpickle takes along the class that a notebook defines."""
+    dumps = pickle.dumps
+    try:
+        from cloudpickle import dumps
+    except ImportError:
         if type(problem).__module__ == "__main__":
             raise InvalidValueError(_NEEDS_CLOUDPICKLE) from None
     try:
-        pickled: bytes = pickler.dumps(problem)
+        return dumps(problem)
     except Exception as error:
         raise InvalidValueError(
             f"{type(problem).__name__} cannot be sent to worker processes: {error}; with jobs=1 "
             "its trials are run in this one"
         ) from error
-    return pickled
 
 
 def _work(connection: Connection, threads: int) -> None:
@@ -534,7 +497,7 @@ class _Runner:
 
     def __init__(self, threads: int) -> None:
         self._threads = threads
-        self._arms: list[_NewArm | Arm] = []
+        self._arms: dict[int, Arm | bytes] = {}
         self._problems: dict[bytes, Problem] = {}
 
     def all_answers(self, message: bytes) -> list[bytes]:
@@ -544,13 +507,12 @@ class _Runner:
     def answers(self, message: bytes) -> Iterator[bytes]:
         """Yield what there is to answer, as soon as it is known."""
         request = _REQUESTS.decode(message)
-        if isinstance(request, _NewArm):
-            self._arms.append(request)
-            return
+        if request.new:
+            self._arms[request.arm] = request.new
         started = perf_counter()
         try:
             arm = self._arms[request.arm]
-            if isinstance(arm, _NewArm):
+            if isinstance(arm, bytes):
                 self._arms[request.arm] = arm = _arm_in_worker(arm, self._threads, self._problems)
                 yield _ENCODE(_Built())
             result = _run_one(arm, request.trial, NULL_OBSERVER)
@@ -562,35 +524,30 @@ class _Runner:
         yield answer
 
 
-def _arm_in_worker(sent: _NewArm, threads: int, problems: dict[bytes, Problem]) -> Arm:
+def _arm_in_worker(pickled: bytes, threads: int, problems: dict[bytes, Problem]) -> Arm:
     """Build an arm in a worker.
 
     Arms that differ in their settings alone share a problem of ``problems``: it may be large.
     """
-    if sent.plain is not None:
-        sections = sent.plain["configuration"]
-        key = _ENCODE([sent.plain["path"], *map(sections.get, _OF_THE_PROBLEM)])
+    arm: Arm = pickle.loads(pickled)
+    if arm.plain is not None:
+        sections = arm.plain["configuration"]
+        key = _ENCODE([arm.plain["path"], *map(sections.get, _OF_THE_PROBLEM)])
         if key not in problems:
-            problems[key] = Configuration.from_plain(sent.plain).problem
+            problems[key] = Configuration.from_plain(arm.plain).problem
         problem = problems[key]
     else:
-        import pickle
-
         try:
-            problem = pickle.loads(sent.pickled)
+            problem = pickle.loads(arm.problem)  # type: ignore[arg-type]
         except Exception as error:
             raise InvalidValueError(
-                f"{sent.problem_name} cannot be made again in a worker process: "
+                f"{arm.problem_name} cannot be made again in a worker process: "
                 f"{type(error).__name__}: {error}; {_NEEDS_CLOUDPICKLE}"
             ) from error
-    own = sent.planning.active_sensing
-    cores = min(threads, own.num_cores) if own.num_cores else threads
-    planning = msgspec.structs.replace(
-        sent.planning, active_sensing=msgspec.structs.replace(own, num_cores=cores)
-    )
-    return Arm(
-        problem, planning, sent.seed, sent.max_steps, sent.lost, sent.problem_name, sent.label
-    )
+    own = arm.planning.active_sensing
+    own = msgspec.structs.replace(own, num_cores=min(threads, own.num_cores or threads))
+    planning = msgspec.structs.replace(arm.planning, active_sensing=own)
+    return replace(arm, problem=problem, planning=planning)
 
 
 def _error_of(arm: Arm, failed: _Failed) -> Exception:
