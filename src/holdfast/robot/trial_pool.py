@@ -52,7 +52,7 @@ from holdfast.planning.settings import LostSettings, PlanningSettings
 from holdfast.problems.problem import Problem
 from holdfast.robot.trial import NULL_OBSERVER, TrialObserver, run_trial
 from holdfast.runtime.command_line import MAX_JOBS
-from holdfast.runtime.ray_workers import RayCluster
+from holdfast.runtime.ray_workers import RayCluster, RayProcess
 from holdfast.runtime.workers import WorkerProcess, end_workers
 
 __all__ = ["Arm", "FinishedTrial", "TrialPool", "available_cores"]
@@ -66,17 +66,12 @@ _BUILD_S = 60.0  # for a worker to start and to build a problem, before a trial'
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """What trials are run of. Two arms with the same seed meet the same worlds.
-
-    ``dataclasses.replace`` makes an arm with another seed or other settings. Arms are told apart by
-    identity, so they are keys of a dictionary.
+    """What trials are run of, told apart by identity. Of one seed they meet the same worlds.
 
     Attributes
     ----------
-    problem_name : str
-        For messages.
-    label : str
-        What tells it from other arms, for messages; empty if there is only one.
+    problem_name, label : str
+        For messages; the label tells it from other arms, and is empty if there is only one.
     plain : mapping or None
         :meth:`Configuration.plain` of the configuration that built the problem, from which a worker
         builds it again. None: the problem itself is sent, as a pickle in the pipe.
@@ -271,7 +266,7 @@ class TrialPool:
         if self._queue:
             self._start_workers()  # in place of those that died
         while self._queue:
-            worker = min(self._workers, key=_Worker.load)
+            worker = min(self._workers, key=lambda each: (bool(each.outstanding), each.expected_s))
             arm, trial = self._queue[0]
             times = self._times.get(arm)
             # One whose time nobody knows may be long.
@@ -300,7 +295,10 @@ class TrialPool:
                 continue
             arm, trial = worker.take_finished()
             if isinstance(message, _Failed):
-                raise _error_of(arm, message)
+                crash = TrialCrashError(f"in a worker process:\n{message.text}")
+                error = TrialError(message.text) if message.expected else crash
+                error.arm = arm
+                raise error
             yield self._finished(arm, trial, message.result, message.elapsed_s)
         for connection, worker in by_connection.items():
             if self._overdue is not None and connection not in ready and worker.outstanding:
@@ -332,12 +330,12 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+@dataclass
 class _Times:
     """How long trials took."""
 
-    def __init__(self) -> None:
-        self.count = 0
-        self.mean_s = 0.0
+    count: int = 0
+    mean_s: float = 0.0
 
     def add(self, elapsed_s: float) -> None:
         self.count += 1
@@ -380,14 +378,11 @@ def _run_one(arm: Arm, trial: int, observer: TrialObserver) -> TrialResult:
         ours = isinstance(error, HoldfastError)
         text = str(error) if ours else account_of_user_error(error, arm.problem_name)
         if text is not None:
-            raise _with_arm(TrialError(f"{where}: {text}"), arm) from error
+            failed = TrialError(f"{where}: {text}")
+            failed.arm = arm
+            raise failed from error
         error.add_note(f"in {where}")
         raise
-
-
-def _with_arm(error: TrialError | TrialCrashError, arm: Arm) -> Exception:
-    error.arm = arm
-    return error
 
 
 # -- workers ---------------------------------------------------------------------------------------
@@ -426,15 +421,10 @@ class _Worker(WorkerProcess):
     def __init__(self, number: int, threads: int, blas: int, cluster: RayCluster | None) -> None:
         super().__init__(f"holdfast-worker-{number}", _work, (threads,), blas)
         if cluster is not None:
-            self._process = cluster.process(_Runner, self._theirs, threads)
+            self._process = RayProcess(cluster, _Runner, self._theirs, threads)
         self.outstanding: deque[tuple[Arm, int, float]] = deque()
-        self.expected_s = 0.0
-        self.began_s = 0.0
+        self.expected_s = self.began_s = 0.0
         self._arms: dict[Arm, int] = {}
-
-    def load(self) -> float:
-        """Return how much it has to do, in seconds; least if it has nothing."""
-        return self.expected_s if self.outstanding else -1.0
 
     def send_trial(self, arm: Arm, trial: int, expected_s: float) -> None:
         # If it is dead, its pipe tells when it is read, where we know which trial it had.
@@ -464,24 +454,26 @@ _NEEDS_CLOUDPICKLE = (
 
 def _pickled(arm: Arm) -> bytes:
     """Return an arm for the pipe; its problem within, pickled too, unless ``plain`` builds it."""
-    return pickle.dumps(replace(arm, problem=None if arm.plain else _pickled_problem(arm.problem)))
+    problem: Any = None if arm.plain is not None else _pickled_problem(arm.problem)
+    return pickle.dumps(replace(arm, problem=problem))
 
 
 def _pickled_problem(problem: Problem) -> bytes:
     """Return a problem; cloudpickle takes along the class that a notebook defines."""
-    dumps = pickle.dumps
     try:
-        from cloudpickle import dumps
+        import cloudpickle as pickler
     except ImportError:
+        pickler = pickle
         if type(problem).__module__ == "__main__":
             raise InvalidValueError(_NEEDS_CLOUDPICKLE) from None
     try:
-        return dumps(problem)
+        pickled: bytes = pickler.dumps(problem)
     except Exception as error:
         raise InvalidValueError(
             f"{type(problem).__name__} cannot be sent to worker processes: {error}; with jobs=1 "
             "its trials are run in this one"
         ) from error
+    return pickled
 
 
 def _work(connection: Connection, threads: int) -> None:
@@ -548,8 +540,3 @@ def _arm_in_worker(pickled: bytes, threads: int, problems: dict[bytes, Problem])
     own = msgspec.structs.replace(own, num_cores=min(threads, own.num_cores or threads))
     planning = msgspec.structs.replace(arm.planning, active_sensing=own)
     return replace(arm, problem=problem, planning=planning)
-
-
-def _error_of(arm: Arm, failed: _Failed) -> Exception:
-    crash = TrialCrashError(f"in a worker process:\n{failed.text}")
-    return _with_arm(TrialError(failed.text) if failed.expected else crash, arm)
