@@ -82,14 +82,10 @@ class CheckOptions(Options):
     quiet: bool = flag("-q", help="Show no progress, and no information: errors and warnings only.")
 
 
+@ended_by_signals()
 def main(arguments: Sequence[str]) -> int:
     """Check the problem and return the exit code."""
     options = CheckOptions.parse("check", arguments)
-    with ended_by_signals():
-        return _check(options)
-
-
-def _check(options: CheckOptions) -> int:
     from holdfast.cli.terminal import counted, progress_line
     from holdfast.tuning.check_process import check_apart
     from holdfast.tuning.findings import OVER

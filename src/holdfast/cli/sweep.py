@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.cli.exit_codes import (
     EXIT_CAN_GO_ON,
@@ -34,7 +34,6 @@ from holdfast.runtime.files import shown_path
 from holdfast.runtime.output_directory import claim_directory
 
 if TYPE_CHECKING:
-    from holdfast.config.loader import Configuration
     from holdfast.planning.outcome import TrialResult
     from holdfast.tuning.sweep import SweptArm
 
@@ -89,10 +88,6 @@ class SweepOptions(Options):
     )
     quiet: bool = flag("-q", help="Show no progress: only the table and errors.")
 
-    def resume_command(self, directory: Path) -> str:
-        """Return the command that goes on."""
-        return self.command_to_resume("sweep", directory)
-
     def arms(self) -> list[SweptArm]:
         """Return the combinations."""
         from holdfast.config.loader import load
@@ -105,12 +100,11 @@ class SweepOptions(Options):
             option_name = "--trials" if key.endswith("trials") else "--seed"
             raise InvalidValueError(f"{option_name} and --set both say what {key} is")
 
-        def load_with(values: Mapping[str, Any]) -> Configuration:
-            return load(shown_path(self.configuration), overrides={**given, **values})
-
-        return arms_of(axes, load_with)
+        path = shown_path(self.configuration)
+        return arms_of(axes, lambda values: load(path, overrides={**given, **values}))
 
 
+@ended_by_signals()
 def main(arguments: Sequence[str]) -> int:
     """Run the sweep and return the exit code."""
     options = SweepOptions.parse("sweep", arguments)
@@ -118,11 +112,6 @@ def main(arguments: Sequence[str]) -> int:
         raise InvalidValueError("--set is missing: which values of which key shall be compared?")
     if options.resume and options.out is None:
         raise InvalidValueError("--resume needs --out, the directory of the sweep that goes on")
-    with ended_by_signals():
-        return _sweep(options)
-
-
-def _sweep(options: SweepOptions) -> int:
     from holdfast.robot.trial_pool import available_cores
     from holdfast.tuning.sweep import Sweep
 
@@ -136,14 +125,14 @@ def _sweep(options: SweepOptions) -> int:
     directory = options.out
     if directory is None or not options.resume:
         directory = claim_directory(options.out, runs, f"sweep-{options.configuration.stem}")
+    again = options.command_to_resume("sweep", directory)
     with Sweep(directory, arms) as sweep:
         line = progress_line(sweep.total, quiet=options.quiet)
         finished = sweep.finished
         note = counted(len(arms), "combination")
 
-        def show(result: TrialResult) -> None:
+        def show(_: TrialResult) -> None:
             nonlocal finished
-            del result
             finished += 1
             line.show(finished, note)
 
@@ -163,11 +152,10 @@ def _sweep(options: SweepOptions) -> int:
             names = sweep.write_tables(comparison)
         except KeyboardInterrupt as interruption:
             kept = f"{finished:,} of {sweep.total:,} trials are finished and kept in {where}"
-            how = interrupted_by(interruption)
-            say_interrupted(how, kept, options.resume_command(directory))
+            say_interrupted(interrupted_by(interruption), kept, again)
             raise
         except HoldfastError as error:
-            raise RunError(error, options.resume_command(directory), EXIT_CAN_GO_ON) from error
+            raise RunError(error, again, EXIT_CAN_GO_ON) from error
     table = str(comparison)
     if sys.stdout.isatty():
         table = comparison.fitting(shutil.get_terminal_size().columns)

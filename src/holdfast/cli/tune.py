@@ -18,12 +18,7 @@ from holdfast.cli.exit_codes import (
 )
 from holdfast.cli.overrides import combined, parse_assignment
 from holdfast.cli.terminal import duration, progress_line
-from holdfast.errors import (
-    InvalidValueError,
-    OutputError,
-    RunError,
-    WorkerDiedError,
-)
+from holdfast.errors import InvalidValueError, OutputError, RunError, WorkerDiedError
 from holdfast.printable import printable
 from holdfast.runtime.command_line import (
     Options,
@@ -132,8 +127,7 @@ class TuneOptions(Options):
         help="A value instead of the file's, as YAML: simulator.max_steps=200.",
     )
     problem: str | None = option(
-        metavar="NAME",
-        help="Problem instead of the file's: a registered name or module:Class.",
+        metavar="NAME", help="Problem instead of the file's: a registered name or module:Class."
     )
     out: Path | None = option(
         "-o",
@@ -147,19 +141,11 @@ class TuneOptions(Options):
     )
     quiet: bool = flag("-q", help="Show only the sentence.")
 
-    def resume_command(self, directory: Path) -> str:
-        """Return the command that goes on."""
-        return self.command_to_resume("tune", directory)
 
-
+@ended_by_signals()
 def main(arguments: Sequence[str]) -> int:
     """Tune and return the exit code."""
     options = TuneOptions.parse("tune", arguments)
-    with ended_by_signals():
-        return _tune(options)
-
-
-def _tune(options: TuneOptions) -> int:
     from holdfast.config.loader import load
     from holdfast.recording.kept_trials import TRIALS_NAME
     from holdfast.tuning.check_process import require_right
@@ -171,21 +157,19 @@ def _tune(options: TuneOptions) -> int:
         if not options.quiet:
             sys.stderr.write(printable(f"note: {found.check}: {found.seen}\n"))
 
-    runs, began_s = Path("runs").absolute(), monotonic()
-    given = [parse_assignment(each) for each in options.assignments]
+    runs, began_s, budget_s = Path("runs").absolute(), monotonic(), _seconds(options.budget)
+    given = combined(map(parse_assignment, options.assignments))
     path = shown_path(options.configuration)
-    configuration = load(
-        path, problem=options.problem, seed=options.seed, overrides=combined(given)
-    )
+    configuration = load(path, problem=options.problem, seed=options.seed, overrides=given)
     if options.check and not options.resume:
-        require_right(configuration, _seconds(options.budget), warn)
+        require_right(configuration, budget_s, warn)
     if options.resume:
         if options.out is None or not (options.out / TRIALS_NAME).is_file():
             raise InvalidValueError(f"--resume needs --out DIR, of a tuning that has {TRIALS_NAME}")
         out = options.out
     else:
         out = claim_directory(options.out, runs, f"{options.configuration.stem}-tuned")
-    budget_s = _seconds(options.budget)
+    again = options.command_to_resume("tune", out)
     left_s = max(0.5 * budget_s, budget_s - (monotonic() - began_s))  # the check had its part
     line = progress_line(round(budget_s), quiet=options.quiet, noun="second", speed=False)
     doing = ""
@@ -215,13 +199,13 @@ def _tune(options: TuneOptions) -> int:
         )
     except KeyboardInterrupt as interruption:
         line.stop()
-        how = interrupted_by(interruption)
-        say_interrupted(how, "The finished trials are kept.", options.resume_command(out))
+        kept = "The finished trials are kept."
+        say_interrupted(interrupted_by(interruption), kept, again)
         raise
     except (OutputError, WorkerDiedError) as error:
         if not doing:
             raise  # the directory is not ours
-        raise RunError(error, options.resume_command(out), EXIT_CAN_GO_ON) from error
+        raise RunError(error, again, EXIT_CAN_GO_ON) from error
     finally:
         line.stop()
     text = f"{found.sentence}\n" if options.quiet else tuning_tables(found)

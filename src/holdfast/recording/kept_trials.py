@@ -19,9 +19,7 @@ from holdfast.runtime.files import shown_path, write_atomically
 
 __all__ = ["FRESH", "KeptTrials", "TrialRow"]
 
-FRESH = 1_000_000
-"""Number of the first trial that judges; those of the race are below it."""
-
+FRESH = 1_000_000  # number of the first trial that judges; those of the race are below it
 TRIALS_NAME = "trials.csv"
 SETTINGS_NAME = "tune.json"
 
@@ -40,13 +38,7 @@ class TrialRow(NamedTuple):
 
 
 class KeptTrials:
-    """The trials that are finished, in memory and, if there is a directory, in its file.
-
-    Attributes
-    ----------
-    rows : dict
-        By candidate and number.
-    """
+    """The finished trials, ``rows``, by candidate and number; kept in a directory, if any."""
 
     def __init__(self, directory: Path | None, settings: Mapping[str, Any]) -> None:
         self.rows: dict[tuple[str, int], TrialRow] = {}
@@ -99,8 +91,7 @@ class KeptTrials:
                     f"{shown_path(path)}: is gone, so nothing tells of which tuning the trials of "
                     f"{TRIALS_NAME} are; choose another directory"
                 ) from None
-            content = msgspec.json.format(msgspec.json.encode(settings), indent=2)
-            write_atomically(path, content)
+            write_atomically(path, msgspec.json.format(msgspec.json.encode(settings), indent=2))
             return
         except (OSError, UnicodeDecodeError, msgspec.DecodeError) as error:
             raise OutputError(f"{shown_path(path)}: cannot be read: {error}") from None

@@ -19,11 +19,7 @@ from holdfast.errors import OutputError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.outcome import TrialResult
 from holdfast.recording.journal_reader import JournalReader
-from holdfast.recording.run_directory import (
-    first_difference,
-    recorded_configuration,
-    world_of,
-)
+from holdfast.recording.run_directory import first_difference, recorded_configuration, world_of
 from holdfast.recording.table_formats import TIMES, Table, aligned, decimals
 from holdfast.recording.tables import wilson_interval
 from holdfast.robot.environment_maker import BUILT_IN
@@ -33,7 +29,6 @@ __all__ = [
     "OutcomeComparison",
     "OutcomeEffect",
     "OutcomeEstimate",
-    "RunOutcomes",
     "bootstrap_interval",
     "compare_outcomes",
     "compare_results",
@@ -47,10 +42,7 @@ LEVEL = 0.95
 RESAMPLES = 9_999
 _SEED = 0
 _LEAST_TRIALS = 2
-_LEAST_FOR_A_VERDICT = 10
-"""With 2 trials half of all intervals miss the truth, with 5 every eighth, as their resamples are
-too few."""
-
+_LEAST_FOR_A_VERDICT = 10  # of 2 trials half of all intervals miss the truth, of 5 every eighth
 _NUMBERS_IN_MEMORY = 10_000_000
 
 Verdict: TypeAlias = Literal[
@@ -94,8 +86,6 @@ class RunOutcomes(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    run : str
-        As it was named.
     trials : int
         Compared trials: of pairs, or of this run alone.
     notes : tuple of str
@@ -122,18 +112,14 @@ class OutcomeComparison(Table, msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    baseline : str
-        The first run, as it was named.
     paired : bool
         Whether trials were compared in pairs of one world.
     step_limit : int
         Steps that a trial counts that did not reach the goal.
-    level : float
+    level, method
         Of each interval by itself.
-    method : str
-        Of the intervals.
     runs : tuple of RunOutcomes
-        All but the first.
+        All but the first, which is the baseline.
     """
 
     baseline: str
@@ -169,7 +155,7 @@ class OutcomeComparison(Table, msgspec.Struct, frozen=True, kw_only=True):
         names = self.names()
         rows = [[f"{self.baseline} (baseline)", *len(names[1:]) * [""]]]
         for run in self.runs:
-            texts: dict[str, str] = {"trials": str(run.trials)}
+            texts = {"trials": str(run.trials)}
             for each in run.effects:
                 baseline, value, *effect = _texts_of(each)
                 at = names.index(each.measure)
@@ -221,9 +207,7 @@ class OutcomeComparison(Table, msgspec.Struct, frozen=True, kw_only=True):
         for run in self.runs:
             lines.append(f"{run.run} against {self.baseline}, {run.trials:,} {self._pairs()}:")
             head = ("", "baseline", "run", "effect", f"{self.level:.0%} interval", "")
-            rows = [
-                (_TEXTS[each.measure][0], *_texts_of(each), each.verdict) for each in run.effects
-            ]
+            rows = ((_TEXTS[one.measure][0], *_texts_of(one), one.verdict) for one in run.effects)
             lines += [*(f"  {'  '.join(row)}".rstrip() for row in aligned([head, *rows])), ""]
         return "\n".join([*lines, *self._definitions()])
 
@@ -277,25 +261,15 @@ def compare_results(
 
 
 class ComparedRun(NamedTuple):
-    """What is compared of a run.
-
-    Attributes
-    ----------
-    world : mapping
-        The settings that say which task it is, as far as known.
-    arguments : mapping
-        Those of a world that is not simulated: they may say no more than how it is reached.
-    simulated : bool
-        Whether it is a simulated one.
-    """
+    """What is compared of a run."""
 
     name: str
     results: Mapping[int, TrialResult]
     seed: Any
     step_limit: int
-    world: Mapping[str, Any]
+    world: Mapping[str, Any]  # the settings that say which task it is, as far as known
     is_finished: bool = True
-    arguments: Mapping[str, Any] = {}
+    arguments: Mapping[str, Any] = {}  # of a world not simulated: perhaps only how it is reached
     simulated: bool = True
     problem_sources: str | None = None
 
@@ -331,12 +305,9 @@ def read_outcomes(path: Path, name: str) -> ComparedRun:
 def _compare(
     baseline: ComparedRun, other: ComparedRun, paired: bool, in_turns: bool, strict: bool
 ) -> RunOutcomes:
-    runs = baseline, other
     refused = f"{other.name}: cannot be {{}} with {baseline.name}: "
-    # What both are known by; a table of Python knows less than a run.
-    there, here = (
-        {key: run.world[key] for key in runs[0].world.keys() & runs[1].world} for run in runs
-    )
+    known = baseline.world.keys() & other.world  # a table of Python knows less than a run
+    there, here = ({key: run.world[key] for key in known} for run in (baseline, other))
     notes = []
     for found, so in (
         (first_difference(there, here), "so the trials are of different tasks"),
@@ -360,10 +331,10 @@ def _compare(
             "so the worlds differ; compare them as independent samples (--unpaired), which takes "
             "more trials to find a difference"
         )
-    pairs = [list(run.results.values()) for run in runs]
+    pairs = [list(run.results.values()) for run in (baseline, other)]
     if paired:
         trials = sorted(baseline.results.keys() & other.results.keys())
-        pairs = [[run.results[trial] for trial in trials] for run in runs]
+        pairs = [[run.results[trial] for trial in trials] for run in (baseline, other)]
         left_out = len(baseline.results.keys() ^ other.results.keys())
         if left_out:
             notes.append(f"trials that only one of the runs has finished, left out: {left_out:,}")
@@ -371,7 +342,7 @@ def _compare(
             notes.append(
                 "the world is not simulated: trials of one number need not be in the same world"
             )
-    notes += [f"{run.name}: is not finished" for run in runs if not run.is_finished]
+    notes += [f"{run.name}: is not finished" for run in (baseline, other) if not run.is_finished]
     if min(map(len, pairs)) < _LEAST_TRIALS:
         raise OutputError(
             f"{other.name}: too few trials to compare with {baseline.name}: "
@@ -379,8 +350,7 @@ def _compare(
         )
     if other.problem_sources != baseline.problem_sources:
         notes.append("the source of the problem differs")
-    limit = baseline.step_limit
-    effects = effects_of(*pairs, step_limit=limit, paired=paired, in_turns=in_turns)
+    effects = effects_of(*pairs, step_limit=baseline.step_limit, paired=paired, in_turns=in_turns)
     return RunOutcomes(run=other.name, trials=len(pairs[1]), effects=effects, notes=tuple(notes))
 
 
@@ -426,21 +396,13 @@ def estimates_of(results: Sequence[TrialResult], *, step_limit: int) -> tuple[Ou
 
 
 class _Measure(NamedTuple):
-    """A number of each trial, and how those of a run are summarised.
-
-    Attributes
-    ----------
-    of_trial : callable
-        Gets a result and the limit of steps; returns None for a trial that says nothing.
-    summarise : callable
-        Gets numbers and an axis.
-    """
+    """A number of each trial, None if that says nothing, and how those of a run are summarised."""
 
     name: str
     kind: Literal["difference", "ratio"]
     more_is_better: bool
-    of_trial: Callable[[TrialResult, int], float | None]
-    summarise: Callable[[FloatArray, int], Any]
+    of_trial: Callable[[TrialResult, int], float | None]  # of a result and the limit of steps
+    summarise: Callable[[FloatArray, int], Any]  # of numbers and an axis
 
 
 def _steps_to_goal(result: TrialResult, limit: int) -> float | None:

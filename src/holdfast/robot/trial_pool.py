@@ -25,10 +25,11 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -49,45 +50,28 @@ from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings, PlanningSettings
 from holdfast.problems.problem import Problem
-from holdfast.robot.trial import (
-    NULL_OBSERVER,
-    TrialObserver,
-    run_trial,
-)
+from holdfast.robot.trial import NULL_OBSERVER, TrialObserver, run_trial
 from holdfast.runtime.command_line import MAX_JOBS
-from holdfast.runtime.ray_workers import RayCluster
+from holdfast.runtime.ray_workers import RayCluster, RayProcess
 from holdfast.runtime.workers import WorkerProcess, end_workers
 
 __all__ = ["Arm", "FinishedTrial", "TrialPool", "available_cores"]
 
-_WORKER_START_S = 1.0
-"""About what it costs to start workers; they must save more than this."""
-
-_LOOKAHEAD_S = 0.1
-"""A worker is sent trials for about this long, so that it never waits for the next one."""
-
+_WORKER_START_S = 1.0  # about what it costs to start workers; they must save more than this
+_LOOKAHEAD_S = 0.1  # of trials that a worker is sent, so that it never waits for the next one
 _MAX_LOOKAHEAD = 16
-
-_TICK_S = 0.25
-"""Between two looks at trials that may be overdue."""
-
-_BUILD_S = 60.0
-"""For a worker to start and to build a problem, before the time of a trial begins."""
+_TICK_S = 0.25  # between two looks at trials that may be overdue
+_BUILD_S = 60.0  # for a worker to start and to build a problem, before a trial's time begins
 
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """What trials are run of. Two arms with the same seed meet the same worlds.
-
-    ``dataclasses.replace`` makes an arm with another seed or other settings. Arms are told apart by
-    identity, so they are keys of a dictionary.
+    """What trials are run of, told apart by identity. Of one seed they meet the same worlds.
 
     Attributes
     ----------
-    problem_name : str
-        For messages.
-    label : str
-        What tells it from other arms, for messages; empty if there is only one.
+    problem_name, label : str
+        For messages; the label tells it from other arms, and is empty if there is only one.
     plain : mapping or None
         :meth:`Configuration.plain` of the configuration that built the problem, from which a worker
         builds it again. None: the problem itself is sent, as a pickle in the pipe.
@@ -175,10 +159,6 @@ class TrialPool:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Forget all trials and end the workers at once; may be repeated."""
         self._queue.clear()
         end_workers(self._workers)
         self._workers.clear()
@@ -187,12 +167,6 @@ class TrialPool:
     def waiting(self) -> int:
         """Trials that were submitted and are not finished."""
         return len(self._queue) + sum(len(worker.outstanding) for worker in self._workers)
-
-    @property
-    def has_room(self) -> bool:
-        """Whether further trials could keep a worker from waiting."""
-        here = self._jobs == 1 and self._overdue is None
-        return len(self._queue) < (1 if here else self._jobs * _MAX_LOOKAHEAD)
 
     def submit(self, arm: Arm, trial: int) -> None:
         """Add a trial, which :meth:`run` yields when it is finished."""
@@ -223,8 +197,10 @@ class TrialPool:
             as it is, with a note that names the trial.
         """
         more = iter(trials)
+        here = self._jobs == 1 and self._overdue is None
+        room = 1 if here else self._jobs * _MAX_LOOKAHEAD
         while True:
-            while self.has_room and (job := next(more, None)) is not None:
+            while len(self._queue) < room and (job := next(more, None)) is not None:
                 self.submit(*job)
             if self._workers:
                 self._feed()
@@ -290,7 +266,7 @@ class TrialPool:
         if self._queue:
             self._start_workers()  # in place of those that died
         while self._queue:
-            worker = min(self._workers, key=_Worker.load)
+            worker = min(self._workers, key=lambda each: (bool(each.outstanding), each.expected_s))
             arm, trial = self._queue[0]
             times = self._times.get(arm)
             # One whose time nobody knows may be long.
@@ -319,7 +295,10 @@ class TrialPool:
                 continue
             arm, trial = worker.take_finished()
             if isinstance(message, _Failed):
-                raise _error_of(arm, message)
+                crash = TrialCrashError(f"in a worker process:\n{message.text}")
+                error = TrialError(message.text) if message.expected else crash
+                error.arm = arm
+                raise error
             yield self._finished(arm, trial, message.result, message.elapsed_s)
         for connection, worker in by_connection.items():
             if self._overdue is not None and connection not in ready and worker.outstanding:
@@ -351,12 +330,12 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+@dataclass
 class _Times:
     """How long trials took."""
 
-    def __init__(self) -> None:
-        self.count = 0
-        self.mean_s = 0.0
+    count: int = 0
+    mean_s: float = 0.0
 
     def add(self, elapsed_s: float) -> None:
         self.count += 1
@@ -399,35 +378,22 @@ def _run_one(arm: Arm, trial: int, observer: TrialObserver) -> TrialResult:
         ours = isinstance(error, HoldfastError)
         text = str(error) if ours else account_of_user_error(error, arm.problem_name)
         if text is not None:
-            raise _with_arm(TrialError(f"{where}: {text}"), arm) from error
+            failed = TrialError(f"{where}: {text}")
+            failed.arm = arm
+            raise failed from error
         error.add_note(f"in {where}")
         raise
-
-
-def _with_arm(error: TrialError | TrialCrashError, arm: Arm) -> Exception:
-    error.arm = arm
-    return error
 
 
 # -- workers ---------------------------------------------------------------------------------------
 
 
-class _NewArm(msgspec.Struct, tag="arm"):
-    """An arm, sent to a worker before its first trial there; the next number is its own."""
+class _Trial(msgspec.Struct):
+    """A trial of an arm, by the arm's number in that worker; with its first one the arm itself."""
 
-    planning: PlanningSettings
-    seed: int
-    max_steps: int
-    lost: LostSettings
-    problem_name: str
-    label: str
-    plain: dict[str, Any] | None
-    pickled: bytes
-
-
-class _Trial(msgspec.Struct, tag="trial"):
     arm: int
     trial: int
+    new: bytes = b""
 
 
 class _Finished(msgspec.Struct, tag="finished"):
@@ -444,7 +410,7 @@ class _Failed(msgspec.Struct, tag="failed"):
     expected: bool
 
 
-_REQUESTS = msgspec.msgpack.Decoder(_NewArm | _Trial)
+_REQUESTS = msgspec.msgpack.Decoder(_Trial)
 _ANSWERS = msgspec.msgpack.Decoder(_Finished | _Built | _Failed)
 _ENCODE = msgspec.msgpack.Encoder().encode
 
@@ -455,26 +421,20 @@ class _Worker(WorkerProcess):
     def __init__(self, number: int, threads: int, blas: int, cluster: RayCluster | None) -> None:
         super().__init__(f"holdfast-worker-{number}", _work, (threads,), blas)
         if cluster is not None:
-            self._process = cluster.process(_Runner, self._theirs, threads)
+            self._process = RayProcess(cluster, _Runner, self._theirs, threads)
         self.outstanding: deque[tuple[Arm, int, float]] = deque()
-        self.expected_s = 0.0
-        self.began_s = 0.0
+        self.expected_s = self.began_s = 0.0
         self._arms: dict[Arm, int] = {}
-
-    def load(self) -> float:
-        """Return how much it has to do, in seconds; least if it has nothing."""
-        return self.expected_s if self.outstanding else -1.0
 
     def send_trial(self, arm: Arm, trial: int, expected_s: float) -> None:
         # If it is dead, its pipe tells when it is read, where we know which trial it had.
+        new = b"" if arm in self._arms else _pickled(arm)
         if not self.outstanding:
-            self.began_s = perf_counter() + (_BUILD_S if arm not in self._arms else 0.0)
-        if arm not in self._arms:
-            self.send(_ENCODE(_new_arm(arm)))
-            self._arms[arm] = len(self._arms)
+            self.began_s = perf_counter() + (_BUILD_S if new else 0.0)
+        number = self._arms.setdefault(arm, len(self._arms))
         self.outstanding.append((arm, trial, expected_s))
         self.expected_s += expected_s
-        self.send(_ENCODE(_Trial(self._arms[arm], trial)))
+        self.send(_ENCODE(_Trial(number, trial, new)))
 
     def take_finished(self) -> tuple[Arm, int]:
         """Return the trial that an answer was about: they come in order."""
@@ -484,21 +444,7 @@ class _Worker(WorkerProcess):
         return arm, trial
 
 
-def _new_arm(arm: Arm) -> _NewArm:
-    return _NewArm(
-        arm.planning,
-        arm.seed,
-        arm.max_steps,
-        arm.lost,
-        arm.problem_name,
-        arm.label,
-        arm.plain,
-        b"" if arm.plain is not None else _pickled(arm.problem),
-    )
-
-
-_OF_THE_PROBLEM = ("problem", "problem_directory", "model", "state_space_planner")
-"""Sections of a configuration."""
+_OF_THE_PROBLEM = ("problem", "problem_directory", "model", "state_space_planner")  # sections
 
 _NEEDS_CLOUDPICKLE = (
     "a problem that a notebook or a script defines needs cloudpickle: pip install "
@@ -506,13 +452,18 @@ _NEEDS_CLOUDPICKLE = (
 )
 
 
-def _pickled(problem: Problem) -> bytes:
-    """Return a problem for the pipe; cloudpickle takes along the class that a notebook defines."""
+def _pickled(arm: Arm) -> bytes:
+    """Return an arm for the pipe; its problem within, pickled too, unless ``plain`` builds it."""
+    problem: Any = None if arm.plain is not None else _pickled_problem(arm.problem)
+    return pickle.dumps(replace(arm, problem=problem))
+
+
+def _pickled_problem(problem: Problem) -> bytes:
+    """Return a problem; cloudpickle takes along the class that a notebook defines."""
     try:
         import cloudpickle as pickler
     except ImportError:
-        import pickle as pickler
-
+        pickler = pickle
         if type(problem).__module__ == "__main__":
             raise InvalidValueError(_NEEDS_CLOUDPICKLE) from None
     try:
@@ -538,7 +489,7 @@ class _Runner:
 
     def __init__(self, threads: int) -> None:
         self._threads = threads
-        self._arms: list[_NewArm | Arm] = []
+        self._arms: dict[int, Arm | bytes] = {}
         self._problems: dict[bytes, Problem] = {}
 
     def all_answers(self, message: bytes) -> list[bytes]:
@@ -548,13 +499,12 @@ class _Runner:
     def answers(self, message: bytes) -> Iterator[bytes]:
         """Yield what there is to answer, as soon as it is known."""
         request = _REQUESTS.decode(message)
-        if isinstance(request, _NewArm):
-            self._arms.append(request)
-            return
+        if request.new:
+            self._arms[request.arm] = request.new
         started = perf_counter()
         try:
             arm = self._arms[request.arm]
-            if isinstance(arm, _NewArm):
+            if isinstance(arm, bytes):
                 self._arms[request.arm] = arm = _arm_in_worker(arm, self._threads, self._problems)
                 yield _ENCODE(_Built())
             result = _run_one(arm, request.trial, NULL_OBSERVER)
@@ -566,37 +516,27 @@ class _Runner:
         yield answer
 
 
-def _arm_in_worker(sent: _NewArm, threads: int, problems: dict[bytes, Problem]) -> Arm:
+def _arm_in_worker(pickled: bytes, threads: int, problems: dict[bytes, Problem]) -> Arm:
     """Build an arm in a worker.
 
     Arms that differ in their settings alone share a problem of ``problems``: it may be large.
     """
-    if sent.plain is not None:
-        sections = sent.plain["configuration"]
-        key = _ENCODE([sent.plain["path"], *map(sections.get, _OF_THE_PROBLEM)])
+    arm: Arm = pickle.loads(pickled)
+    if arm.plain is not None:
+        sections = arm.plain["configuration"]
+        key = _ENCODE([arm.plain["path"], *map(sections.get, _OF_THE_PROBLEM)])
         if key not in problems:
-            problems[key] = Configuration.from_plain(sent.plain).problem
+            problems[key] = Configuration.from_plain(arm.plain).problem
         problem = problems[key]
     else:
-        import pickle
-
         try:
-            problem = pickle.loads(sent.pickled)
+            problem = pickle.loads(arm.problem)  # type: ignore[arg-type]
         except Exception as error:
             raise InvalidValueError(
-                f"{sent.problem_name} cannot be made again in a worker process: "
+                f"{arm.problem_name} cannot be made again in a worker process: "
                 f"{type(error).__name__}: {error}; {_NEEDS_CLOUDPICKLE}"
             ) from error
-    own = sent.planning.active_sensing
-    cores = min(threads, own.num_cores) if own.num_cores else threads
-    planning = msgspec.structs.replace(
-        sent.planning, active_sensing=msgspec.structs.replace(own, num_cores=cores)
-    )
-    return Arm(
-        problem, planning, sent.seed, sent.max_steps, sent.lost, sent.problem_name, sent.label
-    )
-
-
-def _error_of(arm: Arm, failed: _Failed) -> Exception:
-    crash = TrialCrashError(f"in a worker process:\n{failed.text}")
-    return _with_arm(TrialError(failed.text) if failed.expected else crash, arm)
+    own = arm.planning.active_sensing
+    own = msgspec.structs.replace(own, num_cores=min(threads, own.num_cores or threads))
+    planning = msgspec.structs.replace(arm.planning, active_sensing=own)
+    return replace(arm, problem=problem, planning=planning)

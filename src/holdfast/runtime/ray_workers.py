@@ -14,16 +14,14 @@ import signal
 import socket
 import threading
 from multiprocessing.connection import Connection
-from typing import Any, Self
+from typing import Self
 
 from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.printable import one_line
 
 __all__ = ["RayCluster", "RayProcess"]
 
-_ERROR = 40
-"""The level of Python's logging."""
-
+_ERROR = 40  # the level of Python's logging
 _CONNECT_S = 10.0
 _END_S = 5.0
 _MAX_TEXT = 300
@@ -49,7 +47,7 @@ class RayCluster:
     def __init__(self, address: str) -> None:
         self._address = address
         try:
-            self._ray = importlib.import_module("ray")
+            self.ray = importlib.import_module("ray")
         except ImportError as error:
             raise InvalidValueError(
                 f"Ray cannot be imported ({error}): pip install 'holdfast[ray]'"
@@ -61,10 +59,12 @@ class RayCluster:
             host, _, port = self._address.removeprefix("ray://").rpartition(":")
             if host and port.isdecimal():  # Ray would try for minutes
                 socket.create_connection((host.strip("[]"), int(port)), _CONNECT_S).close()
-            self._ray.init(address=self._address, logging_level=_ERROR, log_to_driver=False)
-            self.cores = int(self._ray.cluster_resources().get("CPU", 0))
+            self.ray.init(address=self._address, logging_level=_ERROR, log_to_driver=False)
+            self.cores = int(self.ray.cluster_resources().get("CPU", 0))
+            if not self.cores:
+                raise ValueError("it has no core")  # noqa: TRY301
         except Exception as error:
-            self._ray.shutdown()
+            self.ray.shutdown()
             raise HoldfastError(
                 f"no Ray cluster can be used at {self._address}: {_line_of(error)}"
             ) from error
@@ -72,21 +72,14 @@ class RayCluster:
             # Ray sets its own, which exits.
             if threading.current_thread() is threading.main_thread():
                 signal.signal(signal.SIGTERM, handler)
-        if not self.cores:
-            self._ray.shutdown()
-            raise HoldfastError(f"the Ray cluster at {self._address} has no core")
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._ray.shutdown()
-
-    def process(self, runner: type, pipe: Connection, threads: int) -> RayProcess:
-        """Return an actor of a class whose ``all_answers`` gets a message and returns several."""
-        return RayProcess(self._ray, runner, pipe, threads)
+        self.ray.shutdown()
 
 
 class RayProcess:
-    """What a worker needs of a process (multiprocessing), of an actor.
+    """An actor in place of a process: its class's ``all_answers`` gets a message, returns several.
 
     Attributes
     ----------
@@ -94,10 +87,9 @@ class RayProcess:
         How it ended, as the predicate of a sentence.
     """
 
-    def __init__(self, ray: Any, runner: type, pipe: Connection, threads: int) -> None:
-        self._ray = ray
-        self._runner = runner
-        self._arguments = (threads,)
+    def __init__(self, cluster: RayCluster, runner: type, pipe: Connection, threads: int) -> None:
+        self._ray = cluster.ray
+        self._runner, self._threads = runner, threads
         self._given = pipe
         self._thread = threading.Thread(target=self._carry, daemon=True)
         self.pid: int | None = None
@@ -107,8 +99,7 @@ class RayProcess:
         """Ask the cluster for the actor."""
         self.pid = 0
         self._pipe = Connection(os.dup(self._given.fileno()))  # the caller closes the other one
-        actor = self._ray.remote(num_cpus=1)(self._runner)
-        self._actor = actor.remote(*self._arguments)
+        self._actor = self._ray.remote(num_cpus=1)(self._runner).remote(self._threads)
         self._thread.start()
 
     def _carry(self) -> None:

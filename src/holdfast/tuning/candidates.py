@@ -56,9 +56,7 @@ BY_DEFAULT: tuple[Variation, ...] = ("methods", "looks", "resolution")
 
 AS_CONFIGURED = "as configured"
 RANDOM = "random"
-DEFAULT = "path_entropy"
-"""The method by default, under its name as a candidate."""
-
+DEFAULT = "path_entropy"  # the method by default, under its name as a candidate
 _LOOKS = (1, 2, 4, 8)
 _FACTORS = (3, 10)
 
@@ -81,11 +79,7 @@ def changed(base: Configuration, changes: Mapping[str, Any]) -> Configuration:
     """Return a configuration with other values of some keys, checked as one from a file.
 
     None of them is the problem's: the problem is that of ``base``, which may be large.
-
-    Raises
-    ------
-    ConfigurationError
-        If they do not fit.
+    ConfigurationError if they do not fit.
     """
     plain = base.plain()
     sections = plain["configuration"]
@@ -98,14 +92,9 @@ def changed(base: Configuration, changes: Mapping[str, Any]) -> Configuration:
 def first_candidates(
     base: Configuration, variations: Sequence[Variation], objective: Objective
 ) -> tuple[list[Candidate], dict[str, str]]:
-    """Return the configuration as it is, random sensing and what else is asked for.
+    """Return the configuration as it is (the first), random sensing and what else is asked for.
 
-    Returns
-    -------
-    candidates : list of Candidate
-        ``as configured`` first. No two decide by the same settings.
-    refused : dict
-        Those that cannot be, with the reason.
+    No two decide by the same settings. Beside them, those that cannot be, with the reason.
     """
     return _distinct(base, [], _first(base, variations, objective))
 
@@ -214,19 +203,14 @@ def _distinct(
             continue
         settings = _what_counts(configuration.planning)
         if all(_what_counts(each.configuration.planning) != settings for each in found):
-            own = base.plain()["configuration"]
-            differing = {
-                key: value
-                for key, value in changes.items()
-                if _plain(configuration, key) != own[key.partition(".")[0]][key.partition(".")[2]]
-            }
+            own, its = (each.plain()["configuration"] for each in (base, configuration))
+            differing = {}
+            for key, value in changes.items():
+                section, _, option = key.partition(".")
+                if its[section][option] != own[section][option]:
+                    differing[key] = value
             found.append(Candidate(name, configuration, differing))
     return found, refused
-
-
-def _plain(configuration: Configuration, key: str) -> Any:
-    section, _, name = key.partition(".")
-    return configuration.plain()["configuration"][section][name]
 
 
 def _what_counts(planning: PlanningSettings) -> PlanningSettings:

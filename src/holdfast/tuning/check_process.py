@@ -35,9 +35,7 @@ if TYPE_CHECKING:
 
 __all__ = ["PATIENCE_S", "check_apart", "require_right"]
 
-PATIENCE_S = 30.0
-"""A single call of the problem's code that takes longer is an error."""
-
+PATIENCE_S = 30.0  # a single call of the problem's code that takes longer is an error
 _OURS = str(Path(__file__).parent)
 _TICK_S = 1.0
 _LONGEST_CHECK_S = 20.0
@@ -46,16 +44,14 @@ _LONGEST_CHECK_S = 20.0
 def check_apart(
     load: Callable[[], Configuration],
     *,
-    budget_s: float,
     on_check: Callable[[str], None] = lambda _: None,
     **how: Any,
 ) -> list[Finding]:
     """Return what :func:`check_problem` finds in a process of its own.
 
-    ``load``, which must be picklable, returns the configuration there; ``how`` is for
-    :func:`check_problem`. HoldfastError is that of ``load``.
+    ``load``, which must be picklable, returns the configuration there; ``how``, with ``budget_s``,
+    is for :func:`check_problem`. HoldfastError is that of ``load``.
     """
-    how |= {"budget_s": budget_s}
     if multiprocessing.current_process().daemon:  # which may have no children
         return _checked(load, on_check, how)
     worker = WorkerProcess("holdfast-check", _work, (load, PATIENCE_S, how), threads=1)
@@ -85,17 +81,15 @@ def require_right(
 ) -> None:
     """Check a problem before it is tuned, for a tenth of that budget and at most 20 s.
 
-    Raises
-    ------
-    ProblemError
-        If it finds an error.
+    ProblemError if it finds an error.
     """
     load = functools.partial(Configuration.from_plain, configuration.plain())
-    found = check_apart(load, budget_s=min(_LONGEST_CHECK_S, 0.1 * budget_s), trials=0)
-    for each in found:
+    errors = []
+    for each in check_apart(load, budget_s=min(_LONGEST_CHECK_S, 0.1 * budget_s), trials=0):
         if each.severity == "warning":
             on_warning(each)
-    errors = [each for each in found if each.severity == "error"]
+        elif each.severity == "error":
+            errors.append(each)
     if errors:
         raise ProblemError(
             f"{errors[0].check}: {errors[0].seen}. holdfast check {configuration.path} says more "
@@ -113,10 +107,7 @@ def _checked(
 
 
 def _work(
-    connection: Connection,
-    load: Callable[[], Configuration],
-    patience_s: float,
-    how: dict[str, Any],
+    connection: Connection, load: Callable[[], Configuration], patience: float, how: dict[str, Any]
 ) -> None:
     """Check, and send the name of each check and then the findings, or an error."""
 
@@ -126,7 +117,7 @@ def _work(
     os._exit = _refuse_to_end
     try:
         # What the problem's code prints is no finding.
-        with contextlib.redirect_stdout(sys.stderr), _clock(how["budget_s"], patience_s):
+        with contextlib.redirect_stdout(sys.stderr), _clock(how["budget_s"], patience):
             tell(_checked(load, tell, how))
     except HoldfastError as error:
         tell(error)

@@ -40,11 +40,8 @@ __all__ = [
     "spread_out",
 ]
 
-FALSE_ALARM_RATE = 0.001
-"""Probability that the statistical tests of a right problem, all together, find an error."""
-
-OVER = "not looked at, or not at all of it: the time was over"
-"""What is seen of a check that the budget has cut short."""
+FALSE_ALARM_RATE = 0.001  # probability that all tests of a right problem together find an error
+OVER = "not looked at, or not at all of it: the time was over"  # of what the budget has cut short
 
 Severity = Literal["error", "warning", "information"]
 
@@ -196,7 +193,6 @@ class Inspection:
                 judged.add(about)
                 seen = f"{found.seen} (p = {p:.1g}, of {self.num_tests} tests)"
                 self.add("error", found.check, seen, found.advice)
-        self._tests.clear()
 
     def ask(
         self, function: str, call: Callable[..., ResultT], *arguments: Any, check: str = "contract"

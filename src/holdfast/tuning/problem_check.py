@@ -24,12 +24,7 @@ from holdfast.tuning.calibration_check import check_likelihoods
 from holdfast.tuning.contract_check import check_contract, check_streams
 from holdfast.tuning.findings import CheckEndedError, Finding, Inspection
 from holdfast.tuning.sensor_check import check_sensors
-from holdfast.tuning.trial_check import (
-    check_decision_time,
-    check_goals,
-    check_method,
-    check_trials,
-)
+from holdfast.tuning.trial_check import check_decision_time, check_goals, check_method, check_trials
 from holdfast.validation import as_function
 
 __all__ = ["CHECKS", "check_problem"]

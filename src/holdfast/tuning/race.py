@@ -36,15 +36,9 @@ __all__ = ["PILOT_TRIALS", "MeasuredTrial", "Standing", "beats", "race"]
 _BETS = np.array([1 / 64, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 9 / 10])
 """Shares of the capital: small ones find small differences, large ones soon find large ones."""
 
-PILOT_TRIALS = 2
-"""Trials of each candidate that show how long a trial takes: the first one may be slower."""
-
-_FIRST_TRIALS = 10
-"""Trials of each candidate before any is set aside."""
-
-_SLOW = 3.0
-"""Times the usual time of a trial."""
-
+PILOT_TRIALS = 2  # of each candidate, to see how long a trial takes: the first may be slower
+_FIRST_TRIALS = 10  # trials of each candidate before any is set aside
+_SLOW = 3.0  # times the usual time of a trial
 State: TypeAlias = Literal["in the race", "beaten", "set aside", "refused"]
 
 
@@ -60,26 +54,17 @@ class MeasuredTrial(NamedTuple):
 class Standing(NamedTuple):
     """Where a candidate stands after the race.
 
-    Attributes
-    ----------
-    mean : float
-        Of its costs. Of one with fewer trials than another it is what it would be on all of them,
-        by its differences from the one with most.
-    deviation : float
-        Standard error of its mean difference from that one.
-    seconds : float
-        Of a processor, per trial.
-    reason : str
-        Why it is not in the race any more.
+    The mean of its costs is that of all trials: with fewer of its own than another one has, it
+    follows from its differences from the one with most.
     """
 
     candidate: str
     trials: int
     mean: float
-    deviation: float
-    seconds: float
+    deviation: float  # standard error of its mean difference from the one with most trials
+    seconds: float  # of a processor, per trial
     state: State
-    reason: str
+    reason: str  # why it is not in the race any more
 
 
 def beats(differences: FloatArray, limit: float, error_rate: float) -> bool:

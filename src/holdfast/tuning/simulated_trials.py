@@ -23,7 +23,6 @@ from holdfast.problems.problem import Problem
 from holdfast.recording.outcome_comparison import (
     ComparedRun,
     OutcomeComparison,
-    OutcomeEstimate,
     compare_results,
     estimates_of,
     read_outcomes,
@@ -35,27 +34,16 @@ from holdfast.robot.trial_pool import Arm, TrialPool, available_cores
 from holdfast.runtime.command_line import MAX_SEED, MAX_TRIALS
 from holdfast.validation import as_function, as_path
 
-__all__ = [
-    "SimulatedTrial",
-    "TrialSummary",
-    "Trials",
-    "arm_of",
-    "compare",
-    "run_trials",
-    "table_of",
-]
+__all__ = ["SimulatedTrial", "Trials", "arm_of", "compare", "run_trials", "table_of"]
 
 _SHOWN = ("trial", "outcome", "steps", "reward", "sensing_decisions", "mean_sensing_ms")
 
 
 class SimulatedTrial(TrialResult, frozen=True, kw_only=True):
-    """The result of a simulated trial; its decisions are left out.
+    """The result of a simulated trial, without its decisions.
 
-    Attributes
-    ----------
-    sensing_price : float or None
-        Sum of the prices of its sensing actions, which ``reward`` has lost already; None if the
-        problem has no prices.
+    ``sensing_price`` is the sum of the prices of its sensing actions, which ``reward`` has lost
+    already; None if the problem has no prices.
     """
 
     sensing_price: float | None = None
@@ -72,21 +60,14 @@ class SimulatedTrial(TrialResult, frozen=True, kw_only=True):
 
 
 class TrialSummary(Table):
-    """Each measure of many trials, with its interval.
+    """Each measure of many trials, as :func:`compare` has them, with its 95 % interval.
 
-    Attributes
-    ----------
-    estimates : tuple of OutcomeEstimate
-        Measures as :func:`compare` has them: rates with Wilson's interval, the others with the
-        percentile bootstrap's, 95 % each.
+    ``estimates`` has Wilson's interval of rates, the percentile bootstrap's of the others.
     """
 
     def __init__(self, trials: Trials) -> None:
-        self._title = str(trials.label)
-        self._limit = trials.max_steps
-        self.estimates: tuple[OutcomeEstimate, ...] = estimates_of(
-            trials.results, step_limit=trials.max_steps
-        )
+        self._title, self._limit = str(trials.label), trials.max_steps
+        self.estimates = estimates_of(trials.results, step_limit=self._limit)
 
     def columns(self) -> Sequence[str]:
         """Return the names of the columns, for programs."""
@@ -113,9 +94,6 @@ class Trials(Table):
 
     Attributes
     ----------
-    label : str
-        For messages and tables.
-    seed, max_steps : int
     results : tuple of SimulatedTrial
         In the order of their numbers.
     world : mapping
@@ -152,7 +130,7 @@ class Trials(Table):
     def names(self) -> Sequence[str]:
         """Return the names of those columns."""
         prices = any(result.sensing_price is not None for result in self.results)
-        return (*_SHOWN, *(("sensing_price",) if prices else ()))
+        return (*_SHOWN, *["sensing_price"] * prices)
 
     def summary(self) -> TrialSummary:
         """Return each measure with its interval."""

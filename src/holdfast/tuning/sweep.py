@@ -21,11 +21,7 @@ import msgspec
 from holdfast.config.loader import Configuration
 from holdfast.errors import InvalidValueError, OutputError
 from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
-from holdfast.recording.outcome_comparison import (
-    ComparedRun,
-    OutcomeComparison,
-    compare_results,
-)
+from holdfast.recording.outcome_comparison import ComparedRun, OutcomeComparison, compare_results
 from holdfast.recording.run_directory import RunDirectory
 from holdfast.recording.table_formats import csv_rows
 from holdfast.recording.tables import trial_row
@@ -35,9 +31,7 @@ from holdfast.tuning.simulated_trials import arm_of, table_of
 
 __all__ = ["MAX_ARMS", "Sweep", "SweptArm", "arms_of"]
 
-MAX_ARMS = 200
-"""Largest number of combinations; each has an open journal."""
-
+MAX_ARMS = 200  # largest number of combinations; each has an open journal
 _MAX_NAME = 100
 _UNSAFE = re.compile(r"[^\w.=,+-]+")
 _TABLE, _TRIALS, _SWEEP = "table", "trials.csv", "sweep.json"
@@ -85,7 +79,8 @@ def arms_of(
     """
     for key, values in axes.items():
         for index, value in enumerate(values):
-            if any(_same(value, other) for other in values[:index]):
+            # 1 and true are equal but not the same.
+            if repr(value) in map(repr, values[:index]):
                 raise InvalidValueError(f"{key} has the value {_text(value)} twice")
     count = 1
     for values in axes.values():
@@ -110,10 +105,6 @@ def arms_of(
     return arms
 
 
-def _same(first: Any, second: Any) -> bool:
-    return repr(first) == repr(second)  # 1 and true are equal but not the same
-
-
 def _text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value, default=str)
 
@@ -133,17 +124,8 @@ def _free_name(label: str, taken: Sequence[str]) -> str:
 class Sweep:
     """The open directories of all arms, to be used in a ``with`` statement.
 
-    Parameters
-    ----------
-    directory : Path
-        Gets a directory for each arm; one that has begun goes on.
-
-    Attributes
-    ----------
-    total, finished : int
-        Trials of all arms, and how many of them were finished before.
-    new : list of str
-        The arms that a sweep which goes on did not have before.
+    ``directory`` gets one for each arm; a sweep that has begun goes on, perhaps with ``new`` arms.
+    ``total`` counts the trials of all arms, ``finished`` those that were finished before.
 
     Raises
     ------
@@ -154,6 +136,7 @@ class Sweep:
     def __init__(self, directory: Path, arms: Sequence[SweptArm]) -> None:
         self.directory = directory.absolute()
         self.arms = arms
+        self.total = sum(arm.configuration.simulator.num_trials for arm in arms)
         self.finished = 0
         self.new: list[str] = []
         self._pool_arms = [arm_of(arm.configuration, arm.label) for arm in arms]
@@ -200,11 +183,6 @@ class Sweep:
     def __exit__(self, *error: object) -> None:
         self._stack.close()
 
-    @property
-    def total(self) -> int:
-        """Trials of all arms."""
-        return sum(arm.configuration.simulator.num_trials for arm in self.arms)
-
     def run(self, jobs: int, on_result: Callable[[TrialResult], None]) -> None:
         """Run what is not finished; raises what :meth:`TrialPool.run` raises.
 
@@ -238,28 +216,23 @@ class Sweep:
     def comparison(self, baseline: int = 0) -> OutcomeComparison:
         """Compare all arms, which are finished, with one of them."""
         order = [baseline, *(each for each in range(len(self.arms)) if each != baseline)]
-        compared = [self._compared(number) for number in order]
+        compared = []
+        for arm, run in ((self._pool_arms[number], self._runs[number]) for number in order):
+            results = {result.trial: result for result in run.journal.results()}
+            world = table_of(arm, ()).world
+            compared.append(ComparedRun(arm.label, results, arm.seed, arm.max_steps, world))
         return compare_results(compared, in_turns=self._in_turns)
-
-    def _compared(self, number: int) -> ComparedRun:
-        arm, journal = self._pool_arms[number], self._runs[number].journal
-        results = {result.trial: result for result in journal.results()}
-        world = table_of(arm, ()).world
-        return ComparedRun(arm.label, results, arm.seed, arm.max_steps, world)
 
     def write_tables(self, comparison: OutcomeComparison) -> list[str]:
         """Write ``trials.csv`` and the comparison in three formats; return the files' names."""
         keys = list(self.arms[0].values)
-        write_atomically(
-            self.directory / _TRIALS, csv_rows((*keys, *TRIAL_COLUMNS), self._rows(keys))
+        rows = (
+            (*(_text(arm.values[key]) for key in keys), *trial_row(result))
+            for arm, run in zip(self.arms, self._runs, strict=True)
+            for result in run.journal.results()
         )
+        write_atomically(self.directory / _TRIALS, csv_rows((*keys, *TRIAL_COLUMNS), rows))
         comparison.to_csv(self.directory / f"{_TABLE}.csv")
         comparison.to_latex(self.directory / f"{_TABLE}.tex")
         comparison.to_markdown(self.directory / f"{_TABLE}.md")
         return [f"{_TABLE}.md", f"{_TABLE}.tex", f"{_TABLE}.csv", _TRIALS]
-
-    def _rows(self, keys: Sequence[str]) -> Iterator[tuple[object, ...]]:
-        for arm, run in zip(self.arms, self._runs, strict=True):
-            chosen = tuple(_text(arm.values[key]) for key in keys)
-            for result in run.journal.results():
-                yield (*chosen, *trial_row(result))

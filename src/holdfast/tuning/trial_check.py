@@ -35,13 +35,7 @@ from holdfast.problems.problem import ProblemBase
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 from holdfast.tuning.contract_check import acted, check_contract
-from holdfast.tuning.findings import (
-    CheckEndedError,
-    Inspection,
-    Severity,
-    Walk,
-    spread_out,
-)
+from holdfast.tuning.findings import CheckEndedError, Inspection, Severity, Walk, spread_out
 from holdfast.tuning.verdict import mean_difference
 
 __all__ = ["check_decision_time", "check_goals", "check_method", "check_trials"]
@@ -162,9 +156,7 @@ def _report_walk(
     if (reached & ~in_time).any():
         seen += f"; within max_steps, {limit}, it is {in_time.sum()}"
     cut = running > 0 and steps < limit
-    advice = (
-        "What is lost here no sensing can win. Look at is_goal and at the policy near the goal."
-    )
+    advice = "No sensing wins what is lost here. Look at is_goal and at the policy near the goal."
     if reached.mean() >= _ENOUGH:
         needed = int(np.quantile(walk.reached[reached], 0.9))
         advice = f"Set simulator.max_steps to {2 * needed} or more."

@@ -14,21 +14,18 @@ Trials run in processes of their own: a candidate that ends its process, or hang
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from time import monotonic
 from typing import NamedTuple, get_args
 
+import msgspec
 import numpy as np
 
 from holdfast.config.loader import Configuration, load
-from holdfast.errors import (
-    InvalidValueError,
-    TrialCrashError,
-    TrialError,
-    WorkerDiedError,
-)
+from holdfast.errors import InvalidValueError, TrialCrashError, TrialError, WorkerDiedError
 from holdfast.numerics.arrays import FloatArray, real_number, whole
 from holdfast.recording.fingerprint import fingerprint
 from holdfast.recording.kept_trials import FRESH, TRIALS_NAME, KeptTrials, TrialRow
@@ -59,23 +56,13 @@ __all__ = ["Progress", "tune"]
 
 _SHARE_OF_THE_RACE = 0.6
 _LEAST_FRESH = 20
-_AT_MOST_OF_THE_RACE = 0.75
-"""Where trials take longer than those before."""
-
+_AT_MOST_OF_THE_RACE = 0.75  # where trials take longer than those before
 _REPORT_S = 3.0
 _JUDGED_ANYWAY = (AS_CONFIGURED, RANDOM)
-
-_PATIENCE_S = 10.0
-"""No trial is ended sooner while there is time."""
-
-_FAR_LONGER = 10.0
-"""Times what the longest possible trial would take, by the seconds per step seen so far."""
-
-_FIRST_SHARE = 0.1
-"""Of the budget: a first trial that takes longer leaves no time for ten."""
-
-_MOST_REFUSED = 4
-"""Of those that could not be tried, the sentence names so many."""
+_PATIENCE_S = 10.0  # no trial is ended sooner while there is time
+_FAR_LONGER = 10.0  # times the longest possible trial, by the seconds per step seen so far
+_FIRST_SHARE = 0.1  # of the budget: a first trial that takes longer leaves no time for ten
+_MOST_REFUSED = 4  # of those that could not be tried, the sentence names so many
 
 
 class Progress(NamedTuple):
@@ -188,27 +175,20 @@ def tune(
     return found
 
 
+@dataclasses.dataclass
 class _Tuner:
     """One tuning: its candidates, and the trials that are asked for of them."""
 
-    pool: TrialPool
+    base: Configuration
+    objective: Objective
+    kept: KeptTrials
+    jobs: int
+    max_decision_ms: float
+    on_progress: Callable[[Progress], None]
+    pool: TrialPool = dataclasses.field(init=False)
 
-    def __init__(
-        self,
-        base: Configuration,
-        objective: Objective,
-        kept: KeptTrials,
-        jobs: int,
-        max_decision_ms: float,
-        on_progress: Callable[[Progress], None],
-    ) -> None:
-        self._base = base
-        self._objective = objective
-        self._kept = kept
-        self._jobs = jobs
-        self._max_decision_ms = max_decision_ms
-        self._on_progress = on_progress
-        self._limit = base.simulator.max_steps
+    def __post_init__(self) -> None:
+        self._limit = self.base.simulator.max_steps
         self._candidates: dict[str, Candidate] = {}
         self._arms: dict[str, Arm] = {}
         self._failed: dict[str, str] = {}
@@ -223,15 +203,15 @@ class _Tuner:
         """Race and judge, within ``budget_s``."""
         self._budget_s = budget_s
         # What was run before has had its part of the budget.
-        self._began_s -= self._seconds(key for key in self._kept.rows if key[1] < FRESH)
-        candidates, refused = first_candidates(self._base, vary, self._objective)
+        self._began_s -= self._seconds(key for key in self.kept.rows if key[1] < FRESH)
+        candidates, refused = first_candidates(self.base, vary, self.objective)
         left_out = dict(refused)
         later = [each for each in vary if each in ("interval", "particles")]
         for_first = _SHARE_OF_THE_RACE * budget_s * (0.6 if later else 1.0)
         standings = self._race(candidates, refused, most, for_first)
         if later:
             winner = self._candidates[standings[0].candidate]
-            others, refused = later_candidates(self._base, winner, later)
+            others, refused = later_candidates(self.base, winner, later)
             more = self._race(others, refused, most, _SHARE_OF_THE_RACE * budget_s)
             standings = [*more, *(each for each in standings if each.candidate != winner.name)]
         finalists = self._finalists(standings)
@@ -240,7 +220,7 @@ class _Tuner:
         self._until_s = budget_s
         most_fresh = 2 * most
         wanted = [(name, FRESH + trial) for trial in range(most_fresh) for name in judged]
-        self._began_s -= self._seconds(key for key in wanted if key in self._kept.rows)
+        self._began_s -= self._seconds(key for key in wanted if key in self.kept.rows)
         # Whether to go on depends on the time alone, never on what has come out.
         for _ in self._measured(wanted):
             pass
@@ -248,15 +228,14 @@ class _Tuner:
         fresh = next(
             trial
             for trial in range(most_fresh + 1)
-            if any((name, FRESH + trial) not in self._kept.rows for name in judged)
+            if any((name, FRESH + trial) not in self.kept.rows for name in judged)
         )
         rows = {
-            name: [self._kept.rows[name, FRESH + trial] for trial in range(fresh)]
-            for name in judged
+            name: [self.kept.rows[name, FRESH + trial] for trial in range(fresh)] for name in judged
         }
         barred = {name for name in rows if self._refusal(name) is not None}
         verdict = judge(
-            rows, finalists, self._objective, self._limit, barred, min(most, _LEAST_FRESH)
+            rows, finalists, self.objective, self._limit, barred, min(most, _LEAST_FRESH)
         )
         sentence = verdict.sentence
         left_out |= self._failed
@@ -279,7 +258,7 @@ class _Tuner:
             choice=verdict.choice,
             changes=dict(self._candidates[verdict.choice].changes),
             matters=verdict.matters,
-            objective=self._objective,
+            objective=self.objective,
             fresh_trials=fresh,
             comparisons=verdict.comparisons,
             candidates=tuple(map(self._row, standings)),
@@ -290,14 +269,10 @@ class _Tuner:
 
     def _seconds(self, keys: Iterable[tuple[str, int]]) -> float:
         """Return how long kept trials took, over all processes."""
-        return sum(self._kept.rows[key].seconds for key in keys) / self._jobs
+        return sum(self.kept.rows[key].seconds for key in keys) / self.jobs
 
     def _race(
-        self,
-        candidates: Sequence[Candidate],
-        refused: Mapping[str, str],
-        most: int,
-        until_s: float,
+        self, candidates: Sequence[Candidate], refused: Mapping[str, str], most: int, until_s: float
     ) -> list[Standing]:
         for each in candidates:
             self._add(each)
@@ -305,23 +280,23 @@ class _Tuner:
         self._doing = f"{len(names)} candidates race"
         self._until_s = until_s * _AT_MOST_OF_THE_RACE / _SHARE_OF_THE_RACE
         before_s = self._seconds(
-            key for key in self._kept.rows if key[0] in names and key[1] < FRESH
+            key for key in self.kept.rows if key[0] in names and key[1] < FRESH
         )
         standings = race(
             names,
             self._measured,
-            limit={"steps": float(self._limit), "success": 1.0}.get(self._objective),
+            limit={"steps": float(self._limit), "success": 1.0}.get(self.objective),
             most=most,
-            budget_s=self._jobs * (until_s - self._spent_s() + before_s),
+            budget_s=self.jobs * (until_s - self._spent_s() + before_s),
             refuse=self._refusal,
         )
         if standings[0].state == "refused":
             raise InvalidValueError(
                 f"no candidate is admitted: {standings[0].candidate}: {standings[0].reason}"
             )
-        nothing = Standing("", 0, math.inf, math.inf, 0.0, "refused", "")
         return standings + [
-            nothing._replace(candidate=name, reason=reason) for name, reason in refused.items()
+            Standing(name, 0, math.inf, math.inf, 0.0, "refused", reason)
+            for name, reason in refused.items()
         ]
 
     def _finalists(self, standings: Sequence[Standing]) -> list[str]:
@@ -346,7 +321,7 @@ class _Tuner:
             judged = self._judged([*found, name])
             needed_s = 3 * _LEAST_FRESH * sum(each_s.get(each, 0.0) for each in judged)
             has_room = len(found) < 2 + (winner in _JUDGED_ANYWAY)
-            if has_room and needed_s <= self._jobs * (self._budget_s - self._spent_s()):
+            if has_room and needed_s <= self.jobs * (self._budget_s - self._spent_s()):
                 found.append(name)
         return found
 
@@ -358,36 +333,30 @@ class _Tuner:
     def _judged(self, finalists: Sequence[str]) -> list[str]:
         """Return whom the fresh trials judge, the configuration first."""
         rivals = dict.fromkeys((AS_CONFIGURED, *finalists))
-        own = self._base.planning.selector.method
+        own = self.base.planning.selector.method
         if own != "random":
             rivals[RANDOM] = None
         if own not in ("random", DEFAULT) and DEFAULT in self._candidates:
             rivals[DEFAULT] = None
         for finalist in finalists:
-            others = {
-                key: value
-                for key, value in self._candidates[finalist].changes.items()
-                if not key.startswith("selector.")
-            }
+            own_keys = self._candidates[finalist].changes
+            others = {key: own_keys[key] for key in own_keys if not key.startswith("selector.")}
             if others:
                 # It must not be that the particles or the interval do it, and not what is sensed.
                 changes = others | {"selector.method": "random"}
                 name = f"random,{finalist.rpartition(',')[2]}"
-                self._add(Candidate(name, changed(self._base, changes), changes))
+                self._add(Candidate(name, changed(self.base, changes), changes))
                 rivals[name] = None
         return [name for name in rivals if name not in self._failed]
 
     def _refusal(self, name: str) -> str | None:
         """Return why a candidate must not win."""
-        rows = self._kept.of(name)
-        if rows and name not in self._failed:
-            decision_ms = self._decision_ms(name)
-            if decision_ms > self._max_decision_ms:
-                return (
-                    f"a decision takes {decision_ms:.3g} ms, and at most "
-                    f"{self._max_decision_ms:g} were asked for"
-                )
-        return self._failed.get(name)
+        if name in self._failed or not self.kept.of(name):
+            return self._failed.get(name)
+        own_ms, most_ms = self._decision_ms(name), self.max_decision_ms
+        if own_ms <= most_ms:
+            return None
+        return f"a decision takes {own_ms:.3g} ms, and at most {most_ms:g} were asked for"
 
     def is_overdue(self, arm: Arm, ran_s: float) -> bool:
         """Return whether a trial that has run so long is to be ended."""
@@ -404,13 +373,8 @@ class _Tuner:
 
         Those of a candidate that fails are left out.
         """
-        missing = []
-        for name, trial in jobs:
-            row = self._kept.rows.get((name, trial))
-            if row is None:
-                missing.append((name, trial))
-            else:
-                yield self._count(row)
+        missing = [key for key in jobs if key not in self.kept.rows]
+        yield from [self._count(self.kept.rows[key]) for key in jobs if key in self.kept.rows]
         more = (
             (self._arms[name], trial)
             for name, trial in missing
@@ -430,7 +394,7 @@ class _Tuner:
                         float(np.median(result.sensing_ms)) if result.sensing_ms else 0.0,
                         finished.elapsed_s,
                     )
-                    self._kept.add(row)
+                    self.kept.add(row)
                     yield self._count(row)
                     if self._spent_s() >= self._until_s:
                         self.pool.drop()
@@ -472,38 +436,36 @@ class _Tuner:
             self._counted.add(key)
             possible_s = row.seconds * self._limit / max(1, row.steps)
             self._longest_s[key[0]] = max(self._longest_s.get(key[0], 0.0), possible_s)
-        self._on_progress(Progress(self._spent_s(), len(self._counted), self._doing))
-        cost = cost_of(row, self._objective, self._limit)
+        self.on_progress(Progress(self._spent_s(), len(self._counted), self._doing))
+        cost = cost_of(row, self.objective, self._limit)
         return MeasuredTrial(row.candidate, row.trial, cost, row.seconds)
 
     def _costs(self, name: str) -> FloatArray:
         """Return what the trials of the race cost, in order."""
-        return np.array([cost_of(row, self._objective, self._limit) for row in self._kept.of(name)])
+        return np.array([cost_of(row, self.objective, self._limit) for row in self.kept.of(name)])
 
     def _decision_ms(self, name: str) -> float:
-        return float(np.median([row.decision_ms for row in self._kept.of(name)]))
+        return float(np.median([row.decision_ms for row in self.kept.of(name)]))
 
     def _row(self, standing: Standing) -> CandidateRow:
         name = standing.candidate
         changes = dict(self._candidates[name].changes) if name in self._candidates else {}
         state = " ".join(f"{standing.state}{': ' * bool(standing.reason)}{standing.reason}".split())
-        rows = self._kept.of(name)[: standing.trials]
+        rows = self.kept.of(name)[: standing.trials]
         costs, base = self._costs(name)[: len(rows)], self._costs(AS_CONFIGURED)
         common = min(len(costs), len(base))
+        plain = CandidateRow(candidate=name, changes=changes, trials=len(rows), state=state)
         if common <= PILOT_TRIALS:
-            return CandidateRow(candidate=name, changes=changes, trials=len(rows), state=state)
+            return plain
         difference, interval = mean_difference(costs[:common] - base[:common])
-        return CandidateRow(
-            candidate=name,
-            changes=changes,
-            trials=len(rows),
+        return msgspec.structs.replace(
+            plain,
             cost=float(np.mean(costs)),
             difference=difference,
             interval=interval,
             success=float(np.mean([row.success for row in rows])),
             decision_ms=self._decision_ms(name),
             trial_s=standing.seconds,
-            state=state,
         )
 
 

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,80 +24,41 @@ from holdfast.tuning.verdict import FAMILY_LEVEL, Comparison
 __all__ = ["CandidateRow", "Tuning", "tuned_yaml", "tuning_figure", "tuning_tables", "write_report"]
 
 CONFIGURATION_NAME = "tuned.yaml"
-TABLES_NAME = "tune.md"
-CANDIDATES_NAME = "candidates.csv"
-FIGURE_NAME = "tune.png"
 
-_PATHS = (
-    ("problem_directory",),
-    ("offload", "services"),
-    ("offload", "tls"),
-    ("environment", "directory"),
-)
+_PATHS = (("offload", "services"), ("offload", "tls"), ("environment", "directory"))
 """Keys of a file whose values may be relative to it; the result lies in another directory."""
 
 
 class CandidateRow(msgspec.Struct, frozen=True, kw_only=True):
     """What the race has found of a candidate.
 
-    Attributes
-    ----------
-    changes : dict
-        Keys (``section.key``) whose values differ from the configuration's.
-    trials : int
-        In the race; of fewer trials than others' they are the first.
-    cost : float or None
-        Mean steps, rate of no success, or negative reward, whichever decides.
-    difference, interval
-        Of its cost to that of the configuration, over the trials of both. It is what the choice
-        rests on, so the best of many looks too good.
-    decision_ms : float or None
-        Median time to choose a sensing action.
-    trial_s : float
-        Seconds of a processor that a trial takes.
-    state : str
-        How it left the race, and why.
+    Its ``difference`` to the configuration's cost, over the trials of both, is what the choice
+    rests on, so the best of many looks too good.
     """
 
     candidate: str
-    changes: dict[str, Any]
-    trials: int
-    cost: float | None = None
+    changes: dict[str, Any]  # values that differ from the configuration's, by section.key
+    trials: int  # in the race; of fewer trials than others' they are the first
+    cost: float | None = None  # mean steps, rate of no success, or negative reward
     difference: float | None = None
     interval: tuple[float, float] | None = None
     success: float | None = None
-    decision_ms: float | None = None
-    trial_s: float = 0.0
-    state: str
+    decision_ms: float | None = None  # median time to choose a sensing action
+    trial_s: float = 0.0  # seconds of a processor that a trial takes
+    state: str  # how it left the race, and why
 
 
 class Tuning(Table, msgspec.Struct, frozen=True, kw_only=True):
-    """What a tuning has found; as a table, a row for each candidate of the race.
+    """What a tuning has found; as a table, a row for each candidate of the race."""
 
-    Attributes
-    ----------
-    sentence : str
-        What to do, and how sure that is.
-    choice : str
-        The candidate to take.
-    changes : dict
-        Keys (``section.key``) in which it differs from the configuration; empty if that stays.
-    matters : bool
-        Whether any two of those judged differed beyond noise.
-    comparisons : tuple of Comparison
-        The choice against each other one, on ``fresh_trials`` that had no part in the race.
-    candidates : tuple of CandidateRow
-        In the order of the race's end, the winner first.
-    """
-
-    sentence: str
-    choice: str
-    changes: dict[str, Any]
-    matters: bool
+    sentence: str  # what to do, and how sure that is
+    choice: str  # the candidate to take
+    changes: dict[str, Any]  # in what it differs from the configuration, by section.key
+    matters: bool  # whether any two of those judged differed beyond noise
     objective: Objective
-    fresh_trials: int
-    comparisons: tuple[Comparison, ...]
-    candidates: tuple[CandidateRow, ...]
+    fresh_trials: int  # that had no part in the race
+    comparisons: tuple[Comparison, ...]  # of the choice with each other one, on the fresh trials
+    candidates: tuple[CandidateRow, ...]  # as the race ended, the winner first
 
     def columns(self) -> Sequence[str]:
         """Return the names of the columns, for programs."""
@@ -104,13 +66,12 @@ class Tuning(Table, msgspec.Struct, frozen=True, kw_only=True):
 
     def rows(self) -> list[tuple[object, ...]]:
         """Return a row for each candidate."""
-        plain = [[getattr(each, name) for name in self.columns()[:-2]] for each in self.candidates]
-        for values in plain:
-            values[1] = msgspec.json.encode(values[1]).decode()
-        return [
-            (*values, *(each.interval or (None, None)))
-            for values, each in zip(plain, self.candidates, strict=True)
-        ]
+        rows: list[tuple[object, ...]] = []
+        for each in self.candidates:
+            values = [getattr(each, name) for name in self.columns()[:-2]]
+            values[1] = msgspec.json.encode(each.changes).decode()
+            rows.append((*values, *(each.interval or (None, None))))
+        return rows
 
     def shown(self) -> list[tuple[str, ...]]:
         """Return a row for each candidate, for people."""
@@ -157,13 +118,10 @@ def _raced(each: CandidateRow, objective: Objective) -> tuple[str, ...]:
 def write_report(out: Path, configuration: Configuration, found: Tuning) -> None:
     """Write all files; the figure only if matplotlib is installed."""
     write_atomically(out / CONFIGURATION_NAME, tuned_yaml(configuration, found).encode())
-    write_atomically(out / TABLES_NAME, tuning_tables(found).encode())
-    found.to_csv(out / CANDIDATES_NAME)
-    try:
-        picture = tuning_figure(found)
-    except ImportError:
-        return
-    write_atomically(out / FIGURE_NAME, picture)
+    write_atomically(out / "tune.md", tuning_tables(found).encode())
+    found.to_csv(out / "candidates.csv")
+    with contextlib.suppress(ImportError):
+        write_atomically(out / "tune.png", tuning_figure(found))
 
 
 def tuned_yaml(configuration: Configuration, found: Tuning) -> str:
@@ -179,13 +137,10 @@ def tuned_yaml(configuration: Configuration, found: Tuning) -> str:
         before = msgspec.json.encode(resolved[section][name]).decode()
         head.append(f"# {key} was {before}.\n")
         data[section] = {**(data.get(section) or {}), name: value}
-    data["problem"] = resolved["problem"]
-    for section, *names in _PATHS:
-        if not names and "problem_directory" in resolved:
-            data[section] = resolved[section]
-        for name in names:
-            if name in (data.get(section) or {}):
-                data[section] = {**data[section], name: resolved[section][name]}
+    data |= {key: resolved[key] for key in ("problem", "problem_directory") if key in resolved}
+    for section, name in _PATHS:
+        if name in (data.get(section) or {}):
+            data[section] = {**data[section], name: resolved[section][name]}
     return "".join(head) + write(data)
 
 
@@ -240,39 +195,36 @@ def tuning_figure(found: Tuning) -> bytes:
 
     from holdfast.recording.figure import STYLE
 
-    rows = [each for each in found.candidates if each.interval is not None][::-1]
-    judged = [each for each in found.comparisons if each.measure == found.objective][::-1]
+    raced: list[tuple[Any, ...]] = [
+        (
+            each.candidate,
+            *_in_its_unit(found.objective, each.difference or 0.0),
+            _in_its_unit(found.objective, *each.interval),
+        )
+        for each in found.candidates
+        if each.interval is not None
+    ]
+    judged: list[tuple[Any, ...]] = [
+        (each.against, each.difference, each.interval)
+        for each in found.comparisons
+        if each.measure == found.objective
+    ]
     side = "left" if found.objective == "steps" else "right"
+    titles = (
+        f"{found.choice}, on {found.fresh_trials} fresh trials: {found.objective} less that of "
+        f"({side} is better)",
+        f"the race: {found.objective} less that of the configuration",
+    )
     with mpl.rc_context(STYLE):
-        height = 1.6 + 0.24 * (len(rows) + len(judged))
+        height = 1.6 + 0.24 * (len(raced) + len(judged))
         figure = Figure(figsize=(8.0, height), layout="constrained")
         FigureCanvasAgg(figure)
-        ratios = (len(judged) + 0.5, len(rows) + 0.5) if judged else (0.5, len(rows) + 0.5)
-        above, below = figure.subplots(2, 1, height_ratios=ratios)
-        for panel, title, points in (
-            (
-                above,
-                f"{found.choice}, on {found.fresh_trials} fresh trials: {found.objective} less "
-                f"that of ({side} is better)",
-                [(each.against, each.difference, each.interval) for each in judged],
-            ),
-            (
-                below,
-                f"the race: {found.objective} less that of the configuration",
-                [
-                    (
-                        each.candidate,
-                        *_in_its_unit(found.objective, each.difference or 0.0),
-                        _in_its_unit(found.objective, *(each.interval or ())),
-                    )
-                    for each in rows
-                ],
-            ),
-        ):
+        ratios = (len(judged) + 0.5, len(raced) + 0.5)
+        panels = figure.subplots(2, 1, height_ratios=ratios)
+        for panel, title, points in zip(panels, titles, (judged[::-1], raced[::-1]), strict=True):
             panel.set_title(title, loc="left")
             panel.axvline(0.0, color="#8A9099", linewidth=0.8)
             for place, (_, middle, ends) in enumerate(points):
-                assert ends is not None
                 panel.plot(ends, (place, place), color="#2F6DB3", linewidth=1.6)
                 panel.plot(middle, place, "o", color="#111111", markersize=4.0)
             panel.set_yticks(range(len(points)), [name for name, *_ in points])

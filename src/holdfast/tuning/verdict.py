@@ -22,38 +22,18 @@ from holdfast.recording.kept_trials import TrialRow
 from holdfast.recording.outcome_comparison import bootstrap_interval
 from holdfast.tuning.candidates import AS_CONFIGURED, RANDOM, Objective
 
-__all__ = [
-    "FAMILY_LEVEL",
-    "MUCH_SLOWER",
-    "Comparison",
-    "Verdict",
-    "cost_of",
-    "judge",
-    "mean_difference",
-]
+__all__ = ["FAMILY_LEVEL", "MUCH_SLOWER", "Comparison", "cost_of", "judge", "mean_difference"]
 
-FAMILY_LEVEL = 0.95
-"""Confidence of all intervals of the objective together."""
-
-_WIDE = 0.1
-"""An interval that reaches so far, as a share of the mean, says little."""
-
+FAMILY_LEVEL = 0.95  # confidence of all intervals of the objective together
+_WIDE = 0.1  # an interval that reaches so far, as a share of the mean, says little
 MUCH_SLOWER = 2.0
-_NOTICED_MS = 0.5
-"""A decision that takes so many times as long, and so much longer, needs a reason."""
+_NOTICED_MS = 0.5  # a decision that takes so many times as long, and so much longer, needs a reason
 
 
 class Comparison(msgspec.Struct, frozen=True, kw_only=True):
     """How a measure of a candidate differs from another one's, over the same worlds.
 
-    Attributes
-    ----------
-    measure : {"steps", "success", "reward"}
-        Mean steps, a trial without success at the limit; rate of success; mean reward.
-    value, other, difference : float
-        Means, and the candidate's less the other's.
-    interval : (float, float)
-        For the difference; those of the objective hold together.
+    Mean steps have a trial without success at the limit.
     """
 
     candidate: str
@@ -61,8 +41,8 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
     measure: Objective
     value: float
     other: float
-    difference: float
-    interval: tuple[float, float]
+    difference: float  # the candidate's mean less the other's
+    interval: tuple[float, float]  # for the difference; those of the objective hold together
 
     @property
     def finding(self) -> int:
@@ -91,8 +71,7 @@ _MEASURES: Mapping[Objective, Callable[[TrialRow, int], float | None]] = {
 def cost_of(row: TrialRow, objective: Objective, limit: int) -> float:
     """Return what is to be small; NaN for a trial without a reward."""
     value = _MEASURES[objective](row, limit)
-    if value is None:
-        return float("nan")
+    value = float("nan") if value is None else value
     return value if objective == "steps" else -value
 
 
@@ -134,7 +113,12 @@ def judge(
     choice = next(name for name in (configured, *finalists, *admitted) if name in admitted)
     trials, slower = len(rows[configured]), ""
     if trials < least:
-        return Verdict(choice, False, _too_few(choice, configured, trials, least), ())
+        keep = _advice(choice, configured)
+        sentence = (
+            f"The budget was too short to judge: {trials} fresh trials of at least {least}. "
+            f"A larger one goes on (--resume); until then, {keep[0].lower()}{keep[1:]}."
+        )
+        return Verdict(choice, False, sentence, ())
     pairs = [
         (one, other)
         for other, one in combinations(names, 2)
@@ -201,12 +185,10 @@ def _decision_ms(rows: Sequence[TrialRow]) -> float:
 # -- words -----------------------------------------------------------------------------------------
 
 
-def _too_few(choice: str, configured: str, trials: int, least: int) -> str:
-    keep = "keep your configuration" if choice == configured else f"sense by {choice}"
-    return (
-        f"The budget was too short to judge: {trials} fresh trials of at least {least}. "
-        f"A larger one goes on (--resume); until then, {keep}."
-    )
+def _advice(choice: str, configured: str) -> str:
+    if choice == configured:
+        return "Keep your configuration"
+    return "Sense at random" if choice == RANDOM else f"Sense by {choice}"
 
 
 def _sentence(
@@ -225,39 +207,34 @@ def _sentence(
     if not matters:
         reach = max(abs(end) for each in decisive for end in each.interval)
         wide = reach > _WIDE * abs(decisive[0].value)
-        text = f"What you sense does not matter here, as far as {fresh} tell"
-        if wide:
-            text = f"No difference showed in {fresh}"
-        keep = "Keep your configuration" if choice == configured else f"Sense by {choice}"
-        text += f": {effects}. {keep}."
+        text = f"No difference showed in {fresh}"
+        if not wide:
+            text = f"What you sense does not matter here, as far as {fresh} tell"
+        text += f": {effects}. {_advice(choice, configured)}."
         if wide:
             text += (
                 f" One of up to {_amount(reach, objective)} would not have shown: "
                 "a larger budget may find it."
             )
         return text
-    advice = f"Sense by {choice}"
-    if choice == configured:
-        advice = "Keep your configuration"
-    elif choice == RANDOM:
-        advice = "Sense at random"
     value = _amount(decisive[0].value, objective)
-    text = f"{advice}: {value} on average in {fresh}; {effects}."
+    text = f"{_advice(choice, configured)}: {value} on average in {fresh}; {effects}."
     for each in comparisons:
         if each.measure != objective and each.finding < 0:
             text += f" But {each.measure} says otherwise: {_effect(each)}."
     return text
 
 
+_UNITS = {"success": "points of success", "steps": "steps", "reward": "of reward"}
+
+
 def _amount(value: float, measure: Objective) -> str:
-    if measure == "success":
-        return f"{100.0 * value:.3g} points of success"
-    return f"{value:.4g} {measure if measure == 'steps' else 'of reward'}"
+    number = f"{100.0 * value:.3g}" if measure == "success" else f"{value:.4g}"
+    return f"{number} {_UNITS[measure]}"
 
 
 def _effect(each: Comparison) -> str:
-    scale = 100.0 if each.measure == "success" else 1.0
-    unit = {"success": "points of success", "steps": "steps", "reward": "of reward"}[each.measure]
+    scale, unit = 100.0 if each.measure == "success" else 1.0, _UNITS[each.measure]
     low, high = (f"{scale * end:+.3g}" for end in each.interval)
     whose = "your configuration" if each.against == AS_CONFIGURED else each.against
     whose = "random sensing" if whose == RANDOM else whose
