@@ -10,8 +10,11 @@ import msgspec
 import numpy as np
 
 from holdfast.config.loader import Configuration, load
+from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.belief import Belief, ObservationInfo
 from holdfast.planning.outcome import Decisions, TrialResult
-from holdfast.planning.planner import Planner, digest
+from holdfast.planning.planner import Planner, PlanningState, TaskInfo, digest
+from holdfast.planning.sensing import SensingInfo
 from holdfast.protocol.records import ActingRecord, ObservedRecord, PerformedRecord, Record
 from holdfast.recording.journal import Journal
 from holdfast.recording.journal_file import START, Finished, decode_entry
@@ -108,6 +111,27 @@ def record_trial(configuration: Configuration, trial: int = 1) -> Recorder:
         observer=recorder,
     )
     return recorder
+
+
+def a_sensing_step(
+    belief: Belief, sensing_action: int, *, trial: int = 0, step: int = 0, **values: Any
+) -> SensingStep:
+    """Return a step whose observation has left the belief as it was."""
+    state = PlanningState(5, trial, step, 0, sensed=False, belief=belief)
+    info = SensingInfo(values.pop("entropies", None), None, 0, 0)
+    observation = values.pop("observation", None)
+    found = ObservationInfo(**{"effective_sample_size": 1.5, "explained": True,
+                               "resampled": False, **values})  # fmt: skip
+    return SensingStep(state, sensing_action, info, observation, state, found)
+
+
+def a_task_step(
+    belief: Belief, action: FloatArray, estimate: FloatArray, *, trial: int = 0
+) -> TaskStep:
+    """Return the first step of a trial of a world that nothing asks."""
+    state = PlanningState(5, trial, 0, 0, sensed=True, belief=belief)
+    nobody: Any = None
+    return TaskStep(nobody, state, TaskInfo(estimate, action, 0), action, None)
 
 
 class Journalling(TrialObserver):

@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 
 import numpy as np
-from tests.recordings import configuration_of, result_of
+from tests.recordings import a_sensing_step, a_task_step, configuration_of, result_of
 
 from holdfast.planning.belief import Belief
 from holdfast.recording.csv_export import TABLES, CsvSink, state_labels
@@ -33,14 +33,12 @@ def test_rows(tmp_path: Path) -> None:
     decider = Decider("local", "standard", 1.5, None, None)
     with CsvSink(tables, problem) as sink:
         sink.trial_begins(TrialBeginFact(0, 1_000_000_000))
-        sensed = SensingFact(
-            0, 0, 1_500_000_000, 1_600_000_000, 2, bytes(32), decider, belief, belief, 0
-        )
-        sink.sensed(sensed)
+        sensed = a_sensing_step(belief, 2)
+        sink.sensed(SensingFact(sensed, 1_500_000_000, 1_600_000_000, decider))
         action, estimate = np.array([0.5, -0.0, 1e-300]), belief.states[0]
-        sink.acted(TaskFact(0, 0, 1_700_000_000, action, None, belief, 0, estimate))
-        again = sensed._replace(step=1, decided_ns=2_500_000_000, sensing_action=1, decider=None)
-        sink.sensed(again)
+        sink.acted(TaskFact(a_task_step(belief, action, estimate), 1_700_000_000, None))
+        again = a_sensing_step(belief, 1, step=1)
+        sink.sensed(SensingFact(again, 2_500_000_000, 2_600_000_000, None))
         sink.happened(EventFact(2_700_000_000, "status", {"status": "keep_alive"}))
         sink.trial_ends(TrialEndFact(0, 3_000_000_000, 1, None))
         sink.trial_begins(TrialBeginFact(1, 3_500_000_000))

@@ -13,7 +13,7 @@ from tests.recordings import configuration_of
 from holdfast.config.loader import Configuration
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.outcome import Ending
-from holdfast.planning.planner import Planner
+from holdfast.planning.planner import Planner, digest
 from holdfast.planning.tracking import LateObservation
 from holdfast.protocol.events import Timing
 from holdfast.protocol.messages import encode_floats
@@ -112,19 +112,21 @@ def test_the_same_facts_as_of_the_trial_itself(configuration: Configuration) -> 
     )  # fmt: skip
     assert len(facts.of(SensingFact)) == len(expected.sensing) > 1
     for fact, step in zip(facts.of(SensingFact), expected.sensing, strict=True):
-        assert fact.sensing_action == step.sensing_action
-        assert np.array_equal(fact.entropies, _known(step.sensing_info.entropies))
-        assert np.array_equal(fact.observation, _known(step.observation))
-        assert fact.before.states.tobytes() == step.before.belief.states.tobytes()
-        assert fact.after.states.tobytes() == step.after.belief.states.tobytes()
-        assert fact.explained == step.observation_info.explained
+        shown = fact.step
+        assert shown.sensing_action == step.sensing_action
+        entropies = _known(step.sensing_info.entropies)
+        assert np.array_equal(shown.sensing_info.entropies, entropies)
+        assert np.array_equal(shown.observation, _known(step.observation))
+        assert digest(shown.before) == digest(step.before)
+        assert digest(shown.after) == digest(step.after)
+        assert shown.observation_info == step.observation_info
     world = SimulatedEnvironment(configuration.problem, configuration.simulator.seed, 1)
     for fact, acted in zip(facts.of(TaskFact), expected.acting, strict=True):
-        assert fact.action.tobytes() == acted.executed.tobytes()
-        assert fact.belief.states.tobytes() == acted.state.belief.states.tobytes()
-        assert fact.estimate.tolist() == acted.task_info.estimate.tolist()
+        assert fact.step.executed.tobytes() == acted.executed.tobytes()
+        assert digest(fact.step.state) == digest(acted.state)
+        assert fact.step.task_info.estimate.tolist() == acted.task_info.estimate.tolist()
         assert fact.true_state.tolist() == world.state.tolist()
-        world.perform(fact.action)
+        world.perform(fact.step.executed)
     (end,) = facts.of(TrialEndFact)
     assert end.steps == 20
     assert (end.result.outcome, end.result.reason) == ("failed", "it fell")
@@ -165,7 +167,7 @@ def test_the_files_of_a_run_that_goes_on(configuration: Configuration, tmp_path:
         events.write_text('{"time":"2026-11-26T13:00:00Z","event":"before"}\n')
         for _ in range(2):
             files.tell(follower, facts, time.time_ns())
-            assert [fact.step for fact in facts.of(TaskFact)] == [0]
+            assert [fact.step.state.step for fact in facts.of(TaskFact)] == [0]
         with events.open("a") as log:
             log.write('{"time":"2026-11-26T13:00:01Z","component":"robot","eve')
             log.flush()
@@ -192,7 +194,7 @@ def test_the_files_of_a_run_that_goes_on(configuration: Configuration, tmp_path:
     assert first.decider is None
     assert second.decider.service == "tcp/a:1"
     assert third.decider == second.decider  # of the same answer
-    (sensed, *_) = (fact for fact in facts.of(SensingFact) if fact.trial == 2)
+    (sensed, *_) = (fact for fact in facts.of(SensingFact) if fact.step.before.trial == 2)
     assert sensed.decider.service == "tcp/a:1"
     assert sensed.decided_ns <= sensed.observed_ns
     assert [fact.trial for fact in facts.of(TrialBeginFact)] == [1, 2]
@@ -219,9 +221,11 @@ def test_an_observation_that_comes_late(configuration: Configuration) -> None:
     follower.records(0, [observed, acting, performed, late], 0)
     follower.end(0)
     (sensed,) = facts.of(SensingFact)
-    assert (sensed.sensing_action, sensed.observation, sensed.explained) == (1, None, True)
+    assert (sensed.step.sensing_action, sensed.step.observation) == (1, None)
+    assert sensed.step.observation_info.explained
     (came_late,) = facts.of(LateFact)
-    assert (came_late.step, came_late.taken, came_late.explained) == (1, 0, came[0].explained)
-    assert came_late.observation.tobytes() == shown.tobytes()
-    assert came_late.after.states.tobytes() == history.state.belief.states.tobytes()
+    taken, after, info = came_late.step
+    assert (after.step, taken.step, info) == (1, 0, came[0])
+    assert taken.observation.tobytes() == shown.tobytes()
+    assert digest(after) == digest(history.state)
     assert facts.all[-1].belief.states.tobytes() == history.state.belief.states.tobytes()

@@ -377,12 +377,14 @@ class TestUnexplainedObservations:
             environment=alike,
             observer=recorder,
         )
-        unexplained = [each for each in recorder.record.sensing if not each.explained]
+        unexplained = [
+            each for each in recorder.record.sensing if not each.observation_info.explained
+        ]
         told = world.reports("unexplained")
         assert [(fields["step"], fields["sensing_action"]) for fields in told] == [
-            (each.step, each.sensing_action) for each in unexplained
+            (each.before.step, each.sensing_action) for each in unexplained
         ]
-        assert {2 * 4, 4 * 4} <= {each.step for each in unexplained}
+        assert {2 * 4, 4 * 4} <= {each.before.step for each in unexplained}
         assert len(unexplained) == world.results[0].unexplained_observations < 5
         for fields in told:
             assert fields["trial"] == 0

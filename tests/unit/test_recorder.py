@@ -23,12 +23,13 @@ class TestRecorder:
         assert len(record.true_states) == len(record.estimates) == steps + 1
         assert len(record.standard_deviations) == steps + 1
         assert sum(record.rewards) == pytest.approx(record.result.reward)
-        assert [sensing.step for sensing in record.sensing] == list(range(0, steps, 9))
+        assert [sensing.before.step for sensing in record.sensing] == list(range(0, steps, 9))
 
     def test_the_choice_has_the_least_entropy(self, tmp_path: Path) -> None:
         for sensing in record_trial(configuration_of(tmp_path)).record.sensing:
-            assert sensing.entropies is not None
-            assert sensing.sensing_action == int(np.argmin(sensing.entropies))
+            entropies = sensing.sensing_info.entropies
+            assert entropies is not None
+            assert sensing.sensing_action == int(np.argmin(entropies))
 
     def test_it_keeps_copies(self, tmp_path: Path) -> None:
         record = record_trial(configuration_of(tmp_path)).record
@@ -50,5 +51,5 @@ class TestRecorder:
 
     def test_particles_are_thinned_out(self, tmp_path: Path) -> None:
         configuration = configuration_of(tmp_path, num_particles=2 * MAX_PARTICLES_KEPT + 1)
-        before = record_trial(configuration).record.sensing[0].before
+        before = record_trial(configuration).record.sensing[0].before.belief.states
         assert MAX_PARTICLES_KEPT // 2 < len(before) <= MAX_PARTICLES_KEPT

@@ -13,14 +13,7 @@ from tests.recordings import configuration_of, record_trial
 from holdfast.errors import HoldfastError, OutputError
 from holdfast.planning.outcome import TrialResult
 from holdfast.recording.csv_export import CsvSink
-from holdfast.recording.facts import (
-    EventFact,
-    LateFact,
-    SensingFact,
-    TaskFact,
-    TrialBeginFact,
-    TrialEndFact,
-)
+from holdfast.recording.facts import SensingFact, TaskFact, TrialBeginFact, TrialEndFact
 from holdfast.recording.recorder import TrialRecord
 from holdfast.recording.replay import RecordedRun
 from holdfast.recording.run_directory import RunDirectory
@@ -31,24 +24,8 @@ class Collected:
 
     def __init__(self) -> None:
         self.facts: list[Any] = []
-
-    def trial_begins(self, fact: TrialBeginFact) -> None:
-        self.facts.append(fact)
-
-    def sensed(self, fact: SensingFact) -> None:
-        self.facts.append(fact)
-
-    def acted(self, fact: TaskFact) -> None:
-        self.facts.append(fact)
-
-    def observed_late(self, fact: LateFact) -> None:
-        self.facts.append(fact)
-
-    def trial_ends(self, fact: TrialEndFact) -> None:
-        self.facts.append(fact)
-
-    def happened(self, fact: EventFact) -> None:
-        self.facts.append(fact)
+        self.trial_begins = self.sensed = self.acted = self.observed_late = self.facts.append
+        self.trial_ends = self.happened = self.facts.append
 
 
 def make_run(tmp_path: Path, change: Any = None) -> tuple[Path, list[TrialRecord]]:
@@ -76,12 +53,12 @@ def test_facts_are_those_of_the_run(tmp_path: Path) -> None:
     assert end.result == record.result
     sensed = [fact for fact in between if isinstance(fact, SensingFact)]
     acted = [fact for fact in between if isinstance(fact, TaskFact)]
-    assert [fact.sensing_action for fact in sensed] == [
+    assert [fact.step.sensing_action for fact in sensed] == [
         sensing.sensing_action for sensing in record.sensing
     ]
     for fact, sensing in zip(sensed, record.sensing, strict=True):
-        assert np.array_equal(fact.before.states, sensing.before)
-    assert np.array_equal([fact.action for fact in acted], record.actions)
+        assert np.array_equal(fact.step.before.belief.states, sensing.before.belief.states)
+    assert np.array_equal([fact.step.executed for fact in acted], record.actions)
     for task, true_state in zip(acted, record.true_states, strict=False):
         assert task.true_state is not None
         assert np.array_equal(task.true_state, true_state)

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
-from tests.recordings import result_of
+from tests.recordings import a_sensing_step, a_task_step, result_of
 
 from holdfast.config.loader import Configuration, load
 from holdfast.planning.belief import Belief
 from holdfast.planning.outcome import TrialResult
+from holdfast.planning.tracking import LateObservation
 from holdfast.recording.facts import (
     Decider,
     EventFact,
@@ -27,6 +28,7 @@ from holdfast.recording.facts import (
 )
 from holdfast.recording.rerun_sink import MAX_PARTICLES, RerunSink
 from holdfast.recording.view_target import ViewTarget
+from holdfast.robot.trial import LateStep
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -80,23 +82,21 @@ def values(rows: list[dict[str, Any]], name: str) -> list[Any]:
 
 
 def a_trial(sink: RerunSink, trial: int = 0, at: int = 10 * MS, particles: int = 2) -> None:
-    before, after = belief_of(particles), belief_of(particles)
+    belief = belief_of(particles)
     estimate = np.array([2.5, 2.0, 0.1])
     sink.trial_begins(TrialBeginFact(trial, at))
     sink.sensed(
         SensingFact(
-            trial, 0, at, at + MS, 2, bytes(32), DECIDER, before, after, 0,
-            np.array([-1.0, np.inf, -2.0]), np.array([0.2]), explained=False, resampled=True,
-            effective_sample_size=1.5, mahalanobis_distance=9.0,
+            a_sensing_step(
+                belief, 2, trial=trial, entropies=np.array([-1.0, np.inf, -2.0]),
+                observation=np.array([0.2]), explained=False, mahalanobis_distance=9.0,
+            ),
+            at, at + MS, DECIDER,
         )
     )  # fmt: skip
-    sink.acted(
-        TaskFact(
-            trial, 0, at + 2 * MS, np.array([-0.1, 0.0, 0.0]), DECIDER, after, 0, estimate,
-            np.array([2.4, 2.1, 0.0]),
-        )
-    )  # fmt: skip
-    sink.trial_ends(TrialEndFact(trial, at + 3 * MS, 1, result_of(trial), after, estimate))
+    acted = a_task_step(belief, np.array([-0.1, 0.0, 0.0]), estimate, trial=trial)
+    sink.acted(TaskFact(acted, at + 2 * MS, DECIDER, np.array([2.4, 2.1, 0.0])))
+    sink.trial_ends(TrialEndFact(trial, at + 3 * MS, 1, result_of(trial), belief, estimate))
 
 
 def test_a_step_in_all_its_parts(tmp_path: Path) -> None:
@@ -178,10 +178,12 @@ def test_events(tmp_path: Path) -> None:
 def test_a_late_observation_and_the_choice_not_to_sense(tmp_path: Path) -> None:
     def happen(sink: RerunSink) -> None:
         belief = belief_of(2)
-        sink.sensed(SensingFact(0, 3, MS, 2 * MS, 3, bytes(32), None, belief, belief, 0))
-        late = LateFact(0, 5, 3 * MS, 2, np.array([0.1]), belief, explained=False)
-        sink.observed_late(late)
-        sink.observed_late(late._replace(explained=True))
+        sink.sensed(SensingFact(a_sensing_step(belief, 3, step=3), MS, 2 * MS, None))
+        for explained in (False, True):
+            after = a_sensing_step(belief, 3, step=5, explained=explained)
+            late = LateObservation(2, np.array([0.1]))
+            step = LateStep(late, after.after, after.observation_info)
+            sink.observed_late(LateFact(step, 3 * MS))
 
     rows, _ = shown(tmp_path, happen)
     assert values(rows["/decisions/sensing_action"], "StateChange:state") == [["no sensing"]]

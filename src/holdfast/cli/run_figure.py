@@ -142,9 +142,7 @@ def repeat(
     trials = RecordedTrials(
         journal, configuration, world_is_simulated=configuration.environment.object is None
     )
-    decisions = list(result.decisions or ())
-    compared = ComparedTrial(result.trial, decisions, result, recorder)
-    return trials.run(result, compared) is not None
+    return trials.run(result, ComparedTrial(result, observer=recorder))
 
 
 def service_that_decided(error: DecidedOtherwiseError, timings: Path) -> str | None:

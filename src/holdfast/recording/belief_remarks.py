@@ -8,7 +8,6 @@ certain and wrong.
 
 from __future__ import annotations
 
-import itertools
 from typing import Any
 
 import numpy as np
@@ -46,7 +45,7 @@ def belief_remarks(problem: Any, settings: PlanningSettings, record: TrialRecord
     for coordinate, label in enumerate(state_labels(problem)):
         if coordinate in circular or "rad" not in label:
             continue
-        wraps = sum(_wraps(step.after, coordinate) for step in record.sensing)
+        wraps = sum(_wraps(step.after.belief.states, coordinate) for step in record.sensing)
         if wraps > _SHARE * count:
             remarks.append(
                 f"{label} lay on both sides of a whole turn in {wraps} of {count} beliefs, and was "
@@ -64,7 +63,7 @@ def belief_remarks(problem: Any, settings: PlanningSettings, record: TrialRecord
     failed = record.result is not None and not record.result.success
     if failed and not remarks and settings.particle_filter.estimate == "mean":
         several = sum(
-            heaviest_mode(step.after, step.weights, circular) is not step.weights
+            heaviest_mode(*step.after.belief, circular) is not step.after.belief.weights
             for step in record.sensing
         )
         if several > _SHARE * count:
@@ -82,13 +81,15 @@ def _depleted(record: TrialRecord) -> list[tuple[int, int, int]]:
     """
     steps = record.sensing
     found = []
-    for at in range(steps[0].before.shape[1] if len(steps) > 1 else 0):
-        first, last = (len(np.unique(step.before[:, at])) for step in (steps[0], steps[-1]))
-        varied = 2 * first > len(steps[0].before)
+    befores = [step.before.belief.states for step in steps]
+    afters = [step.after.belief.states for step in steps]
+    for at in range(befores[0].shape[1] if len(steps) > 1 else 0):
+        first, last = (len(np.unique(states[:, at])) for states in (befores[0], befores[-1]))
+        varied = 2 * first > len(befores[0])
         if varied and last <= max(1.0, _FEW * first):
-            pairs = itertools.pairwise(steps)
-            if all(np.array_equal(one.after[:, at], two.before[:, at]) for one, two in pairs):
-                found.append((at, last, steps[-1].step))
+            moves = zip(afters, befores[1:], strict=False)
+            if all(np.array_equal(one[:, at], two[:, at]) for one, two in moves):
+                found.append((at, last, steps[-1].before.step))
     return found
 
 

@@ -229,7 +229,7 @@ def _compare_unfinished(
     begun: Sequence[UnfinishedTrial | None], trial: int, same: Counter[str]
 ) -> Difference | None:
     """Return where the same number of decisions of an unfinished trial first differ."""
-    decided = [[] if each is None else list(decisions_of(each.records)) for each in begun]
+    decided = (() if each is None else decisions_of(each.records) for each in begun)
     for one, other in zip(*decided, strict=True):
         found = _difference_of_decision(one, other, trial)
         if found is not None:

@@ -17,6 +17,7 @@ from typing import Any, Self
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.belief import Belief
 from holdfast.planning.outcome import TRIAL_COLUMNS
+from holdfast.planning.planner import digest
 from holdfast.printable import cell
 from holdfast.problems.attributes import choice_labels
 from holdfast.problems.attributes import state_labels as declared_labels
@@ -99,17 +100,20 @@ class CsvSink:
     def sensed(self, fact: SensingFact) -> None:
         """Write the belief before; the rest of the row comes with the task action."""
         self._sensing = fact
-        self._write_belief(fact.trial, fact.step, "sensing", fact.before)
+        before = fact.step.before
+        self._write_belief(before.trial, before.step, "sensing", before.belief)
 
     def acted(self, fact: TaskFact) -> None:
         """Write the row of the step, and the belief."""
-        self._write_step(fact.trial, fact.step, fact)
-        self._write_belief(fact.trial, fact.step, "acting", fact.belief)
+        state = fact.step.state
+        self._write_step(state.trial, state.step, fact)
+        self._write_belief(state.trial, state.step, "acting", state.belief)
 
     def observed_late(self, fact: LateFact) -> None:
         """Write a late observation among the events: the row of its step is written."""
-        shown = {"trial": fact.trial, "step": fact.step, "taken": fact.taken}
-        shown["observation"] = fact.observation.tolist()
+        late, after, _ = fact.step
+        shown = {"trial": after.trial, "step": after.step, "taken": late.step}
+        shown["observation"] = late.observation.tolist()
         self.happened(EventFact(fact.time_ns, "late_observation", shown))
 
     def trial_ends(self, fact: TrialEndFact) -> None:
@@ -136,31 +140,33 @@ class CsvSink:
         sensing, self._sensing = self._sensing, None
         row: dict[str, Any] = {"trial": trial, "step": step}
         if sensing is not None:
+            sensed, info = sensing.step, sensing.step.observation_info
             row |= {
-                "stage": sensing.stage,
-                "sensing_action": sensing.sensing_action,
-                "sensing_action_label": self._choices[sensing.sensing_action],
-                "explained": None if sensing.explained is None else int(sensing.explained),
-                "mahalanobis_distance": sensing.mahalanobis_distance,
-                "effective_sample_size": sensing.effective_sample_size,
-                "resampled": None if sensing.resampled is None else int(sensing.resampled),
-                "state_digest": sensing.state_digest.hex(),
+                "stage": sensed.before.stage,
+                "sensing_action": sensed.sensing_action,
+                "sensing_action_label": self._choices[sensed.sensing_action],
+                "observation": _numbers(sensed.observation),
+                "explained": int(info.explained),
+                "mahalanobis_distance": info.mahalanobis_distance,
+                "effective_sample_size": info.effective_sample_size,
+                "resampled": int(info.resampled),
+                "state_digest": digest(sensed.after).hex(),
                 "sensing_time": _seconds(sensing.decided_ns),
                 "observation_time": _seconds(sensing.observed_ns),
-                **_cells("entropy_{}", sensing.entropies),
+                **_cells("entropy_{}", sensed.sensing_info.entropies),
                 **_decider_cells("sensing", sensing.decider),
             }
-            row["observation"] = _numbers(sensing.observation)
         if fact is not None:
+            acted, (motion, observation) = fact.step, fact.shown
             row |= {
-                "stage": fact.stage,
-                "reward": fact.reward,
-                "motion": _numbers(fact.motion),
-                "move_observation": _numbers(fact.observation),
+                "stage": acted.task_info.stage,
+                "reward": acted.reward,
+                "motion": _numbers(motion),
+                "move_observation": _numbers(observation),
                 "action_time": _seconds(fact.time_ns),
-                **_cells("estimate {}", fact.estimate, self._labels),
+                **_cells("estimate {}", acted.task_info.estimate, self._labels),
                 **_cells("true {}", fact.true_state, self._labels),
-                **_cells("action_{}", fact.action),
+                **_cells("action_{}", acted.executed),
                 **_decider_cells("action", fact.decider),
             }
         self._steps.writerow({name: cell(value) for name, value in row.items()})

@@ -9,27 +9,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
-import numpy as np
-
-from holdfast.numerics.arrays import FloatArray
+from holdfast.numerics.arrays import FloatArray, floats_or_none
 from holdfast.planning.belief import Belief
 from holdfast.planning.outcome import TrialResult
-from holdfast.planning.planner import digest
 from holdfast.recording.run_clock import Stamp
-from holdfast.robot.trial import LateStep, SensingStep
-
-__all__ = [
-    "SCORES",
-    "Decider",
-    "EventFact",
-    "FactSink",
-    "LateFact",
-    "SensingFact",
-    "TaskFact",
-    "TrialBeginFact",
-    "TrialEndFact",
-]
-
+from holdfast.robot.trial import LateStep, SensingStep, TaskStep
 
 SCORES = {
     "action_entropy": "expected entropy of\nthe actions (nats)",
@@ -72,124 +56,45 @@ class TrialBeginFact(NamedTuple):
 
 
 class SensingFact(NamedTuple):
-    """A sensing action and its observation.
-
-    ``sensing_action`` may be the choice not to sense, one more than the last.
+    """A sensing step, and who chose its action; the choice may be not to sense.
 
     Attributes
     ----------
-    observation : array or None
-        None too if it comes late, or never.
     decided_ns, observed_ns : int
         When it was chosen, and when its observation was part of the belief.
-    state_digest : bytes
-        Of the planning state after the observation.
-    before, after : Belief
-        The beliefs before and after the observation.
-    entropies : array of shape (num_sensing_actions,) or None
-        What was minimised, in nats; None if nothing was.
     """
 
-    trial: int
-    step: int
+    step: SensingStep
     decided_ns: int
     observed_ns: int
-    sensing_action: int
-    state_digest: bytes
     decider: Decider | None
-    before: Belief
-    after: Belief
-    stage: int
-    entropies: FloatArray | None = None
-    observation: FloatArray | None = None
-    explained: bool | None = None
-    resampled: bool | None = None
-    effective_sample_size: float | None = None
-    mahalanobis_distance: float | None = None
-
-    @classmethod
-    def of(
-        cls, step: SensingStep, decided_ns: int, observed_ns: int, decider: Decider | None
-    ) -> SensingFact:
-        """Return the fact of a step."""
-        before, after, entropies = step.before, step.after, step.sensing_info.entropies
-        info = step.observation_info
-        return cls(
-            trial=before.trial,
-            step=before.step,
-            decided_ns=decided_ns,
-            observed_ns=observed_ns,
-            sensing_action=step.sensing_action,
-            state_digest=digest(after),
-            decider=decider,
-            before=before.belief,
-            after=after.belief,
-            stage=before.stage,
-            entropies=None if entropies is None else np.array(entropies, dtype=np.float64),
-            observation=step.observation,
-            explained=info.explained,
-            resampled=info.resampled,
-            effective_sample_size=info.effective_sample_size,
-            mahalanobis_distance=info.mahalanobis_distance,
-        )
 
 
 class TaskFact(NamedTuple):
-    """A task action that was performed.
+    """A task action that was ordered or performed, and who chose it.
 
     Attributes
     ----------
-    action : array of shape (action_size,)
-        As it was executed.
-    belief, estimate : Belief, array of shape (state_size,)
-        From which it was chosen, and the state with which the policy was evaluated.
     true_state : array of shape (state_size,) or None
         Before the action.
-    motion, observation : array or None
-        What the move has shown.
     """
 
-    trial: int
-    step: int
+    step: TaskStep
     time_ns: int
-    action: FloatArray
     decider: Decider | None
-    belief: Belief
-    stage: int
-    estimate: FloatArray
     true_state: FloatArray | None = None
-    reward: float | None = None
-    motion: FloatArray | None = None
-    observation: FloatArray | None = None
+
+    @property
+    def shown(self) -> tuple[FloatArray | None, FloatArray | None]:
+        """What the move has shown: its motion, and its observation."""
+        return floats_or_none(self.step.shown.motion), floats_or_none(self.step.shown.observation)
 
 
 class LateFact(NamedTuple):
-    """An observation that came late.
+    """An observation that came late, and when."""
 
-    Attributes
-    ----------
-    step, taken : int
-        Task actions performed when it came, and when it was taken.
-    after : Belief
-        After it was folded in at its step, and all that followed again.
-    """
-
-    trial: int
-    step: int
+    step: LateStep
     time_ns: int
-    taken: int
-    observation: FloatArray
-    after: Belief
-    explained: bool
-
-    @classmethod
-    def of(cls, step: LateStep, time_ns: int) -> LateFact:
-        """Return the fact of a late observation."""
-        late, after = step.late, step.after
-        explained = step.observation_info.explained
-        return cls(
-            after.trial, after.step, time_ns, late.step, late.observation, after.belief, explained
-        )
 
 
 class TrialEndFact(NamedTuple):
@@ -200,7 +105,8 @@ class TrialEndFact(NamedTuple):
     result : TrialResult or None
         None if the trial is not finished.
     belief, estimate, true_state
-        As in :class:`TaskFact`, after the last action; None where the records end before that.
+        After the last action, and the state that stood for the belief; None where the records end
+        before that.
     """
 
     trial: int

@@ -37,7 +37,8 @@ from holdfast.problems import checked
 from holdfast.problems.attributes import choice_labels, circular_states, state_labels
 from holdfast.problems.problem import Problem, Scene
 from holdfast.recording.facts import SCORES
-from holdfast.recording.recorder import SensingRecord, TrialRecord
+from holdfast.recording.recorder import TrialRecord
+from holdfast.robot.trial import SensingStep
 from holdfast.runtime.files import write_atomically
 
 __all__ = ["STYLE", "trial_figure"]
@@ -226,7 +227,7 @@ def _draw_workspace(panel: Axes, problem: Problem, scene: Scene, record: TrialRe
     if len(truth):
         panel.plot(*truth[:, axes].T, color=_TRUE, linewidth=1.3)
     for sensing in record.sensing if len(record.sensing) <= _MAX_MARKS else ():
-        x, y = way[sensing.step, axes]
+        x, y = way[sensing.before.step, axes]
         _scatter_chosen(panel, x, y, sensing.sensing_action, record)
     if scene.points is not None:
         x, y = scene.points.T
@@ -298,12 +299,13 @@ def _draw_obstacles(panel: Axes, scene: Scene) -> None:
         panel.add_collection(drawn, autolim=False)
 
 
-def _draw_clouds(panel: Axes, sensing: Sequence[SensingRecord], axes: list[int]) -> None:
+def _draw_clouds(panel: Axes, sensing: Sequence[SensingStep], axes: list[int]) -> None:
     """Draw the particles of a few beliefs, the older the paler."""
     if not sensing:
         return
     chosen = np.unique(np.linspace(0, len(sensing) - 1, _NUM_CLOUDS).round().astype(int))
-    clouds: list[FloatArray] = [sensing[0].before, *(sensing[index].after for index in chosen)]
+    clouds: list[FloatArray] = [sensing[0].before.belief.states]
+    clouds += [sensing[index].after.belief.states for index in chosen]
     for cloud, opacity in zip(clouds, np.linspace(0.3, 0.8, len(clouds)), strict=True):
         x, y = cloud[:, axes].T
         panel.scatter(x, y, s=9, color=_BELIEF, alpha=float(opacity), linewidth=0, zorder=2)
@@ -386,7 +388,10 @@ def _choices(problem: Problem, record: TrialRecord) -> list[str]:
     labels, count = choice_labels(problem), len(problem.sensing_actions)
     is_optional = any(
         sensing.sensing_action == count
-        or (sensing.entropies is not None and len(sensing.entropies) > count)
+        or (
+            sensing.sensing_info.entropies is not None
+            and len(sensing.sensing_info.entropies) > count
+        )
         for sensing in record.sensing
     )
     return labels if is_optional else labels[:-1]
@@ -402,7 +407,7 @@ def _wrapped_choices(problem: Problem, record: TrialRecord) -> list[str]:
 def _action_handles(problem: Problem, record: TrialRecord) -> list[Line2D]:
     """Return a legend's entries for the actions that are drawn: chosen, or with an entropy."""
     chosen = {sensing.sensing_action for sensing in record.sensing}
-    compared = any(sensing.entropies is not None for sensing in record.sensing)
+    compared = any(sensing.sensing_info.entropies is not None for sensing in record.sensing)
     handles = []
     for action, name in enumerate(_choices(problem, record)):
         if action in chosen:
@@ -443,7 +448,7 @@ def _draw_coordinates(
             panel.plot(np.arange(len(truth)), truth[:, index], color=_TRUE, linewidth=1.1)
         if len(record.sensing) <= _MAX_MARKS:
             _scatter_sensing(
-                panel, record, [estimates[sensing.step, index] for sensing in record.sensing]
+                panel, record, [estimates[sensing.before.step, index] for sensing in record.sensing]
             )
         panel.set_ylabel(label)
         panel.yaxis.set_major_locator(MaxNLocator(nbins=4))
@@ -454,7 +459,7 @@ def _draw_coordinates(
         Line2D([], [], **_ESTIMATED, label="estimate"),
         Patch(facecolor=_BELIEF, alpha=0.22, label="± 2 standard deviations"),
     ]
-    if not all(sensing.explained for sensing in record.sensing):
+    if not all(sensing.observation_info.explained for sensing in record.sensing):
         handles.append(_dot(_TRUE, "x", "far from every particle", size=7.0, hollow=1.0))
     above: Any = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": len(handles)}
     panels[0].legend(handles=handles, columnspacing=1.2, handletextpad=0.5, **above)
@@ -475,7 +480,7 @@ def _scatter_sensing(panel: Axes, record: TrialRecord, heights: Sequence[float])
     """Mark the sensing steps, one call for each sensing action."""
     height = np.asarray(heights, dtype=np.float64)
     actions = np.array([sensing.sensing_action for sensing in record.sensing], dtype=int)
-    steps = np.array([sensing.step for sensing in record.sensing], dtype=int)
+    steps = np.array([sensing.before.step for sensing in record.sensing], dtype=int)
     for action in np.unique(actions):
         chosen = actions == action
         _scatter_chosen(panel, steps[chosen], height[chosen], int(action), record)
@@ -487,9 +492,9 @@ def _draw_choices(panel: Axes, problem: Problem, record: TrialRecord) -> None:
     count = len(choices)
     _scatter_sensing(panel, record, [float(sensing.sensing_action) for sensing in record.sensing])
     unexplained = [
-        (sensing.step, float(sensing.sensing_action))
+        (sensing.before.step, float(sensing.sensing_action))
         for sensing in record.sensing
-        if not sensing.explained
+        if not sensing.observation_info.explained
     ]
     if unexplained:
         x, y = zip(*unexplained, strict=True)
@@ -506,7 +511,7 @@ def _draw_entropies(panel: Axes, configuration: Configuration, record: TrialReco
     """Draw every sensing action's score at each sensing step; the lowest was chosen."""
     panel.set_ylabel(SCORES.get(configuration.planning.selector.method, ""), fontsize=_SMALLEST)
     panel.yaxis.set_major_locator(MaxNLocator(nbins=4))
-    known = [sensing for sensing in record.sensing if sensing.entropies is not None]
+    known = [sensing for sensing in record.sensing if sensing.sensing_info.entropies is not None]
     if not known:
         panel.text(
             0.5, 0.5, "no entropies: the selector looks at no belief", ha="center", va="center",
@@ -514,8 +519,8 @@ def _draw_entropies(panel: Axes, configuration: Configuration, record: TrialReco
         )  # fmt: skip
         panel.set_yticks([])
         return
-    steps = np.array([sensing.step for sensing in known])
-    entropies = np.array([sensing.entropies for sensing in known])
+    steps = np.array([sensing.before.step for sensing in known])
+    entropies = np.array([sensing.sensing_info.entropies for sensing in known])
     chosen = np.array([sensing.sensing_action for sensing in known])
     panel.vlines(
         steps, entropies.min(axis=1), entropies.max(axis=1), color="#B4B9C0", linewidth=0.8

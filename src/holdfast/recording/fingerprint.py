@@ -17,15 +17,6 @@ from holdfast.config.loader import Configuration
 from holdfast.config.registry import problem_module
 from holdfast.config.source_digest import core_version, problem_sources
 
-__all__ = [
-    "Difference",
-    "EarlierCode",
-    "difference",
-    "fingerprint",
-    "ranges_of",
-    "read_earlier",
-]
-
 _VERSION = "holdfast_version"
 _CORE = "holdfast_core"
 _SOURCES = "problem_sources"

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 
@@ -46,8 +46,8 @@ from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME
 from holdfast.recording.step_times import events_of
 from holdfast.recording.timings import TimingRow, timings_of
 from holdfast.recording.view_target import ViewTarget
-from holdfast.robot.environment import SimulatedEnvironment
-from holdfast.robot.trial import LateStep, SensingStep
+from holdfast.robot.environment import Environment, SimulatedEnvironment
+from holdfast.robot.trial import LateStep, SensingStep, TaskStep
 
 __all__ = ["Follower", "FollowerReport", "RunFiles", "follow"]
 
@@ -174,9 +174,7 @@ class Follower:
             late = record.late()
             found = trial.observe_late(late)
             if found is not None and not is_late:
-                self._sink.observed_late(
-                    LateFact.of(LateStep(late, trial.state, found[0]), time_ns)
-                )
+                self._sink.observed_late(LateFact(LateStep(late, trial.state, found[0]), time_ns))
         elif isinstance(record, ReinitialisedRecord):
             trial.reinitialise()  # an event tells of it
 
@@ -190,7 +188,7 @@ class Follower:
         )
         if why is not None:
             step = SensingStep(before, record.sensing_action, why, observation, trial.state, info)
-            self._sink.sensed(SensingFact.of(step, decided_ns, time_ns, decider))
+            self._sink.sensed(SensingFact(step, decided_ns, time_ns, decider))
 
     def _acting(self, state: PlanningState, action: FloatArray, time_ns: int) -> None:
         """Show an action when it is ordered: how it went shows at the next one."""
@@ -199,19 +197,8 @@ class Follower:
             # An answer has the task actions up to the next sensing step.
             self._answered = asked[1]
         info = self._planner.choose_task_action(state)[1]
-        self._sink.acted(
-            TaskFact(
-                trial=state.trial,
-                step=state.step,
-                time_ns=time_ns,
-                action=action,
-                decider=self._answered,
-                belief=state.belief,
-                stage=info.stage,
-                estimate=info.estimate,
-                true_state=self._true_state,
-            )
-        )
+        step = TaskStep(cast("Environment", self._simulated), state, info, action, None)
+        self._sink.acted(TaskFact(step, time_ns, self._answered, self._true_state))
 
 
 class RunFiles:

@@ -109,9 +109,22 @@ def scene_markers(
     size = _size(scene)
     box = getattr(problem, "world", None)
     solid = isinstance(box, BoxWorld) and layout.indices[:3] == (0, 1, 2)
-    markers = _boxes(box.obstacles, scene, frame) if solid and box is not None else []
-    if not solid:
-        markers = _rectangles(scene, axes, frame, size)
+    # The obstacles as far as they are in the part that is to be shown, in a plane as flat boxes.
+    x_min, y_min, x_max, y_max = scene.limits
+    if solid and box is not None:
+        lows = np.maximum(box.obstacles[:, :3], (x_min, x_min, y_min))
+        highs = np.minimum(box.obstacles[:, 3:], (x_max, x_max, y_max))
+        markers = _cuboids(zip(lows, highs, strict=True), frame)
+    else:
+        half = 0.5 * _THICKNESS * size
+        corners = [
+            (
+                _in_space(np.maximum(obstacle[:2], (x_min, y_min)), axes, -half),
+                _in_space(np.minimum(obstacle[2:], (x_max, y_max)), axes, half),
+            )
+            for obstacle in scene.obstacles
+        ]
+        markers = _cuboids(corners, frame)
     for name, places in (("landmark", scene.points), ("goal", scene.goal)):
         if places is None:
             continue
@@ -231,28 +244,6 @@ def _outline(scene: Scene) -> FloatArray:
         turn = np.linspace(0.0, 2.0 * np.pi, _DISC_POINTS)
         return np.asarray(body * np.stack([np.cos(turn), np.sin(turn)], axis=1))
     return np.vstack([body, body[:1]])
-
-
-def _rectangles(scene: Scene, axes: tuple[int, int], frame: str, size: float) -> list[Marker]:
-    """Return the obstacles as flat boxes, as far as they are in the part that is to be shown."""
-    limits = np.array(scene.limits, dtype=np.float64)
-    half = 0.5 * _THICKNESS * size
-    corners = [
-        (
-            _in_space(np.maximum(obstacle[:2], limits[:2]), axes, -half),
-            _in_space(np.minimum(obstacle[2:], limits[2:]), axes, half),
-        )
-        for obstacle in scene.obstacles
-    ]
-    return _cuboids(corners, frame)
-
-
-def _boxes(obstacles: FloatArray, scene: Scene, frame: str) -> list[Marker]:
-    """Return the obstacles in space, as far as they are in the part that is to be shown."""
-    x_min, z_min, x_max, z_max = scene.limits
-    lows = np.maximum(obstacles[:, :3], (x_min, x_min, z_min))
-    highs = np.minimum(obstacles[:, 3:], (x_max, x_max, z_max))
-    return _cuboids(zip(lows, highs, strict=True), frame)
 
 
 def _cuboids(corners: Iterable[tuple[Any, Any]], frame: str) -> list[Marker]:

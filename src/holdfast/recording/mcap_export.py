@@ -21,6 +21,7 @@ from holdfast.config.loader import Configuration
 from holdfast.errors import MissingRosbagsError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.belief import Belief
+from holdfast.planning.planner import PlanningState
 from holdfast.problems.attributes import choice_labels
 from holdfast.protocol.status import Status
 from holdfast.recording.csv_export import state_labels
@@ -130,73 +131,64 @@ class McapSink:
                 self._has_frame = True
                 turned = np.array([0.0, 0.0, 0.0, *self._layout.upright])
                 self._transform(now, "/tf_static", MAP_FRAME, {TASK_FRAME: turned})
-            markers = scene_markers(
-                self._problem,
-                self._layout,
-                TASK_FRAME,
-                ESTIMATE_FRAME,
-                TRUTH_FRAME,
-            )
+            frames = TASK_FRAME, ESTIMATE_FRAME, TRUTH_FRAME
+            markers = scene_markers(self._problem, self._layout, *frames)
             self._markers(now, "/holdfast/scene", markers, anew=True)
             self._markers(now, "/holdfast/sensing", [], anew=True)
         self._log(now, "INFO", f"trial {fact.trial} begins")
 
     def sensed(self, fact: SensingFact) -> None:
         """Write the belief and the choice, then the observation and the belief that it led to."""
-        now = fact.decided_ns
-        self._place(now, fact.trial, fact.step, fact.stage)
-        self._belief(now, fact.before)
-        label = self._choices[fact.sensing_action]
-        self._number(now, "/holdfast/sensing_action", "Int32", fact.sensing_action)
+        (before, action, _, observation, after, info), now, later, decider = fact
+        self._place(now, before, before.stage)
+        self._belief(now, before.belief)
+        label = self._choices[action]
+        self._number(now, "/holdfast/sensing_action", "Int32", action)
         self._write(now, "/holdfast/sensing_action_label", "std_msgs/msg/String", data=label)
-        if fact.entropies is not None:
-            labels = "; ".join(self._choices[: len(fact.entropies)])
-            self._array(now, "/holdfast/entropies", fact.entropies, labels)
-        is_performed = fact.sensing_action < len(self._problem.sensing_actions)
-        if self._layout is not None and is_performed:
+        entropies = fact.step.sensing_info.entropies
+        if entropies is not None:
+            self._array(now, "/holdfast/entropies", entropies,
+                        "; ".join(self._choices[: len(entropies)]))  # fmt: skip
+        if self._layout is not None and action < len(self._problem.sensing_actions):
             markers = sensing_markers(
-                self._problem, self._layout, TASK_FRAME, fact.before, fact.sensing_action
+                self._problem, self._layout, TASK_FRAME, before.belief, action
             )
             self._markers(now, "/holdfast/sensing", markers)
-        later = fact.observed_ns
-        if fact.observation is not None:
-            self._array(later, "/holdfast/observation", fact.observation, label)
-        self._belief(later, fact.after)
+        if observation is not None:
+            self._array(later, "/holdfast/observation", observation, label)
+        self._belief(later, after.belief)
         values: dict[str, Any] = {"sensing_action": label}
         values |= {
-            name: getattr(fact, name)
+            name: getattr(info, name)
             for name in ("effective_sample_size", "mahalanobis_distance", "explained", "resampled")
         }
-        self._diagnose(
-            later, fact.trial, fact.step, "sensing", fact.decider, values, fact.explained
-        )
-        if fact.explained is False and fact.decider is None:
+        self._diagnose(later, before, "sensing", decider, values)
+        if not info.explained and decider is None:
             # With services there is an event of it.
-            self._log(later, "WARN", f"trial {fact.trial}, step {fact.step}: no particle explains "
-                      f"the observation of {label}")  # fmt: skip
+            self._log(later, "WARN", f"trial {before.trial}, step {before.step}: no particle "
+                      f"explains the observation of {label}")  # fmt: skip
 
     def acted(self, fact: TaskFact) -> None:
         """Write the belief, its estimate, the true state if it is known, and the action."""
-        now = fact.time_ns
-        self._place(now, fact.trial, fact.step, fact.stage)
-        self._state(now, fact.belief, fact.estimate, fact.true_state)
-        labels = self._labels if len(fact.action) == len(self._labels) else None
-        self._array(now, "/holdfast/task_action", fact.action,
-                    "action" if labels is None else "; ".join(labels))  # fmt: skip
-        for name, shown in (("motion", fact.motion), ("move_observation", fact.observation)):
+        step, now, decider, true_state = fact
+        state, reward, action = step.state, step.reward, step.executed
+        self._place(now, state, step.task_info.stage)
+        self._state(now, state.belief, step.task_info.estimate, true_state)
+        labels = self._labels if len(action) == len(self._labels) else ["action"]
+        self._array(now, "/holdfast/task_action", action, "; ".join(labels))
+        for name, shown in zip(("motion", "move_observation"), fact.shown, strict=True):
             if shown is not None:
                 self._array(now, f"/holdfast/{name}", shown, name)
-        if fact.reward is not None:
-            self._number(now, "/holdfast/reward", "Float64", fact.reward)
-        values = {} if fact.reward is None else {"reward": fact.reward}
-        self._diagnose(now, fact.trial, fact.step, "task", fact.decider, values, None)
+        if reward is not None:
+            self._number(now, "/holdfast/reward", "Float64", reward)
+        self._diagnose(now, state, "task", decider, {"reward": reward})
 
     def observed_late(self, fact: LateFact) -> None:
         """Write a late observation and the belief that it led to."""
-        now = fact.time_ns
-        label = f"taken at step {fact.taken}"
-        self._array(now, "/holdfast/late_observation", fact.observation, label)
-        self._belief(now, fact.after)
+        (late, after, _), now = fact
+        label = f"taken at step {late.step}"
+        self._array(now, "/holdfast/late_observation", late.observation, label)
+        self._belief(now, after.belief)
 
     def trial_ends(self, fact: TrialEndFact) -> None:
         """Write the last belief, and what the trial came to."""
@@ -227,11 +219,10 @@ class McapSink:
 
     # -- messages ----------------------------------------------------------------------------------
 
-    def _place(self, now: int, trial: int, step: int, stage: int | None) -> None:
-        self._number(now, "/holdfast/trial", "Int32", trial)
-        self._number(now, "/holdfast/step", "Int32", step)
-        if stage is not None:
-            self._number(now, "/holdfast/stage", "Int32", stage)
+    def _place(self, now: int, state: PlanningState, stage: int) -> None:
+        self._number(now, "/holdfast/trial", "Int32", state.trial)
+        self._number(now, "/holdfast/step", "Int32", state.step)
+        self._number(now, "/holdfast/stage", "Int32", stage)
 
     def _state(
         self,
@@ -334,21 +325,19 @@ class McapSink:
     def _diagnose(
         self,
         now: int,
-        trial: int,
-        step: int,
+        state: PlanningState,
         kind: str,
         decider: Decider | None,
         facts: Mapping[str, Any],
-        explained: bool | None,
     ) -> None:
         status = "decided" if decider is None else decider.status
-        entries: dict[str, Any] = {"trial": trial, "step": step, **facts}
+        entries: dict[str, Any] = {"trial": state.trial, "step": state.step, **facts}
         if decider is not None:
             entries |= decider._asdict()
         level, message = 0, status
         if decider is not None and decider.status == Status.LOCAL_RECOVERY.value:
             level = 1
-        if explained is False:
+        if not facts.get("explained", True):
             level, message = 1, f"{status}; no particle explains the observation"
         values = [(key, str(entry)) for key, entry in entries.items() if entry is not None]
         service = "" if decider is None else decider.service
@@ -437,24 +426,17 @@ def _header(now: int, frame: str = TASK_FRAME) -> dict[str, Any]:
 
 
 def _qos(*, latched: bool) -> Any:
-    from rosbags.interfaces import (
-        Qos,
-        QosDurability,
-        QosHistory,
-        QosLiveliness,
-        QosReliability,
-        QosTime,
-    )
+    from rosbags import interfaces as ros
 
-    for_ever = QosTime(9223372036, 854775807)
-    return Qos(
-        history=QosHistory.KEEP_LAST,
+    for_ever = ros.QosTime(9223372036, 854775807)
+    return ros.Qos(
+        history=ros.QosHistory.KEEP_LAST,
         depth=1 if latched else 10,
-        reliability=QosReliability.RELIABLE,
-        durability=QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+        reliability=ros.QosReliability.RELIABLE,
+        durability=ros.QosDurability.TRANSIENT_LOCAL if latched else ros.QosDurability.VOLATILE,
         deadline=for_ever,
         lifespan=for_ever,
-        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness=ros.QosLiveliness.AUTOMATIC,
         liveliness_lease_duration=for_ever,
         avoid_ros_namespace_conventions=False,
     )

@@ -31,6 +31,7 @@ from holdfast.recording.facts import (
 )
 from holdfast.recording.journal_reader import JournalReader
 from holdfast.recording.replay import RecordedRun
+from holdfast.robot.trial import SensingStep
 
 __all__ = ["RunArrays", "TrialArrays", "open_run"]
 
@@ -176,7 +177,7 @@ class _Collector:
 
     def __init__(self, num_choices: int) -> None:
         self._no_entropies = np.full(num_choices, np.nan)
-        self._sensing: list[SensingFact] = []
+        self._sensing: list[SensingStep] = []
         self._late: dict[int, FloatArray] = {}
         self._tasks: list[TaskFact] = []
         self._end: TrialEndFact | None = None
@@ -188,7 +189,7 @@ class _Collector:
 
     def sensed(self, fact: SensingFact) -> None:
         """Keep a sensing action."""
-        self._sensing.append(fact)
+        self._sensing.append(fact.step)
 
     def acted(self, fact: TaskFact) -> None:
         """Keep a task action."""
@@ -196,7 +197,7 @@ class _Collector:
 
     def observed_late(self, fact: LateFact) -> None:
         """Keep a late observation."""
-        self._late[fact.taken] = fact.observation
+        self._late[fact.step.late.step] = fact.step.late.observation
 
     def trial_ends(self, fact: TrialEndFact) -> None:
         """Keep the end."""
@@ -209,13 +210,15 @@ class _Collector:
         """Return the trial that has just ended."""
         sensing, tasks, end = self._sensing, self._tasks, self._end
         assert end is not None
-        actions = np.array([task.action for task in tasks]).reshape(-1, action_size)
-        steps = np.array([each.step for each in sensing], dtype=np.int64)
+        acted = [task.step for task in tasks]
+        actions = np.array([step.executed for step in acted]).reshape(-1, action_size)
+        steps = np.array([each.before.step for each in sensing], dtype=np.int64)
         chosen = np.array([each.sensing_action for each in sensing], dtype=np.int64)
-        entropies = [
-            self._no_entropies if each.entropies is None else each.entropies for each in sensing
-        ]
-        rewards = [np.nan if task.reward is None else task.reward for task in tasks]
+        known = (each.sensing_info.entropies for each in sensing)
+        entropies = [self._no_entropies if each is None else each for each in known]
+        rewards = [np.nan if step.reward is None else step.reward for step in acted]
+        beliefs = [*(step.state.belief for step in acted), end.belief]
+        estimates = [*(step.task_info.estimate for step in acted), end.estimate]
         ends: list[TaskFact | TrialEndFact] = [*tasks, end]
         true_states = [each.true_state for each in ends if each.true_state is not None]
         return TrialArrays(
@@ -225,17 +228,17 @@ class _Collector:
             steps,
             chosen,
             observations=tuple(
-                _shown(self._late.get(each.step, each.observation)) for each in sensing
+                _shown(self._late.get(each.before.step, each.observation)) for each in sensing
             ),
             entropies=np.array(entropies).reshape(-1, self._no_entropies.size),
-            priors=tuple(each.before for each in sensing),
-            beliefs=tuple(each.belief for each in ends if each.belief is not None),
-            estimates=np.array([each.estimate for each in ends if each.estimate is not None]),
-            stages=np.array([task.stage for task in tasks], dtype=np.int64),
+            priors=tuple(each.before.belief for each in sensing),
+            beliefs=tuple(each for each in beliefs if each is not None),
+            estimates=np.array([each for each in estimates if each is not None]),
+            stages=np.array([step.task_info.stage for step in acted], dtype=np.int64),
             rewards=np.array(rewards, dtype=np.float64),
             true_states=np.array(true_states) if true_states else None,
-            motions=tuple(_shown(task.motion) for task in tasks),
-            move_observations=tuple(_shown(task.observation) for task in tasks),
+            motions=tuple(_shown(task.shown[0]) for task in tasks),
+            move_observations=tuple(_shown(task.shown[1]) for task in tasks),
         )
 
 

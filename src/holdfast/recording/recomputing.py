@@ -10,6 +10,7 @@ decide the same, but their sources do not tell. Their decisions do.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from time import perf_counter
 
@@ -28,7 +29,6 @@ from holdfast.robot.environment import Environment, SimulatedEnvironment
 from holdfast.robot.recorded_trial import run_recorded_trial
 from holdfast.robot.trial import (
     NULL_OBSERVER,
-    LateStep,
     SensingStep,
     TaskStep,
     TrialObserver,
@@ -58,71 +58,73 @@ class RecordedTrials:
         self._world_is_simulated = world_is_simulated
         self.planner = Planner(configuration.problem, configuration.planning)
 
-    def run(self, result: TrialResult, observer: TrialObserver) -> TrialResult | None:
-        """Run a finished trial again; return None if its observations were not kept.
+    def run(self, recorded: TrialResult | UnfinishedTrial, observer: TrialObserver) -> bool:
+        """Run a trial again, as far as it went; return whether its observations were kept.
 
-        ``result`` has its decisions.
+        A result has its decisions.
 
         Raises
         ------
         DecidedOtherwiseError
             If the recorded world has no answer to a decision.
         """
-        seed, trial = self._simulator.seed, result.trial
-        if self._world_is_simulated:
-            assert result.decisions is not None
-            return run_trial(
-                self.planner,
+        seed, trial, planner = self._simulator.seed, recorded.trial, self.planner
+        if isinstance(recorded, UnfinishedTrial):
+            simulated = None
+            if self._world_is_simulated:
+                simulated = SimulatedEnvironment(planner.problem, seed, trial)
+            run_recorded_trial(
+                planner, seed, trial, recorded.records, observer, simulated=simulated
+            )
+        elif self._world_is_simulated:
+            assert recorded.decisions is not None
+            run_trial(
+                planner,
                 seed,
                 trial,
                 max_steps=self._simulator.max_steps,
                 observer=observer,
-                reinitialised_after=result.decisions.reinitialised_after(),
+                reinitialised_after=recorded.decisions.reinitialised_after(),
             )
-        records = self._journal.kept_steps(trial)
-        if records is None and result.steps:
-            return None
-        return run_recorded_trial(self.planner, seed, trial, records or [], observer, result)
-
-    def run_unfinished(self, begun: UnfinishedTrial, observer: TrialObserver) -> None:
-        """Run the unfinished trial again, as far as its records go; raises as :meth:`run` does."""
-        seed, trial = self._simulator.seed, begun.trial
-        simulated = None
-        if self._world_is_simulated:
-            simulated = SimulatedEnvironment(self.planner.problem, seed, trial)
-        run_recorded_trial(self.planner, seed, trial, begun.records, observer, simulated=simulated)
+        else:
+            records = self._journal.kept_steps(trial)
+            if records is None and recorded.steps:
+                return False
+            run_recorded_trial(planner, seed, trial, records or [], observer, recorded)
+        return True
 
 
 class ComparedTrial(TrialObserver):
-    """Observes a trial that is run again, and compares its decisions with the recorded ones.
+    """Observes a trial that is run again; a decision that differs raises DecidedOtherwiseError.
 
-    A decision that differs raises DecidedOtherwiseError. What is the same goes on to ``observer``.
+    ``observer`` gets the beginning, what is decided as recorded, and the end.
+
+    Attributes
+    ----------
+    expected : list of decisions
+        The recorded ones.
     """
 
     def __init__(
         self,
-        trial: int,
-        expected: Sequence[SensingDecision | TaskDecision],
-        result: TrialResult | None,
+        recorded: TrialResult | UnfinishedTrial,
+        on_same: Callable[[], None] = lambda: None,
         observer: TrialObserver = NULL_OBSERVER,
     ) -> None:
-        self._trial = trial
-        self._expected = expected
-        self._result = result
-        self.compared = 0
+        self.trial = recorded.trial
+        self.result = recorded if isinstance(recorded, TrialResult) else None
+        self.expected: list[SensingDecision | TaskDecision]
+        if isinstance(recorded, TrialResult):
+            self.expected = list(recorded.decisions or ())
+        else:
+            self.expected = list(decisions_of(recorded.records))
+        self._compared = 0
+        self._on_same = on_same
         self._observer = observer
 
     def trial_began(self, environment: Environment, state: PlanningState) -> None:
         """Pass it on."""
         self._observer.trial_began(environment, state)
-
-    def observed_late(self, step: LateStep) -> None:
-        """Pass it on: the next decision shows the state."""
-        self._observer.observed_late(step)
-
-    def reinitialised(self, state: PlanningState) -> None:
-        """Pass it on."""
-        self._observer.reinitialised(state)
 
     @in_own_mode
     def sensed(self, step: SensingStep) -> None:
@@ -139,12 +141,18 @@ class ComparedTrial(TrialObserver):
 
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
         """Compare what is no decision, too: the digests of all states."""
-        if self._result is None or result.decisions != self._result.decisions:
-            raise DecidedOtherwiseError(self._trial, result.steps, None)
+        if self.result is None or result.decisions != self.result.decisions:
+            raise DecidedOtherwiseError(self.trial, result.steps, None)
         self._observer.trial_ended(state, result)
 
+    def require_all(self) -> None:
+        """Raise DecidedOtherwiseError if a recorded decision was not made again."""
+        if self._compared < len(self.expected):
+            raise DecidedOtherwiseError(self.trial, self.expected[self._compared].step, None)
+
     def _require(self, decision: SensingDecision | TaskDecision) -> None:
-        kept = self._expected[self.compared] if self.compared < len(self._expected) else None
+        at = self._compared
+        kept = self.expected[at] if at < len(self.expected) else None
         kind: str | None = "task" if isinstance(decision, TaskDecision) else "sensing"
         if isinstance(kept, TaskDecision) and isinstance(decision, TaskDecision):
             # By their bits: 0.0 and -0.0 are different actions.
@@ -155,24 +163,9 @@ class ComparedTrial(TrialObserver):
             # A state that differs after the same choice is nobody's decision.
             kind = None if kept is not None and kept[:2] == decision[:2] else kind
         if not same:
-            raise DecidedOtherwiseError(self._trial, decision.step, kind)
-        self.compared += 1
-
-
-class _Counting(TrialObserver):
-    """Counts decisions."""
-
-    def __init__(self, total: int, on_progress: Callable[[int, int], None]) -> None:
-        self._done = 0
-        self._total = total
-        self._on_progress = on_progress
-
-    def sensed(self, step: object) -> None:
-        del step
-        self._done += 1
-        self._on_progress(self._done, self._total)
-
-    acted = sensed
+            raise DecidedOtherwiseError(self.trial, decision.step, kind)
+        self._compared += 1
+        self._on_same()
 
 
 def compute_again(
@@ -210,29 +203,24 @@ def compute_again(
     finished, begun = sorted(journal.finished()), journal.unfinished()
     last = len(finished) - 1
     chosen = {finished[index] for index in (0, last // 2, last)} if finished else set()
-    results = {
-        each.trial: msgspec.structs.replace(each, decisions=journal.decisions(each.trial))
+    recorded: list[TrialResult | UnfinishedTrial] = [
+        msgspec.structs.replace(each, decisions=journal.decisions(each.trial))
         for each in journal.results()
         if each.trial in chosen
-    }
-    expected = {trial: list(each.decisions or ()) for trial, each in results.items()}
-    so_far = [] if begun is None else list(decisions_of(begun.records))
-    total = len(so_far) + sum(map(len, expected.values()))
-    counting = _Counting(total, on_progress)
+    ]
+    if begun is not None and any(decisions_of(begun.records)):
+        recorded.insert(0, begun)
+    done = itertools.count(1)
+    observers = [ComparedTrial(each, lambda: on_progress(next(done), total)) for each in recorded]
+    total = sum(len(each.expected) for each in observers)
     computed: list[int] = []
     started = perf_counter()
-    if begun is not None and so_far:
-        observer = ComparedTrial(begun.trial, so_far, None, counting)
-        trials.run_unfinished(begun, observer)
-        if observer.compared < len(so_far):
-            raise DecidedOtherwiseError(begun.trial, so_far[observer.compared].step, None)
-        computed.append(begun.trial)
-    for trial, result in results.items():
+    for each, observer in zip(recorded, observers, strict=True):
         if computed and perf_counter() - started > _FINISHED_S:
             break
-        observer = ComparedTrial(trial, expected[trial], result, counting)
-        if trials.run(result, observer) is not None:
-            computed.append(trial)
+        if trials.run(each, observer):
+            observer.require_all()
+            computed.append(each.trial)
     if finished and not computed:
         raise HoldfastError("it has not kept its observations")
     known = {
@@ -244,6 +232,8 @@ def compute_again(
     return EarlierCode(
         holdfast=made_by,
         finished=ranges_of([trial for trial in finished if trial not in known]),
-        unfinished=None if begun is None else (begun.trial, len(so_far)),
+        unfinished=None
+        if begun is None
+        else (begun.trial, sum(1 for _ in decisions_of(begun.records))),
         computed_again=tuple(sorted(computed)),
     )

@@ -15,38 +15,13 @@ from holdfast.problems.attributes import circular_states
 from holdfast.robot.environment import Environment
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver
 
-__all__ = ["Recorder", "SensingRecord", "TrialRecord"]
+__all__ = ["Recorder", "TrialRecord", "true_state"]
 
 MAX_PARTICLES_KEPT = 500
 """Particles kept of a belief; more would not show in a figure."""
 
 MAX_STEPS_KEPT = 100_000
 """Steps kept of a trial, so that a recorder's memory is bounded."""
-
-
-@dataclass(frozen=True)
-class SensingRecord:
-    """One sensing step.
-
-    Attributes
-    ----------
-    entropies : array of shape (num_sensing_actions,) or None
-        What was minimised; None if nothing was.
-    before, after : array of shape (at most 500, state_size)
-        Particles of the belief before and after the observation.
-    weights : array of shape (at most 500,)
-        Of the particles after, normalised.
-    explained : bool
-        Whether any particle explained the observation.
-    """
-
-    step: int
-    sensing_action: int
-    entropies: FloatArray | None
-    before: FloatArray
-    after: FloatArray
-    weights: FloatArray
-    explained: bool
 
 
 @dataclass
@@ -63,6 +38,8 @@ class TrialRecord:
         Executed task actions.
     rewards : list of float
         NaN where the environment reported none.
+    sensing : list of SensingStep
+        Of their beliefs at most 500 particles each, with weights that are normalised.
     result : TrialResult or None
         None while the trial runs.
     """
@@ -72,7 +49,7 @@ class TrialRecord:
     standard_deviations: list[FloatArray] = field(default_factory=list)
     actions: list[FloatArray] = field(default_factory=list)
     rewards: list[float] = field(default_factory=list)
-    sensing: list[SensingRecord] = field(default_factory=list)
+    sensing: list[SensingStep] = field(default_factory=list)
     result: TrialResult | None = None
 
 
@@ -97,25 +74,16 @@ class Recorder(TrialObserver):
         """Start a new record if this is the trial."""
         if state.trial == self.trial:
             self.record = TrialRecord()
-            self._keep_true_state(environment)
+            self._keep(true_state(environment))
 
     @in_own_mode
     def sensed(self, step: SensingStep) -> None:
         """Keep a sensing step."""
         if not self._keeps(step.before):
             return
-        entropies = step.sensing_info.entropies
-        self.record.sensing.append(
-            SensingRecord(
-                step=step.before.step,
-                sensing_action=step.sensing_action,
-                entropies=None if entropies is None else np.array(entropies, dtype=np.float64),
-                before=_some_particles(step.before.belief),
-                after=_some_particles(step.after.belief),
-                weights=_some_weights(step.after.belief),
-                explained=step.observation_info.explained,
-            )
-        )
+        info = step.sensing_info._replace(samples=None)
+        before, after = _thinned(step.before), _thinned(step.after)
+        self.record.sensing.append(step._replace(before=before, after=after, sensing_info=info))
 
     @in_own_mode
     def acted(self, step: TaskStep) -> None:
@@ -123,7 +91,7 @@ class Recorder(TrialObserver):
         if not self._keeps(step.state):
             return
         mean = np.array(step.task_info.estimate, dtype=np.float64)
-        self._keep_true_state(step.environment)
+        self._keep(true_state(step.environment))
         self.record.estimates.append(mean)
         self.record.standard_deviations.append(self._deviation(step.state))
         self.record.actions.append(np.array(step.executed, dtype=np.float64))
@@ -149,23 +117,22 @@ class Recorder(TrialObserver):
     def _keeps(self, state: PlanningState) -> bool:
         return state.trial == self.trial and state.step < MAX_STEPS_KEPT
 
-    def _keep_true_state(self, environment: Environment) -> None:
-        # Only a simulated world knows its own state; a robot's does not have the attribute.
-        state = getattr(environment, "state", None)
+    def _keep(self, state: FloatArray | None) -> None:
         if state is not None:
-            self.record.true_states.append(np.array(state, dtype=np.float64))
+            self.record.true_states.append(state)
 
 
-def _some_particles(belief: Belief) -> FloatArray:
-    return np.array(belief.states[:: _stride(belief)], dtype=np.float64)
+def true_state(environment: Environment) -> FloatArray | None:
+    """Return a copy of the world's own state, which only a simulated world knows."""
+    state = getattr(environment, "state", None)
+    return None if state is None else np.array(state, dtype=np.float64)
 
 
-def _some_weights(belief: Belief) -> FloatArray:
-    weights = np.array(belief.weights[:: _stride(belief)], dtype=np.float64)
-    total = weights.sum()
-    # None of these few need have any.
-    return np.asarray(weights / total if total > 0.0 else np.full(len(weights), 1 / len(weights)))
-
-
-def _stride(belief: Belief) -> int:
-    return -(-len(belief.states) // MAX_PARTICLES_KEPT)
+def _thinned(state: PlanningState) -> PlanningState:
+    states, weights = state.belief
+    every = -(-len(states) // MAX_PARTICLES_KEPT)
+    some = np.array(weights[::every], dtype=np.float64)
+    total = some.sum()
+    # None of these few need have any weight.
+    some = some / total if total > 0.0 else np.full(len(some), 1 / len(some))
+    return state._replace(belief=Belief(np.array(states[::every], dtype=np.float64), some))

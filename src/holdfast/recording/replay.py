@@ -19,8 +19,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
-import numpy as np
-
 from holdfast.config.loader import Configuration
 from holdfast.errors import (
     DecidedOtherwiseError,
@@ -28,12 +26,11 @@ from holdfast.errors import (
     OutputError,
     UntrustedCodeError,
 )
-from holdfast.numerics.arrays import FloatArray, floats_or_none
+from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.planning.outcome import TaskDecision, TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.printable import one_line
-from holdfast.protocol.records import decisions_of
 from holdfast.recording.facts import (
     Decider,
     EventFact,
@@ -47,6 +44,7 @@ from holdfast.recording.facts import (
 from holdfast.recording.fingerprint import difference, fingerprint
 from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.recording.recomputing import ComparedTrial, RecordedTrials
+from holdfast.recording.recorder import true_state
 from holdfast.recording.run_clock import RunClock
 from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME, recorded_configuration
 from holdfast.recording.step_times import (
@@ -58,7 +56,7 @@ from holdfast.recording.step_times import (
 )
 from holdfast.recording.timings import rows_by_trial
 from holdfast.robot.environment import Environment
-from holdfast.robot.trial import LateStep, SensingStep, TaskStep, TrialObserver
+from holdfast.robot.trial import LateStep, SensingStep, TaskStep
 
 __all__ = ["RecordedRun"]
 
@@ -167,52 +165,36 @@ class RecordedRun:
         begun = self._begun if self._begun is not None and self._begun.trial in chosen else None
         for result in self._journal.results(with_decisions=True):
             if begun is not None and begun.trial < result.trial:
-                yield self._replay_unfinished(begun, output, clock)
+                yield self._replay(begun, output, clock)
                 begun = None
             if result.trial in chosen:
-                yield self._replay_finished(result, output, clock)
+                yield self._replay(result, output, clock)
         if begun is not None:
-            yield self._replay_unfinished(begun, output, clock)
+            yield self._replay(begun, output, clock)
         output.at(math.inf, between_trials=True)
 
-    def _replay_finished(self, result: TrialResult, output: _Output, clock: StepClock) -> int:
-        trial, decisions = result.trial, result.decisions
-        assert decisions is not None
-        times = self._times(trial, result.steps, clock)
-        facts = _Facts(trial, times, output, result, self._recorded.planner)
-        compared = ComparedTrial(trial, list(decisions), result, facts)
-        with self._named_otherwise():
-            if self._recorded.run(result, compared) is None:
-                raise OutputError(
-                    f"{self.path}: trial {trial} cannot be computed again: this run is older than "
-                    "the keeping of what an environment of your own has shown; --trials leaves it "
-                    "out"
-                )
-        return trial
-
-    def _replay_unfinished(self, begun: UnfinishedTrial, output: _Output, clock: StepClock) -> int:
-        trial = begun.trial
-        expected = list(decisions_of(begun.records))
-        steps = sum(isinstance(decision, TaskDecision) for decision in expected)
-        times = self._times(trial, steps, clock)
-        facts = _Facts(trial, times, output, None, self._recorded.planner)
-        with self._named_otherwise():
-            self._recorded.run_unfinished(begun, ComparedTrial(trial, expected, None, facts))
-        facts.end_here()
-        return trial
-
-    @contextlib.contextmanager
-    def _named_otherwise(self) -> Iterator[None]:
-        """Say what may be the reason where something is decided otherwise."""
+    def _replay(
+        self, recorded: TrialResult | UnfinishedTrial, output: _Output, clock: StepClock
+    ) -> int:
+        facts = _Facts(recorded, output, self._recorded.planner)
+        facts.times = self._times(facts, clock)
         try:
-            yield
+            if not self._recorded.run(recorded, facts):
+                raise OutputError(
+                    f"{self.path}: trial {recorded.trial} cannot be computed again: this run is "
+                    "older than the keeping of what an environment of your own has shown; --trials "
+                    "leaves it out"
+                )
         except DecidedOtherwiseError as error:
             # Most likely the code has changed.
             changed = difference(self._meta, fingerprint(self.configuration))
             because = "" if changed is None else f" ({changed.words})"
             raise HoldfastError(f"{error}{because}; --trials leaves it out") from error
+        facts.end_here()
+        return recorded.trial
 
-    def _times(self, trial: int, steps: int, clock: StepClock) -> TrialTimes:
+    def _times(self, facts: _Facts, clock: StepClock) -> TrialTimes:
+        trial, steps = facts.trial, sum(isinstance(each, TaskDecision) for each in facts.expected)
         rows = self._rows.get(trial, {}) if self.has_times else {}
         times = clock.next_trial(steps, rows, self._ends.get(trial))
         deciders = {key: Decider.of(row) for key, row in rows.items()}
@@ -229,21 +211,16 @@ class RecordedRun:
         return TrialTimes(times, deciders)
 
 
-class _Facts(TrialObserver):
+class _Facts(ComparedTrial):
     """Writes the facts of a trial that is run again."""
 
+    times: TrialTimes
+
     def __init__(
-        self,
-        trial: int,
-        times: TrialTimes,
-        output: _Output,
-        result: TrialResult | None,
-        planner: Planner,
+        self, recorded: TrialResult | UnfinishedTrial, output: _Output, planner: Planner
     ) -> None:
-        self._trial = trial
-        self._result = result
+        super().__init__(recorded)
         self._planner = planner
-        self._times = times
         self._output = output
         self._steps = 0
         self._sensed_step = -1
@@ -252,16 +229,17 @@ class _Facts(TrialObserver):
 
     def trial_began(self, environment: Environment, state: PlanningState) -> None:
         self._state = state
-        self._true_state = _true_state(environment)
-        begin = TrialBeginFact(self._trial, self._times.at(0, 0))
+        self._true_state = true_state(environment)
+        begin = TrialBeginFact(self.trial, self.times.at(0, 0))
         for sink in self._output.at(begin.time_ns, between_trials=True):
             sink.trial_begins(begin)
 
     @in_own_mode
     def sensed(self, step: SensingStep) -> None:
-        number, times = step.before.step, self._times
+        super().sensed(step)
+        number, times = step.before.step, self.times
         decider = times.deciders.get((number, "sensing"))
-        fact = SensingFact.of(step, times.at(number, 0), times.at(number, 1), decider)
+        fact = SensingFact(step, times.at(number, 0), times.at(number, 1), decider)
         for sink in self._output.at(fact.decided_ns):
             sink.sensed(fact)
         self._state = step.after
@@ -269,25 +247,13 @@ class _Facts(TrialObserver):
 
     @in_own_mode
     def acted(self, step: TaskStep) -> None:
+        super().acted(step)
         number = step.state.step
-        action = np.array(step.executed, dtype=np.float64)
-        fact = TaskFact(
-            trial=self._trial,
-            step=number,
-            time_ns=self._times.at(number, 2),
-            action=action,
-            decider=self._times.deciders.get((number, "task")),
-            belief=step.state.belief,
-            stage=step.task_info.stage,
-            estimate=np.array(step.task_info.estimate, dtype=np.float64),
-            true_state=self._true_state,
-            reward=None if step.reward is None else float(step.reward),
-            motion=floats_or_none(step.shown.motion),
-            observation=floats_or_none(step.shown.observation),
-        )
+        decider = self.times.deciders.get((number, "task"))
+        fact = TaskFact(step, self.times.at(number, 2), decider, self._true_state)
         for sink in self._output.at(fact.time_ns):
             sink.acted(fact)
-        self._true_state = _true_state(step.environment)
+        self._true_state = true_state(step.environment)
         self._steps = number + 1
         self._state = None  # the next one is not known before something is done in it
 
@@ -298,7 +264,7 @@ class _Facts(TrialObserver):
         moment = (number, 1) if self._sensed_step == number else (number - 1, 3)
         if self._state is not None:
             self._state = step.after
-        fact = LateFact.of(step, self._times.at(*moment))
+        fact = LateFact(step, self.times.at(*moment))
         for sink in self._output.at(fact.time_ns):
             sink.observed_late(fact)
 
@@ -306,31 +272,24 @@ class _Facts(TrialObserver):
         if self._state is not None:
             self._state = state
 
-    @in_own_mode
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
-        del result
+        super().trial_ended(state, result)
         self._state = state
-        self.end_here()
 
+    @in_own_mode
     def end_here(self) -> None:
         belief = None if self._state is None else self._state.belief
         end = TrialEndFact(
-            trial=self._trial,
-            time_ns=self._times.at(self._steps, 3 if self._result is None else 0),
+            trial=self.trial,
+            time_ns=self.times.at(self._steps, 3 if self.result is None else 0),
             steps=self._steps,
-            result=self._result,
+            result=self.result,
             belief=belief,
             estimate=None if self._state is None else self._planner.estimate(self._state),
             true_state=self._true_state,
         )
         for sink in self._output.at(end.time_ns):
             sink.trial_ends(end)
-
-
-def _true_state(environment: Environment) -> FloatArray | None:
-    # Only a simulated world knows its own state.
-    state = getattr(environment, "state", None)
-    return None if state is None else np.array(state, dtype=np.float64)
 
 
 class _Output:

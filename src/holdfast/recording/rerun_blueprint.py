@@ -58,22 +58,17 @@ def blueprint(
     problem = configuration.problem
     method = configuration.planning.selector.method
     score = SCORES.get(method, method).replace("\n", " ")
-    coordinates = [
-        rrb.TimeSeriesView(
-            origin=rr.new_entity_path(["state", label]),
-            name=label,
-            plot_legend=rrb.PlotLegend(visible=False),
+    labels, hidden = state_labels(problem), rrb.PlotLegend(visible=False)
+    coordinates, histograms = (
+        [
+            view(origin=rr.new_entity_path([part, label]), name=name + label, plot_legend=hidden)
+            for label in labels
+        ]
+        for view, part, name in (
+            (rrb.TimeSeriesView, "state", ""),
+            (rrb.BarChartView, "belief", "belief, "),
         )
-        for label in state_labels(problem)
-    ]
-    histograms = [
-        rrb.BarChartView(
-            origin=rr.new_entity_path(["belief", label]),
-            name=f"belief, {label}",
-            plot_legend=rrb.PlotLegend(visible=False),
-        )
-        for label in state_labels(problem)
-    ]
+    )
     column = rrb.Vertical if len(coordinates) <= _MAX_IN_A_COLUMN else rrb.Grid
     plots = rrb.Vertical(
         rrb.TimeSeriesView(

@@ -146,49 +146,48 @@ class RerunSink:
 
     def sensed(self, fact: SensingFact) -> None:
         """Log the choice and the alternatives, then the belief that the observation led to."""
-        self._at(fact.decided_ns, fact.trial, fact.step)
-        self._belief(fact.before)
-        label = self._choices[fact.sensing_action]
+        (before, action, why, _, after, info), decided_ns, observed_ns, decider = fact
+        self._at(decided_ns, before.trial, before.step)
+        self._belief(before.belief)
+        label = self._choices[action]
         self._state("sensing_action", label)
-        self._decider(fact.decider)
-        entropies = fact.entropies
-        if entropies is not None:
-            self._recording.log("scores", rr.Scalars(_finite(entropies)))
-            self._recording.log(
-                "scores/chosen", rr.Scalars(_finite(entropies[fact.sensing_action]))
-            )
-        is_performed = fact.sensing_action < len(self._problem.sensing_actions)
-        if self._layout is not None and is_performed:
-            self._sensing(fact.before, fact.sensing_action)
-        self._at(fact.observed_ns, fact.trial, fact.step)
-        self._belief(fact.after)
+        self._decider(decider)
+        if why.entropies is not None:
+            self._recording.log("scores", rr.Scalars(_finite(why.entropies)))
+            self._recording.log("scores/chosen", rr.Scalars(_finite(why.entropies[action])))
+        if self._layout is not None and action < len(self._problem.sensing_actions):
+            self._sensing(before.belief, action)
+        self._at(observed_ns, before.trial, before.step)
+        self._belief(after.belief)
         for name in ("effective_sample_size", "mahalanobis_distance"):
-            value = getattr(fact, name)
+            value = getattr(info, name)
             if value is not None:
                 self._recording.log(f"filter/{name}", rr.Scalars(_finite(value)))
-        if fact.explained is False:
-            distance = fact.mahalanobis_distance
+        if not info.explained:
+            distance = info.mahalanobis_distance
             self._recording.log(
                 "filter/mahalanobis_distance/unexplained",
                 rr.Scalars(_finite(0.0 if distance is None else distance)),
             )
-            self._text("WARN", f"trial {fact.trial}, step {fact.step}: no particle explains the "
-                       f"observation of {label}")  # fmt: skip
+            self._text("WARN", f"trial {before.trial}, step {before.step}: no particle explains "
+                       f"the observation of {label}")  # fmt: skip
 
     def acted(self, fact: TaskFact) -> None:
         """Log the belief, its estimate, the true state if it is known, and the action."""
-        self._at(fact.time_ns, fact.trial, fact.step)
+        step, state, estimate = fact.step, fact.step.state, fact.step.task_info.estimate
+        self._at(fact.time_ns, state.trial, state.step)
         self._decider(fact.decider)
-        self._place(fact.belief, fact.estimate, fact.true_state)
-        self._action(fact.estimate, fact.action)
+        self._place(state.belief, estimate, fact.true_state)
+        self._action(estimate, step.executed)
         self._flush()
 
     def observed_late(self, fact: LateFact) -> None:
         """Log the belief that an earlier step's observation led to."""
-        self._at(fact.time_ns, fact.trial, fact.step)
-        self._belief(fact.after)
-        text = f"trial {fact.trial}, step {fact.step}: the observation of step {fact.taken} came"
-        if fact.explained:
+        late, after, info = fact.step
+        self._at(fact.time_ns, after.trial, after.step)
+        self._belief(after.belief)
+        text = f"trial {after.trial}, step {after.step}: the observation of step {late.step} came"
+        if info.explained:
             self._text("INFO", text)
         else:
             self._text("WARN", f"{text}, which no particle explains")
@@ -344,7 +343,6 @@ class RerunSink:
         def static(entity: str | list[object], *shapes: rr.AsComponents) -> None:
             self._recording.log(entity, *shapes, static=True)
 
-        actions = self._choices[:-1]
         colors = [_SERIES[index % len(_SERIES)] for index in range(len(self._choices))]
         static("scores", rr.SeriesLines(names=self._choices, colors=colors))
         static("scores/chosen", rr.SeriesPoints(names="chosen", colors=_TRUE, marker_sizes=4))
@@ -358,57 +356,41 @@ class RerunSink:
                 ),
             )
             static(["state", label, "true"], rr.SeriesLines(names="true", colors=_TRUE))
-        static(
-            "filter/effective_sample_size",
-            rr.SeriesLines(names="effective sample size", colors=_ESTIMATED),
-        )
-        static(
-            "filter/mahalanobis_distance",
-            rr.SeriesLines(names="distance of the observation (standard deviations)",
-                           colors=_SENSED),
-        )  # fmt: skip
+        for name, words, color in (
+            ("effective_sample_size", "effective sample size", _ESTIMATED),
+            ("mahalanobis_distance", "distance of the observation (standard deviations)", _SENSED),
+        ):
+            static(f"filter/{name}", rr.SeriesLines(names=words, colors=color))
         static(
             "filter/mahalanobis_distance/unexplained",
             rr.SeriesPoints(names="outside the validation gate", colors=_ACTED, marker_sizes=6,
                             markers="cross"),
         )  # fmt: skip
-        _static_states = {
-            "status": dict(_STATUSES),
-            "trial": dict(_OUTCOMES),
-            "sensing_action": dict(zip(actions, colors, strict=False)),
-        }
-        for name, looks in _static_states.items():
-            static(
-                f"decisions/{name}",
-                rr.StateConfiguration(values=list(looks), colors=list(looks.values())),
-            )
+        looks: dict[str, Any] = {"status": _STATUSES, "trial": _OUTCOMES}
+        looks["sensing_action"] = dict(zip(self._choices[:-1], colors, strict=False))
+        for name, look in looks.items():
+            states = rr.StateConfiguration(values=list(look), colors=list(look.values()))
+            static(f"decisions/{name}", states)
         if self._layout is None:
             return
-        static(
-            f"{_TASK}/belief",
-            rr.Points3D.from_fields(radii=rr.Radius.ui_points(2.0)),
-        )
-        static(f"{_TASK}/action", rr.Arrows3D.from_fields(radii=rr.Radius.ui_points(2.0)))
+        thin, thick = rr.Radius.ui_points(1.0), rr.Radius.ui_points(2.0)
+        static(f"{_TASK}/belief", rr.Points3D.from_fields(radii=thick))
+        static(f"{_TASK}/action", rr.Arrows3D.from_fields(radii=thick))
         for entity, color in ((_ESTIMATE, _ESTIMATED), (_TRUTH, _TRUE)):
-            static(
-                f"{entity}_path",
-                rr.LineStrips3D.from_fields(colors=color, radii=rr.Radius.ui_points(1.0)),
-            )
+            static(f"{entity}_path", rr.LineStrips3D.from_fields(colors=color, radii=thin))
         self._log_scene()
 
     def _log_scene(self) -> None:
         assert self._layout is not None
         looks = {"obstacle": _OBSTACLE, "goal": _GOAL, "landmark": _GOAL}
         solid: list[Marker] = []
-        for number, marker in enumerate(
-            scene_markers(self._problem, self._layout, _TASK, _ESTIMATE, _TRUTH)
-        ):
+        markers = scene_markers(self._problem, self._layout, _TASK, _ESTIMATE, _TRUTH)
+        for number, marker in enumerate(markers):
             if marker.namespace == "obstacle":
                 solid.append(marker)
             else:
-                color = looks.get(
-                    marker.namespace, _ESTIMATED if marker.frame == _ESTIMATE else _TRUE
-                )
+                body = _ESTIMATED if marker.frame == _ESTIMATE else _TRUE
+                color = looks.get(marker.namespace, body)
                 name = "body" if marker.frame != _TASK else f"{marker.namespace}/{number}"
                 self._recording.log(f"{marker.frame}/{name}", _shape(marker, color), static=True)
         if solid:

@@ -46,26 +46,6 @@ from holdfast.recording.tables import RunSummary, SummaryBuilder, csv_lines
 from holdfast.recording.timings import count_answers, count_verified
 from holdfast.runtime.files import write_atomically
 
-__all__ = [
-    "CONFIGURATION_NAME",
-    "EVENTS_NAME",
-    "FIGURE_NAME",
-    "JOURNAL_NAME",
-    "OUTPUT_NAMES",
-    "RECOVERY_LOG_NAME",
-    "SUMMARY_NAME",
-    "TIMINGS_NAME",
-    "TRIALS_NAME",
-    "VERIFICATION_NAME",
-    "RunDirectory",
-    "claim_default_directory",
-    "configuration_difference",
-    "first_difference",
-    "latest_default_directory",
-    "recorded_configuration",
-    "world_of",
-]
-
 CONFIGURATION_NAME = "config.yaml"
 EVENTS_NAME = "events.jsonl"
 FIGURE_NAME = "trial.png"
@@ -549,11 +529,9 @@ def _services_in(text: str) -> tuple[str, ...]:
 
 
 def _require_enough_trials(path: Path, journal: Journal, num_trials: int) -> None:
-    last = max(journal.finished(), default=-1)
-    begun = journal.unfinished_trial()
-    state = "finished"
-    if begun is not None and begun > last:
-        last, state = begun, "begun"
+    finished, begun = journal.finished(), journal.unfinished_trial()
+    last = max(finished if begun is None else {*finished, begun}, default=-1)
+    state = "begun" if last == begun else "finished"
     if last >= num_trials:
         raise OutputError(
             f"{path}: trial {last} of that run is {state}, so simulator.num_trials (--trials) is "

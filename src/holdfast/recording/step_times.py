@@ -20,18 +20,6 @@ from holdfast.recording.run_clock import RunClock, Stamp
 from holdfast.recording.timings import TimingRow, nanoseconds
 from holdfast.runtime.files import bounded_lines
 
-__all__ = [
-    "MOMENTS",
-    "NS_PER_S",
-    "UNTIMED_STEP_S",
-    "StepClock",
-    "TrialTimes",
-    "dated",
-    "events_of",
-    "read_events",
-    "trial_ends",
-]
-
 NS_PER_S = 1_000_000_000
 
 UNTIMED_STEP_S = 0.1

@@ -23,19 +23,6 @@ from holdfast.protocol.events import Timing, VerificationNoted
 from holdfast.recording.run_clock import Stamp, read_clocks
 from holdfast.runtime.files import bounded_lines
 
-__all__ = [
-    "AnswerCounts",
-    "EventTable",
-    "TimingRow",
-    "VerificationCounts",
-    "count_answers",
-    "count_verified",
-    "nanoseconds",
-    "read_timings",
-    "rows_by_trial",
-    "timings_of",
-]
-
 
 class EventTable:
     """A table with a row for each event of a kind, open for more.
