@@ -35,7 +35,7 @@ from holdfast.transport.endpoints import (
 from holdfast.transport.frames import CALL, END, LAST, REPLY, Frame, Hello, encode_hello
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
-from holdfast.transport.schemes import load_scheme
+from holdfast.transport.schemes import link_maker
 from holdfast.transport.tls import ClientCredentials, TlsStream
 
 _PAUSE_S = 0.004
@@ -191,7 +191,7 @@ class _ServiceLinks(LinkOwner):
         self._name = name
         self._endpoint = endpoint
         self._credentials = credentials
-        self._scheme = None if endpoint is None else load_scheme(endpoint.protocol)
+        self._maker = None if endpoint is None else link_maker(endpoint.protocol, "robot")
         self._dialer: Dialer | None = None
         # To a launched process that has said nothing yet.
         self._silent: socket.socket | None = None
@@ -278,12 +278,12 @@ class _ServiceLinks(LinkOwner):
     # -- links -----------------------------------------------------------------------------------
 
     def _make_link(self) -> Link:
-        assert self._endpoint is not None and self._scheme is not None
+        assert self._endpoint is not None and self._maker is not None
         tls = None
         if self._credentials is not None:
             context = self._credentials.context()
             tls = TlsStream(context, self._endpoint.host, self._incarnation)
-        link = self._scheme.make_link(self, self._robot.settings, tls, role="robot")
+        link = self._maker(self, self._robot.settings, tls=tls)
         self._made[link] = None
         return link
 

@@ -40,7 +40,7 @@ from holdfast.transport.frames import (
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.listener import MAX_SILENT, Listener, connection_to_drop
-from holdfast.transport.schemes import load_scheme
+from holdfast.transport.schemes import link_maker
 
 if TYPE_CHECKING:
     import ssl
@@ -149,9 +149,7 @@ class StreamServiceTransport(LinkOwner):
             check_credentials(endpoint, tls)
         self._robot = robot
         self._shared: Sequence[socket.socket | None] = shared or [None] * len(listen)
-        self._schemes = {
-            endpoint.protocol: load_scheme(endpoint.protocol) for endpoint in self._listen
-        }
+        self._makers = {at.protocol: link_maker(at.protocol, "service") for at in self._listen}
         self._incarnation = incarnation
         self._max_links = MAX_LINKS if max_links is None else max_links
         self._tls = tls
@@ -237,8 +235,6 @@ class StreamServiceTransport(LinkOwner):
             self._end(link)
         if self._closing:
             await asyncio.wait(self._closing, timeout=timeout_s)
-        for scheme in self._schemes.values():
-            scheme.close()
         if self._robot is not None:
             self._robot.close()
 
@@ -314,7 +310,7 @@ class StreamServiceTransport(LinkOwner):
 
             assert self._context is not None
             tls = TlsStream(self._context)
-        link = self._schemes[endpoint.protocol].make_link(self, self._settings, tls, role="service")
+        link = self._makers[endpoint.protocol](self, self._settings, tls=tls)
         self._add(link, network)
         link.begin(connection)
 
