@@ -157,7 +157,7 @@ def _serve_supervised(options: ServeOptions, parent: int, descriptor: int) -> in
         if supervised.has_served:
             raise
         # The supervisor reports it, once.
-        supervised.failed(str(error))
+        supervised.tell(str(error)[:4000])
         return 2
 
 

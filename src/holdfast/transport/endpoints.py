@@ -47,7 +47,6 @@ _MAX_LABEL = 63
 _INTERFACE = re.compile(r"[!-~]{1,15}")
 _NUMBERS = re.compile(r"[0-9.]+")
 
-
 PROTOCOLS = "tcp", "tls", "udp", "unix"
 
 _ALLOWED = "tcp, tls, udp and unix"
@@ -156,11 +155,6 @@ def parse_endpoint(text: str) -> Endpoint:
             f"endpoint {text!r}: protocol {protocol} is not allowed"
             + (f" ({instead})" if instead else "")
             + f"; allowed are {_ALLOWED}, as in tcp/127.0.0.1:7447"
-        )
-    if "?" in place or "#" in place:
-        raise TransportError(
-            f"endpoint {text!r}: options after '?' or '#' are not allowed; "
-            f"give the place alone, as in tcp/127.0.0.1:7447"
         )
     if protocol == "unix":
         return _local_socket(text, place)

@@ -54,10 +54,6 @@ _MAX_REPORTED_REASONS = 8
 """Reasons that are not reported again; bounded, as a service may send a new one each time."""
 
 
-def _unheard(_name: str, **_fields: object) -> None:
-    """Log nothing."""
-
-
 class StreamRobotTransport:
     """The robot's end: see :class:`~holdfast.transport.contract.RobotTransport`.
 
@@ -84,7 +80,7 @@ class StreamRobotTransport:
         # robot or is another one (recent reasons are not repeated until it has appeared);
         # ``no_datagrams`` with ``service`` and ``reason``, once for each; ``credentials`` with
         # ``reason``, when replaced ones cannot be used.
-        on_event: Callable[..., None] = _unheard,
+        on_event: Callable[..., None] = lambda _, **__: None,
     ) -> None:
         if name:
             check_name("name of a robot", name)
@@ -159,14 +155,11 @@ class StreamRobotTransport:
 
     async def close(self, timeout_s: float = 1.0) -> None:
         """Close all links, within this time whatever the other ends do. May be repeated."""
-        closing = self._stop()
-        if closing:
-            await asyncio.wait(closing, timeout=timeout_s)
-
-    def _stop(self) -> list[asyncio.Future[None]]:
         self._closed = True
         self.calls.close()
-        return [closing for service in self._services.values() for closing in service.stop()]
+        closing = [each for service in self._services.values() for each in service.stop()]
+        if closing:
+            await asyncio.wait(closing, timeout=timeout_s)
 
     def _service(self, service: str) -> _ServiceLinks:
         try:
