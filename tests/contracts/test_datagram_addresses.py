@@ -7,6 +7,7 @@ import os
 import socket
 import struct
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from tests.contracts.test_datagram_links import (
@@ -24,7 +25,7 @@ from tests.contracts.wires import Inbox, StreamWire, echo, until
 from tests.ports import free_port
 
 from holdfast.protocol.events import ServiceAppeared, ServiceVanished
-from holdfast.transport.datagram_links import DatagramScheme, RobotDatagramLink
+from holdfast.transport.datagram_links import RobotDatagramLink
 from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.exchanges import ECHO
 from holdfast_lab.testbed.bad_line import Impairment
@@ -169,15 +170,14 @@ class TestSocketsOfAService:
         other = udp.robot("cloud")
         other.start(Inbox())
         await until(lambda: other.sends_datagrams("cloud"))
-        scheme = next(iter(service._schemes.values()))
-        assert isinstance(scheme, DatagramScheme)
-        (used,) = scheme._sockets.values()
+        sockets = cast("Any", service._makers["udp"]).keywords["sockets"]
+        (used,) = sockets.values()
         await other.close()
         await until(lambda: len(service._links) == 1)
         await answers(robot, inbox, 1)
         await robot.close()
         await until(lambda: not service._links)
-        assert scheme._sockets == {}
+        assert sockets == {}
         assert used._socket.fileno() == -1
         again = udp.robot("cloud")
         again.start(Inbox())

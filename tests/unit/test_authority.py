@@ -66,7 +66,7 @@ class TestSignatures:
         assert not authority.is_signed_by(other.certificate, made)
         assert authority.common_name_of(made) == "anna"
         assert authority.role_of(made) == "robot"
-        assert authority.public_key_of(made) == key.public_key()
+        assert made.public_key() == key.public_key()
         assert authority.role_of(ours.certificate) is None
 
     def test_a_list_grows_and_keeps_what_was_revoked_when(self, tmp_path: Path) -> None:

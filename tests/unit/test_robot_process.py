@@ -193,7 +193,7 @@ def scripted(robots: Robots, begin: Callable[[], object]) -> tuple[RobotProcess,
     """Return a robot whose machine is a script, which begins with something of the test's own."""
     robot, machine = robots.make(), Machine()
     robot._transport = NoWire()
-    robot._robot = machine  # type: ignore[assignment]
+    robot.robot = machine  # type: ignore[assignment]
     robot._begin_next = begin  # type: ignore[method-assign, assignment]
     return robot, machine
 
@@ -565,4 +565,4 @@ def test_who_looks_on_sees_each_order_and_its_state(robots: Robots) -> None:
             for one in result.decisions
         ]
     assert seen == expected
-    assert (robot.status, robot.unexplained_observations) == (Status.STANDARD, 0)
+    assert (robot.robot.status, robot.robot.unexplained_observations) == (Status.STANDARD, 0)

@@ -1,31 +1,30 @@
-"""The table of schemes: each has an implementation."""
+"""The links of each protocol."""
 
 from __future__ import annotations
 
-import inspect
 import subprocess
 import sys
 
 import pytest
 
-from holdfast.transport.endpoints import SCHEMES
-from holdfast.transport.schemes import Scheme, load_scheme
+from holdfast.transport import endpoints
+from holdfast.transport.datagram_links import RobotDatagramLink, ServiceDatagramLink
+from holdfast.transport.links import Link
+from holdfast.transport.schemes import link_maker
 
 
-@pytest.mark.parametrize("name", SCHEMES)
-def test_each_is_implemented_by_a_class_with_the_same_methods(name: str) -> None:
-    scheme = load_scheme(name)
-    assert isinstance(scheme, Scheme)
-    for method, base in inspect.getmembers(Scheme, inspect.isfunction):
-        if not method.startswith("_"):
-            assert inspect.signature(getattr(type(scheme), method)) == inspect.signature(base)
-    scheme.close()
+@pytest.mark.parametrize("protocol", endpoints.PROTOCOLS)
+def test_udp_alone_has_datagrams_beside_its_streams(protocol: str) -> None:
+    robot, service = link_maker(protocol, "robot"), link_maker(protocol, "service")
+    made = [getattr(each, "func", each) for each in (robot, service)]
+    udp = protocol == "udp"
+    assert made == ([RobotDatagramLink, ServiceDatagramLink] if udp else [Link, Link])
 
 
 def test_what_no_endpoint_uses_is_not_imported() -> None:
     program = (
-        "import sys; from holdfast.transport.schemes import load_scheme; "
-        "load_scheme('tcp'); print(*sys.modules)"
+        "import sys; from holdfast.transport.schemes import link_maker; "
+        "link_maker('tcp', 'service'); print(*sys.modules)"
     )
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 
 import msgspec
 import pytest
@@ -14,13 +15,14 @@ from holdfast import __version__
 from holdfast.protocol.messages import PROTOCOL_VERSION
 from holdfast.protocol.service_limits import ServiceStatistics
 from holdfast.runtime.exposition import BUCKETS_S
-from holdfast.service.metrics import DecisionTimes, Exposition, ServiceReport, summed
+from holdfast.service.metrics import DecisionTimes, ServiceReport, service_exposition, summed
 
 Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
 
 
-def told(report: ServiceReport, exposition: Exposition | None = None) -> Samples:
-    text = (exposition or Exposition("cloud_active_sensing")).text(report).decode()
+def told(report: ServiceReport, processes: Sequence[int] = ()) -> Samples:
+    own = (os.getpid(),)
+    text = service_exposition("cloud_active_sensing", report, processes or own).decode()
     return {
         (sample.name, tuple(sorted(sample.labels.items()))): sample.value
         for family in text_string_to_metric_families(text)
@@ -99,7 +101,7 @@ class TestWhatIsTold:
         child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
         try:
             ids = [os.getpid(), child.pid]
-            both = told(ServiceReport(), Exposition("cloud", lambda: ids))
+            both = told(ServiceReport(), ids)
         finally:
             child.communicate(b"\n", timeout=30)
         assert one["process_resident_memory_bytes", ()] > 1e6
@@ -107,7 +109,7 @@ class TestWhatIsTold:
         assert both["process_start_time_seconds", ()] == one["process_start_time_seconds", ()]
         assert both["process_max_fds", ()] == one["process_max_fds", ()]
         # What has ended still counts.
-        after = told(ServiceReport(), Exposition("cloud", lambda: [os.getpid()]))
+        after = told(ServiceReport())
         assert after["process_cpu_seconds_total", ()] >= both["process_cpu_seconds_total", ()]
 
 
@@ -151,8 +153,8 @@ def test_without_the_package_the_error_says_how_to_get_it() -> None:
     program = (
         "import sys; sys.modules['prometheus_client'] = None\n"
         "from holdfast.errors import MetricsError\n"
-        "from holdfast.service.metrics import Exposition\n"
-        "try:\n    Exposition('x')\n"
+        "from holdfast.runtime.exposition import require_prometheus\n"
+        "try:\n    require_prometheus()\n"
         "except MetricsError as error:\n    print(error)\n"
     )
     done = subprocess.run(

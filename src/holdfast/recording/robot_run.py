@@ -141,4 +141,4 @@ def perform_trials(
         if observer is not None:
             observer.process(robot)
         robot.run(directory.journal.finished())
-        return robot.missed_ticks
+        return robot.robot.missed_ticks

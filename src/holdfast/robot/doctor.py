@@ -348,11 +348,10 @@ class Examination:
             if refused := _of_kind(Refused, replies):
                 advice = "deploy the same holdfast and problem at both ends"
                 raise _LayerError(f"{refused.code}: {refused.text}", advice)
-            if _of_kind(NeedState, replies):
-                other = "comes to another state than this robot"
-                raise _LayerError(f"the service {other}, with the same code", _DISTRUST)
             if answer_in(replies) != decision.answer:
                 other = "answers otherwise than this robot's own planner"
+                if _of_kind(NeedState, replies):
+                    other = "comes to another state than this robot"
                 raise _LayerError(f"the service {other}, with the same code", _DISTRUST)
         self._decision_s = took_s, decision.took_s
         described = own[0].request.session_configuration

@@ -69,11 +69,9 @@ class EnvironmentMaker:
         self._seed = seed
         self._class = environment_class
         self._arguments = dict(arguments or {})
-        self._provided = (
-            ()
-            if environment_class is None
-            else _provided_parameters(name, environment_class, self._arguments)
-        )
+        self._provided: tuple[str, ...] = ()
+        if environment_class is not None:
+            self._provided = _provided_parameters(name, environment_class, self._arguments)
 
     def __call__(
         self, trial: int, *, resumed: bool = False, performed: Sequence[FloatArray] = ()
@@ -101,9 +99,7 @@ class EnvironmentMaker:
         )
         require_methods(environment, self.name)
         made: Environment = environment
-        if self._sense_in_background:
-            return SenseInBackground(made)
-        return made
+        return SenseInBackground(made) if self._sense_in_background else made
 
 
 def load_environment(configuration: Configuration, option: str | None = None) -> EnvironmentMaker:

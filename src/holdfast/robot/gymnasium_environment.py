@@ -150,12 +150,8 @@ class GymnasiumEnvironment:
         self._observation = self._reader(observation, "observation")
         self._motion_noise = _deviations(motion_noise, "motion_noise")
         self._observation_noise = _deviations(observation_noise, "observation_noise")
-        self._success_key: str | None = None
-        self._success: Callable[..., Any] | None = None
-        if isinstance(success, str) and ":" not in success:
-            self._success_key = success
-        elif success is not None:
-            self._success = _function(success, "success")
+        named = isinstance(success, str) and ":" not in success
+        self._success = success if success is None or named else _function(success, "success")
 
         self._steps = 0
         self._ending: Ending | None = None
@@ -235,37 +231,34 @@ class GymnasiumEnvironment:
             self.environment.close()
 
     def _ended(self, *, terminated: bool, truncated: bool) -> Ending | None:
-        found: Any = False
-        if self._success is not None:
+        if callable(self._success):
             found = self._success(self.environment, self._seen, self.info)
-        elif self._success_key == _TERMINATED:
-            found = terminated
-        elif self._success_key is not None:
-            found = self.info.get(self._success_key, False)
+        else:
+            found = (
+                terminated if self._success == _TERMINATED else self.info.get(self._success or "")
+            )
         if isinstance(found, Ending):
             return found
         if bool(found):
             return Ending("succeeded")
+        hint = self._missing_key()
         if terminated:
-            unsaid = self._success_key is None and self._success is None
-            hint = "; success is not defined" if unsaid else ""
-            hint += self._missing_key()
+            hint = "; success is not defined" if self._success is None else hint
             return Ending("failed", f"{self._name} terminated without success{hint}")
         if truncated:
-            hint = self._missing_key()
             return Ending("truncated", f"{self._name} truncated after {self._steps} steps{hint}")
         return None
 
     def _missing_key(self) -> str:
         """Return in words that ``info`` has no such key as ``success``; empty if it has."""
-        key = self._success_key
-        if key in (None, _TERMINATED, *self.info):
+        key = self._success
+        if not isinstance(key, str) or key in (_TERMINATED, *self.info):
             return ""
         from holdfast.validation import close_match
 
         keys = [str(each) for each in self.info]
         there = ", ".join(keys) or "nothing"
-        return f"; info has no {key}{close_match(str(key), keys)}; it has {there}"
+        return f"; info has no {key}{close_match(key, keys)}; it has {there}"
 
     def _translated(self, task_action: FloatArray) -> Any:
         from gymnasium import spaces
@@ -334,11 +327,9 @@ class GymnasiumEnvironment:
         return readers, [_deviations(each, f"sensing_noise[{n}]") for n, each in enumerate(noise)]
 
     def _reader(self, given: Any, key: str) -> Callable[..., Any] | list[int] | None:
-        if given is None:
-            return None
         if callable(given) or isinstance(given, str):
             return _function(given, key)
-        return self._indices(given, key)
+        return None if given is None else self._indices(given, key)
 
     def _indices(self, given: Any, key: str) -> list[int]:
         from gymnasium import spaces

@@ -27,7 +27,7 @@ from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.frames import CALL, END, LAST, REPLY, Frame, Hello
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.robot_end import StreamRobotTransport
-from holdfast.transport.schemes import load_scheme
+from holdfast.transport.schemes import link_maker
 from holdfast.transport.tls import TlsStream
 
 _GREETING_S: Final = 3.0
@@ -107,9 +107,8 @@ class AddressPath(LinkOwner):
         robot = StreamRobotTransport(
             {}, name=self._robot, incarnation=os.urandom(8).hex(), lease_ms=_LEASE_MS
         )
-        self._link = load_scheme(endpoint.protocol).make_link(
-            self, robot.settings, self.tls, role="robot"
-        )
+        make_link = link_maker(endpoint.protocol, "robot")
+        self._link = make_link(self, robot.settings, tls=self.tls)
         await self._link.connect(self._stream)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_GREETING_S):

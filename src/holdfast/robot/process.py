@@ -25,7 +25,6 @@ from holdfast.config.user_code import account_of_user_error, describe_problem_er
 from holdfast.errors import DEFECT, HeldError, HoldfastError, TrialError, defect_fields
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import PlanningState
-from holdfast.problems.problem import Problem
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.events import (
     Abandon,
@@ -52,7 +51,6 @@ from holdfast.protocol.events import (
 from holdfast.protocol.question import DecisionSource, InProcessSource
 from holdfast.protocol.records import Record, TrialHistory, replay
 from holdfast.protocol.robot import Robot
-from holdfast.protocol.status import Status
 from holdfast.robot.ending_signals import ending_signals
 from holdfast.robot.environment_maker import EnvironmentMaker
 from holdfast.robot.environment_runner import EnvironmentRunner, make_runner
@@ -190,37 +188,22 @@ class RobotProcess:
                 distrusted,
             )
 
-        def another_problem() -> Problem:
-            return Configuration.from_plain(configuration.plain()).problem
-
         self._own = OwnPlanner(
-            lambda: links.make_planner(another_problem(), configuration.planning),
+            lambda: links.make_planner(
+                Configuration.from_plain(configuration.plain()).problem, configuration.planning
+            ),
             functools.partial(describe_problem_error, configuration.problem_name),
             self._happens,
             self._fail,
             may_be_brief=":" not in configuration.problem_name,
         )
         self._planner = links.make_planner(problem, configuration.planning)
-        self._robot = Robot(self._planner, simulator, dispatcher, rate_hz, configuration.lost)
-
-    @property
-    def missed_ticks(self) -> int:
-        """Ticks of the rate at which the robot was not ready."""
-        return self._robot.missed_ticks
-
-    @property
-    def status(self) -> Status:
-        """Who decides."""
-        return self._robot.status
-
-    @property
-    def unexplained_observations(self) -> int:
-        """Those of the current trial; 0 between two trials."""
-        return self._robot.unexplained_observations
+        # Who decides, the observations of the current trial that nothing explains, missed ticks.
+        self.robot = Robot(self._planner, simulator, dispatcher, rate_hz, configuration.lost)
 
     def condition(self) -> Condition:
         """Return the robot's condition."""
-        robot = self._robot
+        robot = self.robot
         if self._interrupted is not None or self._verifying:
             return Condition("ending", False, robot.trial)
         if robot.is_holding:
@@ -253,7 +236,7 @@ class RobotProcess:
         sys.setswitchinterval(_SWITCH_INTERVAL_S)
         try:
             if self._watch is not None:
-                loop.run_until_complete(self._watch.start(self.condition, self._robot))
+                loop.run_until_complete(self._watch.start(self.condition, self.robot))
             with ending_signals(loop, self._interrupt):
                 loop.call_soon(self._start)
                 loop.run_forever()
@@ -290,7 +273,7 @@ class RobotProcess:
     def _salvage(self) -> None:
         """Journal all known facts before an error ends the run."""
         with contextlib.suppress(HoldfastError):
-            for effect in self._robot.salvage():
+            for effect in self.robot.salvage():
                 self._journal.append(effect.trial, effect.records)
 
     def _where(self) -> str:
@@ -299,7 +282,7 @@ class RobotProcess:
             return f"trial {self._replayed} (seed {seed}), as the journal has it"
         if self._starting is not None:
             return f"trial {self._starting[0]} (seed {seed})"
-        return f"trial {self._robot.trial} (seed {seed}), step {self._robot.step}"
+        return f"trial {self.robot.trial} (seed {seed}), step {self.robot.step}"
 
     def _interrupt(self, number: int | None, within_s: float | None = None) -> None:
         """Ask for an end in order, from any thread or a signal's handler."""
@@ -315,7 +298,7 @@ class RobotProcess:
             if self._transport is not None:
                 self._transport.start(self._hear)
             self._now = monotonic()
-            self._carry_out(self._robot.start(self._now))
+            self._carry_out(self.robot.start(self._now))
             self._begin_next()
         self._go_on()
 
@@ -350,7 +333,7 @@ class RobotProcess:
         with self._errors():
             if wake and not self._ended:
                 self._now = max(self._now, now)
-                self._carry_out(self._robot.wake(self._now))
+                self._carry_out(self.robot.wake(self._now))
             while not self._ended and (self._happened or self._own.compute_brief()):
                 if now - began > self._turn_s:
                     self._go_on_soon()
@@ -365,7 +348,7 @@ class RobotProcess:
             self._stop_loop()
             return
         self._listens_since = now
-        self._wake_at = wake_at = self._robot.next_wakeup()
+        self._wake_at = wake_at = self.robot.next_wakeup()
         # A timer that fires too early does no harm.
         if wake_at is not None and (self._timer is None or wake_at < self._timer.when()):
             if self._timer is not None:
@@ -374,7 +357,7 @@ class RobotProcess:
 
     def _event_loop_stalled(self, seconds: float) -> None:
         if seconds > _LOOP_STALL_S:
-            self._robot.event_loop_stalled(seconds)
+            self.robot.event_loop_stalled(seconds)
 
     @contextlib.contextmanager
     def _errors(self) -> Iterator[None]:
@@ -427,7 +410,7 @@ class RobotProcess:
         return self._loop
 
     def _handle(self, event: _Happening, now: float) -> None:
-        robot = self._robot
+        robot = self.robot
         if isinstance(event, _Interrupted):
             self._interrupted = self._interrupted or event
             if event.within_s is not None:
@@ -490,7 +473,7 @@ class RobotProcess:
                 raise effect.error
 
     def _report_order(self, order: Act | Sense) -> None:
-        if self._on_order is not None and (state := self._robot.state) is not None:
+        if self._on_order is not None and (state := self.robot.state) is not None:
             self._on_order(state, order)
 
     def _end_trial(self, result: TrialResult) -> None:
@@ -526,7 +509,7 @@ class RobotProcess:
         else:
             following = next((n for n in self._numbers if n not in self._finished), None)
             if following is None:
-                left = self._robot.num_unverified
+                left = self.robot.num_unverified
                 if left:
                     self._events.event(
                         "verifying", reason=f"{left} answers are still being computed again"

@@ -10,11 +10,7 @@ from holdfast.planning.outcome import TrialResult
 from holdfast.robot.trial import NULL_OBSERVER, TrialObserver
 from holdfast.robot.trial_pool import Arm, TrialPool, available_cores
 
-__all__ = [
-    "TrialError",
-    "available_cores",
-    "run_trials",
-]
+__all__ = ["TrialError", "available_cores", "run_trials"]
 
 
 def run_trials(
@@ -24,20 +20,10 @@ def run_trials(
     on_result: Callable[[TrialResult], None],
     observer: TrialObserver = NULL_OBSERVER,
 ) -> None:
-    """Run the trials of a configuration that are not yet finished.
+    """Run the trials of a configuration that are not ``finished``, in at most ``jobs`` processes.
 
+    ``on_result`` is called in this process with each result as soon as it is there, in any order.
     Raises what :meth:`TrialPool.run` raises; KeyboardInterrupt after the workers have been ended.
-
-    Parameters
-    ----------
-    jobs : int
-        Largest number of processes; 1 runs all trials in this one. Changes time only.
-    finished : collection of int
-        Numbers of the trials to leave out.
-    on_result : callable
-        Called in this process with the result of each trial as soon as it is there, in any order.
-    observer : TrialObserver
-        See :class:`TrialPool`.
     """
     num_trials = configuration.simulator.num_trials
     finished = finished if isinstance(finished, (set, frozenset, range)) else set(finished)

@@ -138,31 +138,28 @@ def _measure(problem: Any, one_s: float, own: dict[str, Any]) -> None:
 
 def _sensed(problem: Any, number: int, few: FloatArray, many: FloatArray) -> tuple[CallCost, int]:
     """Return what the predictions of a sensing action take, and the size of its observation."""
-    random = stream(0, 0, 0, Purpose.HYPOTHESES)
-    if has_general_observations(problem):
-        shown = checked.sample_observation(problem, few[0], number, random)
-        if has_batched_likelihoods(problem):
-            several = np.repeat(shown[np.newaxis], _BATCH, axis=0)
+    if not has_general_observations(problem):
 
-            def sense_several(states: FloatArray) -> None:
-                for _ in range(_BATCH):
-                    problem.sample_observation(states[0], number, random.anew())
-                problem.log_likelihoods(states, number, several)
-
-            cost = _measured(sense_several, few, many)
-            return CallCost(cost.call_s / _BATCH, cost.state_s / _BATCH), shown.size
-
-        def sense(states: FloatArray) -> None:
-            problem.sample_observation(states[0], number, random.anew())
-            problem.log_likelihood(states, number, shown)
-    else:
-        shown = problem.observation_mean(few, number)
-
-        def sense(states: FloatArray) -> None:
+        def predict(states: FloatArray) -> None:
             problem.observation_mean(states, number)
             problem.observation_variance(states, number)
 
-    return _measured(sense, few, many), int(shown.shape[-1])
+        size = int(problem.observation_mean(few, number).shape[-1])
+        return _measured(predict, few, many), size
+    random = stream(0, 0, 0, Purpose.HYPOTHESES)
+    shown = checked.sample_observation(problem, few[0], number, random)
+    together, judge, judged = 1, problem.log_likelihood, shown
+    if has_batched_likelihoods(problem):
+        together, judge = _BATCH, problem.log_likelihoods
+        judged = np.repeat(shown[np.newaxis], _BATCH, axis=0)
+
+    def sense(states: FloatArray) -> None:
+        for _ in range(together):
+            problem.sample_observation(states[0], number, random.anew())
+        judge(states, number, judged)
+
+    cost = _measured(sense, few, many)
+    return CallCost(cost.call_s / together, cost.state_s / together), shown.size
 
 
 def _measured(call: Callable[[FloatArray], object], few: FloatArray, many: FloatArray) -> CallCost:

@@ -8,8 +8,7 @@ process would load it at its start, while robots may wait: 45 ms.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import msgspec
@@ -17,7 +16,7 @@ import msgspec
 from holdfast import __version__
 from holdfast.protocol.messages import PROTOCOL_VERSION
 from holdfast.protocol.service_limits import ServiceStatistics
-from holdfast.runtime.exposition import Durations, exposition, require_prometheus
+from holdfast.runtime.exposition import Durations, exposition
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
@@ -103,80 +102,72 @@ def summed(reports: Iterable[ServiceReport]) -> ServiceReport:
     return total
 
 
-class Exposition:
-    """Writes a service's report in Prometheus's text format.
+def service_exposition(
+    name: str, report: ServiceReport, processes: Sequence[int], *, is_ready: bool = True
+) -> bytes:
+    """Return a service's report in Prometheus's text format.
 
-    ``processes`` returns the ids of the processes whose memory and time are summed, this process
-    first. Raises a MetricsError if ``prometheus_client`` is not installed.
+    The memory and time of the processes are summed; this process is the first.
     """
+    return exposition(_families(name, report, is_ready), processes)
 
-    def __init__(
-        self, name: str, processes: Callable[[], Sequence[int]] = lambda: (os.getpid(),)
-    ) -> None:
-        require_prometheus()
-        self._name = name
-        self._processes = processes
 
-    def text(self, report: ServiceReport, *, is_ready: bool = True) -> bytes:
-        """Return the metrics."""
-        return exposition(self._families(report, is_ready), self._processes())
+def _families(name: str, report: ServiceReport, is_ready: bool) -> Iterator[Metric]:
+    from prometheus_client.core import (
+        CounterMetricFamily,
+        GaugeMetricFamily,
+        HistogramMetricFamily,
+    )
 
-    def _families(self, report: ServiceReport, is_ready: bool) -> Iterator[Metric]:
-        from prometheus_client.core import (
-            CounterMetricFamily,
-            GaugeMetricFamily,
-            HistogramMetricFamily,
+    now, times = report.statistics, report.times
+    build = GaugeMetricFamily(
+        "holdfast_build_info",
+        "Version of holdfast and of its protocol, and the service's name.",
+        labels=["version", "protocol", "service"],
+    )
+    build.add_metric([__version__, str(PROTOCOL_VERSION), name], 1)
+    yield build
+    yield GaugeMetricFamily("holdfast_ready", "Whether robots are welcome.", int(is_ready))
+    if report.certificate_expires_s is not None:
+        yield GaugeMetricFamily(
+            "holdfast_certificate_expiry_timestamp_seconds",
+            "When the certificate in use expires, in seconds since 1970.",
+            report.certificate_expires_s,
         )
-
-        now, times = report.statistics, report.times
-        build = GaugeMetricFamily(
-            "holdfast_build_info",
-            "Version of holdfast and of its protocol, and the service's name.",
-            labels=["version", "protocol", "service"],
+        yield GaugeMetricFamily(
+            "holdfast_credentials_stale",
+            "Processes that could not read changed credentials: they use the previous ones, "
+            "and know of no later revocation.",
+            report.stale_credentials,
         )
-        build.add_metric([__version__, str(PROTOCOL_VERSION), self._name], 1)
-        yield build
-        yield GaugeMetricFamily("holdfast_ready", "Whether robots are welcome.", int(is_ready))
-        if report.certificate_expires_s is not None:
-            yield GaugeMetricFamily(
-                "holdfast_certificate_expiry_timestamp_seconds",
-                "When the certificate in use expires, in seconds since 1970.",
-                report.certificate_expires_s,
-            )
-            yield GaugeMetricFamily(
-                "holdfast_credentials_stale",
-                "Processes that could not read changed credentials: they use the previous ones, "
-                "and know of no later revocation.",
-                report.stale_credentials,
-            )
-        decisions = CounterMetricFamily(
-            "holdfast_decisions", "Parts of answers computed.", labels=["kind"]
-        )
-        decisions.add_metric(["task"], now.task_parts)
-        decisions.add_metric(["sensing"], now.sensing_parts)
-        yield decisions
-        seconds = HistogramMetricFamily(
-            "holdfast_decision_seconds", "Time to compute a decision.", labels=["kind"]
-        )
-        seconds.add_metric(["task"], times.task.cumulative(), times.task.sum_s)
-        seconds.add_metric(["sensing"], times.sensing.cumulative(), times.sensing.sum_s)
-        yield seconds
-        yield HistogramMetricFamily(
-            "holdfast_wait_seconds",
-            "Time for which a decision waited for its turn.",
-            buckets=times.waited.cumulative(),
-            sum_value=times.waited.sum_s,
-        )
-        refusals = CounterMetricFamily(
-            "holdfast_refusals", "Requests refused, by code.", labels=["code"]
-        )
-        for code, count in sorted(now.refusals.items()):
-            refusals.add_metric([code], count)
-        yield refusals
-        for field, text in _COUNTERS:
-            yield CounterMetricFamily(f"holdfast_{field}", text, getattr(now, field))
-        for field, name, text in _GAUGES:
-            yield GaugeMetricFamily(f"holdfast_{name}", text, getattr(now, field))
-        yield CounterMetricFamily(
-            "holdfast_process_restarts", "Processes of the service started again.", report.restarts
-        )
+    decisions = CounterMetricFamily(
+        "holdfast_decisions", "Parts of answers computed.", labels=["kind"]
+    )
+    decisions.add_metric(["task"], now.task_parts)
+    decisions.add_metric(["sensing"], now.sensing_parts)
+    yield decisions
+    seconds = HistogramMetricFamily(
+        "holdfast_decision_seconds", "Time to compute a decision.", labels=["kind"]
+    )
+    seconds.add_metric(["task"], times.task.cumulative(), times.task.sum_s)
+    seconds.add_metric(["sensing"], times.sensing.cumulative(), times.sensing.sum_s)
+    yield seconds
+    yield HistogramMetricFamily(
+        "holdfast_wait_seconds",
+        "Time for which a decision waited for its turn.",
+        buckets=times.waited.cumulative(),
+        sum_value=times.waited.sum_s,
+    )
+    refusals = CounterMetricFamily(
+        "holdfast_refusals", "Requests refused, by code.", labels=["code"]
+    )
+    for code, count in sorted(now.refusals.items()):
+        refusals.add_metric([code], count)
+    yield refusals
+    for field, text in _COUNTERS:
+        yield CounterMetricFamily(f"holdfast_{field}", text, getattr(now, field))
+    for field, gauge, text in _GAUGES:
+        yield GaugeMetricFamily(f"holdfast_{gauge}", text, getattr(now, field))
+    yield CounterMetricFamily(
+        "holdfast_process_restarts", "Processes of the service started again.", report.restarts
+    )

@@ -77,15 +77,12 @@ class ProblemFactory:
         name = session_configuration.problem
         if name not in self._digests:
             self._digests[name] = problem_digest(found, registry.problem_module(name))
+        theirs, code = session_configuration.problem_digest, "the digest of the problem's code"
         differences = [
             f"{what} is {here} on this service, {there or 'not told'} on the robot"
             for what, here, there in (
                 ("holdfast", self._core_version, session_configuration.core_version),
-                (
-                    "the digest of the problem's code",
-                    self._digests[name],
-                    session_configuration.problem_digest,
-                ),
+                (code, self._digests[name], theirs),
             )
             if here != there
         ]

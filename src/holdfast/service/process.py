@@ -157,7 +157,7 @@ def _serve_supervised(options: ServeOptions, parent: int, descriptor: int) -> in
         if supervised.has_served:
             raise
         # The supervisor reports it, once.
-        supervised.failed(str(error))
+        supervised.tell(str(error)[:4000])
         return 2
 
 
@@ -432,13 +432,14 @@ async def _watched(
     if options.health is not None:
         offered["health"] = options.health, {"/livez": alive, "/readyz": ready}
     if options.metrics is not None:
-        from holdfast.runtime.exposition import CONTENT_TYPE
-        from holdfast.service.metrics import Exposition
+        from holdfast.runtime.exposition import CONTENT_TYPE, require_prometheus
+        from holdfast.service.metrics import service_exposition
 
-        exposition = Exposition(options.name, processes)
+        require_prometheus()
 
         async def metrics() -> Page:
-            text = exposition.text(report(), is_ready=why_not_ready() is None)
+            is_ready = why_not_ready() is None
+            text = service_exposition(options.name, report(), processes(), is_ready=is_ready)
             return Page(200, text, CONTENT_TYPE)
 
         offered["metrics"] = options.metrics, {"/metrics": metrics}

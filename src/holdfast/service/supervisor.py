@@ -48,7 +48,6 @@ _FIRST_DELAY_S, _LAST_DELAY_S = 0.2, 30.0
 _CHECK_INTERVAL_S = 0.01
 
 _MAX_MESSAGE_BYTES = 65_536
-_MAX_TEXT = 4000
 
 
 class Supervised:
@@ -67,12 +66,8 @@ class Supervised:
         self.tell(report())
         asyncio.get_running_loop().call_later(_REPORT_EVERY_S, self.start, report)
 
-    def failed(self, text: str) -> None:
-        """Report why this process cannot serve."""
-        self.tell(text[:_MAX_TEXT])
-
     def tell(self, message: ServiceReport | str) -> None:
-        """Send a report, or a failure."""
+        """Send a report, or why this process cannot serve."""
         # A dropped report is no loss: the next one has all counters.
         with contextlib.suppress(BlockingIOError, BrokenPipeError, ConnectionResetError):
             os.write(self._descriptor, msgspec.msgpack.encode(message))
@@ -185,8 +180,8 @@ class Supervisor:
         """Return why no process takes robots; None if one does."""
         if self._stopping.done():
             return "draining"
-        reasons = [report.why_not_ready for report in self._reports()]
-        return None if None in reasons else next(iter(reasons), "starting")
+        reasons = [report.why_not_ready for report in self._reports()] or ["starting"]
+        return None if None in reasons else reasons[0]
 
     def why_not_alive(self) -> str | None:
         """Return which process is stuck; None if none is."""
@@ -220,13 +215,16 @@ class Supervisor:
         while not self._stopping.done():
             started_at = monotonic()
             fields = {}
-            try:
-                child, control = self._start()
-            except OSError as error:
-                reason = f"cannot be started: {error.strerror}"
-            else:
-                fields["pid"] = child.process.pid
-                with control:
+            control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            with control:
+                control.setblocking(False)
+                try:
+                    with theirs:
+                        child = self._start(theirs.fileno())
+                except OSError as error:
+                    reason = f"cannot be started: {error.strerror}"
+                else:
+                    fields["pid"] = child.process.pid
                     reason = await self._until_it_ends(child, control)
             if self._stopping.done():
                 return
@@ -238,30 +236,23 @@ class Supervisor:
             self._past.restarts += 1
             await asyncio.wait([self._stopping], timeout=delay_s)
 
-    def _start(self) -> tuple[_Child, socket.socket]:
-        """Start a process; return it and the socket that gets its reports."""
-        control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        control.setblocking(False)
+    def _start(self, reports: int) -> _Child:
+        """Start a process that sends its reports to a descriptor."""
         descriptors = self._listening.descriptors
-        with theirs:
-            try:
-                process = subprocess.Popen(
-                    [
-                        *self._command,
-                        f"--supervised={os.getpid()},{theirs.fileno()}",
-                        f"--sockets={','.join(map(str, descriptors))}",
-                    ],
-                    stdin=subprocess.DEVNULL,
-                    pass_fds=[theirs.fileno(), *descriptors],
-                    # A terminal's Ctrl-C is the supervisor's to answer.
-                    start_new_session=True,
-                )
-            except OSError:
-                control.close()
-                raise
+        process = subprocess.Popen(
+            [
+                *self._command,
+                f"--supervised={os.getpid()},{reports}",
+                f"--sockets={','.join(map(str, descriptors))}",
+            ],
+            stdin=subprocess.DEVNULL,
+            pass_fds=[reports, *descriptors],
+            # A terminal's Ctrl-C is the supervisor's to answer.
+            start_new_session=True,
+        )
         child = _Child(process)
         self._living.append(child)
-        return child, control
+        return child
 
     async def _until_it_ends(self, child: _Child, control: socket.socket) -> str:
         """Take a process's reports until it ends; return how it ended."""

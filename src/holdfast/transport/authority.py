@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Sequence
 from datetime import datetime, timedelta
 from ipaddress import ip_address
@@ -21,6 +22,7 @@ try:
     from cryptography.exceptions import InvalidSignature
     from cryptography.hazmat.primitives import hashes
     from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.hazmat.primitives.asymmetric.types import CertificatePublicKeyTypes
     from cryptography.hazmat.primitives.serialization import (
         Encoding,
         NoEncryption,
@@ -91,7 +93,7 @@ class Authority(NamedTuple):
         name: str,
         role: Role,
         hosts: Sequence[str],
-        public_key: ec.EllipticCurvePublicKey,
+        public_key: CertificatePublicKeyTypes,
         now: datetime,
         end: datetime,
     ) -> x509.Certificate:
@@ -144,7 +146,7 @@ class Authority(NamedTuple):
 def _builder(
     subject: x509.Name,
     issuer: x509.Name,
-    public_key: ec.EllipticCurvePublicKey,
+    public_key: CertificatePublicKeyTypes,
     begin: datetime,
     end: datetime,
     *,
@@ -177,11 +179,10 @@ def _builder(
 
 def is_signed_by(authority: x509.Certificate, certificate: x509.Certificate) -> bool:
     """Return whether an authority has signed a certificate."""
-    try:
+    with contextlib.suppress(ValueError, TypeError, InvalidSignature):
         certificate.verify_directly_issued_by(authority)
-    except (ValueError, TypeError, InvalidSignature):
-        return False
-    return True
+        return True
+    return False
 
 
 def read_revocations(
@@ -209,17 +210,9 @@ def new_key() -> ec.EllipticCurvePrivateKey:
 
 def key_belongs_to(path: Path, certificate: x509.Certificate) -> bool:
     """Return whether a file has the key of a certificate."""
-    try:
-        key = load_pem_private_key(read_file(path), None)
-    except (ValueError, TypeError):
-        return False
-    return key.public_key() == certificate.public_key()
-
-
-def public_key_of(certificate: x509.Certificate) -> ec.EllipticCurvePublicKey | None:
-    """Return a certificate's key; None if it is not of an elliptic curve."""
-    key = certificate.public_key()
-    return key if isinstance(key, ec.EllipticCurvePublicKey) else None
+    with contextlib.suppress(ValueError, TypeError):
+        return load_pem_private_key(read_file(path), None).public_key() == certificate.public_key()
+    return False
 
 
 def common_name_of(certificate: x509.Certificate) -> str:
@@ -285,11 +278,9 @@ def key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 def is_host(host: str) -> bool:
     """Return whether a certificate can name this host."""
-    try:
-        parse_host(f"[{host}]" if ":" in host else host)
-    except TransportError:
-        return False
-    return True
+    with contextlib.suppress(TransportError):
+        return bool(parse_host(f"[{host}]" if ":" in host else host))
+    return False
 
 
 def normal_host(host: str) -> str:

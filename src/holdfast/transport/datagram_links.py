@@ -27,7 +27,7 @@ from time import thread_time
 from typing import Any, Final
 
 from holdfast.errors import FrameError, KeysExhaustedError
-from holdfast.transport.datagram_cipher import AssociationKeys, DatagramCipher, require_cryptography
+from holdfast.transport.datagram_cipher import AssociationKeys, DatagramCipher
 from holdfast.transport.datagram_sockets import (
     DATAGRAMS_AT_ONCE,
     LARGEST_DATAGRAM,
@@ -36,7 +36,6 @@ from holdfast.transport.datagram_sockets import (
     connected_socket,
     reported_errors,
 )
-from holdfast.transport.endpoints import Role
 from holdfast.transport.exchanges import (
     ECHO,
     MESSAGE_OVERHEAD,
@@ -61,7 +60,6 @@ from holdfast.transport.link_settings import SLICE_S, LinkSettings
 from holdfast.transport.links import Link, LinkOwner, ends_link
 from holdfast.transport.redundancy import Paths
 from holdfast.transport.return_path import SECRET_BYTES, ReturnPath
-from holdfast.transport.schemes import Scheme
 from holdfast.transport.tls import TlsStream
 
 _KEYS: Final = struct.Struct(">I32s32sH")
@@ -553,32 +551,3 @@ class ServiceDatagramLink(_DatagramLink):
                 self._socket.close()
                 self._sockets.pop(self._socket.address, None)
         super()._notify_owner()
-
-
-class DatagramScheme(Scheme):
-    """``udp``: datagrams beside a TLS stream; raises as :func:`require_cryptography` does."""
-
-    def __init__(self) -> None:
-        require_cryptography()
-        # Of a service, one at each address that robots have called: the reply of a socket bound to
-        # all addresses might come from another one, and the robot would ignore it.
-        self._sockets: dict[Any, DatagramSocket] = {}
-
-    def make_link(
-        self,
-        owner: LinkOwner,
-        settings: LinkSettings,
-        tls: TlsStream | None,
-        *,
-        role: Role,
-    ) -> Link:
-        """Make the link of a new connection."""
-        assert tls is not None
-        if role == "robot":
-            return RobotDatagramLink(owner, settings, tls=tls)
-        return ServiceDatagramLink(owner, settings, tls=tls, sockets=self._sockets)
-
-    def close(self) -> None:
-        """Close the service's sockets. May be repeated."""
-        while self._sockets:
-            self._sockets.popitem()[1].close()

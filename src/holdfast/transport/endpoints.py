@@ -47,26 +47,9 @@ _MAX_LABEL = 63
 _INTERFACE = re.compile(r"[!-~]{1,15}")
 _NUMBERS = re.compile(r"[0-9.]+")
 
+PROTOCOLS = "tcp", "tls", "udp", "unix"
 
-class SchemeEntry(NamedTuple):
-    """The properties of a scheme that do not need its implementation."""
-
-    implementation: str  # MODULE:CLASS, a Scheme
-    is_encrypted: bool = False  # and both ends authenticate by a certificate
-    place: Literal["address", "path"] = "address"  # HOST:PORT or a path
-
-
-_STREAMS = "holdfast.transport.schemes:Scheme"
-
-SCHEMES = {
-    "tcp": SchemeEntry(_STREAMS),
-    "tls": SchemeEntry(_STREAMS, is_encrypted=True),
-    "udp": SchemeEntry("holdfast.transport.datagram_links:DatagramScheme", is_encrypted=True),
-    "unix": SchemeEntry(_STREAMS, place="path"),
-}
-"""The protocols of endpoints."""
-
-_ALLOWED = f"{', '.join([*SCHEMES][:-1])} and {[*SCHEMES][-1]}"
+_ALLOWED = "tcp, tls, udp and unix"
 
 
 class TlsFiles(msgspec.Struct, frozen=True):
@@ -120,12 +103,12 @@ class Endpoint(NamedTuple):
     @property
     def is_encrypted(self) -> bool:
         """Whether both ends are authenticated and the link is encrypted."""
-        return SCHEMES[self.protocol].is_encrypted
+        return self.protocol in ("tls", "udp")
 
     @property
     def is_local_socket(self) -> bool:
         """Whether this is a local socket."""
-        return SCHEMES[self.protocol].place == "path"
+        return self.protocol == "unix"
 
     @property
     def is_loopback(self) -> bool:
@@ -152,10 +135,10 @@ class Endpoint(NamedTuple):
 def parse_endpoint(text: str) -> Endpoint:
     """Read ``PROTOCOL/HOST:PORT``, with an IPv6 address in brackets, or another endpoint.
 
-    Raises TransportError if it is none, or its protocol is not in :data:`SCHEMES`.
+    Raises TransportError if it is none, or its protocol is not in :data:`PROTOCOLS`.
     """
     protocol, slash, place = text.partition("/")
-    if protocol[:-1] in SCHEMES and protocol.endswith(":") and place.startswith("/"):
+    if protocol[:-1] in PROTOCOLS and protocol.endswith(":") and place.startswith("/"):
         raise TransportError(
             f"endpoint {text!r} is a URL: write {protocol[:-1]}/{place.removeprefix('/')}"
         )
@@ -164,22 +147,17 @@ def parse_endpoint(text: str) -> Endpoint:
             f"endpoint {text!r} does not begin with a protocol: allowed are {_ALLOWED}, "
             f"as in tcp/127.0.0.1:7447"
         )
-    if protocol not in SCHEMES:
+    if protocol not in PROTOCOLS:
         instead = _RENAMED.get(protocol)
         if instead is None:
-            instead = did_you_mean(protocol, SCHEMES).removeprefix("; ")
+            instead = did_you_mean(protocol, PROTOCOLS).removeprefix("; ")
         raise TransportError(
             f"endpoint {text!r}: protocol {protocol} is not allowed"
             + (f" ({instead})" if instead else "")
             + f"; allowed are {_ALLOWED}, as in tcp/127.0.0.1:7447"
         )
-    if "?" in place or "#" in place:
-        raise TransportError(
-            f"endpoint {text!r}: options after '?' or '#' are not allowed; "
-            f"give the place alone, as in tcp/127.0.0.1:7447"
-        )
-    if SCHEMES[protocol].place == "path":
-        return _local_socket(text, protocol, place)
+    if protocol == "unix":
+        return _local_socket(text, place)
     host, colon, port_text = place.rpartition(":")
     if not colon or place.endswith("]"):
         raise TransportError(
@@ -270,11 +248,10 @@ def check_credentials(endpoint: Endpoint, tls: TlsFiles | None) -> None:
         )
 
 
-def _local_socket(text: str, protocol: str, path: str) -> Endpoint:
+def _local_socket(text: str, path: str) -> Endpoint:
     if not path.strip("/"):
         raise TransportError(
-            f"endpoint {text!r} has no path: write {protocol}/PATH, "
-            f"as in {protocol}//run/holdfast/s"
+            f"endpoint {text!r} has no path: write unix/PATH, as in unix//run/holdfast/s"
         )
     size = len(path.encode("utf-8", "surrogateescape"))
     if size > MAX_SOCKET_PATH_BYTES:
@@ -282,7 +259,7 @@ def _local_socket(text: str, protocol: str, path: str) -> Endpoint:
             f"endpoint {text!r}: a path of {size} bytes; a local socket's has at most "
             f"{MAX_SOCKET_PATH_BYTES}"
         )
-    return Endpoint(protocol, path, 0)
+    return Endpoint("unix", path, 0)
 
 
 def _address_of(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:

@@ -46,7 +46,6 @@ from holdfast.transport.authority import (
     key_pem,
     new_key,
     normal_host,
-    public_key_of,
     read_certificate,
     read_file,
     read_revocations,
@@ -219,33 +218,26 @@ def make_credentials(
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
         raise CredentialsError(f"{directory}: cannot be created: {error.strerror}") from error
+    trusted = {AUTHORITY_FILE: NewFile(certificate_pem(authority.certificate), _PUBLIC_FILE)}
     if authority_is_new:
-        create_directory_atomically(
-            home,
-            {
-                AUTHORITY_FILE: NewFile(certificate_pem(authority.certificate), _PUBLIC_FILE),
-                AUTHORITY_KEY_FILE: NewFile(key_pem(authority.key), _PRIVATE_FILE),
-            },
-        )
+        key = NewFile(key_pem(authority.key), _PRIVATE_FILE)
+        create_directory_atomically(home, {**trusted, AUTHORITY_KEY_FILE: key})
     # Recorded first: a certificate without a record could not be revoked by its name.
     issued = _read_issued(directory, authority.certificate)
     _write_issued(home, [*issued, *(_issued(each.certificate) for each in parties)])
     for party in parties:
         place = party.made.directory
+        files = {CERTIFICATE_FILE: NewFile(certificate_pem(party.certificate), _PUBLIC_FILE)}
         if party.key is None:
-            replace_file(place / CERTIFICATE_FILE, certificate_pem(party.certificate), _PUBLIC_FILE)
+            replace_file(place / CERTIFICATE_FILE, *files[CERTIFICATE_FILE])
+            continue
+        files |= {**trusted, KEY_FILE: NewFile(key_pem(party.key), _PRIVATE_FILE)}
+        if (home / REVOKED_FILE).exists():
+            files[REVOKED_FILE] = NewFile(read_file(home / REVOKED_FILE), _PUBLIC_FILE)
+        if _first_file_of(place) is None:
+            create_directory_atomically(place, files)
         else:
-            files = {
-                AUTHORITY_FILE: NewFile(certificate_pem(authority.certificate), _PUBLIC_FILE),
-                CERTIFICATE_FILE: NewFile(certificate_pem(party.certificate), _PUBLIC_FILE),
-                KEY_FILE: NewFile(key_pem(party.key), _PRIVATE_FILE),
-            }
-            if (home / REVOKED_FILE).exists():
-                files[REVOKED_FILE] = NewFile(read_file(home / REVOKED_FILE), _PUBLIC_FILE)
-            if _first_file_of(place) is None:
-                create_directory_atomically(place, files)
-            else:
-                _rotate(place, files)
+            _rotate(place, files)
     return KeyRing(
         home / AUTHORITY_KEY_FILE,
         authority.certificate.not_valid_after_utc,
@@ -367,8 +359,8 @@ def _present(directory: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
     }
     if not found:
         raise CredentialsError(f"{directory}: has no certificates to renew")
-    services = tuple(name for name, role in found.items() if role == "service")
-    return tuple(name for name in found if name not in services), services
+    robots = [name for name, role in found.items() if role != "service"]
+    return tuple(robots), tuple(name for name in found if name not in robots)
 
 
 def _old_certificate(place: Path, role: Role, authority: Authority) -> x509.Certificate:
@@ -377,7 +369,7 @@ def _old_certificate(place: Path, role: Role, authority: Authority) -> x509.Cert
     old = read_certificate(path)
     if not is_signed_by(authority.certificate, old):
         raise CredentialsError(f"{path}: is not of the authority in {place.parent}")
-    if role_of(old) != role or public_key_of(old) is None:
+    if role_of(old) != role:
         raise CredentialsError(f"{path}: is not a {role}'s certificate, so it is left alone")
     return old
 
@@ -395,17 +387,13 @@ def _party(
 ) -> _Party:
     """Certify a new party, or one that has a certificate: with its key or with a new one."""
     key = new_key() if old is None or rotate else None
-    if key is not None:
-        public_key: ec.EllipticCurvePublicKey | None = key.public_key()
-    else:
-        assert old is not None
-        public_key = public_key_of(old)
-    assert public_key is not None
+    certified = key or old
+    assert certified is not None
     reached_at: tuple[str, ...] = ()
     if role == "service":
         before = _hosts_of_this_machine() if old is None else hosts_of(old)
         reached_at = tuple(dict.fromkeys(map(normal_host, (*before, *hosts))))
-    certificate = authority.certify(place.name, role, reached_at, public_key, now, end)
+    certificate = authority.certify(place.name, role, reached_at, certified.public_key(), now, end)
     made = MadeCredentials(place.name, role, place, reached_at, end, key is None)
     return _Party(made, certificate, key)
 

@@ -96,15 +96,10 @@ class _Holder(Protocol):
     """A link, as far as a :class:`MemoryBudget` knows it."""
 
     @property
-    def owner(self) -> object:
-        """Whose share it takes."""
-
+    def owner(self) -> object: ...
     @property
-    def unsent_bytes(self) -> int:
-        """What waits for the other end to read."""
-
-    def end(self, reason: str, *, abort: bool = False) -> None:
-        """End it."""
+    def unsent_bytes(self) -> int: ...
+    def end(self, reason: str, *, abort: bool = False) -> None: ...
 
 
 class MemoryBudget:

@@ -74,26 +74,21 @@ def revoked_serials(path: Path) -> frozenset[int]:
 
 def _serials(der: bytes) -> Iterator[int]:
     """Yield the serial numbers in a list (RFC 5280, section 5.1)."""
-    ((tag, whole),) = _values(der)
-    _expect(tag, _SEQUENCE)
-    tag, signed = next(_values(whole))
-    _expect(tag, _SEQUENCE)
-    fields = list(_values(signed))
-    tags = [tag for tag, _ in fields]
+    ((_, whole),) = _values(der, _SEQUENCE)
+    signed, *_ = _values(whole)
     # Version, algorithm, issuer, one or two times, then the entries if there are any.
-    at = next(index for index, tag in enumerate([*tags, _TIMES[0]]) if tag in _TIMES)
-    while at < len(fields) and tags[at] in _TIMES:
-        at += 1
-    if at < len(fields) and tags[at] == _SEQUENCE:
-        for tag, entry in _values(fields[at][1]):
-            _expect(tag, _SEQUENCE)
-            tag, serial = next(_values(entry), (0, b""))
-            _expect(tag, _INTEGER)
+    fields = list(_values(signed[1]))
+    times = [index for index, (tag, _) in enumerate(fields) if tag in _TIMES]
+    for tag, entries in fields[times[-1] + 1 :][:1]:
+        for _, entry in _values(entries, _SEQUENCE) if tag == _SEQUENCE else ():
+            (tag, serial), *_ = _values(entry)
+            if tag != _INTEGER:
+                raise ValueError(f"an entry that begins with the tag {tag:#04x}")
             yield int.from_bytes(serial, "big", signed=True)
 
 
-def _values(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield tags and contents of consecutive DER values."""
+def _values(data: bytes, expected: int | None = None) -> Iterator[tuple[int, bytes]]:
+    """Yield tags and contents of consecutive DER values, which all have the expected tag."""
     at = 0
     while at < len(data):
         tag, size = data[at], data[at + 1]
@@ -106,10 +101,7 @@ def _values(data: bytes) -> Iterator[tuple[int, bytes]]:
             at += count
         if at + size > len(data):
             raise ValueError(f"a value of {size} bytes where {len(data) - at} are left")
+        if expected not in (None, tag):
+            raise ValueError(f"a value with the tag {tag:#04x} where {expected:#04x} belongs")
         yield tag, data[at : at + size]
         at += size
-
-
-def _expect(tag: int, expected: int) -> None:
-    if tag != expected:
-        raise ValueError(f"a value with the tag {tag:#04x} where {expected:#04x} belongs")

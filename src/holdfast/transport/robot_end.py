@@ -35,7 +35,7 @@ from holdfast.transport.endpoints import (
 from holdfast.transport.frames import CALL, END, LAST, REPLY, Frame, Hello, encode_hello
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
-from holdfast.transport.schemes import load_scheme
+from holdfast.transport.schemes import link_maker
 from holdfast.transport.tls import ClientCredentials, TlsStream
 
 _PAUSE_S = 0.004
@@ -52,10 +52,6 @@ _NO_DATAGRAMS = "none gets through, so everything goes on the TLS stream; is UDP
 
 _MAX_REPORTED_REASONS = 8
 """Reasons that are not reported again; bounded, as a service may send a new one each time."""
-
-
-def _unheard(_name: str, **_fields: object) -> None:
-    """Log nothing."""
 
 
 class StreamRobotTransport:
@@ -84,7 +80,7 @@ class StreamRobotTransport:
         # robot or is another one (recent reasons are not repeated until it has appeared);
         # ``no_datagrams`` with ``service`` and ``reason``, once for each; ``credentials`` with
         # ``reason``, when replaced ones cannot be used.
-        on_event: Callable[..., None] = _unheard,
+        on_event: Callable[..., None] = lambda _, **__: None,
     ) -> None:
         if name:
             check_name("name of a robot", name)
@@ -159,14 +155,11 @@ class StreamRobotTransport:
 
     async def close(self, timeout_s: float = 1.0) -> None:
         """Close all links, within this time whatever the other ends do. May be repeated."""
-        closing = self._stop()
-        if closing:
-            await asyncio.wait(closing, timeout=timeout_s)
-
-    def _stop(self) -> list[asyncio.Future[None]]:
         self._closed = True
         self.calls.close()
-        return [closing for service in self._services.values() for closing in service.stop()]
+        closing = [each for service in self._services.values() for each in service.stop()]
+        if closing:
+            await asyncio.wait(closing, timeout=timeout_s)
 
     def _service(self, service: str) -> _ServiceLinks:
         try:
@@ -191,7 +184,7 @@ class _ServiceLinks(LinkOwner):
         self._name = name
         self._endpoint = endpoint
         self._credentials = credentials
-        self._scheme = None if endpoint is None else load_scheme(endpoint.protocol)
+        self._maker = None if endpoint is None else link_maker(endpoint.protocol, "robot")
         self._dialer: Dialer | None = None
         # To a launched process that has said nothing yet.
         self._silent: socket.socket | None = None
@@ -278,12 +271,12 @@ class _ServiceLinks(LinkOwner):
     # -- links -----------------------------------------------------------------------------------
 
     def _make_link(self) -> Link:
-        assert self._endpoint is not None and self._scheme is not None
+        assert self._endpoint is not None and self._maker is not None
         tls = None
         if self._credentials is not None:
             context = self._credentials.context()
             tls = TlsStream(context, self._endpoint.host, self._incarnation)
-        link = self._scheme.make_link(self, self._robot.settings, tls, role="robot")
+        link = self._maker(self, self._robot.settings, tls=tls)
         self._made[link] = None
         return link
 

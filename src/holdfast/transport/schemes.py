@@ -1,47 +1,28 @@
-"""What implements a scheme of endpoints: ``tcp``, ``tls``, ``udp``, ``unix``.
-
-Both ends make links through a :class:`Scheme`. The class itself is that of plain stream sockets. A
-new transport is a subclass of it in a module of its own, and a line in
-:data:`~holdfast.transport.endpoints.SCHEMES`, which names the class. It is imported only where an
-endpoint uses it, because a service should start fast.
-"""
+"""The links of each protocol: streams, for ``udp`` with datagrams beside them."""
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from functools import partial
 
-from holdfast.transport.endpoints import SCHEMES, Role
-from holdfast.transport.links import Link, LinkOwner
-
-if TYPE_CHECKING:
-    from holdfast.transport.link_settings import LinkSettings
-    from holdfast.transport.tls import TlsStream
+from holdfast.transport.endpoints import Role
+from holdfast.transport.links import Link
 
 
-def load_scheme(name: str) -> Scheme:
-    """Import and make the implementation of a scheme, for one end of a transport.
+def link_maker(protocol: str, role: Role) -> Callable[..., Link]:
+    """Return what makes the links of new connections: ``make(owner, settings, tls=stream)``.
 
-    Raises TransportError if it needs a package that is not installed.
+    The robot opens the connections. Raises TransportError if a package is missing.
     """
-    module, _, class_name = SCHEMES[name].implementation.partition(":")
-    made: Scheme = getattr(importlib.import_module(module), class_name)()
-    return made
+    if protocol != "udp":
+        return partial(Link, speaks_first=role == "robot")
+    # Imported only where an endpoint uses it, because a service should start fast.
+    from holdfast.transport.datagram_cipher import require_cryptography
+    from holdfast.transport.datagram_links import RobotDatagramLink, ServiceDatagramLink
 
-
-class Scheme:
-    """Stream sockets: ``tcp``, ``tls`` and ``unix``."""
-
-    def make_link(
-        self,
-        owner: LinkOwner,
-        settings: LinkSettings,
-        tls: TlsStream | None,
-        *,
-        role: Role,
-    ) -> Link:
-        """Make the link of a new connection, which the robot has opened."""
-        return Link(owner, settings, speaks_first=role == "robot", tls=tls)
-
-    def close(self) -> None:
-        """Close what the links of this end share. May be repeated."""
+    require_cryptography()
+    if role == "robot":
+        return RobotDatagramLink
+    # One socket at each address that robots have called: the reply of a socket bound to all
+    # addresses might come from another one, and the robot would ignore it.
+    return partial(ServiceDatagramLink, sockets={})

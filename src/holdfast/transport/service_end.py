@@ -40,7 +40,7 @@ from holdfast.transport.frames import (
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.listener import MAX_SILENT, Listener, connection_to_drop
-from holdfast.transport.schemes import load_scheme
+from holdfast.transport.schemes import link_maker
 
 if TYPE_CHECKING:
     import ssl
@@ -140,7 +140,7 @@ class StreamServiceTransport(LinkOwner):
         # exception that no code here expects has ended a link; ``link_refused`` with ``reason``
         # and, if known, ``robot``; ``robot_connected`` with ``robot``; ``robot_disconnected`` with
         # ``robot`` and ``reason``. Each has the robot's ``address``, None over a local socket.
-        on_event: Callable[..., None] | None = None,
+        on_event: Callable[..., None] = lambda _, **__: None,
     ) -> None:
         check_name("name of a service", name)
         check_name("incarnation of a service", incarnation)
@@ -149,9 +149,7 @@ class StreamServiceTransport(LinkOwner):
             check_credentials(endpoint, tls)
         self._robot = robot
         self._shared: Sequence[socket.socket | None] = shared or [None] * len(listen)
-        self._schemes = {
-            endpoint.protocol: load_scheme(endpoint.protocol) for endpoint in self._listen
-        }
+        self._makers = {at.protocol: link_maker(at.protocol, "service") for at in self._listen}
         self._incarnation = incarnation
         self._max_links = MAX_LINKS if max_links is None else max_links
         self._tls = tls
@@ -237,8 +235,6 @@ class StreamServiceTransport(LinkOwner):
             self._end(link)
         if self._closing:
             await asyncio.wait(self._closing, timeout=timeout_s)
-        for scheme in self._schemes.values():
-            scheme.close()
         if self._robot is not None:
             self._robot.close()
 
@@ -314,7 +310,7 @@ class StreamServiceTransport(LinkOwner):
 
             assert self._context is not None
             tls = TlsStream(self._context)
-        link = self._schemes[endpoint.protocol].make_link(self, self._settings, tls, role="service")
+        link = self._makers[endpoint.protocol](self, self._settings, tls=tls)
         self._add(link, network)
         link.begin(connection)
 
@@ -365,7 +361,7 @@ class StreamServiceTransport(LinkOwner):
         """Take a robot's hello."""
         self._without_hello.pop(link, None)
         self._links[link] = set()
-        self._report("robot_connected", robot=_name(link, hello), address=link.address)
+        self._on_event("robot_connected", robot=_name(link, hello), address=link.address)
 
     def on_frame(self, link: Link, frame: Frame) -> None:
         """Take a request."""
@@ -394,7 +390,7 @@ class StreamServiceTransport(LinkOwner):
 
     def on_defect(self, link: Link, error: Exception) -> None:
         """Report an exception."""
-        self._report(DEFECT, robot=_certified(link), address=link.address, **defect_fields(error))
+        self._on_event(DEFECT, robot=_certified(link), address=link.address, **defect_fields(error))
 
     def on_ended(self, link: Link) -> None:
         """Note that a link has ended."""
@@ -407,15 +403,11 @@ class StreamServiceTransport(LinkOwner):
         if calls is not None and link.hello is not None:
             reason = link.reason or (_SAID_GOODBYE if link.said_goodbye else _NO_GOODBYE)
             robot = _name(link, link.hello)
-            self._report("robot_disconnected", robot=robot, reason=reason, address=link.address)
+            self._on_event("robot_disconnected", robot=robot, reason=reason, address=link.address)
         elif link.reason:
             fields = {"robot": link.peer.name} if link.peer is not None else {}
-            self._report("link_refused", reason=link.reason, address=link.address, **fields)
+            self._on_event("link_refused", reason=link.reason, address=link.address, **fields)
         self._resolve_if_all_gone()
-
-    def _report(self, name: str, **fields: object) -> None:
-        if self._on_event is not None:
-            self._on_event(name, **fields)
 
 
 def _certified(link: Link) -> str | None:

@@ -171,13 +171,13 @@ class RunSegment:
     def status(self) -> str:
         """Who decides."""
         process = self._process
-        return "" if process is None else process.status.value
+        return "" if process is None else process.robot.status.value
 
     @property
     def unexplained_observations(self) -> int:
         """Those of the trial that is running."""
         process = self._process
-        return 0 if process is None else process.unexplained_observations
+        return 0 if process is None else process.robot.unexplained_observations
 
     def pause(self, why: str, within_s: float) -> None:
         """End in order, from any thread: :attr:`ended` says when. Only the first call counts.
