@@ -365,7 +365,7 @@ def paced(context: Context) -> Result:
                 configuration = configuration_for(own, num_trials=num_trials, services=services)
                 notebook = Notebook()
                 robot = run_robot(configuration, own, notebook, RATE_HZ)
-                missed[kind] += robot.missed_ticks
+                missed[kind] += robot.robot.missed_ticks
                 for each in notebook.decided:
                     timing = each.timing
                     if timing.step == 0:

@@ -110,7 +110,7 @@ def test_what_ends_or_hangs_the_process(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(check_process, "PATIENCE_S", 2.0)
-    name, budget = written(tmp_path, kind, move), "1000" if kind == "Thread" else "0.1"
+    name, budget = written(tmp_path, kind, move), "0.1" if kind == "Slow" else "1000"
     assert main([name, "--problem-directory", str(tmp_path), "-q", "--budget", budget]) == code
     shown = " ".join(capsys.readouterr().out.split())
     assert seen in shown
