@@ -37,10 +37,10 @@ def test_outcomes(runs: Path) -> None:
     assert head == "random against first, 6 trials paired by number:"
     assert columns.split() == ["baseline", "run", "effect", "95%", "interval"]
     assert [row.split("  ")[1] for row in rows[:4]] == [
-        "success",
-        "steps, geometric mean",
-        "reward, mean",
-        "decision time, median",
+        "success (%)",
+        "steps",
+        "reward",
+        "decision (ms)",
     ]
     assert rows[-2].endswith("counts as its limit, 40 steps.")
 

@@ -68,7 +68,7 @@ def test_a_crash_is_a_failure_in_every_table_and_truncated_is_neither(tmp_path: 
         journal.close()
     compared = holdfast(tmp_path, "compare", "--outcomes", "cut", "crash")
     (line,) = (line for line in compared.stdout.splitlines() if line.startswith("  failed"))
-    assert line.split()[1:4] == ["0.0%", "100.0%", "+100.0"]
+    assert line.split()[1:5] == ["(%)", "0", "100", "+100"]
 
 
 def test_after_a_kill_the_episode_is_where_it_was(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ from holdfast.errors import LostJournalError, OutputError
 
 JOURNAL_NAME = "journal.bin"
 OLD_JOURNAL_NAME = "journal.sqlite"
-"""Of earlier versions; :mod:`holdfast.recording.old_journal` reads it."""
+"""Name of the journal of earlier versions; :mod:`holdfast.recording.old_journal` reads it."""
 
 Survives: TypeAlias = Literal["process_crash", "power_cut"]
 """What a journalled step survives; see :class:`holdfast.planning.settings.RecoverySettings`."""

@@ -189,8 +189,9 @@ class OutcomeComparison(Table, msgspec.Struct, frozen=True, kw_only=True):
         apart = "measured at different moments, so not compared (holdfast sweep takes turns)."
         verdicts = {each.verdict for run in self.runs for each in run.effects}
         return [
-            "steps: the geometric mean fits ratios (the summary has the arithmetic one); a trial "
-            f"that did not reach the goal counts as its limit, {self.step_limit:,} steps.",
+            "steps: the geometric mean, which fits ratios (the summary has the mean of the steps "
+            "that were made); a trial that did not reach the goal counts as its limit, "
+            f"{self.step_limit:,} steps.",
             *[f"decision (ms): {apart}"] * ("not judged" in verdicts),
             f"intervals: {self.level:.0%}, {self.method}, each by itself.",
         ]
