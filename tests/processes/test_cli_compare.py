@@ -42,7 +42,7 @@ def test_outcomes(runs: Path) -> None:
         "reward",
         "decision (ms)",
     ]
-    assert rows[-2].endswith("counts as its limit, 40 steps.")
+    assert rows[-3].endswith("counts as its limit, 40 steps.")
 
 
 def test_json(runs: Path) -> None:
