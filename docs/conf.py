@@ -88,7 +88,7 @@ def adapt(app: Any, page: str, source: list[str]) -> None:
     path = ROOT / PAGES[page] if page in PAGES else DOCS / f"{page}.md"
     if not path.is_file():
         return  # made by autosummary
-    text = path.read_text(encoding="utf-8")
+    text = path.read_text(encoding="utf-8") if page in PAGES else source[0]
     here = (DOCS / page).parent
     own = {(ROOT / file).resolve(): DOCS / f"{name}.md" for name, file in PAGES.items()}
 

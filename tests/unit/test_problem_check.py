@@ -361,6 +361,16 @@ def test_what_is_wrong_is_named(kind: str) -> None:
         assert not [each for each in found if each.severity == E]
 
 
+class WeakAlone(Gaussian):
+    deviations = (0.01, 2.0)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 6])
+def test_what_a_sensor_alone_shows_is_not_dominated(seed: int) -> None:
+    """However sharp another one is: the few particles that it leaves show it by chance."""
+    assert not [each for each in check(WeakAlone(), seed=seed) if "dominated" in each.seen]
+
+
 @pytest.fixture
 def examples() -> Iterator[None]:
     sys.path.insert(0, str(EXAMPLES))

@@ -35,9 +35,9 @@ from holdfast.recording.journal_file import (
     encode,
     packed,
     steps_payload,
-    synchronize_directory,
 )
 from holdfast.recording.journal_reader import SESSION_SIZE, JournalReader
+from holdfast.runtime.files import synchronize
 
 __all__ = ["Journal"]
 
@@ -93,7 +93,7 @@ class Journal(JournalReader):
             journal._on_disk = journal._file.fill(entries)
             journal._read_all()
             os.link(unfinished, path)
-            synchronize_directory(path.parent)
+            synchronize(path.parent)  # its new name survives a power cut
         except BaseException as error:
             journal.close()
             if isinstance(error, FileExistsError):

@@ -282,15 +282,6 @@ def find_journal(run: Path, purpose: str) -> Path:
     return run
 
 
-def synchronize_directory(path: Path) -> None:
-    """Make a new name in a directory survive a power cut."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def boot_id() -> str | None:
     """Return the identity of this boot of the machine, None if there is none."""
     try:

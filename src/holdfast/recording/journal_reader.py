@@ -38,8 +38,8 @@ SESSION_SIZE = 16
 """Bytes that identify a run."""
 
 
-_decode_records = msgspec.msgpack.Decoder(list[Record]).decode
-_decode_result = msgspec.msgpack.Decoder(TrialResult).decode
+decode_records = msgspec.msgpack.Decoder(list[Record]).decode
+decode_result = msgspec.msgpack.Decoder(TrialResult).decode
 _decode_decisions = msgspec.msgpack.Decoder(Decisions).decode
 
 
@@ -176,7 +176,7 @@ class JournalReader:
         for payload, end in self._file.frames(position):
             entry = decode_entry(payload)
             if isinstance(entry, Steps) and entry.trial == trial:
-                records += _decode_records(entry.records)
+                records += decode_records(entry.records)
             if end.offset >= self._end.offset or (
                 isinstance(entry, Finished) and entry.trial == trial
             ):
@@ -228,7 +228,7 @@ class JournalReader:
         with _errors(self.path):
             for trial in sorted(self._results):
                 entry = self._result_of(trial)
-                result = _decode_result(entry.result)
+                result = decode_result(entry.result)
                 if result.trial != trial:
                     raise damaged(self.path, f"trial {trial} has the result of {result.trial}")
                 if with_decisions:

@@ -41,7 +41,7 @@ from holdfast.recording.facts import (
     TrialEndFact,
 )
 from holdfast.recording.journal_file import JOURNAL_NAME, Finished, Steps
-from holdfast.recording.journal_reader import JournalReader
+from holdfast.recording.journal_reader import JournalReader, decode_records, decode_result
 from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME
 from holdfast.recording.step_times import events_of
 from holdfast.recording.timings import TimingRow, timings_of
@@ -226,11 +226,9 @@ class RunFiles:
             follower.records(begun.trial, begun.records, now_ns)
         for entry in entries:
             if isinstance(entry, Steps):
-                records = msgspec.msgpack.decode(entry.records, type=list[Record])
-                follower.records(entry.trial, records, now_ns)
+                follower.records(entry.trial, decode_records(entry.records), now_ns)
             elif isinstance(entry, Finished):
-                result = msgspec.msgpack.decode(entry.result, type=TrialResult)
-                follower.finished(result, now_ns)
+                follower.finished(decode_result(entry.result), now_ns)
 
 
 class _Lines:

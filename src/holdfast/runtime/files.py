@@ -252,12 +252,17 @@ def move_into_place(made: Path, path: Path) -> None:
     """Write a file, or a directory of files, through to the disk, and rename it to its path."""
     with _refusals(path, "written"):
         for file in sorted(made.iterdir()) if made.is_dir() else [made]:
-            descriptor = os.open(file, os.O_RDONLY | os.O_CLOEXEC)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+            synchronize(file)
         made.rename(path)
+
+
+def synchronize(path: Path) -> None:
+    """Write a file, or the names in a directory, through to the disk; OSError if that fails."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _remove_tree(directory: Path) -> None:
