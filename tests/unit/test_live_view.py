@@ -86,7 +86,7 @@ def test_a_view_that_does_not_end_is_waited_for_so_long(
     views: Any, notes: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(live_view, "_CLOSE_S", 0.1)
-    views(hang).close()
+    views(hang).__exit__()
     assert notes[0] == "the view was not complete 0.1 s after the run"
 
 

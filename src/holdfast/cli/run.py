@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from holdfast.journal.tables import RunSummary
     from holdfast.planning.outcome import TrialResult
     from holdfast.robot.environment_maker import EnvironmentMaker
-    from holdfast.robot.recomputing import resume_run, resume_run_if_begun
     from holdfast.runtime.events import EventSink
     from holdfast.runtime.service_manager import ServiceManager
 
@@ -80,6 +79,7 @@ def _run(options: RunOptions) -> int:
     from holdfast.reports.belief_remarks import belief_remarks
     from holdfast.reports.recorder import Recorder
     from holdfast.robot.environment_maker import load_environment
+    from holdfast.robot.recomputing import resume_run, resume_run_if_begun
     from holdfast.robot.trials import available_cores, run_trials
     from holdfast.runtime.service_manager import ServiceManager
 

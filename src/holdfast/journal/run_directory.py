@@ -17,7 +17,7 @@ import stat
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Self, TypeAlias
 
 import msgspec
 
@@ -89,18 +89,11 @@ _MAX_UNUSED_BYTES = 1 << 22
 """Bound on a journal that holds a configuration and no trial."""
 
 
-class ComputeAgain(Protocol):
-    """Computes recorded decisions again; see :func:`holdfast.robot.recomputing.compute_again`."""
-
-    def __call__(
-        self,
-        journal: JournalReader,
-        configuration: Configuration,
-        made_by: str,
-        earlier: Sequence[EarlierCode],
-        on_progress: Callable[[int, int], None],
-    ) -> EarlierCode:
-        """Return what earlier code has decided, or raise DecidedOtherwiseError."""
+ComputeAgain: TypeAlias = Callable[
+    [JournalReader, Configuration, str, Sequence[EarlierCode], Callable[[int, int], None]],
+    EarlierCode,
+]
+"""Computes recorded decisions again: :func:`holdfast.robot.recomputing.compute_again`."""
 
 
 class RunDirectory:
