@@ -186,9 +186,7 @@ class OutcomeComparison(Table, msgspec.Struct, frozen=True, kw_only=True):
         return f"trials {'paired by number' if self.paired else 'not paired'}"
 
     def _definitions(self) -> list[str]:
-        apart = (
-            "not judged, for the runs need not have been measured in turns (a sweep's table is)."
-        )
+        apart = "not judged: the runs may have been measured apart (a sweep's own table is not)."
         verdicts = {each.verdict for run in self.runs for each in run.effects}
         return [
             "steps: the geometric mean, which fits ratios (the summary has the mean of the steps "
