@@ -30,6 +30,7 @@ from holdfast.robot.robot_run import perform_trials
 
 TRIALS = 12
 KILL_AFTER_S = (0.002, 0.12)
+"""From the fork; longer each time that nothing was written, for a machine may be busy."""
 SEED = 20261126
 Seen: TypeAlias = tuple[dict[int, str], tuple[int, list[Any]] | None]
 CONFIGURATION = {
@@ -92,11 +93,12 @@ def main() -> None:
         configuration = hf.load_configuration(file)
         expected = undisturbed(configuration)
         while done < kills:
-            run, is_over = Path(folder, f"run-{runs}"), False
+            run, is_over, fruitless = Path(folder, f"run-{runs}"), False, 0
             before: Seen = {}, None
             while not is_over and done < kills:
                 process = child(run, configuration)
-                time.sleep(draw.uniform(*KILL_AFTER_S))
+                least, most = KILL_AFTER_S
+                time.sleep(draw.uniform(least, most * 1.3**fruitless))
                 os.kill(process, signal.SIGKILL)
                 _, status = os.waitpid(process, 0)
                 is_over = os.WIFEXITED(status)
@@ -105,6 +107,7 @@ def main() -> None:
                 after = seen(run)
                 require_kept(before, after)
                 torn += after != before and not is_over
+                fruitless = 0 if after != before else fruitless + 1
                 before = after
                 if done % 500 == 0 and not is_over:
                     print(f"{done:,} kills, {runs} runs finished", flush=True)
