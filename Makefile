@@ -131,7 +131,7 @@ wheel: $(INSTALLED_DEV) ## dist/: the sources, and a wheel for machines of this 
 	rm -rf $(DIST)/unrepaired
 	SOURCE_DATE_EPOCH=$(RELEASED) $(BIN)/python -m build --outdir $(DIST)/lab lab
 
-sbom: $(INSTALLED_DEV) ## dist/holdfast-VERSION.cdx.json: what the images' environment is made of, with licences
+sbom: $(INSTALLED_DEV) ## dist/holdfast-sensing-VERSION.cdx.json: what the images' environment is made of, with licences
 	$(BIN)/python deploy/sbom.py $(DIST)
 
 requirements: $(INSTALLED_DEV) ## deploy/*requirements.txt anew: the versions and digests that images are made of
@@ -169,7 +169,9 @@ $(INSTALLED_TOOLS): pyproject.toml | $(BIN)/python
 
 # With tools that stay where they are, only what has changed is compiled: pip's own are elsewhere
 # each time, and then so is all that CMake remembers.
+# An environment from before the distribution was called holdfast-sensing still has it as holdfast.
 $(INSTALLED_KERNEL): pyproject.toml $(NATIVE_SOURCES) | $(INSTALLED_TOOLS)
+	@$(BIN)/python -m pip uninstall -q -y holdfast 2>/dev/null
 	@cmake/pip_install $(BIN)/python $(VENV)/pip.log --no-build-isolation --no-deps -e .
 	@touch $@
 
@@ -177,17 +179,17 @@ $(INSTALLED_KERNEL): pyproject.toml $(NATIVE_SOURCES) | $(INSTALLED_TOOLS)
 INSTALL_LAB = @cmake/pip_install $(BIN)/python $(VENV)/pip.log --no-build-isolation --no-deps -e lab
 
 $(INSTALLED_FIGURES): $(INSTALLED_KERNEL) lab/pyproject.toml
-	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[figures,service]"
+	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast-sensing[figures,service]"
 	$(INSTALL_LAB)
 	@touch $@
 
 $(INSTALLED_DEV): $(INSTALLED_KERNEL) lab/pyproject.toml $(wildcard ros/*/setup.py)
-	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[dev]" -e ros/ros1_master_guard -e ros/holdfast_ros
+	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast-sensing[dev]" -e ros/ros1_master_guard -e ros/holdfast_ros
 	$(INSTALL_LAB)
 	@touch $(INSTALLED_FIGURES) $@
 
 $(INSTALLED_DOCS): $(INSTALLED_FIGURES)
-	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast[docs]"
+	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast-sensing[docs]"
 	@touch $@
 
 # The sources are copied into it, so whatever of them changes is installed again.

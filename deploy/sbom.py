@@ -7,7 +7,7 @@ added. The packages of the base image are not in it: scan the image for those. :
 
     python deploy/sbom.py dist
 
-reads the wheel in ``dist`` and writes ``dist/holdfast-VERSION.cdx.json``.
+reads the wheel in ``dist`` and writes ``dist/holdfast-sensing-VERSION.cdx.json``.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from cyclonedx.validation.json import JsonStrictValidator
 __all__ = ["complete", "licences", "main"]
 
 ROOT = Path(__file__).parents[1]
+NAME = "holdfast-sensing"
 
 
 def main(directory: Path) -> None:
@@ -36,11 +37,11 @@ def main(directory: Path) -> None:
         install = ("-m", "pip", "--python", str(python), "install", "-q")
         _run(*install, "--require-hashes", "-r", str(ROOT / "deploy/requirements.txt"))
         # By a name, which is looked for in the directory alone: the list has no path of ours.
-        _run(*install, "--no-deps", "--no-index", "--find-links", str(directory), "holdfast")
+        _run(*install, "--no-deps", "--no-index", "--find-links", str(directory), NAME)
         _run(*install[:4], "check")
         scan = ("-m", "cyclonedx_py", "environment", "--output-reproducible")
         bom = json.loads(_run(*scan, "--pyproject", str(ROOT / "pyproject.toml"), str(python)))
-        for native in Path(name).glob("lib/*/site-packages/holdfast-*/sboms/*.cdx.json"):
+        for native in Path(name).glob("lib/*/site-packages/holdfast_sensing-*/sboms/*.json"):
             complete(bom, json.loads(native.read_text(encoding="utf-8")))
     text = json.dumps(bom, indent=2, sort_keys=True) + "\n"
     if error := JsonStrictValidator(SchemaVersion.V1_6).validate_str(text):
@@ -50,7 +51,7 @@ def main(directory: Path) -> None:
         print(f"{component:32} {licence}")
     if silent := [component for component, licence in stated.items() if not licence]:
         sys.exit(f"these state no licence: {', '.join(silent)}; find it out before you release")
-    file = directory / f"holdfast-{bom['metadata']['component']['version']}.cdx.json"
+    file = directory / f"{NAME}-{bom['metadata']['component']['version']}.cdx.json"
     file.write_text(text, encoding="utf-8")
     print(f"{file}: {len(stated)} components of {wheel.name} and its environment")
 

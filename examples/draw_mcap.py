@@ -4,7 +4,7 @@ Everything is read back from the file, with rosbags and without ROS, so this is 
 how to evaluate such a file in Python. On the left is one moment in the frame `map`; on the right
 are topics over time::
 
-    pip install 'holdfast[mcap,figures]'
+    pip install 'holdfast-sensing[mcap,figures]'
     holdfast export RUN --mcap run.mcap
     python examples/draw_mcap.py run.mcap --trial 0 --step 48 --out run.png
 """

@@ -90,7 +90,7 @@ def test_it_fits_other_machines_and_brings_no_library(wheel: Path) -> None:
 def test_it_holds_the_package_and_nothing_else(wheel: Path) -> None:
     archive = zipfile.ZipFile(wheel)
     names = {name for name in archive.namelist() if not name.endswith("/")}
-    about = f"holdfast-{holdfast.__version__}.dist-info/"
+    about = f"holdfast_sensing-{holdfast.__version__}.dist-info/"
     (kernel,) = (name for name in names if name.endswith(".so"))
     assert kernel.startswith("holdfast/_kernel.")
     package = {name.removeprefix("src/") for name in _tracked("src")}

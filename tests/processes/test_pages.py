@@ -207,7 +207,7 @@ def test_extras_exist_and_keep_the_editable_installation(page: Page) -> None:
     if page is README:
         assert installed
         makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-        assert '"holdfast[figures,service]"' in makefile
+        assert '"holdfast-sensing[figures,service]"' in makefile
         assert " -e .\n" in makefile
 
 

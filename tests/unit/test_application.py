@@ -67,6 +67,21 @@ def test_errors_are_one_message_and_exit_code_2() -> None:
     assert done.stderr == "holdfast: error: missing.yaml: there is no such file\n"
 
 
+def test_another_package_of_the_name_is_told_of() -> None:
+    """Installed later, it puts its own ``holdfast/__init__.py`` over ours; removed, it takes it."""
+    program = """
+import importlib.util, sys, types
+theirs = types.ModuleType("holdfast")
+theirs.__path__ = importlib.util.find_spec("holdfast").submodule_search_locations
+sys.modules["holdfast"] = theirs
+import holdfast.cli
+holdfast.cli.main()
+"""
+    done = python(program, "--version")
+    assert done.returncode == 2
+    assert "pip uninstall holdfast; pip install --force-reinstall --no-deps" in done.stderr
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_in_order(number: signal.Signals) -> None:
     before = signal.getsignal(number)

@@ -788,7 +788,7 @@ class TestRefusals:
         place.run(PEG)
         monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
         said = place.export("--mcap", "run.mcap", code=2)
-        assert "MCAP files need the library rosbags: pip install 'holdfast[mcap]'" in said.stderr
+        assert "library rosbags: pip install 'holdfast-sensing[mcap]'" in said.stderr
         place.export("--csv", "tables")
 
     def test_an_empty_directory_may_be_there(self, place: Place, tmp_path: Path) -> None:

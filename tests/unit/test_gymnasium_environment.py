@@ -356,7 +356,9 @@ class TestWhatIsRefused:
 
     def test_gymnasium_is_not_installed(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, "gymnasium", None)
-        with pytest.raises(ConfigurationError, match=r"pip install 'holdfast\[gymnasium\]'"):
+        with pytest.raises(
+            ConfigurationError, match=r"pip install 'holdfast-sensing\[gymnasium\]'"
+        ):
             car()
 
 

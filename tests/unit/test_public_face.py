@@ -68,7 +68,8 @@ def test_importing_it_imports_nothing_else() -> None:
 
 def test_it_is_typed() -> None:
     assert (SOURCE.parent / "py.typed").is_file()
-    assert "Typing :: Typed" in importlib.metadata.metadata("holdfast").get_all("Classifier", [])
+    about = importlib.metadata.metadata("holdfast-sensing")
+    assert "Typing :: Typed" in about.get_all("Classifier", [])
 
 
 class TestMake:

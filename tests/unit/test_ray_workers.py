@@ -25,7 +25,9 @@ absent = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not install
 
 def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(InvalidValueError, match=r"Ray cannot be .*pip install 'holdfast\[ray\]'"):
+    with pytest.raises(
+        InvalidValueError, match=r"Ray cannot be .*pip install 'holdfast-sensing\[ray\]'"
+    ):
         RayCluster("auto")
 
 

@@ -68,7 +68,7 @@ def test_refusals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(OutputError, match="cannot be written"):
         Prices().to_csv(tmp_path / "missing" / "table.csv")
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(HoldfastError, match=r"needs pandas: pip install 'holdfast\[tune\]'"):
+    with pytest.raises(HoldfastError, match=r"to_pandas: pip install 'holdfast-sensing\[tune\]'"):
         Prices().to_pandas()
 
 

@@ -100,7 +100,11 @@ class Elsewhere(PegInHole2D):
     ("problem", "error", "message"),
     [
         (Locked, InvalidValueError, "Locked cannot be sent to worker processes: a lock; with jobs"),
-        (OfANotebook, InvalidValueError, r"needs cloudpickle: pip install 'holdfast\[tune\]', or"),
+        (
+            OfANotebook,
+            InvalidValueError,
+            r"needs cloudpickle: pip install 'holdfast-sensing\[tune\]', or",
+        ),
         (Elsewhere, TrialError, "peg_in_hole_2d cannot be made again in a worker process: ValueE"),
     ],
 )

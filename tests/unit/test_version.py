@@ -26,7 +26,7 @@ def test_all_files_tell_the_same_version() -> None:
         "lab/pyproject.toml": lab["version"],
         "CITATION.cff": str(citation["version"]),
         "CHANGELOG.md": newest[1],
-        "installed": metadata.version("holdfast"),
+        "installed": metadata.version("holdfast-sensing"),
         "installed, the laboratory": metadata.version("holdfast-lab"),
     } == dict.fromkeys(
         (
@@ -35,7 +35,7 @@ def test_all_files_tell_the_same_version() -> None:
         ),
         holdfast.__version__,
     )
-    assert lab["dependencies"] == [f"holdfast[figures,service]=={holdfast.__version__}"]
+    assert lab["dependencies"] == [f"holdfast-sensing[figures,service]=={holdfast.__version__}"]
     assert re.fullmatch(r"\d+\.\d+\.\d+", holdfast.__version__)
     assert citation["license"] == project["license"]
 

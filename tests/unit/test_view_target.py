@@ -49,5 +49,5 @@ def test_without_rerun_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) 
         raise PackageNotFoundError(name)
 
     monkeypatch.setattr(view_target, "version", lacking)
-    with pytest.raises(ViewError, match=r"pip install 'holdfast\[view\]'"):
+    with pytest.raises(ViewError, match=r"pip install 'holdfast-sensing\[view\]'"):
         require_rerun(ViewTarget(None, "run.rrd"))

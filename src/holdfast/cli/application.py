@@ -14,7 +14,7 @@ from types import ModuleType
 from typing import NamedTuple
 
 from holdfast.cli.exit_codes import EXIT_ERROR
-from holdfast.errors import OptionError
+from holdfast.errors import HoldfastError, OptionError
 
 __all__ = ["COMMANDS", "Command", "FoundCommand", "find_command"]
 
@@ -50,6 +50,12 @@ _ELSEWHERE = {
 }
 """Which package of this project adds a command, and its folders, for whoever lacks it."""
 
+_OVERWRITTEN = (
+    "another package, of the distribution holdfast, has overwritten or removed files of this one, "
+    "which is holdfast-sensing. Put them back: pip uninstall holdfast; pip install "
+    "--force-reinstall --no-deps holdfast-sensing"
+)
+
 _HELP = """\
 usage: holdfast [-h] [--version] COMMAND [ARGS]...
 
@@ -82,8 +88,11 @@ def find_command(arguments: Sequence[str]) -> FoundCommand:
     Raises
     ------
     HoldfastError
-        If there is none of that name, or its package is not here.
+        If there is none of that name, or its package is not here; or if another package of the
+        name ``holdfast`` lies over this one.
     """
+    if "_PLACES" not in vars(sys.modules["holdfast"]):
+        raise HoldfastError(_OVERWRITTEN)
     first = arguments[0] if arguments else ""
     if first in COMMANDS:
         return _in_module(importlib.import_module(COMMANDS[first].module))

@@ -64,7 +64,7 @@ def require_rosbags() -> None:
         import rosbags.rosbag2  # noqa: F401
     except ImportError as error:
         raise MissingRosbagsError(
-            "MCAP files need the library rosbags: pip install 'holdfast[mcap]'"
+            "MCAP files need the library rosbags: pip install 'holdfast-sensing[mcap]'"
         ) from error
 
 

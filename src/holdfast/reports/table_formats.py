@@ -64,7 +64,7 @@ class Table:
         try:
             import pandas as pd
         except ImportError as error:
-            raise HoldfastError("to_pandas needs pandas: pip install 'holdfast[tune]'") from error
+            raise HoldfastError("to_pandas: pip install 'holdfast-sensing[tune]'") from error
         return pd.DataFrame(list(self.rows()), columns=list(self.columns()))
 
     def to_csv(self, path: str | Path | None = None) -> str:

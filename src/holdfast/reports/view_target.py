@@ -60,7 +60,7 @@ def require_rerun(target: ViewTarget) -> None:
         version("rerun-sdk")
     except PackageNotFoundError as error:
         raise ViewError(
-            "a view needs Rerun, which is not installed: pip install 'holdfast[view]'"
+            "a view needs Rerun, which is not installed: pip install 'holdfast-sensing[view]'"
         ) from error
     if target.viewer == "" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ViewError(

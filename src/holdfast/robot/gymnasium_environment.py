@@ -388,7 +388,7 @@ def _made(
         import gymnasium
     except ImportError as error:
         raise ConfigurationError(
-            "GymnasiumEnvironment needs gymnasium: pip install 'holdfast[gymnasium]'"
+            "GymnasiumEnvironment needs gymnasium: pip install 'holdfast-sensing[gymnasium]'"
         ) from error
     if isinstance(env_id, gymnasium.Env):
         return env_id

@@ -448,7 +448,7 @@ _OF_THE_PROBLEM = ("problem", "problem_directory", "model", "state_space_planner
 
 _NEEDS_CLOUDPICKLE = (
     "a problem that a notebook or a script defines needs cloudpickle: pip install "
-    "'holdfast[tune]', or put its class into a module of its own, or use jobs=1"
+    "'holdfast-sensing[tune]', or put its class into a module of its own, or use jobs=1"
 )
 
 

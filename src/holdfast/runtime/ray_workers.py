@@ -50,7 +50,7 @@ class RayCluster:
             self.ray = importlib.import_module("ray")
         except ImportError as error:
             raise InvalidValueError(
-                f"Ray cannot be imported ({error}): pip install 'holdfast[ray]'"
+                f"Ray cannot be imported ({error}): pip install 'holdfast-sensing[ray]'"
             ) from error
 
     def __enter__(self) -> Self:
