@@ -81,6 +81,8 @@ class Question:
         digest: bytes,
         inputs: tuple[Input, ...],
         num_inputs: int,
+        # Whether the robot takes the task actions itself, and asks for the sensing action alone.
+        takes_tasks: bool = False,
     ) -> None:
         self.state = state
         self.digest = digest[:DIGEST_SIZE]
@@ -90,10 +92,12 @@ class Question:
         # Since when the robot waits for the answer; None if it does not.
         self.needed_at: float | None = None
         self.num_ordered = 0  # task actions of the answer that are performed or ordered
-        # task_actions, sensing: what the robot follows; None until it arrives.
-        self.task_actions: Sequence[FloatArray] | None = None
+        # task_actions, sensing: what the robot follows; None until it arrives. Of the actions that
+        # it takes itself, those so far.
+        self.takes_tasks = takes_tasks
+        self.task_actions: list[FloatArray] | None = [] if takes_tasks else None
         self.sensing: SensingAnswer | None = None
-        self.task_provenance: Provenance | None = None
+        self.task_provenance = Provenance(OWN_PLANNER, 0.0, 0.0) if takes_tasks else None
         self.sensing_provenance: Provenance | None = None
         self.check_decided = False  # whether a check by the own planner was ordered, or left out
         self.own: OwnAnswer | None = None  # the own planner's answer
@@ -181,6 +185,7 @@ class DecisionSource:
         self.tracker = StatusTracker()  # which service decides
         # Since when the robot holds still because no service is usable.
         self.holding_since: float | None = None
+        self.takes_tasks = False  # whether the robot takes task actions itself
         self.stopped = False  # whether this source has stopped the run
 
     @property
@@ -255,7 +260,7 @@ class InProcessSource(DecisionSource):
             return
         source = Provenance(OWN_PLANNER, now - self._asked_at, event.computed_s)
         if event.sensing_action is None:
-            question.task_actions = event.actions
+            question.task_actions = list(event.actions)
             question.task_provenance = source
             if question.sensing_step is not None:
                 assert event.ahead is not None

@@ -455,9 +455,16 @@ class Robot:
             question = self._source.question
             assert question is not None
             offset = 0
-        if question.task_actions is None:
+        actions = question.task_actions
+        if actions is None:
             self._await_answer(now)
             return
+        if offset == len(actions):
+            try:
+                actions.append(self._planner.choose_task_action(state)[0])
+            except HoldfastError as error:
+                self._stop(error)
+                return
         provenance = question.task_provenance
         if offset == 0 and provenance is not None and provenance is not self._timed_provenance:
             self._timed_provenance = provenance
@@ -465,7 +472,7 @@ class Robot:
         question.needed_at = None
         if not self._take_tick(now):
             return
-        action = question.task_actions[offset]
+        action = actions[offset]
         self._write(ActingRecord(state.step, encode_floats(action)))
         history = self._current_history
         history.pending = action
@@ -484,7 +491,12 @@ class Robot:
         history = self._current_history
         self._write()
         question = Question(
-            self._planner, history.state, state_digest, history.inputs, history.num_inputs
+            self._planner,
+            history.state,
+            state_digest,
+            history.inputs,
+            history.num_inputs,
+            self._source.takes_tasks,
         )
         self._source.ask(question, now)
 

@@ -89,14 +89,16 @@ class Verification:
     def take_tasks(
         self, question: Question, actions: Sequence[FloatArray], provenance: Provenance
     ) -> None:
-        """Take task actions of a service; the robot follows the first that come.
+        """Take task actions of a service; the robot follows the first that come, or its own.
 
         Raises HoldfastError if they are outside the limits and the own planner fails.
         """
+        if question.takes_tasks:
+            return
         actions, provenance = self._within_limits(question, actions, provenance)
         followed = question.task_actions
         if followed is None:
-            question.task_actions, question.task_provenance = actions, provenance
+            question.task_actions, question.task_provenance = list(actions), provenance
             self._sample(question, "task", provenance.service)
         elif not same_actions(followed, actions):
             self._two_answers(question, "task", provenance.service)
@@ -171,7 +173,7 @@ class Verification:
         question.check_decided = True
         # Before the answer is there: it may never come, and that is to be known.
         asks = len(self._asked) < MAX_OPEN_CHECKS
-        _, service = question.followed()[0]
+        _, service = question.followed()[-1]
         self._note(question, service, "question", "asked" if asks else "left_out")
         if asks:
             self._ask(question, again=False)
