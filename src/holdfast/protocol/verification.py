@@ -245,19 +245,17 @@ class Verification:
 
     def _compare(self, question: Question, kind: str, own: OwnAnswer) -> bool:
         """Return whether a followed part is the own planner's; if not, have it decide again."""
+        service = dict(question.followed())[kind]
+        if service == OWN_PLANNER:
+            return True
         if kind == "task":
-            provenance, followed = question.task_provenance, question.task_actions or []
-            difference = _tasks_differ(question, followed, own.actions)
+            difference = _tasks_differ(question, question.task_actions or [], own.actions)
         else:
-            provenance = question.sensing_provenance
             difference = _sensing_differs(question, own)
-        assert provenance is not None
-        if provenance.service == OWN_PLANNER:
-            return True
         if difference is None:
-            self._note(question, provenance.service, kind, "same")
+            self._note(question, service, kind, "same")
             return True
-        question.differing.append(WrongAnswer(provenance.service, kind, *difference))
+        question.differing.append(WrongAnswer(service, kind, *difference))
         if question not in self._asked.values():
             self._ask(question, again=True)
         return False

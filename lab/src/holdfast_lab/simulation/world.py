@@ -33,6 +33,7 @@ from holdfast.protocol.messages import (
     decode_reply,
     encode,
 )
+from holdfast.protocol.question import OWN_PLANNER
 from holdfast_lab.errors import Violation
 from holdfast_lab.simulation.checked_memo import CheckedPlanner, JobCache, Memo
 from holdfast_lab.simulation.checkers import WireChecker, check_size
@@ -560,7 +561,9 @@ class World:
     def decided(self, timing: Timing) -> None:
         """Take note of whose decision is carried out, and how long the robot stood still for it."""
         now = self.queue.now
-        self._decided_by, self._status = timing.service, timing.status
+        self._status = timing.status
+        if timing.service != OWN_PLANNER:
+            self._decided_by = timing.service
         waited_s = 1e-3 * timing.waited_ms / self.run.robot_clock_rate
         since = max(now - waited_s, self.faults_end_at)
         # Or the local service is launched first.
