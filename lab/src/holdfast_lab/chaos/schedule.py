@@ -44,6 +44,8 @@ class Schedule(msgspec.Struct, frozen=True, kw_only=True):
         Of the robot's run.
     decision_deadline_ms : float or None
         After which the robot asks its local service as well.
+    what : {"sensing", "all"}
+        Which decisions the services make.
     faults : tuple of Fault
         In order of time.
     """
@@ -57,6 +59,7 @@ class Schedule(msgspec.Struct, frozen=True, kw_only=True):
     num_clouds: int
     launch: Launch
     decision_deadline_ms: float | None
+    what: Literal["sensing", "all"]
     faults: tuple[Fault, ...]
 
     @property
@@ -157,6 +160,7 @@ def draw_schedule(
         num_clouds=num_clouds,
         launch=launch,
         decision_deadline_ms=chance.choice(deadlines),
+        what=chance.choice(("sensing", "all")),
         faults=tuple(
             msgspec.structs.replace(fault, cloud=fault.cloud % num_clouds)
             for fault in sorted(faults, key=lambda fault: fault.at)

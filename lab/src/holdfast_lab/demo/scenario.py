@@ -20,7 +20,7 @@ from holdfast_lab.errors import NoProgressError
 from holdfast_lab.testbed.driver import Testbed
 from holdfast_lab.testbed.fault_times import ROBOT, FaultTimes, times_of_faults
 from holdfast_lab.testbed.processes import free_port
-from holdfast_lab.testbed.records import Decision
+from holdfast_lab.testbed.records import Decision, of_services
 from holdfast_lab.testbed.reference_run import ReferenceRun, make_reference_run
 
 __all__ = [
@@ -72,7 +72,7 @@ class Findings(NamedTuple):
     robot_kill : FaultTimes
         Of the kill of the robot's own process.
     usual_wait_ms : float
-        Median time that the robot waits for the cloud's task actions: one round trip.
+        Median time that the robot stands still for a sensing action of the cloud.
     statuses : tuple of list of str
         Of each process that the robot had.
     comparison : Comparison
@@ -158,9 +158,7 @@ class Demo:
         waits = [
             row.waited_ms
             for row in robot.decisions
-            if row.kind == "task"
-            and row.service == self._cloud.endpoint
-            and row.status != Status.LOCAL_RECOVERY.value
+            if row.service == self._cloud.endpoint and row.status != Status.LOCAL_RECOVERY.value
         ]
         *outages, robot_kill = times_of_faults(testbed.faults, robot.events, robot.decisions)
         return Findings(
@@ -204,7 +202,7 @@ class Demo:
         decisions = testbed.robot.decisions
         self._wait_for_progress(kill_at)
         self._wait(
-            lambda: narrator.cloud_decides and decisions[-1].service == cloud.endpoint,
+            lambda: narrator.cloud_decides and of_services(decisions)[-1].service == cloud.endpoint,
             "the use of the cloud service",
         )
         fault = testbed.note_fault("cloud_killed", cloud.endpoint, cloud.process.kill())
