@@ -160,6 +160,51 @@ _defect(
     ),
 )
 _defect(
+    "acts_on_the_asked_belief",
+    "A robot that takes its task actions itself takes them from the belief with which it asked, "
+    "although an observation has come late.",
+    Edit(
+        Robot,
+        "_question",
+        "question is None or question.num_inputs != self._current_history.num_inputs",
+        "question is None",
+    ),
+    Edit(
+        Robot,
+        "_next_action",
+        "self._planner.choose_task_action(state)[0]",
+        "self._planner.plan_until_sensing(question.state, offset + 1)[0][offset]",
+    ),
+)
+_defect(
+    "choice_of_another_belief",
+    "The robot performs the sensing action that was chosen while it moved, although an observation "
+    "has come late.",
+    Edit(
+        Robot,
+        "_question",
+        "question is None or question.num_inputs != self._current_history.num_inputs",
+        "question is None",
+    ),
+    Edit(
+        Robot,
+        "_next_sensing",
+        "answer.digest != self._planner.digest(state)[:DIGEST_SIZE]",
+        "False",
+    ),
+)
+_defect(
+    "choice_of_another_step",
+    "At a sensing step the robot waits for the answer to the question that it has, which is of "
+    "another step.",
+    Edit(
+        Robot,
+        "_next_sensing",
+        "question is None or question.sensing_step != state.step",
+        "question is None",
+    ),
+)
+_defect(
     "late_not_told",
     "To a service that knows everything up to a late observation the robot sends the input before.",
     Edit(

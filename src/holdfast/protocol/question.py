@@ -89,6 +89,9 @@ class Question:
         # inputs, num_inputs: the latest of this trial, and how many there were.
         self.inputs = inputs
         self.num_inputs = num_inputs
+        # Inputs that a service lacks if it has answered the question before; more if the robot has
+        # moved by itself since then, and its moves give observations.
+        self.new_inputs = 1
         # Since when the robot waits for the answer; None if it does not.
         self.needed_at: float | None = None
         self.num_ordered = 0  # task actions of the answer that are performed or ordered
@@ -109,6 +112,8 @@ class Question:
         if planner.needs_sensing(state):
             self.task_count = 0  # task actions in the answer
             self.sensing_step = state.step
+            if takes_tasks and planner.moves_give_observations:
+                self.new_inputs += planner.settings.sensing_interval + 1
         elif planner.moves_give_observations:
             self.task_count = 1
             self.sensing_step = None

@@ -57,12 +57,15 @@ def draw_schedule(seed: int) -> SimulationSchedule:
     some seeds have many faults of few kinds (swarm testing; Groce et al., ISSTA 2012).
     """
     schedule = _Draw(seed).schedule()
-    # A generator of its own: what the other one draws is as it was without it.
+    # Generators of their own: what the first one draws is as it was without them.
+    asks_for_all = random.Random(f"holdfast simulation {seed}: what is asked").random() < 0.5
+    run = msgspec.structs.replace(schedule.run, what="all" if asks_for_all else "sensing")
+    schedule = SimulationSchedule(run, schedule.faults)
     apart = random.Random(f"holdfast simulation {seed}: what is shown, and when")
     if apart.random() >= _SHOW_OTHERWISE:
         return schedule
     run = msgspec.structs.replace(
-        schedule.run,
+        run,
         trial=apart.randrange(_FEW_TRIALS),
         moves_show=apart.random() < 0.3,
         sensing_is_optional=apart.random() < 0.2,
