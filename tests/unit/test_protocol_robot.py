@@ -25,10 +25,11 @@ from holdfast.protocol.events import (
     LogEvent,
     RobotEffect,
     Sensed,
+    Timing,
     WriteRecords,
 )
-from holdfast.protocol.messages import Reply, SensingAnswer
-from holdfast.protocol.question import InProcessSource
+from holdfast.protocol.messages import Reply, SensingAnswer, TaskAnswer
+from holdfast.protocol.question import OWN_PLANNER, InProcessSource
 from holdfast.protocol.records import (
     ActingRecord,
     LateRecord,
@@ -432,6 +433,47 @@ def test_rate_paces_the_steps_and_counts_missed_ticks() -> None:
     assert sum(int(str(f["missed"])) for f in world.reports("missed_ticks")) == (
         world.robot.missed_ticks
     )
+
+
+def test_a_robot_that_takes_its_task_actions_itself_waits_at_sensing_steps_alone() -> None:
+    world = World(what="sensing", rate_hz=20.0, launch="never")
+    cloud = world.services["cloud"]
+    cloud.latency_s = 0.03
+
+    def fault(performed: int) -> None:
+        if performed == 8 and not world.results:
+            world.kill("cloud")
+            world.bring_up("cloud", 0.42)
+
+    world.on_act = fault
+    world.complete()
+    timings = [e for _, e in world.trace if isinstance(e, Timing)]
+    assert {(e.service, e.waited_ms) for e in timings if e.kind == "task"} == {(OWN_PLANNER, 0.0)}
+    waited = [e.step for e in timings if e.kind == "sensing" and e.waited_ms and e.trial == 0]
+    assert waited == [0, 12]  # the trial's first, and the one asked for while nobody was there
+    assert [e["step"] for e in world.reports("holding")] == [8]
+    assert 3 <= world.robot.missed_ticks <= 6
+
+
+def test_what_a_service_says_of_task_actions_that_it_is_not_asked_for_is_not_used() -> None:
+    world = World(what="sensing", verify_share=1.0)
+    answer = world.services["cloud"].answer
+
+    def lies(payload: bytes) -> list[Reply]:
+        return [
+            msgspec.structs.replace(each, actions=bytes(len(each.actions)))
+            if isinstance(each, TaskAnswer)
+            else each
+            for each in answer(payload)
+        ]
+
+    world.services["cloud"].answer = lies  # type: ignore[method-assign]
+    world.complete()
+    assert {(each.kind, each.verdict) for each in world.verified} == {
+        ("question", "asked"),
+        ("sensing", "same"),
+    }
+    assert not world.reports("disagreement")
 
 
 # -- found in review -------------------------------------------------------------------------------
