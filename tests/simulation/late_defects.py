@@ -177,23 +177,6 @@ _defect(
     ),
 )
 _defect(
-    "choice_of_another_belief",
-    "The robot performs the sensing action that was chosen while it moved, although an observation "
-    "has come late.",
-    Edit(
-        Robot,
-        "_question",
-        "question is None or question.num_inputs != self._current_history.num_inputs",
-        "question is None",
-    ),
-    Edit(
-        Robot,
-        "_next_sensing",
-        "answer.digest != self._planner.digest(state)[:DIGEST_SIZE]",
-        "False",
-    ),
-)
-_defect(
     "choice_of_another_step",
     "At a sensing step the robot waits for the answer to the question that it has, which is of "
     "another step.",

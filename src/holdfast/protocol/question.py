@@ -71,7 +71,7 @@ class Question:
 
     The question itself never changes. Its answer is written by
     :class:`~holdfast.protocol.verification.Verification` where services answer, else by
-    :class:`InProcessSource`; the robot writes ``needed_at`` and ``num_ordered``.
+    :class:`InProcessSource`; the robot writes ``needed_at``, ``num_ordered`` and its own actions.
     """
 
     def __init__(
@@ -146,6 +146,16 @@ class Question:
         if self._checkpoint is None:
             self._checkpoint = encode_checkpoint(self.state)
         return self._checkpoint
+
+    def take_own(self, own: OwnAnswer, round_trip_s: float) -> None:
+        """Make the robot follow what its own planner has answered."""
+        provenance = Provenance(OWN_PLANNER, round_trip_s, own.computed_s)
+        if own.actions:
+            self.task_actions, self.task_provenance = list(own.actions), provenance
+        if self.sensing_step is not None and own.sensing_action is not None:
+            digest = own.ahead_digest[:DIGEST_SIZE]
+            self.sensing = SensingAnswer(0, self.sensing_step, own.sensing_action, digest, 0)
+            self.sensing_provenance = provenance
 
     def read_tasks(self, reply: TaskAnswer, action_size: int) -> list[FloatArray]:
         """Return the task actions of a reply.
@@ -263,17 +273,7 @@ class InProcessSource(DecisionSource):
         if event.failure is not None:
             self.stop(event.failure)
             return
-        source = Provenance(OWN_PLANNER, now - self._asked_at, event.computed_s)
-        if event.sensing_action is None:
-            question.task_actions = list(event.actions)
-            question.task_provenance = source
-            if question.sensing_step is not None:
-                assert event.ahead is not None
-                self._compute("sensing", event.ahead)
-        else:
-            assert question.sensing_step is not None
-            digest = event.ahead_digest[:DIGEST_SIZE]
-            question.sensing = SensingAnswer(
-                0, question.sensing_step, event.sensing_action, digest, 0
-            )
-            question.sensing_provenance = source
+        question.take_own(event, now - self._asked_at)
+        if event.sensing_action is None and question.sensing_step is not None:
+            assert event.ahead is not None
+            self._compute("sensing", event.ahead)

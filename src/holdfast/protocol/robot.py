@@ -417,9 +417,7 @@ class Robot:
     def _next_sensing(self, state: PlanningState, now: float) -> None:
         question = self._question()
         if question is None or question.sensing_step != state.step:
-            self._ask(self._planner.digest(state), now)
-            question = self._source.question
-            assert question is not None
+            question = self._ask(self._planner.digest(state), now)
         answer = question.sensing
         if answer is None:
             self._await_answer(now)
@@ -450,10 +448,8 @@ class Robot:
     def _next_action(self, state: PlanningState, now: float) -> None:
         question = self._question()
         offset = -1 if question is None else state.step - question.state.step
-        if question is None or question.task_count == 0 or not 0 <= offset < question.task_count:
-            self._ask(self._planner.digest(state), now)
-            question = self._source.question
-            assert question is not None
+        if question is None or not 0 <= offset < question.task_count:
+            question = self._ask(self._planner.digest(state), now)
             offset = 0
         actions = question.task_actions
         if actions is None:
@@ -487,7 +483,7 @@ class Robot:
             return None
         return question
 
-    def _ask(self, state_digest: bytes, now: float) -> None:
+    def _ask(self, state_digest: bytes, now: float) -> Question:
         history = self._current_history
         self._write()
         question = Question(
@@ -499,6 +495,7 @@ class Robot:
             self._source.takes_tasks,
         )
         self._source.ask(question, now)
+        return question
 
     def _await_answer(self, now: float) -> None:
         """Wait for the rest of the answer."""

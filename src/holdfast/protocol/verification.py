@@ -182,7 +182,7 @@ class Verification:
         """Have a share of the questions answered by the own planner, too."""
         if question.own is not None:
             if not self._compare(question, kind, question.own):
-                _use(question, question.own)
+                question.take_own(question.own, question.own.computed_s)
         elif service != self._exempt and self._is_drawn(question):
             self.check(question)
 
@@ -223,12 +223,13 @@ class Verification:
         performed = question.num_ordered
         if not same_actions((question.task_actions or [])[:performed], event.actions[:performed]):
             return False
-        _use(question, event)
+        question.take_own(event, event.computed_s)
         return True
 
     def _decided_again(self, question: Question, first: OwnAnswer, second: OwnAnswer) -> None:
         # If the second decision failed, the first is all that there is.
-        is_certain = second.failure is not None or _same(first, second)
+        same = same_actions(first.actions, second.actions) and first[2:4] == second[2:4]
+        is_certain = second.failure is not None or same
         if not is_certain:
             self._effects.report(
                 "not_deterministic",
@@ -269,17 +270,6 @@ class Verification:
         self._effects.append(VerificationNoted(state.trial, state.step, service, kind, verdict))
 
 
-def _use(question: Question, own: OwnAnswer) -> None:
-    """Make the own planner's answer the one that the robot follows."""
-    provenance = Provenance(OWN_PLANNER, own.computed_s, own.computed_s)
-    if question.task_count:
-        question.task_actions, question.task_provenance = list(own.actions), provenance
-    if question.sensing_step is not None and own.sensing_action is not None:
-        digest = own.ahead_digest[:DIGEST_SIZE]
-        question.sensing = SensingAnswer(0, question.sensing_step, own.sensing_action, digest, 0)
-        question.sensing_provenance = provenance
-
-
 def _sensing_differs(question: Question, own: OwnAnswer) -> _Difference | None:
     sensing = question.sensing
     assert sensing is not None
@@ -296,14 +286,6 @@ def _tasks_differ(
         if not same_actions([one], [other]):
             return question.state.step + number, _written(one), _written(other)
     return None
-
-
-def _same(first: OwnAnswer, second: OwnAnswer) -> bool:
-    return (
-        same_actions(first.actions, second.actions)
-        and first.sensing_action == second.sensing_action
-        and first.ahead_digest == second.ahead_digest
-    )
 
 
 def _written(action: FloatArray) -> str:

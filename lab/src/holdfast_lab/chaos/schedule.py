@@ -44,8 +44,6 @@ class Schedule(msgspec.Struct, frozen=True, kw_only=True):
         Of the robot's run.
     decision_deadline_ms : float or None
         After which the robot asks its local service as well.
-    what : {"sensing", "all"}
-        Which decisions the services make.
     faults : tuple of Fault
         In order of time.
     """

@@ -216,10 +216,8 @@ def _make_reference_run(
     testbed: Testbed, schedule: Schedule, min_steps: int, keys: Path | None
 ) -> ReferenceRun:
     directory = testbed.directory
-    offload: dict[str, Any] = {
-        "services": [service.endpoint for service in testbed.services],
-        "what": schedule.what,
-    }
+    offload: dict[str, Any] = {"services": [service.endpoint for service in testbed.services]}
+    offload["what"] = schedule.what
     if keys is not None:
         offload["tls"] = str(keys / "robot")
     if schedule.decision_deadline_ms is not None:

@@ -142,7 +142,7 @@ def account(findings: Findings, directory: Path) -> str:
         row("cloud: listening -> used again", *(each.failback_ms for each in outages)),
         row("robot killed -> acting again", findings.robot_kill.recovery_ms),
         "After a kill the robot moves on to its next sensing step; the wait is how long",
-        f"it stood still there. Without a kill that is {findings.usual_wait_ms:.1f} ms (median).",
+        "it stood still there. Without a kill it does not.",
         "",
         "Statuses that the robot passed",
         f"  {passed[0]}",

@@ -91,11 +91,7 @@ def _comparable(outcome: JobResult) -> tuple[object, ...]:
 class CheckedPlanner(MemoizingPlanner):
     """The robot's planner, which knows the states and decisions that it has come to before."""
 
-    shared: ClassVar[tuple[str, ...]] = (
-        *MemoizingPlanner.shared,
-        "decide",
-        "choose_task_action",
-    )
+    shared: ClassVar[tuple[str, ...]] = (*MemoizingPlanner.shared, "decide")
 
     def __init__(self, problem: Problem, settings: PlanningSettings) -> None:
         super().__init__(problem, settings, _CheckedCache())

@@ -292,7 +292,6 @@ class EnvironmentModel:
                 self._deliveries.append(Delivery(self.performed, moment, taken))
             else:
                 # Once more, or of a process that has forgotten that it sensed: it must not count.
-                # (Perhaps the undisturbed run does not sense there any more.)
                 shown = np.array([99.0])
                 self._useless.append(taken)
             late.append(LateObservation(taken, shown))

@@ -58,12 +58,11 @@ def draw_schedule(seed: int) -> SimulationSchedule:
     """
     schedule = _Draw(seed).schedule()
     # Generators of their own: what the first one draws is as it was without them.
-    asks_for_all = random.Random(f"holdfast simulation {seed}: what is asked").random() < 0.5
-    run = msgspec.structs.replace(schedule.run, what="all" if asks_for_all else "sensing")
-    schedule = SimulationSchedule(run, schedule.faults)
+    what = random.Random(f"holdfast simulation {seed}: what is asked").choice(("sensing", "all"))
+    run = msgspec.structs.replace(schedule.run, what=what)
     apart = random.Random(f"holdfast simulation {seed}: what is shown, and when")
     if apart.random() >= _SHOW_OTHERWISE:
-        return schedule
+        return SimulationSchedule(run, schedule.faults)
     run = msgspec.structs.replace(
         run,
         trial=apart.randrange(_FEW_TRIALS),

@@ -33,7 +33,6 @@ from holdfast.protocol.messages import (
     decode_reply,
     encode,
 )
-from holdfast.protocol.question import OWN_PLANNER
 from holdfast_lab.errors import Violation
 from holdfast_lab.simulation.checked_memo import CheckedPlanner, JobCache, Memo
 from holdfast_lab.simulation.checkers import WireChecker, check_size
@@ -562,7 +561,7 @@ class World:
         """Take note of whose decision is carried out, and how long the robot stood still for it."""
         now = self.queue.now
         self._status = timing.status
-        if timing.service != OWN_PLANNER:
+        if timing.kind == "sensing":
             self._decided_by = timing.service
         waited_s = 1e-3 * timing.waited_ms / self.run.robot_clock_rate
         since = max(now - waited_s, self.faults_end_at)
