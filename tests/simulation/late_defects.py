@@ -178,14 +178,10 @@ _defect(
 )
 _defect(
     "choice_of_another_step",
-    "At a sensing step the robot waits for the answer to the question that it has, which is of "
-    "another step.",
-    Edit(
-        Robot,
-        "_next_sensing",
-        "question is None or question.sensing_step != state.step",
-        "question is None",
-    ),
+    "The robot counts from where it asks up to the step for which it wants a sensing action, and "
+    "at that step does not look whether it has asked for it.",
+    Edit(Question, "__init__", "(state.step // interval + 1) * interval", "state.step + interval"),
+    Edit(Robot, "_next_sensing", "question.sensing_step != state.step", "False"),
 )
 _defect(
     "late_not_told",
