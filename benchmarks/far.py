@@ -162,7 +162,7 @@ def standstill(context: Context) -> Result:
             found = _standstills_ms(table)
             waits[what] += found
             rate_hz = float(table["rate_hz"].iloc[0])
-            missed[what] += sum(int(1e-3 * each * rate_hz + 0.5) for each in found)
+            missed[what] += sum(int(1e-3 * each * rate_hz) for each in found)
             context.progress((number + 0.5 * (done + 1)) / rounds)
     rows = [
         [
@@ -181,7 +181,7 @@ def standstill(context: Context) -> Result:
                 step, 300 particles, tls, {ROUND_TRIP_MS:g} ms there and back, in turns. What it
                 stands still in a turn is the time from the last task action before a sensing step
                 to the first one after it, less the period, in milliseconds, as its environment saw
-                it; a missed tick is a whole period of it. All runs decide the same."""
+                it; missed ticks are the whole periods in it. All runs decide the same."""
             ),
             Table(("", "turns", "median", "99 %", "worst", "missed ticks"), rows),
         ],

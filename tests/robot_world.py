@@ -414,10 +414,13 @@ class World:
     def statuses(self) -> list[object]:
         return [fields["to"] for fields in self.reports("status")]
 
-    def complete(self) -> None:
-        """Run from the start to the end, and compare with the run without faults."""
+    def start_and_run(self) -> None:
         self.start()
         self.run()
+
+    def complete(self) -> None:
+        """Run from the start to the end, and compare with the run without faults."""
+        self.start_and_run()
         self.assert_same_as_without_faults()
 
     def assert_same_as_without_faults(self) -> None:

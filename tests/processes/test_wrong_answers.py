@@ -71,8 +71,7 @@ def test_a_lie_within_the_limits_is_found_among_the_answers_computed_again(
     what: str, kind: str, site: Site
 ) -> None:
     cloud = liar(site, what)
-    asked = "all" if kind == "task" else "sensing"
-    offload = {**PATIENT, "verify_share": 1.0, "what": asked}
+    offload = {**PATIENT, "verify_share": 1.0, "what": {"task": "all"}.get(kind, kind)}
     world, file = site.world(DOCUMENT, offload=offload)
     robot = site.run(file, services=[cloud])
     assert robot.wait() == EXIT_WRONG_ANSWER, robot.account()

@@ -149,26 +149,20 @@ _defect(
 
 # -- questions and services ------------------------------------------------------------------------
 
+_STALE_QUESTION = Edit(
+    Robot, "_question", "or question.num_inputs != self._current_history.num_inputs", ""
+)
+
 _defect(
     "stale_answer_used",
     "The robot goes on with the answer that it has, although an observation has come late.",
-    Edit(
-        Robot,
-        "_question",
-        "question is None or question.num_inputs != self._current_history.num_inputs",
-        "question is None",
-    ),
+    _STALE_QUESTION,
 )
 _defect(
     "acts_on_the_asked_belief",
     "A robot that takes its task actions itself takes them from the belief with which it asked, "
     "although an observation has come late.",
-    Edit(
-        Robot,
-        "_question",
-        "question is None or question.num_inputs != self._current_history.num_inputs",
-        "question is None",
-    ),
+    _STALE_QUESTION,
     Edit(
         Robot,
         "_next_action",
@@ -213,9 +207,6 @@ _defect(
     "not_sensing_ordered",
     "The robot orders the choice not to sense from the environment, like the others.",
     Edit(
-        Robot,
-        "_next_sensing",
-        "if answer.sensing_action == self._planner.no_sensing:",
-        "if False:",
+        Robot, "_next_sensing", "if answer.sensing_action == self._planner.no_sensing:", "if False:"
     ),
 )
