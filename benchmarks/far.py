@@ -8,6 +8,7 @@ two, packets take half a round trip each way, or never arrive
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -16,9 +17,9 @@ import pandas as pd
 from benchmarks.common import Context
 from benchmarks.report import Bar, Result, Table, paragraph
 from holdfast_lab.testbed.wide_area import Transport, why_no_wide_area
-from studies.cloud_trials import run_cloud_trials
+from studies.cloud_trials import SENSING_INTERVAL, run_cloud_trials
 
-__all__ = ["far"]
+__all__ = ["far", "standstill"]
 
 # What was asked for.
 FOUND_BAR_MS = 10.0
@@ -27,6 +28,7 @@ FOUND_BAR_MS = 10.0
 USED_AGAIN_BAR_MS = 350.0
 LOSS_BAR_MS = 105.0
 BYTES_BAR = 3.0
+STANDSTILL_BAR_MS = 1.0
 
 ROUND_TRIP_MS = 87.0
 """Round trip to the thesis's cloud."""
@@ -34,6 +36,7 @@ ROUND_TRIP_MS = 87.0
 LOSS = 0.05
 _TRANSPORTS: tuple[Transport, ...] = ("tls", "udp")
 _RATE_HZ = 100.0
+_SLOW_RATE_HZ = 50.0
 _HEADER = ("", "kills", "found, ms", "worst", "used again, ms", "worst")
 
 
@@ -130,6 +133,77 @@ def far(context: Context) -> Result:
         ],
         bars,
     )
+
+
+def standstill(context: Context) -> Result:
+    """Let services make all decisions of a far robot or choose what to sense alone, in turns."""
+    reason = why_no_wide_area()
+    if reason is not None:
+        return Result([f"Not measured: {reason}."])
+    kinds: tuple[Literal["all", "sensing"], ...] = ("all", "sensing")
+    waits: dict[str, list[float]] = {what: [] for what in kinds}
+    missed = dict.fromkeys(kinds, 0)
+    rounds = 1 if context.quick else 4
+    for number in range(rounds):
+        for done, what in enumerate(kinds):
+            table = run_cloud_trials(
+                particles=300,
+                transport="tls",
+                round_trip_ms=ROUND_TRIP_MS,
+                seed=number,
+                rate_hz=_SLOW_RATE_HZ,
+                min_steps=100 if context.quick else 400,
+                kills=False,
+                actions=True,
+                what=what,
+            )
+            if not table["identical"].all():
+                raise RuntimeError(f"a robot that asks for {what} decided otherwise")
+            found = _standstills_ms(table)
+            waits[what] += found
+            rate_hz = float(table["rate_hz"].iloc[0])
+            missed[what] += sum(int(1e-3 * each * rate_hz) for each in found)
+            context.progress((number + 0.5 * (done + 1)) / rounds)
+    rows = [
+        [
+            f"`offload.what: {what}`",
+            str(len(each)),
+            *(f"{np.percentile(each, share):.2f}" for share in (50, 99)),
+            f"{max(each):.2f}",
+            str(missed[what]),
+        ]
+        for what, each in waits.items()
+    ]
+    return Result(
+        [
+            paragraph(
+                f"""A robot of {_SLOW_RATE_HZ:g} task actions a second that senses at every ninth
+                step, 300 particles, tls, {ROUND_TRIP_MS:g} ms there and back, in turns. What it
+                stands still in a turn is the time from the last task action before a sensing step
+                to the first one after it, less the period, in milliseconds, as its environment saw
+                it; missed ticks are the whole periods in it. All runs decide the same."""
+            ),
+            Table(("", "turns", "median", "99 %", "worst", "missed ticks"), rows),
+        ],
+        [
+            Bar(
+                f"{ROUND_TRIP_MS:g} ms, {_SLOW_RATE_HZ:g} Hz: standstill a turn",
+                float(np.median(waits["sensing"])),
+                STANDSTILL_BAR_MS,
+                "ms",
+            ),
+            Bar("its missed ticks", float(missed["sensing"]), 0.0, ""),
+        ],
+    )
+
+
+def _standstills_ms(table: pd.DataFrame) -> list[float]:
+    """Return by how much the time between two task actions exceeds the period, at sensing steps."""
+    actions = table[table["what"] == "action"]
+    period_s = 1.0 / float(table["rate_hz"].iloc[0])
+    pauses_s = actions.groupby("trial")["at_s"].diff() - period_s
+    at_sensing = (actions["step"] % (SENSING_INTERVAL + 1) == 0) & (actions["step"] > 0)
+    return [max(0.0, 1e3 * pause_s) for pause_s in pauses_s[at_sensing]]
 
 
 def _run(transport: Transport, loss: float, number: int, *, kills: bool) -> pd.DataFrame:

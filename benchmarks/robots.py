@@ -34,7 +34,7 @@ simulator:
   sensing_intervals: {sensing_interval}
   seed: 0
 recovery: {{launch: {launch}}}
-offload: {{services: {services}}}
+offload: {{services: {services}, what: all}}
 """
 
 _PATIENCE_S = 30.0
@@ -49,7 +49,7 @@ def configuration_for(
     num_particles: int = 100,
     sensing_interval: int = 8,
 ) -> Configuration:
-    """Return the published settings (M = 10, k = 5, H = 1, interval 8), with services."""
+    """Return the published settings (M = 10, k = 5, H = 1, interval 8), with services for all."""
     path = directory / "robot.yaml"
     path.write_text(
         _CONFIGURATION.format(

@@ -163,12 +163,13 @@ def start_robots(
 
 
 def decisions_of(run: Path) -> list[dict[str, str]]:
-    """Return the rows of a run's timings."""
+    """Return the rows of a run's timings, but for what the robot decided itself."""
     path = run / "timings.csv"
     if not path.exists():
         return []
     # Read at once: the head may be written while it is read line by line.
-    return list(csv.DictReader(path.read_text().splitlines()))
+    rows = csv.DictReader(path.read_text().splitlines())
+    return [row for row in rows if row["service"] != "in_process"]
 
 
 class _Measured(NamedTuple):

@@ -68,6 +68,7 @@ CASES = (
     Case("wire", "Bytes on the wire", service.wire, 20.0, 4.0),
     Case("kills", "A killed cloud, and a new one", faults.kills, 90.0, 12.0),
     Case("far", "A cloud far away", far.far, 600.0, 90.0),
+    Case("standstill", "A far robot that moves on", far.standstill, 180.0, 20.0),
     Case("neighbours", "Bad neighbours", neighbours.neighbours, 150.0, 30.0),
     Case("capacity", "Many robots", service.capacity, 290.0, 60.0),
     Case("serve", "The service's process", service.serve, 50.0, 14.0),

@@ -14,7 +14,7 @@ import shutil
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import pandas as pd
@@ -103,6 +103,7 @@ class CloudTrials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     packets: bool = True  # a path for packets, if possible: holdfast_lab.testbed.wide_area
     actions: bool = False  # a row for each task action that was performed, too
     kills: bool = True
+    what: Literal["sensing", "all"] = "all"  # which decisions the services make; the thesis's: all
 
 
 def run_cloud_trials(**trials: Any) -> pd.DataFrame:
@@ -283,7 +284,7 @@ class _Series:
 
     def _configuration(self, directory: Path, run: int) -> dict[str, Any]:
         wanted = self._wanted
-        offload: dict[str, Any] = {"services": [self._path.connect]}
+        offload: dict[str, Any] = {"services": [self._path.connect], "what": wanted.what}
         if self._keys is not None:
             offload["tls"] = str(self._keys / "robot")
         return {

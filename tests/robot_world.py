@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -200,11 +200,12 @@ class World:
         simulator: SimulatorSettings = SIMULATOR,
         verify_share: float = 0.05,
         distrusted: tuple[str, ...] = (),
+        what: Literal["sensing", "all"] = "all",
         on_lost: OnLost = "continue",
     ) -> None:
         self.now = 0.0
         self.lost = LostSettings(on_lost=on_lost)
-        self.offload = OffloadSettings(services=services, verify_share=verify_share)
+        self.offload = OffloadSettings(services=services, what=what, verify_share=verify_share)
         self.services = {name: SmallService() for name in (*services, LOCAL)}
         self.services[LOCAL].up = False
         self.launchable = True
@@ -413,10 +414,13 @@ class World:
     def statuses(self) -> list[object]:
         return [fields["to"] for fields in self.reports("status")]
 
-    def complete(self) -> None:
-        """Run from the start to the end, and compare with the run without faults."""
+    def start_and_run(self) -> None:
         self.start()
         self.run()
+
+    def complete(self) -> None:
+        """Run from the start to the end, and compare with the run without faults."""
+        self.start_and_run()
         self.assert_same_as_without_faults()
 
     def assert_same_as_without_faults(self) -> None:

@@ -46,6 +46,7 @@ def schedule_of(
         num_clouds=num_clouds,
         launch="on_failure",
         decision_deadline_ms=None,
+        what="all",
         faults=faults,
     )
 

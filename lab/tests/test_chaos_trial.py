@@ -24,6 +24,7 @@ SCHEDULE = Schedule(
     num_clouds=1,
     launch="on_failure",
     decision_deadline_ms=None,
+    what="all",
     faults=(),
 )
 

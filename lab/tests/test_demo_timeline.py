@@ -114,7 +114,6 @@ def findings(*, identical: bool) -> Findings:
         outages=(cold, warm),
         listening_ms=(190.0, 195.0),
         robot_kill=times("robot_killed", recovery_ms=417.0),
-        usual_wait_ms=2.34,
         statuses=(["standard", "local_recovery", "keep_alive"], ["standard"]),
         comparison=Comparison(
             identical=identical,

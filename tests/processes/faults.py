@@ -499,9 +499,9 @@ def sensing_steps(document: Mapping[str, Any]) -> list[int]:
 
 
 def services_in_order(robot: Robot) -> list[str]:
-    """Return who decided, one after the other."""
+    """Return who decided, one after the other, but for task actions that the robot took itself."""
     rows = (robot.out / "timings.csv").read_text().splitlines()[1:]
-    services = [row.split(",")[3] for row in rows]
+    services = [row.split(",")[3] for row in rows if ",task,in_process," not in row]
     return [
         service
         for index, service in enumerate(services)

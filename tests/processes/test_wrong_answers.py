@@ -46,7 +46,7 @@ def verdicts_of(robot: Robot) -> list[tuple[str, str, str]]:
 
 def test_an_action_beyond_the_limits_is_not_performed(site: Site, references: References) -> None:
     cloud = liar(site, "far")
-    story = Story(site, references, DOCUMENT, offload={"verify_share": 0.0})
+    story = Story(site, references, DOCUMENT, offload={"verify_share": 0.0, "what": "all"})
     robot = site.run(story.file, services=[cloud])
     assert robot.wait() == EXIT_WRONG_ANSWER, robot.account()
     story.world.check()
@@ -71,7 +71,8 @@ def test_a_lie_within_the_limits_is_found_among_the_answers_computed_again(
     what: str, kind: str, site: Site
 ) -> None:
     cloud = liar(site, what)
-    world, file = site.world(DOCUMENT, offload={**PATIENT, "verify_share": 1.0})
+    offload = {**PATIENT, "verify_share": 1.0, "what": {"task": "all"}.get(kind, kind)}
+    world, file = site.world(DOCUMENT, offload=offload)
     robot = site.run(file, services=[cloud])
     assert robot.wait() == EXIT_WRONG_ANSWER, robot.account()
     world.check()
@@ -154,7 +155,7 @@ def test_a_lie_that_nobody_computed_again_is_found_when_the_figure_is_drawn(
     what: str, kind: str, simulated: bool, site: Site
 ) -> None:
     cloud = liar(site, what)
-    offload = {**PATIENT, "verify_share": 0.0}
+    offload = {**PATIENT, "verify_share": 0.0, "what": "all"}
     if simulated:
         file = site.configure(DOCUMENT, offload=offload)
     else:
@@ -190,7 +191,7 @@ def test_a_problem_that_is_not_deterministic_is_named_beside_the_service(site: S
     name = "unsteady:Unsteady"
     cloud = site.service("--problem", name, "--problem-directory", str(site.directory)).start()
     document = {**document_of("peg_in_hole_2d", max_steps=20), "problem": name}
-    file = site.configure(document, offload={**PATIENT, "verify_share": 0.0})
+    file = site.configure(document, offload={**PATIENT, "verify_share": 0.0, "what": "all"})
     robot = site.run(file, services=[cloud], command=WITH_FIGURES)
     assert robot.wait() == 3, robot.account()
     told = " ".join(event["reason"] for event in robot.matching("note"))

@@ -119,12 +119,7 @@ _defect(
     "new_epoch_not_noted",
     "The service drops what a robot's last process waited for, but does not note the epoch of the "
     "next one.",
-    Edit(
-        Service,
-        "_take_over",
-        "session.epoch, session.number = epoch, -1",
-        "session.number = -1",
-    ),
+    Edit(Service, "_take_over", "session.epoch, session.number = epoch, -1", "session.number = -1"),
 )
 _defect(
     "old_process_still_served",
@@ -322,12 +317,7 @@ _defect(
 _defect(
     "performance_not_written",
     "The journal does not record that an action was performed; the next action implies it.",
-    Edit(
-        Robot,
-        "_fold_move",
-        "self._unwritten.append(record)",
-        "pass",
-    ),
+    Edit(Robot, "_fold_move", "self._unwritten.append(record)", "pass"),
 )
 _defect(
     "pending_action_assumed_done",
@@ -409,12 +399,7 @@ _defect(
     "The robot never asks a cloud again that it considers lost, neither periodically nor "
     "when the cloud reappears, because the local service decides.",
     Edit(Dispatcher, "_try_others", "if at is not None and at <= now:", "if False:"),
-    Edit(
-        Dispatcher,
-        "_appeared",
-        "self.tracker.is_recovering and question",
-        "False and question",
-    ),
+    Edit(Dispatcher, "_appeared", "self.tracker.is_recovering and question", "False and question"),
 )
 _defect(
     "old_process_taken_for_new",
@@ -471,10 +456,7 @@ _defect(
     "any_answer_ends_recovery",
     "An answer of the local service also counts as the cloud's return.",
     Edit(
-        Dispatcher,
-        "_replied",
-        "elif is_answer and is_first and",
-        "if is_answer and is_first and",
+        Dispatcher, "_replied", "elif is_answer and is_first and", "if is_answer and is_first and"
     ),
 )
 _defect(

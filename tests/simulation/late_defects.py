@@ -149,15 +149,33 @@ _defect(
 
 # -- questions and services ------------------------------------------------------------------------
 
+_STALE_QUESTION = Edit(
+    Robot, "_question", "or question.num_inputs != self._current_history.num_inputs", ""
+)
+
 _defect(
     "stale_answer_used",
     "The robot goes on with the answer that it has, although an observation has come late.",
+    _STALE_QUESTION,
+)
+_defect(
+    "acts_on_the_asked_belief",
+    "A robot that takes its task actions itself takes them from the belief with which it asked, "
+    "although an observation has come late.",
+    _STALE_QUESTION,
     Edit(
         Robot,
-        "_question",
-        "question is None or question.num_inputs != self._current_history.num_inputs",
-        "question is None",
+        "_next_action",
+        "self._planner.choose_task_action(state)[0]",
+        "self._planner.plan_until_sensing(question.state, offset + 1)[0][offset]",
     ),
+)
+_defect(
+    "choice_of_another_step",
+    "The robot counts from where it asks up to the step for which it wants a sensing action, and "
+    "at that step does not look whether it has asked for it.",
+    Edit(Question, "__init__", "(state.step // interval + 1) * interval", "state.step + interval"),
+    Edit(Robot, "_next_sensing", "question.sensing_step != state.step", "False"),
 )
 _defect(
     "late_not_told",
@@ -189,9 +207,6 @@ _defect(
     "not_sensing_ordered",
     "The robot orders the choice not to sense from the environment, like the others.",
     Edit(
-        Robot,
-        "_next_sensing",
-        "if answer.sensing_action == self._planner.no_sensing:",
-        "if False:",
+        Robot, "_next_sensing", "if answer.sensing_action == self._planner.no_sensing:", "if False:"
     ),
 )

@@ -125,8 +125,7 @@ def test_a_sensing_part_that_fails_after_its_task_part_stops_the_robot(
     world = World(launch=launch)
     for service in world.services.values():
         fails_in_its_sensing_part(service, code)
-    world.start()
-    world.run()
+    world.start_and_run()
     assert world.stopped is not None
     assert isinstance(world.stopped.error, ServiceRefusedError)
     asked = ["cloud"] if launch == "never" else ["cloud", LOCAL]

@@ -69,8 +69,7 @@ def test_what_gave_no_reading_is_told_and_counted() -> None:
     """And services decide as the loop in process does."""
     world = World(simulator=SimulatorSettings(num_trials=1, max_steps=200, seed=12))
     world.environment_class = Blinking
-    world.start()
-    world.run()
+    world.start_and_run()
     (result,) = world.results
     told = [e.fields for _, e in world.trace if isinstance(e, LogEvent) and e.name == "no_reading"]
     assert result.missing_observations > 10

@@ -23,8 +23,7 @@ def test_a_stale_epoch_stops_the_robot() -> None:
     world.services["cloud"].rule = lambda r: (
         [Refused(r.number, "stale_epoch", "epoch 1, seen was 2")] if nth(r) == 3 else None
     )
-    world.start()
-    world.run()
+    world.start_and_run()
     assert world.stopped is not None
     assert isinstance(world.stopped.error, StaleEpochError)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import heapq
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import msgspec
 import numpy as np
@@ -25,10 +25,11 @@ from holdfast.protocol.events import (
     LogEvent,
     RobotEffect,
     Sensed,
+    Timing,
     WriteRecords,
 )
-from holdfast.protocol.messages import Reply, SensingAnswer
-from holdfast.protocol.question import InProcessSource
+from holdfast.protocol.messages import Reply, SensingAnswer, TaskAnswer
+from holdfast.protocol.question import OWN_PLANNER, InProcessSource
 from holdfast.protocol.records import (
     ActingRecord,
     LateRecord,
@@ -324,8 +325,7 @@ class TestFailedTask:
     def test_is_still_so_for_a_robot_that_was_killed_right_after(self) -> None:
         killed = self.world()
         killed.on_act = lambda step: setattr(killed, "ended", step == FailingWorld.fails_at - 1)
-        killed.start()
-        killed.run()
+        killed.start_and_run()
         assert not killed.results
         assert isinstance(killed.journal[-1], ActingRecord)
         resumed = self.world()
@@ -346,8 +346,7 @@ class TestFailedTask:
         world.on_act = lambda step: (
             world.after(0.0001, lambda: world.robot.pause(world.now)) if step == last else None
         )
-        world.start()
-        world.run()
+        world.start_and_run()
         (result,) = world.results
         assert result.outcome == ("failed" if environment_class is FailingWorld else "truncated")
         assert result.steps == last + 1
@@ -405,8 +404,7 @@ class TestUnexplainedObservations:
 
         first.environment_class = Lying
         first.on_act = lambda step: setattr(first, "ended", step == 10)
-        first.start()
-        first.run()
+        first.start_and_run()
         assert len(first.reports("unexplained")) == 3
         assert not first.reports("lost")
         second = self.world(set(range(20)), 8, tuple(first.journal[:-1]))
@@ -415,23 +413,52 @@ class TestUnexplainedObservations:
         assert second.results[0].unexplained_observations == 8
 
 
-def test_rate_paces_the_steps_and_counts_missed_ticks() -> None:
-    world = World(rate_hz=20.0, launch="never")
-
+def lose_the_cloud_for_a_while(world: World) -> None:
     def fault(performed: int) -> None:
         if performed == 8 and not world.results:
             world.kill("cloud")
             world.bring_up("cloud", 0.42)
 
     world.on_act = fault
+
+
+def test_rate_paces_the_steps_and_counts_missed_ticks() -> None:
+    world = World(rate_hz=20.0, launch="never")
+    lose_the_cloud_for_a_while(world)
     world.complete()
     times = [at for at, e in world.trace if isinstance(e, Act)][:20]
     gaps = np.diff(times)
     assert np.count_nonzero(np.abs(gaps - 0.05) < 1e-9) >= 17
     assert 3 <= world.robot.missed_ticks <= 6
-    assert sum(int(str(f["missed"])) for f in world.reports("missed_ticks")) == (
-        world.robot.missed_ticks
-    )
+    reported = sum(int(str(f["missed"])) for f in world.reports("missed_ticks"))
+    assert reported == world.robot.missed_ticks
+
+
+def test_a_robot_that_takes_its_task_actions_itself_waits_at_sensing_steps_alone() -> None:
+    world = World(what="sensing", rate_hz=20.0, launch="never", verify_share=1.0)
+    cloud = world.services["cloud"]
+    cloud.latency_s = 0.03
+    answer = cloud.answer
+
+    def lies(payload: bytes) -> Iterator[Reply]:
+        for each in answer(payload):
+            if isinstance(each, TaskAnswer):
+                each = msgspec.structs.replace(each, actions=bytes(len(each.actions)))
+            yield each
+
+    cloud.answer = lies  # type: ignore[method-assign,assignment]
+    lose_the_cloud_for_a_while(world)
+    world.complete()
+    timings = [e for _, e in world.trace if isinstance(e, Timing)]
+    assert {(e.service, e.waited_ms) for e in timings if e.kind == "task"} == {(OWN_PLANNER, 0.0)}
+    waited = [e.step for e in timings if e.kind == "sensing" and e.waited_ms and e.trial == 0]
+    assert waited == [0, 12]  # the trial's first, and the one asked for while nobody was there
+    assert [e["step"] for e in world.reports("holding")] == [8]
+    assert 3 <= world.robot.missed_ticks <= 6
+    # What the service says of task actions is not true, and not used.
+    verdicts = {(each.kind, each.verdict) for each in world.verified}
+    assert verdicts == {("question", "asked"), ("sensing", "same")}
+    assert not world.reports("disagreement")
 
 
 # -- found in review -------------------------------------------------------------------------------
@@ -447,8 +474,7 @@ def test_an_answer_for_another_step_than_was_asked_of_the_environment_stops_the_
         return later(event)
 
     world.later = spoil  # type: ignore[method-assign]
-    world.start()
-    world.run()
+    world.start_and_run()
     assert world.stopped is not None
     assert "step 5 where step 6" in str(world.stopped.error)
 
@@ -482,8 +508,7 @@ def test_an_observation_of_the_wrong_size_stops_the_robot_resumably() -> None:
         return later(event)
 
     world.later = spoil  # type: ignore[method-assign]
-    world.start()
-    world.run()
+    world.start_and_run()
     assert world.stopped is not None
     history = replay(Planner(PROBLEM, PLANNING), 11, 0, world.journal)
     assert history.pending is None

@@ -262,6 +262,7 @@ def question_at(
     step: int = 0,
     size: int = 10,
     is_first: bool = False,
+    new_inputs: int = 1,
 ) -> Question:
     """Return a question after so many inputs, the last of which are there."""
     belief = SimpleNamespace(states=np.zeros(size))
@@ -269,6 +270,7 @@ def question_at(
     made = SimpleNamespace(
         state=SimpleNamespace(trial=trial, step=step, belief=belief),
         num_inputs=num_inputs,
+        new_inputs=new_inputs,
         inputs=tuple(range(num_inputs - kept, num_inputs)),
         is_first=is_first,
         checkpoint=lambda: b"state",
@@ -303,6 +305,9 @@ class TestWhatItNeeds:
         assert needs(self.service(5), question_at(6), whole_state=False) == ((5,), None)
         assert needs(self.service(5), question_at(6), whole_state=True) == WHOLE
         assert needs(self.service(5), question_at(7), whole_state=False) == WHOLE
+        # Of a robot that has moved by itself since the question before.
+        moved = question_at(7, new_inputs=2)
+        assert needs(self.service(5), moved, whole_state=False) == ((5, 6), None)
 
     def test_a_large_state_is_replayed_up_to_a_length(self) -> None:
         for size, large in (((1 << 20) // 8, False), ((1 << 20) // 8 + 1, True)):

@@ -43,8 +43,7 @@ def world_of(environment_class: type[Misleading] = Misleading) -> World:
 
 def test_a_run_in_numbers() -> None:
     world, metrics = world_of(), RobotMetrics()
-    world.start()
-    world.run()
+    world.start_and_run()
     timings = [effect for _, effect in world.trace if isinstance(effect, Timing)]
     for timing in timings:
         metrics.timed(timing)
@@ -74,8 +73,7 @@ def test_a_run_in_numbers() -> None:
 
 def test_what_the_observations_have_shown() -> None:
     world, metrics = world_of(Lying), RobotMetrics()
-    world.start()
-    world.run()
+    world.start_and_run()
     samples = told(metrics, world)
     for name, column in (
         ("unexplained_observations", "unexplained_observations"),

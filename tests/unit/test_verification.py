@@ -86,9 +86,7 @@ def wrong(world: World) -> list[tuple[object, object]]:
 def test_an_action_outside_the_limits_is_never_performed() -> None:
     world = World(verify_share=0.0)
     lie(world, "cloud", other_actions(77.7), after=2)
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     (found,) = world.reports("wrong_answer")
     step = found["step"]
     acts = [e for _, e in world.trace if isinstance(e, Act) and e.step == step]
@@ -113,9 +111,7 @@ def test_a_wrong_answer_does_not_end_the_recovery() -> None:
             world.bring_up("cloud", 0.012)
 
     world.on_act = fault
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     assert wrong(world) == [("cloud", "task")]
     assert world.statuses() == ["local_recovery"]
     assert sum(result.recoveries for result in world.results) == 1
@@ -129,8 +125,7 @@ def test_a_share_of_the_answers_is_computed_again(
 ) -> None:
     world = World(verify_share=1.0)
     lie(world, "cloud", change, after=3)
-    world.start()
-    world.run()
+    world.start_and_run()
     assert world.stopped is None
     assert len(world.results) == 2
     assert wrong(world)[0] == ("cloud", kind)
@@ -148,9 +143,7 @@ def is_report(effect: RobotEffect, name: str) -> bool:
 def test_honest_answers_are_all_the_same_and_cost_no_time() -> None:
     plain, verified = World(verify_share=0.0), World(verify_share=1.0)
     for world in (plain, verified):
-        world.start()
-        world.run()
-        world.assert_same_as_without_faults()
+        world.complete()
     assert {verdict for _, _, verdict in verdicts(verified)} == {"same"}
     # A question for each observation, each with both parts; the last ones of a trial may not come.
     asked = len(verified.sent)
@@ -207,8 +200,7 @@ def test_a_wrong_answer_that_was_obeyed_is_found_and_the_robot_goes_on_from_wher
     world = World(verify_share=1.0)
     world.own_s = 0.025  # two actions are performed meanwhile
     lie(world, "cloud", other_actions(0.5), after=1)
-    world.start()
-    world.run()
+    world.start_and_run()
     assert world.stopped is None
     assert wrong(world)[0] == ("cloud", "task")
     found_at = next(at for at, e in world.trace if is_report(e, "wrong_answer"))
@@ -234,8 +226,7 @@ def test_a_problem_that_is_not_deterministic_is_blamed_itself() -> None:
         return decided._replace(actions=tuple(a * (1.0 - 1e-3 * calls) for a in decided.actions))
 
     world.own = own
-    world.start()
-    world.run()
+    world.start_and_run()
     assert world.stopped is None
     assert world.reports("not_deterministic")
     assert not wrong(world)
@@ -247,16 +238,10 @@ def test_a_planner_that_fails_the_second_time_acquits_nobody() -> None:
     lie(world, "cloud", other_actions(0.5), after=1)
     honest = world.own
 
-    def own(effect: ComputeOwnAnswer) -> OwnAnswer:
-        return (
-            OwnAnswer(effect.number, failure=HoldfastError("gone"))
-            if effect.again
-            else honest(effect)
-        )
-
-    world.own = own
-    world.start()
-    world.run()
+    world.own = lambda it: (
+        OwnAnswer(it.number, failure=HoldfastError("gone")) if it.again else honest(it)
+    )
+    world.start_and_run()
     assert world.stopped is None
     assert len(world.results) == 2
     assert wrong(world)[0] == ("cloud", "task")
@@ -274,17 +259,14 @@ def test_zeros_of_other_sign_are_another_answer() -> None:
         )
 
     lie(world, "cloud", negative_zeros)
-    world.start()
-    world.run()
+    world.start_and_run()
     assert any(np.any(e.action == 0.0) for _, e in world.trace if isinstance(e, Act))
     assert wrong(world)[0] == ("cloud", "task")
 
 
 def test_who_was_wrong_before_the_robot_was_resumed_is_not_asked() -> None:
     world = World(services=("first", "second"), distrusted=("first",))
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     assert {sent.service for sent in world.sent} == {"second"}
     assert [each["service"] for each in world.reports("distrusted")] == ["first"]
 
@@ -292,9 +274,7 @@ def test_who_was_wrong_before_the_robot_was_resumed_is_not_asked() -> None:
 def test_a_failed_verification_is_told_and_stops_nobody() -> None:
     world = World(verify_share=1.0)
     world.own = lambda effect: OwnAnswer(effect.number, failure=HoldfastError("MemoryError"))
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     assert world.reports("verification_failed")
     assert {verdict for _, _, verdict in verdicts(world)} == {"failed"}
 
@@ -303,9 +283,7 @@ def test_a_service_that_was_wrong_is_not_asked_again_when_it_is_started_anew() -
     world = World(verify_share=0.0)
     lie(world, "cloud", other_actions(77.7), after=1)
     world.on_act = lambda step: world.bring_up("cloud") if step == 6 else None
-    world.start()
-    world.run()
-    world.assert_same_as_without_faults()
+    world.complete()
     found_at = next(at for at, e in world.trace if is_report(e, "wrong_answer"))
     assert all(sent.service == LOCAL for sent in world.sent if sent.at > found_at)
 
@@ -313,8 +291,7 @@ def test_a_service_that_was_wrong_is_not_asked_again_when_it_is_started_anew() -
 def test_without_a_local_service_the_robot_stops_when_all_have_lied() -> None:
     world = World(verify_share=0.0, launch="never")
     lie(world, "cloud", other_actions(77.7), after=1)
-    world.start()
-    world.run()
+    world.start_and_run()
     assert isinstance(world.stopped, Halt)
     assert isinstance(world.stopped.error, ServiceRefusedError)
     assert "the robot's own planner" in str(world.stopped.error)
@@ -325,8 +302,7 @@ def test_two_services_that_give_the_same_wrong_answer_are_both_found_out() -> No
     world = World(services=("first", "second"), verify_share=1.0)
     for name in ("first", "second"):
         lie(world, name, other_sensing)
-    world.start()
-    world.run()
+    world.start_and_run()
     assert world.stopped is None
     assert {service for service, _ in wrong(world)} == {"first", "second"}
     assert world.statuses()[-1] == "local_recovery"
@@ -473,8 +449,7 @@ def test_the_robot_stops_if_its_own_planner_cannot_replace_an_action(
         raise ProblemError("no such state")
 
     monkeypatch.setattr(Planner, "plan_until_sensing", fails)
-    world.start()
-    world.run()
+    world.start_and_run()
     assert isinstance(world.stopped, Halt)
     assert str(world.stopped.error) == "no such state"
     assert not [e for _, e in world.trace if isinstance(e, Act)]

@@ -262,6 +262,10 @@ class OffloadSettings(_Section, frozen=True, forbid_unknown_fields=True, kw_only
     ----------
     services : tuple of str
         Endpoints in order of preference. None: the planner runs in the robot's own process.
+    what : {"sensing", "all"}
+        Which decisions services make: sensing actions alone, so the robot takes its task actions
+        itself, from its own belief, and waits for no service before it moves; or, as in the thesis,
+        task actions too.
     detection_timeout_ms : float
         A service from which a decision is awaited and that shows no sign of progress for this long
         counts as dead. (A killed one is found sooner, by its broken link.)
@@ -291,6 +295,7 @@ class OffloadSettings(_Section, frozen=True, forbid_unknown_fields=True, kw_only
     """
 
     services: Annotated[tuple[Text, ...], msgspec.Meta(max_length=MAX_SERVICES)] = ()
+    what: Literal["sensing", "all"] = "sensing"
     detection_timeout_ms: Milliseconds = 250.0
     startup_timeout_ms: Milliseconds = 1000.0
     lease_ms: Annotated[float, msgspec.Meta(ge=50.0, le=60_000.0)] = 30_000.0

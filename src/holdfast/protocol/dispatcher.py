@@ -67,6 +67,7 @@ class Dispatcher(DecisionSource):
         distrusted: Collection[str] = (),  # services that answered wrongly earlier in this run
     ) -> None:
         super().__init__()
+        self.takes_tasks = offload.what == "sensing"
         timeout_s = 1e-3 * offload.detection_timeout_ms
         wanted = recovery_settings.launch != "never"
         self._timeout_s = timeout_s

@@ -71,7 +71,7 @@ class Question:
 
     The question itself never changes. Its answer is written by
     :class:`~holdfast.protocol.verification.Verification` where services answer, else by
-    :class:`InProcessSource`; the robot writes ``needed_at`` and ``num_ordered``.
+    :class:`InProcessSource`; the robot writes ``needed_at``, ``num_ordered`` and its own actions.
     """
 
     def __init__(
@@ -81,19 +81,26 @@ class Question:
         digest: bytes,
         inputs: tuple[Input, ...],
         num_inputs: int,
+        # Whether the robot takes the task actions itself, and asks for the sensing action alone.
+        takes_tasks: bool = False,
     ) -> None:
         self.state = state
         self.digest = digest[:DIGEST_SIZE]
         # inputs, num_inputs: the latest of this trial, and how many there were.
         self.inputs = inputs
         self.num_inputs = num_inputs
+        # Inputs that a service lacks if it has answered the question before; more if the robot has
+        # moved by itself since then, and its moves give observations.
+        self.new_inputs = 1
         # Since when the robot waits for the answer; None if it does not.
         self.needed_at: float | None = None
         self.num_ordered = 0  # task actions of the answer that are performed or ordered
-        # task_actions, sensing: what the robot follows; None until it arrives.
-        self.task_actions: Sequence[FloatArray] | None = None
+        # task_actions, sensing: what the robot follows; None until it arrives. Of the actions that
+        # it takes itself, those so far.
+        self.takes_tasks = takes_tasks
+        self.task_actions: list[FloatArray] | None = [] if takes_tasks else None
         self.sensing: SensingAnswer | None = None
-        self.task_provenance: Provenance | None = None
+        self.task_provenance = Provenance(OWN_PLANNER, 0.0, 0.0) if takes_tasks else None
         self.sensing_provenance: Provenance | None = None
         self.check_decided = False  # whether a check by the own planner was ordered, or left out
         self.own: OwnAnswer | None = None  # the own planner's answer
@@ -105,6 +112,8 @@ class Question:
         if planner.needs_sensing(state):
             self.task_count = 0  # task actions in the answer
             self.sensing_step = state.step
+            if takes_tasks and planner.moves_give_observations:
+                self.new_inputs += planner.settings.sensing_interval + 1
         elif planner.moves_give_observations:
             self.task_count = 1
             self.sensing_step = None
@@ -137,6 +146,16 @@ class Question:
         if self._checkpoint is None:
             self._checkpoint = encode_checkpoint(self.state)
         return self._checkpoint
+
+    def take_own(self, own: OwnAnswer, round_trip_s: float) -> None:
+        """Make the robot follow what its own planner has answered."""
+        provenance = Provenance(OWN_PLANNER, round_trip_s, own.computed_s)
+        if own.actions:
+            self.task_actions, self.task_provenance = list(own.actions), provenance
+        if self.sensing_step is not None and own.sensing_action is not None:
+            digest = own.ahead_digest[:DIGEST_SIZE]
+            self.sensing = SensingAnswer(0, self.sensing_step, own.sensing_action, digest, 0)
+            self.sensing_provenance = provenance
 
     def read_tasks(self, reply: TaskAnswer, action_size: int) -> list[FloatArray]:
         """Return the task actions of a reply.
@@ -181,6 +200,7 @@ class DecisionSource:
         self.tracker = StatusTracker()  # which service decides
         # Since when the robot holds still because no service is usable.
         self.holding_since: float | None = None
+        self.takes_tasks = False  # whether the robot takes task actions itself
         self.stopped = False  # whether this source has stopped the run
 
     @property
@@ -253,17 +273,7 @@ class InProcessSource(DecisionSource):
         if event.failure is not None:
             self.stop(event.failure)
             return
-        source = Provenance(OWN_PLANNER, now - self._asked_at, event.computed_s)
-        if event.sensing_action is None:
-            question.task_actions = event.actions
-            question.task_provenance = source
-            if question.sensing_step is not None:
-                assert event.ahead is not None
-                self._compute("sensing", event.ahead)
-        else:
-            assert question.sensing_step is not None
-            digest = event.ahead_digest[:DIGEST_SIZE]
-            question.sensing = SensingAnswer(
-                0, question.sensing_step, event.sensing_action, digest, 0
-            )
-            question.sensing_provenance = source
+        question.take_own(event, now - self._asked_at)
+        if event.sensing_action is None and question.sensing_step is not None:
+            assert event.ahead is not None
+            self._compute("sensing", event.ahead)

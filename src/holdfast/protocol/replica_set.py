@@ -296,7 +296,7 @@ class Replica:
         known = self.acknowledged
         start = known[1] if known is not None and known[0] == state.trial else 0
         missing = question.num_inputs - start
-        if missing > 1 or not (self.opened or question.is_first):
+        if missing > question.new_inputs or not (self.opened or question.is_first):
             # It knows nothing, or others have decided since. Replaying takes time that other robots
             # need, so it is sent the state, unless that is large.
             whole_state |= (

@@ -417,9 +417,7 @@ class Robot:
     def _next_sensing(self, state: PlanningState, now: float) -> None:
         question = self._question()
         if question is None or question.sensing_step != state.step:
-            self._ask(self._planner.digest(state), now)
-            question = self._source.question
-            assert question is not None
+            question = self._ask(self._planner.digest(state), now)
         answer = question.sensing
         if answer is None:
             self._await_answer(now)
@@ -450,14 +448,19 @@ class Robot:
     def _next_action(self, state: PlanningState, now: float) -> None:
         question = self._question()
         offset = -1 if question is None else state.step - question.state.step
-        if question is None or question.task_count == 0 or not 0 <= offset < question.task_count:
-            self._ask(self._planner.digest(state), now)
-            question = self._source.question
-            assert question is not None
+        if question is None or not 0 <= offset < question.task_count:
+            question = self._ask(self._planner.digest(state), now)
             offset = 0
-        if question.task_actions is None:
+        actions = question.task_actions
+        if actions is None:
             self._await_answer(now)
             return
+        if offset == len(actions):
+            try:
+                actions.append(self._planner.choose_task_action(state)[0])
+            except HoldfastError as error:
+                self._stop(error)
+                return
         provenance = question.task_provenance
         if offset == 0 and provenance is not None and provenance is not self._timed_provenance:
             self._timed_provenance = provenance
@@ -465,7 +468,7 @@ class Robot:
         question.needed_at = None
         if not self._take_tick(now):
             return
-        action = question.task_actions[offset]
+        action = actions[offset]
         self._write(ActingRecord(state.step, encode_floats(action)))
         history = self._current_history
         history.pending = action
@@ -480,13 +483,19 @@ class Robot:
             return None
         return question
 
-    def _ask(self, state_digest: bytes, now: float) -> None:
+    def _ask(self, state_digest: bytes, now: float) -> Question:
         history = self._current_history
         self._write()
         question = Question(
-            self._planner, history.state, state_digest, history.inputs, history.num_inputs
+            self._planner,
+            history.state,
+            state_digest,
+            history.inputs,
+            history.num_inputs,
+            self._source.takes_tasks,
         )
         self._source.ask(question, now)
+        return question
 
     def _await_answer(self, now: float) -> None:
         """Wait for the rest of the answer."""

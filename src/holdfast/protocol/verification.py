@@ -89,14 +89,16 @@ class Verification:
     def take_tasks(
         self, question: Question, actions: Sequence[FloatArray], provenance: Provenance
     ) -> None:
-        """Take task actions of a service; the robot follows the first that come.
+        """Take task actions of a service; the robot follows the first that come, or its own.
 
         Raises HoldfastError if they are outside the limits and the own planner fails.
         """
+        if question.takes_tasks:
+            return
         actions, provenance = self._within_limits(question, actions, provenance)
         followed = question.task_actions
         if followed is None:
-            question.task_actions, question.task_provenance = actions, provenance
+            question.task_actions, question.task_provenance = list(actions), provenance
             self._sample(question, "task", provenance.service)
         elif not same_actions(followed, actions):
             self._two_answers(question, "task", provenance.service)
@@ -171,7 +173,7 @@ class Verification:
         question.check_decided = True
         # Before the answer is there: it may never come, and that is to be known.
         asks = len(self._asked) < MAX_OPEN_CHECKS
-        _, service = question.followed()[0]
+        _, service = question.followed()[-1]
         self._note(question, service, "question", "asked" if asks else "left_out")
         if asks:
             self._ask(question, again=False)
@@ -180,7 +182,7 @@ class Verification:
         """Have a share of the questions answered by the own planner, too."""
         if question.own is not None:
             if not self._compare(question, kind, question.own):
-                _use(question, question.own)
+                question.take_own(question.own, question.own.computed_s)
         elif service != self._exempt and self._is_drawn(question):
             self.check(question)
 
@@ -221,12 +223,13 @@ class Verification:
         performed = question.num_ordered
         if not same_actions((question.task_actions or [])[:performed], event.actions[:performed]):
             return False
-        _use(question, event)
+        question.take_own(event, event.computed_s)
         return True
 
     def _decided_again(self, question: Question, first: OwnAnswer, second: OwnAnswer) -> None:
         # If the second decision failed, the first is all that there is.
-        is_certain = second.failure is not None or _same(first, second)
+        same = same_actions(first.actions, second.actions) and first[2:4] == second[2:4]
+        is_certain = second.failure is not None or same
         if not is_certain:
             self._effects.report(
                 "not_deterministic",
@@ -243,19 +246,17 @@ class Verification:
 
     def _compare(self, question: Question, kind: str, own: OwnAnswer) -> bool:
         """Return whether a followed part is the own planner's; if not, have it decide again."""
+        service = dict(question.followed())[kind]
+        if service == OWN_PLANNER:
+            return True
         if kind == "task":
-            provenance, followed = question.task_provenance, question.task_actions or []
-            difference = _tasks_differ(question, followed, own.actions)
+            difference = _tasks_differ(question, question.task_actions or [], own.actions)
         else:
-            provenance = question.sensing_provenance
             difference = _sensing_differs(question, own)
-        assert provenance is not None
-        if provenance.service == OWN_PLANNER:
-            return True
         if difference is None:
-            self._note(question, provenance.service, kind, "same")
+            self._note(question, service, kind, "same")
             return True
-        question.differing.append(WrongAnswer(provenance.service, kind, *difference))
+        question.differing.append(WrongAnswer(service, kind, *difference))
         if question not in self._asked.values():
             self._ask(question, again=True)
         return False
@@ -267,17 +268,6 @@ class Verification:
     def _note(self, question: Question, service: str, kind: str, verdict: str) -> None:
         state = question.state
         self._effects.append(VerificationNoted(state.trial, state.step, service, kind, verdict))
-
-
-def _use(question: Question, own: OwnAnswer) -> None:
-    """Make the own planner's answer the one that the robot follows."""
-    provenance = Provenance(OWN_PLANNER, own.computed_s, own.computed_s)
-    if question.task_count:
-        question.task_actions, question.task_provenance = list(own.actions), provenance
-    if question.sensing_step is not None and own.sensing_action is not None:
-        digest = own.ahead_digest[:DIGEST_SIZE]
-        question.sensing = SensingAnswer(0, question.sensing_step, own.sensing_action, digest, 0)
-        question.sensing_provenance = provenance
 
 
 def _sensing_differs(question: Question, own: OwnAnswer) -> _Difference | None:
@@ -296,14 +286,6 @@ def _tasks_differ(
         if not same_actions([one], [other]):
             return question.state.step + number, _written(one), _written(other)
     return None
-
-
-def _same(first: OwnAnswer, second: OwnAnswer) -> bool:
-    return (
-        same_actions(first.actions, second.actions)
-        and first.sensing_action == second.sensing_action
-        and first.ahead_digest == second.ahead_digest
-    )
 
 
 def _written(action: FloatArray) -> str:

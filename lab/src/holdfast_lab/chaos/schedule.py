@@ -57,6 +57,7 @@ class Schedule(msgspec.Struct, frozen=True, kw_only=True):
     num_clouds: int
     launch: Launch
     decision_deadline_ms: float | None
+    what: Literal["sensing", "all"]
     faults: tuple[Fault, ...]
 
     @property
@@ -157,6 +158,7 @@ def draw_schedule(
         num_clouds=num_clouds,
         launch=launch,
         decision_deadline_ms=chance.choice(deadlines),
+        what=chance.choice(("sensing", "all")),
         faults=tuple(
             msgspec.structs.replace(fault, cloud=fault.cloud % num_clouds)
             for fault in sorted(faults, key=lambda fault: fault.at)

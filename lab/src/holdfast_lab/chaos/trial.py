@@ -217,6 +217,7 @@ def _make_reference_run(
 ) -> ReferenceRun:
     directory = testbed.directory
     offload: dict[str, Any] = {"services": [service.endpoint for service in testbed.services]}
+    offload["what"] = schedule.what
     if keys is not None:
         offload["tls"] = str(keys / "robot")
     if schedule.decision_deadline_ms is not None:

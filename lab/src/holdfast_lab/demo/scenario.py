@@ -7,12 +7,10 @@ only after the robot has reacted to the one before, so the demo is the same on a
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable
 from typing import NamedTuple
 
 from holdfast.cli.terminal import counted
-from holdfast.protocol.status import Status
 from holdfast.reports.compare import Comparison, compare_runs
 from holdfast.robot.links import RECOVERY_SERVICE
 from holdfast_lab.demo.narrator import DemoState, Line, Narrator
@@ -20,7 +18,7 @@ from holdfast_lab.errors import NoProgressError
 from holdfast_lab.testbed.driver import Testbed
 from holdfast_lab.testbed.fault_times import ROBOT, FaultTimes, times_of_faults
 from holdfast_lab.testbed.processes import free_port
-from holdfast_lab.testbed.records import Decision
+from holdfast_lab.testbed.records import Decision, of_services
 from holdfast_lab.testbed.reference_run import ReferenceRun, make_reference_run
 
 __all__ = [
@@ -71,8 +69,6 @@ class Findings(NamedTuple):
         From the start of each cloud service that followed until it listened.
     robot_kill : FaultTimes
         Of the kill of the robot's own process.
-    usual_wait_ms : float
-        Median time that the robot waits for the cloud's task actions: one round trip.
     statuses : tuple of list of str
         Of each process that the robot had.
     comparison : Comparison
@@ -82,7 +78,6 @@ class Findings(NamedTuple):
     outages: tuple[FaultTimes, ...]
     listening_ms: tuple[float, ...]
     robot_kill: FaultTimes
-    usual_wait_ms: float
     statuses: tuple[list[str], ...]
     comparison: Comparison
 
@@ -155,19 +150,11 @@ class Demo:
         self._kill_robot()
         self._wait(lambda: robot.is_done, "the end of the robot's run", steps / rate_hz)
         robot.table.read()
-        waits = [
-            row.waited_ms
-            for row in robot.decisions
-            if row.kind == "task"
-            and row.service == self._cloud.endpoint
-            and row.status != Status.LOCAL_RECOVERY.value
-        ]
         *outages, robot_kill = times_of_faults(testbed.faults, robot.events, robot.decisions)
         return Findings(
             outages=tuple(outages),
             listening_ms=listening_ms,
             robot_kill=robot_kill,
-            usual_wait_ms=statistics.median(waits) if waits else 0.0,
             statuses=tuple(self._narrator.statuses),
             comparison=compare_runs(directory / REFERENCE_RUN_NAME, robot.out),
         )
@@ -204,7 +191,7 @@ class Demo:
         decisions = testbed.robot.decisions
         self._wait_for_progress(kill_at)
         self._wait(
-            lambda: narrator.cloud_decides and decisions[-1].service == cloud.endpoint,
+            lambda: narrator.cloud_decides and of_services(decisions)[-1].service == cloud.endpoint,
             "the use of the cloud service",
         )
         fault = testbed.note_fault("cloud_killed", cloud.endpoint, cloud.process.kill())

@@ -286,13 +286,13 @@ class EnvironmentModel:
             self._told += came
         late = []
         for taken, _ in came:
-            shown = self._shown_at(taken)
             if taken in self._awaited:
+                shown = self._shown_at(taken)
                 self._awaited.remove(taken)
                 self._deliveries.append(Delivery(self.performed, moment, taken))
             else:
                 # Once more, or of a process that has forgotten that it sensed: it must not count.
-                shown = shown + 1.0
+                shown = np.array([99.0])
                 self._useless.append(taken)
             late.append(LateObservation(taken, shown))
         self._refer()

@@ -115,6 +115,7 @@ class RobotNode:
         )
         self._offload = OffloadSettings(
             services=run.services,
+            what=run.what,
             lease_ms=max(50.0, 1e3 * run.lease_s),
             decision_deadline_ms=run.deadline_ms,
         )

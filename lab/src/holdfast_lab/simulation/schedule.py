@@ -73,6 +73,7 @@ class RunSettings(_Item, frozen=True, kw_only=True, tag="run", tag_field="item")
     num_trials: Annotated[int, msgspec.Meta(ge=1, le=4)] = 1
     replicas: Annotated[int, msgspec.Meta(ge=1, le=9)] = 1
     launch: Literal["on_failure", "at_start", "never"] = "on_failure"
+    what: Literal["sensing", "all"] = "all"
     deadline_ms: Annotated[float, msgspec.Meta(gt=0.0, le=1e6)] | None = None
     rate_hz: Annotated[float, msgspec.Meta(ge=0.1, le=1e6)] | None = None
     sense_s: Seconds = 0.001

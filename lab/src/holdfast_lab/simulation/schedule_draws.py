@@ -57,12 +57,14 @@ def draw_schedule(seed: int) -> SimulationSchedule:
     some seeds have many faults of few kinds (swarm testing; Groce et al., ISSTA 2012).
     """
     schedule = _Draw(seed).schedule()
-    # A generator of its own: what the other one draws is as it was without it.
+    # Generators of their own: what the first one draws is as it was without them.
+    what = random.Random(f"holdfast simulation {seed}: what is asked").choice(("sensing", "all"))
+    run = msgspec.structs.replace(schedule.run, what=what)
     apart = random.Random(f"holdfast simulation {seed}: what is shown, and when")
     if apart.random() >= _SHOW_OTHERWISE:
-        return schedule
+        return SimulationSchedule(run, schedule.faults)
     run = msgspec.structs.replace(
-        schedule.run,
+        run,
         trial=apart.randrange(_FEW_TRIALS),
         moves_show=apart.random() < 0.3,
         sensing_is_optional=apart.random() < 0.2,

@@ -560,7 +560,9 @@ class World:
     def decided(self, timing: Timing) -> None:
         """Take note of whose decision is carried out, and how long the robot stood still for it."""
         now = self.queue.now
-        self._decided_by, self._status = timing.service, timing.status
+        self._status = timing.status
+        if timing.kind == "sensing":
+            self._decided_by = timing.service
         waited_s = 1e-3 * timing.waited_ms / self.run.robot_clock_rate
         since = max(now - waited_s, self.faults_end_at)
         # Or the local service is launched first.

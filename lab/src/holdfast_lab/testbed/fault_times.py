@@ -20,7 +20,7 @@ import numpy as np
 
 from holdfast.protocol.status import Status
 from holdfast.robot.links import RECOVERY_SERVICE
-from holdfast_lab.testbed.records import Decision, LogEvent
+from holdfast_lab.testbed.records import Decision, LogEvent, of_services
 
 __all__ = [
     "ROBOT",
@@ -103,6 +103,8 @@ def _end_of(fault: InjectedFault, later: Sequence[InjectedFault]) -> float:
 def _times_of(
     fault: InjectedFault, until: float, log: Sequence[LogEvent], decisions: Sequence[Decision]
 ) -> FaultTimes:
+    if fault.target != ROBOT:
+        decisions = of_services(decisions)
     before = [each for each in decisions if each.at <= fault.injected_at]
     after = [each for each in decisions if fault.injected_at < each.at < until]
     events = [each for each in log if fault.injected_at <= each.at < until]

@@ -6,7 +6,7 @@ The testbed looks into no process. All that it knows of a run it reads here.
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -14,7 +14,9 @@ from typing import IO, Any, NamedTuple
 
 import msgspec
 
-__all__ = ["Decision", "DecisionTable", "LogEvent", "log_event_of", "time_of"]
+from holdfast.protocol.question import OWN_PLANNER
+
+__all__ = ["Decision", "DecisionTable", "LogEvent", "log_event_of", "of_services", "time_of"]
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,11 @@ class Decision(NamedTuple):
     waited_ms: float
     round_trip_ms: float = 0.0
     computed_ms: float = 0.0
+
+
+def of_services(decisions: Iterable[Decision]) -> list[Decision]:
+    """Return the decisions without the task actions that the robot took itself."""
+    return [each for each in decisions if (each.kind, each.service) != ("task", OWN_PLANNER)]
 
 
 class DecisionTable:

@@ -24,6 +24,7 @@ from holdfast.config.loader import Configuration
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.protocol.events import Act, Sense, Timing
+from holdfast.protocol.question import OWN_PLANNER
 from holdfast.protocol.status import Status
 from holdfast.robot.links import RECOVERY_SERVICE
 
@@ -129,7 +130,8 @@ class Telemetry:
     def time(self, timing: Timing) -> None:
         """Take note of who decided."""
         self._decided_by[timing.kind] = timing.service
-        self._decided_last = timing
+        if timing.kind == "sensing" or timing.service != OWN_PLANNER:  # not its own task actions
+            self._decided_last = timing
 
     def order(self, state: PlanningState, order: Act | Sense, status: str) -> None:
         """Take note of an order; returns at once."""
