@@ -31,7 +31,7 @@ PACKAGE_SOURCES := $(shell find cmake src lab/src -type f -not -name '*.pyc') la
 CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
 
 .DEFAULT_GOAL := help
-.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-ros test-ros1 test-compiled lint format simulate chaos fuzz soak mutants bench results docs wheel sbom requirements clean
+.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-ros test-ros1 test-compiled lint format simulate chaos fuzz soak mutants bench results docs wheel sbom release-rehearsal requirements clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -130,6 +130,11 @@ wheel: $(INSTALLED_DEV) ## dist/: the sources, and a wheel for machines of this 
 	    $(BIN)/auditwheel repair -w $(DIST) $(DIST)/unrepaired/*.whl
 	rm -rf $(DIST)/unrepaired
 	SOURCE_DATE_EPOCH=$(RELEASED) $(BIN)/python -m build --outdir $(DIST)/lab lab
+	for package in ros1_master_guard holdfast_ros; do \
+	    SOURCE_DATE_EPOCH=$(RELEASED) $(BIN)/python -m build --outdir $(DIST)/ros ros/$$package || exit; done
+
+release-rehearsal: wheel sbom ## a release up to its upload, to an index of this machine's own; then README's first steps from there
+	deploy/rehearse_release $(DIST) $(WHEELS)
 
 sbom: $(INSTALLED_DEV) ## dist/holdfast-sensing-VERSION.cdx.json: what the images' environment is made of, with licences
 	$(BIN)/python deploy/sbom.py $(DIST)
