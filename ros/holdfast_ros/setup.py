@@ -8,7 +8,6 @@ setup(
     name=NAME,
     version="0.1.0",
     description="holdfast in ROS 1 and ROS 2",
-    long_description="The lifecycle node of ROS 2, and the services and the client of ROS 1.",
     license="Apache-2.0",
     maintainer="The holdfast developers",
     maintainer_email="holdfast@example.org",

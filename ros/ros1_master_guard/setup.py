@@ -8,7 +8,6 @@ setup(
     name=NAME,
     version="0.1.0",
     description="Keeps a ROS 1 master alive",
-    long_description="When it dies, the next one knows all that it knew, and no node restarts.",
     license="Apache-2.0",
     maintainer="The holdfast developers",
     maintainer_email="holdfast@example.org",
