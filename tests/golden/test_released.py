@@ -47,7 +47,7 @@ def parameters(function: Any) -> str:
         if each.kind is each.KEYWORD_ONLY and not star:
             words.append("*")
         star |= each.kind in (each.KEYWORD_ONLY, each.VAR_POSITIONAL)
-        mark = {each.VAR_POSITIONAL: "*", each.VAR_KEYWORD: "**"}.get(each.kind, "")
+        mark = {"VAR_POSITIONAL": "*", "VAR_KEYWORD": "**"}.get(each.kind.name, "")
         words.append(f"{mark}{name}{'' if each.default is each.empty else '='}")
     return ", ".join(words)
 
@@ -130,8 +130,16 @@ def requests() -> list[bytes]:
         observed = Observed(state.step, sensing, encode_floats(shown))
         state, _ = planner.observe(state, sensing, shown)
         found.append(request_of(state, session, number, inputs=(observed,)))
-    more = {"session_configuration": about, "checkpoint": encode_checkpoint(state)}
-    return [encode(each) for each in (*found, request_of(state, b"another session.", 5, **more))]
+    found.append(
+        request_of(
+            state,
+            b"another session.",
+            5,
+            session_configuration=about,
+            checkpoint=encode_checkpoint(state),
+        )
+    )
+    return [encode(each) for each in found]
 
 
 def as_recorded(sent: list[bytes]) -> str:
