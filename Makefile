@@ -31,7 +31,7 @@ PACKAGE_SOURCES := $(shell find cmake src lab/src -type f -not -name '*.pyc') la
 CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
 
 .DEFAULT_GOAL := help
-.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-ros test-ros1 test-compiled lint format simulate chaos fuzz soak mutants bench results docs wheel sbom requirements clean
+.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-ros test-ros1 test-compiled lint lint-forge format simulate chaos fuzz soak mutants bench results docs wheel sbom release-rehearsal requirements clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -89,7 +89,15 @@ soak: $(INSTALLED_DEV) ## sessions come and go for 10 minutes, and nothing may g
 mutants: $(INSTALLED_DEV) ## small mistakes in the product: how many do its tests notice? An hour at most, and again to go on
 	nice -n 19 $(BIN)/python -m tests.mutants
 
-lint: $(INSTALLED_DEV) ## style, types and layers
+# On the forge actionlint looks at them, too (.github/workflows/test.yml).
+lint-forge: $(INSTALLED_DEV)
+	$(BIN)/check-jsonschema -q --builtin-schema vendor.github-workflows .github/workflows/*.yml
+	$(BIN)/check-jsonschema -q --builtin-schema vendor.github-issue-config .github/ISSUE_TEMPLATE/config.yml
+	$(BIN)/check-jsonschema -q --builtin-schema vendor.github-issue-forms $(filter-out %/config.yml,$(wildcard .github/ISSUE_TEMPLATE/*.yml))
+	$(BIN)/check-jsonschema -q --builtin-schema vendor.dependabot .github/dependabot.yml
+	$(BIN)/zizmor -q --offline --min-severity medium .github
+
+lint: $(INSTALLED_DEV) lint-forge ## style, types, layers, and the forge's workflows
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -130,6 +138,11 @@ wheel: $(INSTALLED_DEV) ## dist/: the sources, and a wheel for machines of this 
 	    $(BIN)/auditwheel repair -w $(DIST) $(DIST)/unrepaired/*.whl
 	rm -rf $(DIST)/unrepaired
 	SOURCE_DATE_EPOCH=$(RELEASED) $(BIN)/python -m build --outdir $(DIST)/lab lab
+	for package in ros1_master_guard holdfast_ros; do \
+	    SOURCE_DATE_EPOCH=$(RELEASED) $(BIN)/python -m build --outdir $(DIST)/ros ros/$$package || exit; done
+
+release-rehearsal: wheel sbom ## a release up to its upload, to an index of this machine's own; then README's first steps from there
+	deploy/rehearse_release $(DIST) $(WHEELS)
 
 sbom: $(INSTALLED_DEV) ## dist/holdfast-sensing-VERSION.cdx.json: what the images' environment is made of, with licences
 	$(BIN)/python deploy/sbom.py $(DIST)

@@ -158,7 +158,7 @@ class RockSample(ProblemBase):
         del stages
         return np.where(self.is_goal(states), 0.0, tours()[0][self._known(states)])
 
-    def execute(self, actions: FloatArray) -> FloatArray:
+    def limit_action(self, actions: FloatArray) -> FloatArray:
         along = np.clip(np.rint(actions), -1.0, 1.0)
         along[..., 1] *= along[..., 0] == 0.0
         along[..., 2] *= (along[..., :2] == 0.0).all(axis=-1)

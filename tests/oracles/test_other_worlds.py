@@ -18,7 +18,7 @@ class TestRockSample:
         state = np.array([*rock_sample.START, *world.good], dtype=float)
         noise, reward = stream(0, 0, 0, Purpose.PREDICTION), 0.0
         while not world.over:
-            action = problem.execute(problem.policy(state, 0))
+            action = problem.limit_action(problem.policy(state, 0))
             state = problem.move(state, action, noise)
             reward += rock_sample.DISCOUNT**world.steps * float(problem.reward(state, action))
             world.act(rock_sample.code_of(action))

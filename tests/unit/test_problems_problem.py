@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from holdfast.config.registry import make_problem
+from holdfast.earlier_names import warn_of_earlier_name
 from holdfast.errors import ProblemError
 from holdfast.problems import checked
 from holdfast.problems.attributes import know_earlier_names
@@ -41,9 +42,14 @@ class TestProblemBase:
     def test_the_earlier_name_of_limit_action(self) -> None:
         """``execute`` is the same function, in a class, a subclass, a mixin and a plain class."""
 
-        class Halves(Minimal):
-            def execute(self, actions: Any) -> Any:
-                return super().execute(0.5 * actions)
+        warn_of_earlier_name.cache_clear()
+        with pytest.warns(DeprecationWarning, match=r"limit_action now; execute goes with") as said:
+
+            class Halves(Minimal):
+                def execute(self, actions: Any) -> Any:
+                    return super().execute(0.5 * actions)
+
+        assert [each.filename for each in said] == [__file__]  # whose author can change it
 
         class Quarters(Halves):
             def limit_action(self, actions: Any) -> Any:

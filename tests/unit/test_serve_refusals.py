@@ -33,7 +33,6 @@ from holdfast.transport.key_ring import make_credentials
         (["--tls", "/nowhere"], ["/nowhere"]),
         (["--lis", "tcp/127.0.0.1:0"], ["--lis"]),
         (["--processes", "2", "--until-stdin-closes"], ["--until-stdin-closes"]),
-        (["--listen", "ros1/cloud"], ["--listen", "ros1 is not allowed", "ros1-serve"]),
         (["--processes", "2", "--health", "here"], ["here"]),
         *(
             (

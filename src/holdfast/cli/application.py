@@ -116,8 +116,6 @@ def find_command(arguments: Sequence[str]) -> FoundCommand:
             f"the command {first} is in the package {package}, which is not installed here; in a "
             f"clone of the same version: pip install {folders}"
         )
-    if first == "experiment":
-        raise OptionError("experiment is python -m studies now, in a clone: docs/results.md")
     from holdfast.validation import close_match
 
     what = "option of holdfast" if first.startswith("-") else "command"

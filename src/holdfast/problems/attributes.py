@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from holdfast.earlier_names import EARLIER_NAMES, warn_of_earlier_name
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.numerics.arrays import FloatArray, in_brief, integer, real_numbers
 
@@ -479,10 +480,12 @@ def moves_give_observations(problem: object) -> bool:
 
 
 def know_earlier_names(kind: type) -> None:
-    """Give the classes of a problem ``limit_action`` and ``execute``, its name until 0.1."""
+    """Give the classes of a problem ``limit_action`` and ``execute``, its earlier name."""
     for base in kind.__mro__:
         for name, other in (("limit_action", "execute"), ("execute", "limit_action")):
             if name in vars(base) and other not in vars(base):
+                if name in EARLIER_NAMES:
+                    warn_of_earlier_name(name)
                 setattr(base, other, vars(base)[name])
 
 

@@ -32,13 +32,6 @@ REVOKED_FILE = "revoked.pem"
 NEXT_KEY_FILE = "key.next.pem"
 """The key of the next certificate, while ``holdfast keys --rotate`` replaces both."""
 
-_RENAMED = {
-    "quic": "over UDP, services are at udp/HOST:PORT",
-    "unixsock-stream": "a local socket is written unix/PATH",
-    "ros1": "sessions go over tcp/HOST:PORT; in ROS 1 there is holdfast ros1-serve",
-}
-"""Protocols of earlier releases, and their replacements."""
-
 _HOST_NAME = re.compile(
     r"(?=.{1,253}\Z)[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_-]+)*"
 )
@@ -148,9 +141,7 @@ def parse_endpoint(text: str) -> Endpoint:
             f"as in tcp/127.0.0.1:7447"
         )
     if protocol not in PROTOCOLS:
-        instead = _RENAMED.get(protocol)
-        if instead is None:
-            instead = did_you_mean(protocol, PROTOCOLS).removeprefix("; ")
+        instead = did_you_mean(protocol, PROTOCOLS).removeprefix("; ")
         raise TransportError(
             f"endpoint {text!r}: protocol {protocol} is not allowed"
             + (f" ({instead})" if instead else "")
