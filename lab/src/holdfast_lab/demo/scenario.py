@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from holdfast.cli.terminal import counted
-from holdfast.recording.compare import Comparison, compare_runs
+from holdfast.reports.compare import Comparison, compare_runs
 from holdfast.robot.links import RECOVERY_SERVICE
 from holdfast_lab.demo.narrator import DemoState, Line, Narrator
 from holdfast_lab.errors import NoProgressError
