@@ -142,7 +142,7 @@ def standstill(context: Context) -> Result:
         return Result([f"Not measured: {reason}."])
     kinds: tuple[Literal["all", "sensing"], ...] = ("all", "sensing")
     waits: dict[str, list[float]] = {what: [] for what in kinds}
-    missed = dict.fromkeys(kinds, 0)
+    missed = dict.fromkeys(waits, 0)
     rounds = 1 if context.quick else 4
     for number in range(rounds):
         for done, what in enumerate(kinds):

@@ -238,8 +238,8 @@ def test_a_planner_that_fails_the_second_time_acquits_nobody() -> None:
     lie(world, "cloud", other_actions(0.5), after=1)
     honest = world.own
 
-    world.own = lambda it: (
-        OwnAnswer(it.number, failure=HoldfastError("gone")) if it.again else honest(it)
+    world.own = lambda effect: (
+        OwnAnswer(effect.number, failure=HoldfastError("gone")) if effect.again else honest(effect)
     )
     world.start_and_run()
     assert world.stopped is None
