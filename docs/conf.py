@@ -38,7 +38,7 @@ exclude_patterns = ["results/*/**"]
 # A block without a language is a drawing or a session, not Python.
 highlight_language = "none"
 
-# MyST resolves links to pages and headings, and a warning is an error. `check_links` below then
+# MyST resolves links to pages and headings, and a warning is an error. `finish_pages` below then
 # follows every link of the finished pages. `make docs-links` asks other sites, too.
 linkcheck_timeout = 20
 myst_enable_extensions = ["colon_fence", "dollarmath"]
@@ -215,28 +215,38 @@ def check_names(app: Any, environment: Any) -> None:
         raise ExtensionError(f"docs/reference lacks {', '.join(missing)}")
 
 
-def check_links(app: Any, error: Exception | None) -> None:
-    """Follow every link of the pages: files and anchors exist, other addresses are well formed."""
+def finish_pages(app: Any, error: Exception | None) -> None:
+    """Name what the theme and notebooks leave nameless, then follow every link.
+
+    Files and anchors must exist; addresses of other sites must be well formed.
+    """
     if error or app.builder.name != "html":
         return
     site = Path(app.outdir)
-    files = (path for path in site.rglob("*.html") if path.parent.name != "_static")  # templates
-    pages = {path: path.read_text(encoding="utf-8") for path in files}
+    pages = {}
+    for path in site.rglob("*.html"):
+        if path.parent.name != "_static":  # templates
+            text = path.read_text(encoding="utf-8")
+            text = text.replace("<summary><span", '<summary aria-label="pages below"><span')
+            label = '<span class="visually-hidden">row</span>'
+            pages[path] = text.replace("<th></th>", f"<th>{label}</th>")
+            path.write_text(pages[path], encoding="utf-8")
     anchors = {path: set(re.findall(r'\bid="([^"]+)"', text)) for path, text in pages.items()}
-    broken = []
+    broken = set()
     for page, text in pages.items():
         for link in map(unescape, re.findall(r'\b(?:href|src)="([^"]*)"', text)):
             parts = urlsplit(link)
             if parts.scheme or parts.netloc:
-                if parts.scheme not in ("https", "http", "data", "mailto") or " " in link:
-                    broken.append(f"{page.relative_to(site)}: {link}")
-                continue
-            target = (page.parent / unquote(parts.path)).resolve() if parts.path else page
-            ids = anchors.get(target, {unquote(parts.fragment)})
-            if not target.exists() or (parts.fragment and unquote(parts.fragment) not in ids):
-                broken.append(f"{page.relative_to(site)}: {link}")
+                well_formed = parts.scheme in ("https", "http", "data", "mailto")
+            else:
+                target = (page.parent / unquote(parts.path)).resolve() if parts.path else page
+                anchor = unquote(parts.fragment)
+                found = not anchor or target not in anchors or anchor in anchors[target]
+                well_formed = target.exists() and found
+            if not well_formed:
+                broken.add(f"{page.relative_to(site)}: {link}")
     if broken:
-        raise ExtensionError("links that lead nowhere:\n  " + "\n  ".join(sorted(set(broken))))
+        raise ExtensionError("links that lead nowhere:\n  " + "\n  ".join(sorted(broken)))
 
 
 def setup(app: Any) -> None:
@@ -245,4 +255,4 @@ def setup(app: Any) -> None:
     app.connect("source-read", adapt)
     app.connect("doctree-read", name_columns)
     app.connect("env-check-consistency", check_names)
-    app.connect("build-finished", check_links)
+    app.connect("build-finished", finish_pages)
