@@ -58,6 +58,8 @@ numpydoc_xref_param_type = False
 
 html_static_path = ["static"]
 html_css_files = ["site.css"]
+html_search_scorer = "static/scorer.js"
+toc_object_entries = False  # headings have the names
 html_extra_path = [str(NOTEBOOKS)]
 html_theme = "pydata_sphinx_theme"
 html_title = "holdfast"
