@@ -58,7 +58,7 @@ numpydoc_xref_param_type = False
 
 html_static_path = ["static"]
 html_css_files = ["site.css"]
-html_search_scorer = "static/scorer.js"
+html_search_scorer = str(DOCS / "static" / "scorer.js")
 toc_object_entries = False  # headings have the names
 html_extra_path = [str(NOTEBOOKS)]
 html_theme = "pydata_sphinx_theme"
