@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast.errors import InvalidValueError
+from holdfast.journal.tables import wilson_interval
 from holdfast.numerics.arrays import BoolArray, FloatArray
-from holdfast.recording.tables import wilson_interval
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -213,7 +213,7 @@ class RandomEffects(NamedTuple):
     """What an effect is over problems of which those that were tried are a sample."""
 
     mean: Interval
-    """Of the effects over all such problems."""
+    """Mean of the effects over all such problems."""
     p_value: float
     """That this mean is zero."""
     deviation: float
