@@ -59,9 +59,8 @@ PAGES = [
     for page in [read_page(path)]
     if page.commands or page.programs
 ]
-README, ROBOTS = (
-    next(page for page in PAGES if page.name == name) for name in ("README.md", "docs/robots.md")
-)
+NAMED = {page.name: page for page in PAGES}
+README, ROBOTS = NAMED["README.md"], NAMED["docs/robots.md"]
 
 SMALLER = {"--trials": "2", "--rate": "10000", "--seeds": "17:18", "--budget": "1s"}
 """What takes less time and is the same command."""
@@ -241,5 +240,4 @@ def test_nothing_is_left_to_fill_in(name: str) -> None:
     text = (ROOT / name).read_text(encoding="utf-8")
     prose = re.sub(r"^```.*?^```$|`[^`\n]+`", "", text, flags=re.DOTALL | re.MULTILINE)
     left = re.findall(r"\b[A-Z0-9]+(?:_[A-Z0-9]+)+\b|\b(?:TODO|FIXME|TBD|XXX)\b", prose)
-    assert left == []
-    assert name != "README.md" or text.count("\n") <= 160  # what a newcomer reads
+    assert not left and (name != "README.md" or text.count("\n") <= 160), left
