@@ -123,7 +123,7 @@ docs: $(INSTALLED_DOCS) ## the site, in build/site; its tutorials are run, and a
 	$(BIN)/python -m sphinx -E -W --keep-going -q -b html -d build/site-doctrees docs build/site
 
 docs-links: $(INSTALLED_DOCS) ## every link of the site, those to other sites too: needs the internet
-	$(BIN)/python -m sphinx -E -q -b linkcheck -D nb_execution_mode=off -d build/links-doctrees docs build/links
+	$(BIN)/python -m sphinx -E -q -b linkcheck -D nb_execution_mode=off -D suppress_warnings=myst-nb.lexer -d build/links-doctrees docs build/links
 
 wheel: $(INSTALLED_DEV) ## dist/: the sources, and a wheel for machines of this kind, the same bytes each time; dist/lab/
 	rm -rf $(DIST)
