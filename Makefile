@@ -31,7 +31,7 @@ PACKAGE_SOURCES := $(shell find cmake src lab/src -type f -not -name '*.pyc') la
 CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
 
 .DEFAULT_GOAL := help
-.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-ros test-ros1 test-compiled lint lint-forge format simulate chaos fuzz soak mutants bench results docs wheel sbom release-rehearsal requirements clean
+.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-ros test-ros1 test-compiled lint lint-forge format simulate chaos fuzz soak mutants bench results docs docs-links wheel sbom release-rehearsal requirements clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -129,6 +129,9 @@ results: $(INSTALLED_DEV) ## the experiments behind docs/results.md: hours, the 
 
 docs: $(INSTALLED_DOCS) ## the site, in build/site; its tutorials are run, and a warning is an error
 	$(BIN)/python -m sphinx -E -W --keep-going -q -b html -d build/site-doctrees docs build/site
+
+docs-links: $(INSTALLED_DOCS) ## every link of the site, those to other sites too: needs the internet
+	$(BIN)/python -m sphinx -E -q -b linkcheck -D nb_execution_mode=off -D suppress_warnings=myst-nb.lexer -d build/links-doctrees docs build/links
 
 wheel: $(INSTALLED_DEV) ## dist/: the sources, and a wheel for machines of this kind, the same bytes each time; dist/lab/
 	rm -rf $(DIST)

@@ -33,7 +33,7 @@ class Yard(hf.ProblemBase):
         return self.start + 0.2 * stream.normal((count, 2))
 
     def reinitial_states(self, states, stream):
-        """Know nothing of a lost robot but that it is in the yard."""
+        """Spread the belief over the whole yard: nothing else is known of a lost robot."""
         return self.side * stream.uniform(states.shape)
 
     def move(self, states, actions, stream):

@@ -59,7 +59,8 @@ PAGES = [
     for page in [read_page(path)]
     if page.commands or page.programs
 ]
-README = next(page for page in PAGES if page.name == "README.md")
+NAMED = {page.name: page for page in PAGES}
+README, ROBOTS = NAMED["README.md"], NAMED["docs/robots.md"]
 
 SMALLER = {"--trials": "2", "--rate": "10000", "--seeds": "17:18", "--budget": "1s"}
 """What takes less time and is the same command."""
@@ -177,10 +178,10 @@ def test_commands_and_programs(page: Page, smaller: dict[str, str], clone: Path)
             assert (clone / "runs" / "first" / name).stat().st_size > 0
 
 
-def test_the_robot_of_the_readme(clone: Path) -> None:
+def test_the_robot_of_the_page(clone: Path) -> None:
     """The class and its configuration run as they stand there."""
     for name in ("my_robot.py", "my_robot.yaml"):
-        (clone / name).write_text(README.files[name], encoding="utf-8")
+        (clone / name).write_text(ROBOTS.files[name], encoding="utf-8")
     done = run(["holdfast", "run", "my_robot.yaml", "--trials", "1"], clone)
     assert done.returncode == 0, done.stderr
     assert "(1 of 1; " in done.stdout
@@ -239,4 +240,4 @@ def test_nothing_is_left_to_fill_in(name: str) -> None:
     text = (ROOT / name).read_text(encoding="utf-8")
     prose = re.sub(r"^```.*?^```$|`[^`\n]+`", "", text, flags=re.DOTALL | re.MULTILINE)
     left = re.findall(r"\b[A-Z0-9]+(?:_[A-Z0-9]+)+\b|\b(?:TODO|FIXME|TBD|XXX)\b", prose)
-    assert left == []
+    assert not left and (name != "README.md" or text.count("\n") <= 160), left

@@ -32,7 +32,7 @@ def forgotten_imports(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def test_what_it_quotes_stands_in_an_example() -> None:
     sources = [path.read_text(encoding="utf-8") for path in EXAMPLE.parent.glob("*.py")]
-    quoted = re.findall(r"^```py\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
+    quoted = re.findall(r"^```py\n((?!# ).*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
     assert len(quoted) >= 4
     for block in quoted:
         assert any(textwrap.indent(block, "    ") in source for source in sources), block
