@@ -1,4 +1,4 @@
-"""A process whose event loop stands still ends itself; one that was stopped from outside does not."""
+"""A process whose event loop stands still ends itself; one that was only stopped does not."""
 
 from __future__ import annotations
 
