@@ -8,6 +8,7 @@ has the file open, not this code.
 from __future__ import annotations
 
 import copyreg
+import os
 import traceback
 
 
@@ -235,6 +236,13 @@ DEFECT = "defect"
 
 _MAX_TRACEBACK = 4000
 """Characters; the end is kept, where the exception is."""
+
+
+def how_to_install(package: str, extra: str | None = None) -> str:
+    """Return what installs a package or its extra: pip, or in an image ``HOLDFAST_INSTALL``."""
+    if (of_image := os.environ.get("HOLDFAST_INSTALL")) is not None:
+        return of_image.replace("{}", package)
+    return f"pip install {package}" if extra is None else f"pip install 'holdfast-sensing[{extra}]'"
 
 
 def defect_fields(error: BaseException) -> dict[str, str]:

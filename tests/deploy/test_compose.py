@@ -16,6 +16,7 @@ import pytest
 import yaml
 from tests.deploy.docker import ROOT, USER, Engine, Images, give_to, holdfast, wait_until
 from tests.ports import free_port
+from tests.processes.test_watchdog import STANDS_STILL
 
 from holdfast.journal.journal import Journal
 
@@ -39,6 +40,8 @@ class Site:
         configuration["offload"] = {"services": [self.endpoint], "tls": "/keys"}
         self.write("config/robot.yaml", configuration)
         (directory / "runs").mkdir()
+        (directory / "still").mkdir()
+        (directory / "still/sitecustomize.py").write_text(STANDS_STILL)
         give_to(USER, directory / "keys", directory / "runs")
         self.variables = {
             "HOLDFAST_CLOUD_IMAGE": images.cloud,
@@ -47,7 +50,7 @@ class Site:
             "HOLDFAST_RUNS": str(directory / "runs"),
         }
         serve = ["serve", "--listen", f"{protocol}/0.0.0.0:7447", "--tls", "/keys"]
-        self.override("cloud", [*serve, "--health", "0.0.0.0:8080"])
+        self.override("cloud", [*serve, "--health", "0.0.0.0:8080", "--watchdog-s", "3"])
         self.start_robot_with("--rate", "50")
 
     def write(self, name: str, document: object) -> None:
@@ -57,7 +60,8 @@ class Site:
 
     def override(self, role: str, command: list[str]) -> None:
         """Say what is the test's own: the network between the two, and the command."""
-        service = {"command": command, "networks": ["line"]}
+        service = {"command": command, "networks": ["line"], "environment": ["PYTHONPATH=/still"]}
+        service["volumes"] = [f"{self.directory}/still:/still:ro"]
         networks = {"line": {"external": True, "name": self.name}}
         self.write(f"{role}.yaml", {"services": {role: service}, "networks": networks})
 
@@ -81,7 +85,7 @@ class Site:
         )
 
     def container(self, role: str) -> str:
-        found = self.compose(role, "ps", "-q", role)
+        found = self.compose(role, "ps", "-a", "-q", role)
         assert found, f"there is no container of {role}"
         return found
 
@@ -160,6 +164,12 @@ def test_the_cloud_is_killed_paused_cut_off_and_moved(site: Site, engine: Engine
 
     harm(lambda: docker("kill", cloud), heal=lambda: docker("start", cloud))
     harm(lambda: docker("pause", cloud), heal=lambda: docker("unpause", cloud))
+    # Its loop stands still: it ends itself, and the engine starts it again with nobody there.
+    harm(
+        lambda: os.kill(site.state("cloud")["Pid"], signal.SIGUSR1),
+        heal=lambda: None,
+    )
+    assert engine.inspect(cloud)["RestartCount"] == 1
     harm(
         lambda: docker("network", "disconnect", site.name, cloud),
         heal=lambda: docker("network", "connect", "--alias", "cloud", site.name, cloud),

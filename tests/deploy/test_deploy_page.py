@@ -30,12 +30,18 @@ done
 """
 """What a person who types takes for granted."""
 
+LOOKED_AT = """\
+until docker compose logs robot | grep -q 'local_recovery -> keep_alive'; do sleep 0.2; done
+"""
+"""And what this person looks at before the robot is killed, too."""
+
 
 def test_ten_minutes(engine: Engine, images: Images, tmp_path: Path) -> None:
     assert len(BLOCKS) == 5
     typed = [block.replace("num_trials: 20", "num_trials: 5") for block in BLOCKS]
     assert typed != BLOCKS
     typed = [block.replace("up -d\n", f"up -d\n{AFTER_A_WHILE}") for block in typed]
+    typed = [block.replace("start cloud\n", f"start cloud\n{LOOKED_AT}") for block in typed]
     tracked = subprocess.run(
         ["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True, text=True
     )

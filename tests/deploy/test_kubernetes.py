@@ -1,8 +1,9 @@
 """The manifests for Kubernetes: rendered, held against its schemas, and started as they say.
 
-There is no cluster here. What one would do with the manifests is done by hand: a certificate is
-made with the fields that cert-manager is told, files are mounted as the volume says, and ``serve``
-runs with the container's own arguments.
+There is no cluster here. What one would do with the manifests is done by hand: files are mounted as
+the volume says, and ``serve`` and ``run`` have the containers' own arguments. ``custom_kinds.json``
+has the schemas of kinds that are not Kubernetes's own, strict, of the package
+cloudcoil-models-prometheus-operator 0.80.
 """
 
 from __future__ import annotations
@@ -15,23 +16,13 @@ import subprocess
 import tempfile
 import urllib.request
 from collections.abc import Iterator
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import kubernetes_validate
 import pytest
 import yaml
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.serialization import (
-    Encoding,
-    NoEncryption,
-    PrivateFormat,
-    load_pem_private_key,
-)
-from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from tests.deploy.docker import ROOT
 from tests.ports import free_port
 from tests.processes.faults import COMMAND, PATIENCE_S, Site, document_of, services_in_order
@@ -40,7 +31,8 @@ from holdfast.transport.key_ring import make_credentials, revoke_credentials
 
 KUBERNETES = ROOT / "deploy" / "kubernetes"
 BASE = KUBERNETES / "base"
-OVERLAYS = ("small", "autoscaled", "autoscaled-on-decisions")
+OVERLAYS = ("small", "outside", "autoscaled", "autoscaled-on-decisions")
+CUSTOM = json.loads(Path(__file__).with_name("custom_kinds.json").read_text())
 VERSIONS = ("1.30", kubernetes_validate.latest_version())
 """The oldest that has ``preStop.sleep``, and the newest whose schemas there are."""
 
@@ -99,13 +91,19 @@ def container_of(manifests: list[Manifest]) -> Manifest:
     return container
 
 
+def check_schemas(manifests: list[Manifest]) -> None:
+    assert manifests
+    for each in manifests:
+        if each["apiVersion"] == "monitoring.coreos.com/v1":
+            jsonschema.validate(each, CUSTOM[each["kind"]])
+        else:
+            for version in VERSIONS:
+                kubernetes_validate.validate(each, version, strict=True)
+
+
 def check(manifests: list[Manifest]) -> None:
     """Hold manifests against the schemas, and against each other."""
-    for each in manifests:
-        if each["apiVersion"] == "cert-manager.io/v1":
-            continue  # no kind of Kubernetes's own: the package has no schema (see below)
-        for version in VERSIONS:
-            kubernetes_validate.validate(each, version, strict=True)
+    check_schemas(manifests)
     deployment = of_kind(manifests, "Deployment")
     template = deployment["spec"]["template"]
     labels = template["metadata"]["labels"]
@@ -147,52 +145,30 @@ def check(manifests: list[Manifest]) -> None:
                     deployment["metadata"]["name"],
                 ]
                 assert "replicas" not in deployment["spec"]
-        assert each["kind"] == "Namespace" or each["metadata"].get("namespace") in (
-            None,
-            "holdfast",
-        )
+        assert each["metadata"].get("namespace") in (None, "holdfast")
     for selector in selectors:
         assert selector
         assert selector.items() <= labels.items()
     for name in ("startupProbe", "livenessProbe", "readinessProbe"):
         assert container[name]["httpGet"]["port"] in ports
-    check_certificate(manifests)
+    names = {(each["kind"], each["metadata"]["name"]) for each in manifests}
+    pod = template["spec"]
+    assert ("ServiceAccount", pod["serviceAccountName"]) in names
+    assert ("PriorityClass", pod["priorityClassName"]) in names
+    assert not pod["automountServiceAccountToken"]
 
 
-def check_certificate(manifests: list[Manifest]) -> None:
-    """Look at cert-manager's kinds: whether they lead from our authority to the pod's files."""
-    issuer = of_kind(manifests, "Issuer", "holdfast-authority")
-    spec = of_kind(manifests, "Certificate")["spec"]
-    assert issuer["spec"] == {"ca": {"secretName": "holdfast-authority"}}
-    assert spec["issuerRef"]["name"] == issuer["metadata"]["name"]
-    assert spec.keys() == {
-        *("secretName", "issuerRef", "commonName", "dnsNames", "usages", "isCA"),
-        *("duration", "renewBefore", "privateKey"),
-    }
-    assert 0 < len(spec["commonName"]) <= 64
-    # Whoever steals it must not be able to ask as well.
-    assert spec["usages"] == ["digital signature", "server auth"]
-    services = [each["metadata"]["name"] for each in manifests if each["kind"] == "Service"]
-    assert {f"{name}.holdfast.svc" for name in services} <= set(spec["dnsNames"])
-    (secret,) = (each["secret"] for each in keys_volume(manifests)["sources"] if "secret" in each)
-    assert secret["name"] == spec["secretName"]
-
-
-def keys_volume(manifests: list[Manifest]) -> Manifest:
-    (volume,) = (each for each in pod_of(manifests)["volumes"] if each["name"] == "keys")
-    projected = volume["projected"]
-    assert isinstance(projected, dict)
-    return projected
+def secret_of(pod: Manifest, name: str) -> Manifest:
+    """Return the Secret that a volume of a pod shows."""
+    (volume,) = (each for each in pod["volumes"] if each["name"] == name)
+    secret = volume["secret"]
+    assert isinstance(secret, dict)
+    return secret
 
 
 @pytest.mark.parametrize("path", files_of_base(), ids=lambda path: path.name)
 def test_a_file_of_the_base_alone(path: Path) -> None:
-    manifests = read(path.read_text())
-    assert manifests
-    for each in manifests:
-        if each["apiVersion"] != "cert-manager.io/v1":
-            for version in VERSIONS:
-                kubernetes_validate.validate(each, version, strict=True)
+    check_schemas(read(path.read_text()))
 
 
 def test_the_base_as_it_is_written() -> None:
@@ -214,8 +190,8 @@ def test_the_base_rendered() -> None:
     manifests = rendered(BASE)
     check(manifests)
     assert kinds(manifests) == kinds(base())
-    assert keys_volume(manifests)["defaultMode"] == 0o440
-    named = [each for each in manifests if each["kind"] != "Namespace"]
+    assert secret_of(pod_of(manifests), "keys")["defaultMode"] == 0o440
+    named = [each for each in manifests if each["kind"] not in ("Namespace", "PriorityClass")]
     assert {each["metadata"]["namespace"] for each in named} == {"holdfast"}
 
 
@@ -232,6 +208,13 @@ def test_an_overlay(overlay: str) -> None:
         assert container_of(manifests)["args"] == args
         assert "cpu" not in container_of(manifests)["resources"]["limits"]
         return
+    if overlay == "outside":
+        service = of_kind(manifests, "Service")["spec"]
+        assert service["type"] == "LoadBalancer"
+        assert [each["protocol"] for each in service["ports"]] == ["UDP", "TCP"]
+        assert of_kind(manifests, "Deployment")["spec"]["replicas"] == 1
+        assert container_of(manifests)["args"][1] == "--listen=udp/0.0.0.0:7447"
+        return
     assert kinds(manifests) == sorted([*kinds(base), "HorizontalPodAutoscaler"])
     (metric,) = of_kind(manifests, "HorizontalPodAutoscaler")["spec"]["metrics"]
     if overlay == "autoscaled":
@@ -239,6 +222,57 @@ def test_an_overlay(overlay: str) -> None:
         assert "cpu" in container_of(manifests)["resources"]["requests"]
     else:
         assert metric["pods"]["metric"]["name"] == adapter_rule()["name"]["as"]
+
+
+def test_an_overlay_of_ones_own_says_where_the_image_is(tmp_path: Path) -> None:
+    tree = shutil.copytree(KUBERNETES, tmp_path / "kubernetes")
+    overlay = tree / "overlays/mine"
+    for base, image in (("../../base", "holdfast-cloud"), ("../../robot", "holdfast-robot")):
+        overlay.mkdir(exist_ok=True)
+        images = f"images: [{{name: {image}, newName: registry.example.org/x, newTag: 0.1.0}}]"
+        (overlay / "kustomization.yaml").write_text(f"resources: [{base}]\n{images}\n")
+        (used,) = re.findall(r"image: (.*)", yaml.safe_dump(rendered(overlay)))
+        assert used == "registry.example.org/x:0.1.0"
+
+
+def test_what_the_prometheus_operator_is_given() -> None:
+    manifests = rendered(KUBERNETES / "monitoring")
+    check_schemas(manifests)
+    monitor, rule = of_kind(manifests, "PodMonitor"), of_kind(manifests, "PrometheusRule")
+    assert rule["spec"] == yaml.safe_load((ROOT / "deploy/prometheus/rules.yaml").read_text())
+    spec = monitor["spec"]
+    (names,) = spec["selector"]["matchExpressions"]
+    (endpoint,) = spec["podMetricsEndpoints"]
+    pods = [of_kind(base(), "Deployment")["spec"]["template"], robot_pod()]
+    for pod in pods:
+        assert pod["metadata"]["labels"][names["key"]] in names["values"]
+        (container,) = pod["spec"]["containers"]
+        assert endpoint["port"] in {each["name"] for each in container["ports"]}
+        assert "--metrics=0.0.0.0:8080" in container["args"]
+    wrong = {**monitor, "spec": {**spec, "podMetricsEndpoint": []}}
+    with pytest.raises(jsonschema.ValidationError):
+        check_schemas([wrong])
+
+
+def robot_pod() -> Manifest:
+    return of_kind(rendered(KUBERNETES / "robot"), "Pod", "holdfast-robot")
+
+
+def test_a_robot_is_started_by_a_person_alone() -> None:
+    manifests = rendered(KUBERNETES / "robot")
+    check_schemas(manifests)
+    pod = robot_pod()["spec"]
+    assert pod["restartPolicy"] == "Never"
+    (container,) = pod["containers"]
+    assert {"--restart", "--resume-if-begun"} <= set(container["args"])
+    names = {(each["kind"], each["metadata"]["name"]) for each in manifests}
+    assert ("ServiceAccount", pod["serviceAccountName"]) in names
+    for volume in pod["volumes"]:
+        claim, config = volume.get("persistentVolumeClaim"), volume.get("configMap")
+        assert claim is None or ("PersistentVolumeClaim", claim["claimName"]) in names
+        assert config is None or ("ConfigMap", config["name"]) in names
+    assert container["securityContext"] == container_of(base())["securityContext"]
+    assert pod["securityContext"] == pod_of(base())["securityContext"]
 
 
 def adapter_rule() -> Manifest:
@@ -293,88 +327,18 @@ def site() -> Iterator[Site]:
         yield site
 
 
-def issued(spec: Manifest, authority: Path, key: Path) -> dict[str, bytes]:
-    """Return the Secret that cert-manager makes for a Certificate, with an Issuer's CA."""
-    assert spec["privateKey"] == {
-        "algorithm": "ECDSA",
-        "size": 256,
-        "encoding": "PKCS8",
-        "rotationPolicy": "Always",
-    }
-    signed_by = x509.load_pem_x509_certificate(authority.read_bytes())
-    signs_with = load_pem_private_key(key.read_bytes(), None)
-    assert isinstance(signs_with, ec.EllipticCurvePrivateKey)
-    own = ec.generate_private_key(ec.SECP256R1())
-    usages = set(spec["usages"])
-    extended = {
-        "server auth": ExtendedKeyUsageOID.SERVER_AUTH,
-        "client auth": ExtendedKeyUsageOID.CLIENT_AUTH,
-    }
-    assert usages <= {"digital signature", "key encipherment", *extended}
-    hours = int(spec["duration"].removesuffix("h"))
-    now = datetime.now(UTC)
-    others = dict.fromkeys(
-        (
-            *("content_commitment", "data_encipherment", "key_agreement", "key_cert_sign"),
-            *("crl_sign", "encipher_only", "decipher_only"),
-        ),
-        False,
-    )
-    usage = x509.KeyUsage(
-        digital_signature="digital signature" in usages,
-        key_encipherment="key encipherment" in usages,
-        **others,
-    )
-    certificate = (
-        x509.CertificateBuilder()
-        .subject_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, spec["commonName"])]))
-        .issuer_name(signed_by.subject)
-        .public_key(own.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now)
-        .not_valid_after(now + timedelta(hours=hours))
-        .add_extension(x509.BasicConstraints(ca=spec["isCA"], path_length=None), critical=True)
-        .add_extension(usage, critical=True)
-        .add_extension(
-            x509.ExtendedKeyUsage([extended[each] for each in sorted(usages & extended.keys())]),
-            critical=False,
-        )
-        .add_extension(
-            x509.AuthorityKeyIdentifier.from_issuer_public_key(signs_with.public_key()),
-            critical=False,
-        )
-        .add_extension(
-            x509.SubjectAlternativeName([x509.DNSName(each) for each in spec["dnsNames"]]),
-            critical=False,
-        )
-        .sign(signs_with, hashes.SHA256())
-    )
-    return {
-        "tls.crt": certificate.public_bytes(Encoding.PEM),
-        "tls.key": own.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()),
-        "ca.crt": authority.read_bytes(),
-    }
-
-
-def mount(
-    volume: Manifest, directory: Path, objects: dict[str, dict[str, bytes]], group: int
-) -> None:
-    """Write what a projected volume shows, in place of what it showed, as the kubelet does."""
+def mount(secret: Manifest, keys: Path, directory: Path, group: int) -> None:
+    """Write what a Secret of these keys shows, in place of what it showed, as the kubelet does."""
     directory.mkdir(exist_ok=True)
     new = directory / f"..{len(list(directory.iterdir()))}"
     new.mkdir()
-    for source in volume["sources"]:
-        ((kind, told),) = source.items()
-        if told["name"] not in objects:
-            assert told.get("optional"), f"no {kind} {told['name']}: the pod would not start"
-            continue
-        for item in told["items"]:
-            file = new / item["path"]
-            file.write_bytes(objects[told["name"]][item["key"]])
-            file.chmod(volume["defaultMode"])
-            os.chown(file, 0, group)
-            if not (directory / item["path"]).is_symlink():
-                (directory / item["path"]).symlink_to(Path("..data") / item["path"])
+    for path in keys.iterdir():
+        file = new / path.name
+        file.write_bytes(path.read_bytes())
+        file.chmod(secret["defaultMode"])
+        os.chown(file, 0, group)
+        if not (directory / path.name).is_symlink():
+            (directory / path.name).symlink_to(Path("..data") / path.name)
     (directory / "..new").symlink_to(new.name)
     (directory / "..new").rename(directory / "..data")
 
@@ -385,11 +349,16 @@ def test_a_robot_decides_through_what_the_manifests_start(site: Site) -> None:
     pod, container = pod_of(manifests), container_of(manifests)
     user = pod["securityContext"]
     home, keys = site.directory / "home", site.directory / "keys"
-    make_credentials(home, robots=["robot", "berta"])
-    spec = of_kind(manifests, "Certificate")["spec"]
-    authority, key = home / "authority" / "authority.pem", home / "authority" / "authority.key"
-    objects = {spec["secretName"]: issued(spec, authority, key)}
-    mount(keys_volume(manifests), keys, objects, group=user["fsGroup"])
+    robot_spec = robot_pod()["spec"]
+    configuration = yaml.safe_load((KUBERNETES / "robot/configuration.yaml").read_text())
+    (endpoint,) = configuration["offload"]["services"]
+    host = endpoint.removeprefix("tls/").removesuffix(":7447")
+    services = {each["metadata"]["name"] for each in manifests if each["kind"] == "Service"}
+    assert host in {f"{each}.holdfast.svc" for each in services}
+    make_credentials(home, robots=["robot", "berta"], services=["service"], hosts=[host])
+    secret = secret_of(pod, "keys")
+    assert secret["secretName"] != secret_of(robot_spec, "keys")["secretName"]
+    mount(secret, home / "service", keys, group=user["fsGroup"])
 
     ports = [free_port(), free_port()]
     words = " ".join(container["args"]).replace("/keys", str(keys))
@@ -408,7 +377,7 @@ def test_a_robot_decides_through_what_the_manifests_start(site: Site) -> None:
 
     # The robot calls it as in the cluster; the names are its own, and nobody else sees them.
     hosts = site.directory / "hosts"
-    hosts.write_text(f"127.0.0.1 localhost {' '.join(spec['dnsNames'])}\n")
+    hosts.write_text(f"127.0.0.1 localhost {host}\n")
     own_hosts = (
         "unshare",
         "--mount",
@@ -418,14 +387,12 @@ def test_a_robot_decides_through_what_the_manifests_start(site: Site) -> None:
     )
     file = site.configure(document_of("peg_in_hole_2d", max_steps=20))
     options = ("--tls", home / "robot", "--rate", "10000", "--recovery", "never")
-    endpoint = f"tls/{spec['dnsNames'][1]}:{ports[0]}"
+    endpoint = f"tls/{host}:{ports[0]}"
     robot = site.run(file, *options, services=[endpoint], command=(*own_hosts, "sh", *COMMAND))
     robot.finish()
     assert services_in_order(robot) == [endpoint]
 
-    # cert-manager renews, and somebody makes the list of what is revoked: the service notices.
+    # It is renewed, and a robot revoked: the Secret is made again, and the service notices.
     revoke_credentials(home, names=["berta"])
-    objects[spec["secretName"]] = issued(spec, authority, key)
-    objects["holdfast-revoked"] = {"revoked.pem": (home / "authority" / "revoked.pem").read_bytes()}
-    mount(keys_volume(manifests), keys, objects, group=user["fsGroup"])
+    mount(secret, home / "service", keys, group=user["fsGroup"])
     cloud.wait_for("credentials_reloaded", num_revoked=1)

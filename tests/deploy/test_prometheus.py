@@ -21,6 +21,13 @@ from holdfast.transport.key_ring import make_credentials
 RULES = ROOT / "deploy" / "prometheus" / "rules.yaml"
 PLAYED = Path(__file__).with_name("prometheus_rules.yaml")
 ADAPTER = ROOT / "deploy/kubernetes/overlays/autoscaled-on-decisions/prometheus-adapter.yaml"
+SCRAPES = {
+    "job": {},
+    "pods by annotation": dict.fromkeys(("holdfast", "holdfast-robots"), "kubernetes-pods"),
+    "PodMonitor": {"holdfast": "holdfast", "holdfast-robots": "holdfast-robot"},
+}
+"""What a scrape calls the jobs; of pods it tells the name and namespace, too."""
+
 METRIC = re.compile(r"\b(?:holdfast|process)_\w+")
 
 
@@ -28,6 +35,22 @@ def promtool(*words: str | Path) -> subprocess.CompletedProcess[str]:
     if shutil.which("promtool") is None:
         missing("there is no command promtool (Debian: prometheus)")
     return subprocess.run(["promtool", *words], text=True, capture_output=True, check=False)
+
+
+def played(text: str, directory: Path, scrape: str = "job", rules: Path = RULES) -> Path:
+    """Return a file for promtool: what is played, with the labels of a scrape."""
+    text = text.replace("../../deploy/prometheus/rules.yaml", str(rules))
+    if scrape != "job":
+        jobs = SCRAPES[scrape]
+        for job, name in (("holdfast", "holdfast"), ("holdfast-robots", "holdfast-robot")):
+            its = jobs.get(job, job)
+            pod = rf'job="{its}",namespace="{name}",instance="10.0.0.7:8080",pod="\1"'
+            text = re.sub(rf'job="{job}",instance="(\w)"', pod, text)
+            pod = rf'job: {its}, namespace: {name}, instance: "10.0.0.7:8080", pod: \1'
+            text = re.sub(rf"job: {job}, instance: (\w)", pod, text)
+            text = text.replace(f"job: {job}}}", f"job: {its}}}")
+    (directory / "played.yaml").write_text(text)
+    return directory / "played.yaml"
 
 
 def alerts() -> dict[str, dict[str, Any]]:
@@ -46,22 +69,23 @@ def test_the_rules_are_in_order() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_each_alert_is_set_off_by_what_it_is_for() -> None:
-    done = promtool("test", "rules", PLAYED)
+@pytest.mark.parametrize("scrape", SCRAPES)
+def test_each_alert_is_set_off_by_what_it_is_for(scrape: str, tmp_path: Path) -> None:
+    """Whatever scrapes: a job of one's own, pods by their annotations, or a PodMonitor."""
+    done = promtool("test", "rules", played(PLAYED.read_text(), tmp_path, scrape))
     assert done.returncode == 0, done.stdout + done.stderr
-    played = yaml.safe_load(PLAYED.read_text())["tests"]
-    cases = [each for test in played for each in test["alert_rule_test"]]
+    tests = yaml.safe_load(PLAYED.read_text())["tests"]
+    cases = [each for test in tests for each in test["alert_rule_test"]]
     assert {each["alertname"] for each in cases if each["exp_alerts"]} == alerts().keys()
     assert {each["alertname"] for each in cases if not each["exp_alerts"]} == alerts().keys()
 
 
 def test_a_rule_that_watches_for_nothing_is_found(tmp_path: Path) -> None:
-    text = RULES.read_text()
+    text, rules = RULES.read_text(), tmp_path / "rules.yaml"
     for alert in alerts().values():
-        (tmp_path / "rules.yaml").write_text(text.replace(alert["alert"], f"{alert['alert']}Not"))
-        played = PLAYED.read_text().replace("../../deploy/prometheus/rules.yaml", "rules.yaml")
-        (tmp_path / "played.yaml").write_text(played)
-        assert promtool("test", "rules", tmp_path / "played.yaml").returncode != 0, alert["alert"]
+        rules.write_text(text.replace(alert["alert"], f"{alert['alert']}Not"))
+        file = played(PLAYED.read_text(), tmp_path, rules=rules)
+        assert promtool("test", "rules", file).returncode != 0, alert["alert"]
 
 
 def test_the_adapter_counts_decisions_in_progress(tmp_path: Path) -> None:

@@ -10,7 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from holdfast.runtime.events import BoundedEventLog
 from holdfast.runtime.service_manager import ServiceManager
+
+EVENTS = BoundedEventLog()
 
 
 @pytest.fixture
@@ -53,7 +56,7 @@ async def test_the_status_and_the_watchdog(
     monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
     manager = ServiceManager()
     alive = [True]
-    manager.watch(asyncio.get_running_loop(), lambda: "serving", lambda: alive[0])
+    manager.watch(asyncio.get_running_loop(), EVENTS, lambda: "serving", lambda: alive[0])
     assert heard(notified) == ["STATUS=serving", "WATCHDOG=1"]
     notified.setblocking(False)
     assert await asyncio.get_running_loop().sock_recv(notified, 4096) == b"WATCHDOG=1"

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import socket
 from typing import cast
 
 import pytest
 
-from holdfast.transport.links import Link, ends_link
+from holdfast.transport.frames import MAGIC, Frame, Hello, encode_goodbye
+from holdfast.transport.link_settings import LinkSettings
+from holdfast.transport.links import Link, LinkOwner, ends_link
 
 
 class Fragile:
@@ -33,3 +36,33 @@ def test_an_exception_ends_the_link_and_goes_no_further() -> None:
     with pytest.raises(KeyboardInterrupt):  # this process is asked to end
         take(cast(Link, link), KeyboardInterrupt(), twice=True)
     assert link.failed == [defect]
+
+
+class Owner(LinkOwner):
+    """Takes whatever comes."""
+
+    def refusal(self, link: Link, hello: Hello) -> None:
+        """Refuse nobody."""
+
+    def on_hello(self, link: Link, hello: Hello) -> None:
+        """Note nothing."""
+
+    def on_frame(self, link: Link, frame: Frame) -> None:
+        """Note nothing."""
+
+    def on_ended(self, link: Link) -> None:
+        """Note nothing."""
+
+
+@pytest.mark.parametrize("says_goodbye", [True, False])
+async def test_a_goodbye_counts_that_a_write_finds_before_a_read(*, says_goodbye: bool) -> None:
+    """As on a busy machine: its end is known from a failed write, and what it said is unread."""
+    settings = LinkSettings(bytes, 1000.0, 1000, pauses_for_readers=False)
+    link = Link(Owner(), settings, speaks_first=False)
+    ours, theirs = socket.socketpair()
+    await link.connect(ours)
+    theirs.send(MAGIC + (encode_goodbye("") if says_goodbye else b""))
+    theirs.close()
+    link.send(b"too late")
+    await link.closed
+    assert link.said_goodbye == says_goodbye

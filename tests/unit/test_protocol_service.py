@@ -552,8 +552,10 @@ class TestRefusals:
         reply = refused(bench.ask(Robot().request()))
         assert reply.code == "unknown_problem"
         assert "this and that" in reply.text
-        assert bench.service.statistics.sessions == 0
-        assert bench.service.statistics.refusals == {"unknown_problem": 1}
+        statistics = bench.service.statistics
+        assert statistics.refusals == {"unknown_problem": 1}
+        counted = statistics.sessions, statistics.sessions_opened, statistics.sessions_evicted
+        assert counted == (0, 0, 0)
 
     def test_a_problem_is_not_lent_to_a_robot_with_other_code(self) -> None:
         def make(session_configuration: SessionConfiguration) -> Problem:
@@ -720,6 +722,8 @@ class TestCapacity:
         robots = [Robot(key=key) for key in (1, 2, 3)]
         for robot in (robots[0], robots[1], robots[0], robots[2]):
             bench.ask(robot.request())
+        statistics = bench.service.statistics
+        assert (statistics.sessions_opened, statistics.sessions_evicted) == (3, 1)
         request = robots[1].request(session_configuration=False)
         assert bench.ask(request) == [NeedState(request.number, differs=False)]
         assert (

@@ -51,3 +51,6 @@ def test_without_rerun_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(view_target, "version", lacking)
     with pytest.raises(ViewError, match=r"pip install 'holdfast-sensing\[view\]'"):
         require_rerun(ViewTarget(None, "run.rrd"))
+    monkeypatch.setenv("HOLDFAST_INSTALL", "build with {}")  # as an image says it
+    with pytest.raises(ViewError, match="not installed: build with rerun-sdk"):
+        require_rerun(ViewTarget(None, "run.rrd"))

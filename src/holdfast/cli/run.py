@@ -63,6 +63,9 @@ def main(arguments: Sequence[str]) -> int:
 
         if not options.resume_if_begun:
             raise InvalidValueError("--restart needs --resume-if-begun, to go on with what it had")
+        from holdfast.runtime.watchdog import DEFAULT_WATCHDOG_S
+
+        options.watchdog_s = options.watchdog_s or DEFAULT_WATCHDOG_S
         return run_until_it_ends(["run", *options.words("restart")])
     with ended_by_signals():
         return _run(options)
@@ -83,7 +86,7 @@ def _run(options: RunOptions) -> int:
     from holdfast.robot.trials import available_cores, run_trials
     from holdfast.runtime.service_manager import ServiceManager
 
-    manager = ServiceManager()
+    manager = ServiceManager(options.watchdog_s)
     runs = _RUNS.absolute()  # before the user's code, which may change the current directory
     configuration = options.load()
     quiet = options.quiet

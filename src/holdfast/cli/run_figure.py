@@ -18,7 +18,7 @@ import msgspec
 
 from holdfast.cli.exit_codes import EXIT_WRONG_ANSWER
 from holdfast.cli.terminal import duration
-from holdfast.errors import DecidedOtherwiseError
+from holdfast.errors import DecidedOtherwiseError, how_to_install
 
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
@@ -86,7 +86,8 @@ def _drawn(
     except ImportError as error:
         if error.name is None or error.name.split(".")[0] != "matplotlib":
             raise
-        return Remark("no figure, because matplotlib is not installed: pip install matplotlib")
+        advice = how_to_install("matplotlib")
+        return Remark(f"no figure, because matplotlib is not installed: {advice}")
     if recorder.record.result is None:
         kept = msgspec.structs.replace(result, decisions=directory.journal.decisions(trial))
         try:

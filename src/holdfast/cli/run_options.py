@@ -25,6 +25,7 @@ from holdfast.runtime.command_line import (
 from holdfast.runtime.files import shown_path
 from holdfast.runtime.log_lines import LogFormat
 from holdfast.runtime.logs import log_option
+from holdfast.runtime.watchdog import watchdog_option
 from holdfast.service.options import http_address
 
 if TYPE_CHECKING:
@@ -165,6 +166,7 @@ class RunOptions(Options):
         help="Write what is shown to FILE (.rrd), with --view or without it.",
     )
     log: LogFormat = log_option("Format of the events shown: text or json.")
+    watchdog_s: float | None = watchdog_option(None, " (default: never; with --restart 20)")
 
     def view_target(self) -> ViewTarget | None:
         """Return where to show the run while it goes on, if anywhere."""
@@ -181,7 +183,9 @@ class RunOptions(Options):
         return self.command_to_resume(
             "run",
             directory,
-            *("resume_if_begun", "after_reboot", "restart", "quiet", "view_file"),
+            *("resume_if_begun", "after_reboot", "restart", "watchdog_s"),
+            *("quiet", "view_file"),
+            "watchdog_s",
         )
 
     def overrides(self) -> list[Override]:

@@ -73,6 +73,9 @@ _INERTIA_OF_ONE = 4.0
 _NO_ROOM_RETRY_MS = 100.0
 """Shortest retry time for a robot that finds no free session."""
 
+_NO_ROOM = "room needed"
+"""The reason to forget a session that counts as an eviction."""
+
 
 class Service:
     """Answers the requests of many robots."""
@@ -173,6 +176,8 @@ class Service:
             # The first job of a problem also imports and builds it: no measure of the next ones.
             typical = session.built
             session.built = session.built or outcome.problem is not None
+            # One whose problem cannot be built is refused: it opens none, and evicts none.
+            self._statistics.sessions_opened += session.built and not typical
             session.price = price or session.price
             if outcome.cancelled or outcome.postponed is not None:
                 if is_awaited:
@@ -299,9 +304,8 @@ class Service:
                 least_ms = _NO_ROOM_RETRY_MS
                 self._reject_busy(call, request.number, key, lane, now, least_ms=least_ms)
                 return None
-            self._forget(unused, "room needed")
+            self._forget(unused, _NO_ROOM)
         self._sessions.add(session)
-        self._statistics.sessions_opened += 1
         named = {"problem": configuration.problem, "particles": count, "epoch": request.epoch}
         self._note("session_opened", session, **named)
         return session
@@ -566,7 +570,7 @@ class Service:
             unused = sessions.largest_evictable()
             if unused is None or unused is session:
                 break
-            self._forget(unused, "room needed")
+            self._forget(unused, _NO_ROOM)
         if sessions.over_budget:
             # The others are all in use: this robot sends its state each time.
             sessions.drop_states(session)
@@ -574,7 +578,7 @@ class Service:
     def _forget(self, session: Session, reason: str) -> None:
         self._supersede(session, None)
         self._sessions.forget(session)
-        self._statistics.sessions_evicted += 1
+        self._statistics.sessions_evicted += reason == _NO_ROOM
         self._note("evicted", session, reason=reason)
 
     def _note(self, event: str, session: Session, **fields: object) -> None:

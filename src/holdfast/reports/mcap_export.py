@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import numpy as np
 
 from holdfast.config.loader import Configuration
-from holdfast.errors import MissingRosbagsError
+from holdfast.errors import MissingRosbagsError, how_to_install
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.belief import Belief
 from holdfast.planning.planner import PlanningState
@@ -63,9 +63,8 @@ def require_rosbags() -> None:
     try:
         import rosbags.rosbag2  # noqa: F401
     except ImportError as error:
-        raise MissingRosbagsError(
-            "MCAP files need the library rosbags: pip install 'holdfast-sensing[mcap]'"
-        ) from error
+        advice = how_to_install("rosbags", "mcap")
+        raise MissingRosbagsError(f"MCAP files need the library rosbags: {advice}") from error
 
 
 class McapSink:

@@ -7,7 +7,7 @@ import re
 from importlib.metadata import PackageNotFoundError, version
 from typing import NamedTuple
 
-from holdfast.errors import InvalidValueError, ViewError
+from holdfast.errors import InvalidValueError, ViewError, how_to_install
 
 __all__ = ["LOCAL_URL", "ViewTarget", "require_rerun", "viewer_url"]
 
@@ -59,9 +59,8 @@ def require_rerun(target: ViewTarget) -> None:
     try:
         version("rerun-sdk")
     except PackageNotFoundError as error:
-        raise ViewError(
-            "a view needs Rerun, which is not installed: pip install 'holdfast-sensing[view]'"
-        ) from error
+        advice = how_to_install("rerun-sdk", "view")
+        raise ViewError(f"a view needs Rerun, which is not installed: {advice}") from error
     if target.viewer == "" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ViewError(
             "there is no display for Rerun's viewer (neither DISPLAY nor WAYLAND_DISPLAY is set): "

@@ -27,7 +27,12 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
+from holdfast.errors import (
+    ConfigurationError,
+    EnvironmentFailedError,
+    InvalidValueError,
+    how_to_install,
+)
 from holdfast.numerics.arrays import (
     FloatArray,
     floats,
@@ -387,9 +392,8 @@ def _made(
     try:
         import gymnasium
     except ImportError as error:
-        raise ConfigurationError(
-            "GymnasiumEnvironment needs gymnasium: pip install 'holdfast-sensing[gymnasium]'"
-        ) from error
+        advice = how_to_install("gymnasium", "gymnasium")
+        raise ConfigurationError(f"GymnasiumEnvironment needs gymnasium: {advice}") from error
     if isinstance(env_id, gymnasium.Env):
         return env_id
     if not isinstance(env_id, str):

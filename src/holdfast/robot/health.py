@@ -62,7 +62,8 @@ class RobotWatch:
         """
         if self._health is not None or self._metrics_address is not None:
             await self._offer(condition, robot)
-        self._manager.watch(asyncio.get_running_loop(), lambda: str(condition()))
+        loop = asyncio.get_running_loop()
+        self._manager.watch(loop, self._events, lambda: str(condition()))
 
     async def _offer(self, condition: Callable[[], Condition], robot: Robot) -> None:
         from holdfast.runtime.monitoring import MonitoringServers, Page

@@ -15,7 +15,7 @@ stopped, note,
 interrupted, offers.
 Of a service: ready, session_opened, session_taken_over, restored, state_diverged, refused, busy,
 evicted, robot_connected, robot_disconnected, link_refused, credentials, credentials_reloaded,
-stopping, process_ended, process_started, ros_master, ros_shutdown. Of both: defect.
+stopping, process_ended, process_started, ros_master, ros_shutdown. Of both: defect, stuck.
 Of a command that ends with an error: error. These fields have a place of their own in the text
 form: ``from`` and ``to`` (of a change), ``service``, ``robot``, ``reason``, ``duration_ms``.
 """
@@ -66,7 +66,7 @@ _WARNINGS = frozenset(
     ]
 )
 _ERRORS = frozenset(
-    ("wrong_answer", "not_deterministic", "state_diverged", "stopped", "error", DEFECT)
+    ("wrong_answer", "not_deterministic", "state_diverged", "stopped", "stuck", "error", DEFECT)
 )
 
 _WORSE_STATUS = "local_recovery"

@@ -21,6 +21,7 @@ from holdfast.runtime.command_line import (
 )
 from holdfast.runtime.log_lines import LogFormat
 from holdfast.runtime.logs import log_option
+from holdfast.runtime.watchdog import DEFAULT_WATCHDOG_S, watchdog_option
 
 if TYPE_CHECKING:
     from holdfast.runtime.monitoring import HttpAddress
@@ -94,6 +95,7 @@ class ServeOptions(Options):
         "--health.",
     )
     log: LogFormat = log_option()
+    watchdog_s: float = watchdog_option(DEFAULT_WATCHDOG_S)
     workers: int | None = option(
         read=whole_number(1, 256),
         metavar="N",

@@ -110,7 +110,7 @@ def _serve_with_several(options: ServeOptions) -> int:
     from holdfast.service.listening import SharedEndpoints
     from holdfast.service.supervisor import Supervisor
 
-    manager = ServiceManager()
+    manager = ServiceManager(options.watchdog_s)
     workers = options.workers or max(1, len(os.sched_getaffinity(0)) // options.processes)
     shared = SharedEndpoints(listen)
     events = EventLog(sys.stderr, format=options.log, component=options.name)
@@ -120,7 +120,7 @@ def _serve_with_several(options: ServeOptions) -> int:
     of_each += [f"--listen={endpoint}" for endpoint in endpoints]
 
     async def run() -> int:
-        supervisor = Supervisor(of_each, options.processes, shared, events)
+        supervisor = Supervisor(of_each, options.processes, shared, events, options.watchdog_s)
         async with _watched(
             options,
             supervisor.why_not_alive,
@@ -255,7 +255,7 @@ class _ServiceProcess:
         self.events = EventLog(sys.stderr, format=options.log, component=options.name)
         self._times = DecisionTimes()
         self._shell = ServiceShell(service, self._transport, self.events, self._times.add)
-        self._manager = ServiceManager()
+        self._manager = ServiceManager(options.watchdog_s)
 
     @property
     def is_computing(self) -> bool:
@@ -293,10 +293,10 @@ class _ServiceProcess:
                     where: dict[str, object] = {"boot": self._incarnation, **watched, **offered}
                     where["listen"] = list(self._transport.endpoints)
                     _say_ready(options, where)
-                    self._manager.watch(loop, self._status)
-                    self._manager.ready()
                 else:
                     supervised.start(self._report)
+                self._manager.watch(loop, self.events, self._status)
+                self._manager.ready()
                 reason = await shell.wait()
                 if supervised is None:
                     self.events.event("stopping", reason=reason)

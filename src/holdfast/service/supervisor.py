@@ -37,9 +37,12 @@ if TYPE_CHECKING:
 
 _REPORT_EVERY_S = 1.0
 
-_SILENT_S = 10.0
-_START_S = 60.0
+_SILENT_S = 10
+_START_S = 60
 """A process that is silent for so long, after its first report or since its start, is stuck."""
+
+_KILL_S = 5
+"""It is killed if it lives for so long after its own watchdog should have ended it."""
 
 _STEADY_S = 10.0
 """A process that ends earlier than this has failed at its start; its restart is delayed."""
@@ -78,15 +81,22 @@ class _Child:
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self.process = process
-        self.started_at = self.heard_at = monotonic()
+        self.started_at = monotonic()
+        # Counted by the supervisor's timer: what stops this process, too, does not count.
+        self.silent_s = 0
         self.report: ServiceReport | None = None
 
-    def trouble(self, now: float) -> str | None:
+    def trouble(self) -> str | None:
         """Return what is wrong with it, if anything."""
-        silent_s = now - self.heard_at
-        if silent_s <= (_START_S if self.report is None else _SILENT_S):
+        if self.silent_s <= (_START_S if self.report is None else _SILENT_S):
             return None
-        return f"process {self.process.pid} has said nothing for {silent_s:.0f} s"
+        return f"process {self.process.pid} has said nothing for {self.silent_s} s"
+
+    def note_second(self, watchdog_s: float) -> None:
+        """Count a second without a report; kill one that its own watchdog has failed to end."""
+        self.silent_s += 1
+        if self.report is not None and self.silent_s > watchdog_s + _KILL_S:
+            self.process.kill()
 
 
 class Supervisor:
@@ -102,12 +112,14 @@ class Supervisor:
         processes: int,
         listening: SharedEndpoints,
         events: EventSink,
+        watchdog_s: float,
     ) -> None:
         # -P: modules in the current directory are not imported.
         self._command = [sys.executable, "-P", "-m", "holdfast", "serve", *arguments]
         self._processes = processes
         self._listening = listening
         self._events = events
+        self._watchdog_s = watchdog_s
         self._living: list[_Child] = []
         self._past = ServiceReport()
         self._loop = asyncio.get_running_loop()
@@ -147,12 +159,15 @@ class Supervisor:
         self._loop.add_signal_handler(signal.SIGHUP, reload)
         for each in ending:
             self._loop.add_signal_handler(each, stop, each)
+        self._note_second()
         kept = [self._loop.create_task(self._keep_one()) for _ in range(self._processes)]
         try:
             await _first_of(self._serving, self._stopping, *kept)
             if self._serving.done():
                 ready()
-                manager.watch(self._loop, self._status, lambda: self.why_not_alive() is None)
+                manager.watch(
+                    *(self._loop, self._events, self._status), lambda: self.why_not_alive() is None
+                )
                 manager.ready()
                 await _first_of(self._stopping, *kept)
             number = self._stopping.result()
@@ -185,8 +200,12 @@ class Supervisor:
 
     def why_not_alive(self) -> str | None:
         """Return which process is stuck; None if none is."""
-        now = monotonic()
-        return next(filter(None, (child.trouble(now) for child in self._living)), None)
+        return next(filter(None, (child.trouble() for child in self._living)), None)
+
+    def _note_second(self) -> None:
+        for child in self._living:
+            child.note_second(self._watchdog_s)
+        self._loop.call_later(_REPORT_EVERY_S, self._note_second)
 
     def _status(self) -> str:
         """Return the status in a few words, from the processes' last reports."""
@@ -259,12 +278,12 @@ class Supervisor:
         failure = None
         while data := await self._loop.sock_recv(control, _MAX_MESSAGE_BYTES):
             message = msgspec.msgpack.decode(data, type=ServiceReport | str)
-            child.heard_at = monotonic()
+            child.silent_s = 0
             if isinstance(message, str):
                 failure = message
                 continue
             if child.report is None and self._serving.done():
-                started_ms = round((child.heard_at - child.started_at) * 1000)
+                started_ms = round((monotonic() - child.started_at) * 1000)
                 self._events.event("process_started", pid=child.process.pid, launch_ms=started_ms)
             child.report = message
             if not self._serving.done() and len(self._reports()) == self._processes:

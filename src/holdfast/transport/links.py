@@ -16,6 +16,7 @@ import asyncio
 import contextlib
 import functools
 import math
+import os
 import socket
 import time
 from abc import ABC, abstractmethod
@@ -61,6 +62,8 @@ _UNSENT_IN_SYSTEM_BYTES: Final = 128 * 1024
 
 _DECODED_AT_ONCE_BYTES: Final = 16 * 1024
 """Received bytes that are decoded at once: more can hold thousands of frames or TLS records."""
+
+_LAST_WORDS_BYTES: Final = 64 * 1024
 
 _PINGS_IN_LEASE: Final = 3
 _CLOSE_TIMEOUT_S: Final = 1.0
@@ -380,6 +383,8 @@ class Link(asyncio.BufferedProtocol):
     @ends_link
     def connection_lost(self, exc: Exception | None) -> None:
         """Handle the end of the connection."""
+        if not self._ended and isinstance(exc, (ConnectionResetError, BrokenPipeError)):
+            self._read_last_words()
         self._transport = None
         self._timer.cancel()
         if not self._ended:
@@ -391,6 +396,17 @@ class Link(asyncio.BufferedProtocol):
         self._notify_owner()
         if not self.closed.done():
             self.closed.set_result(None)
+
+    def _read_last_words(self) -> None:
+        """Look for a goodbye in what was received before a write noticed that the peer is gone."""
+        stream = None if self._transport is None else self._transport.get_extra_info("socket")
+        if stream is None:
+            return
+        # FrameError and OSError: an end that is gone may also have said nonsense.
+        with contextlib.suppress(FrameError, OSError):
+            data = self._unread[self._unread_at :] + os.read(stream.fileno(), _LAST_WORDS_BYTES)
+            self._frames.extend(self._decoder.feed(self.tls.receive(data) if self.tls else data))
+        self.said_goodbye |= any(frame.kind == GOODBYE for frame in self._frames)
 
     # -- receiving -------------------------------------------------------------------------------
 
