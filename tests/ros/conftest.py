@@ -70,6 +70,8 @@ def ros1() -> dict[str, str]:
     """Return the environment for processes of Debian's ROS 1."""
     if shutil.which("rosmaster") is None:
         left_out("no ROS 1: apt-get install ros-core")
+    if not Path("/usr/lib/rosout/rosout").exists():
+        left_out("no /rosout for the guard: apt-get install rosout")
     return {
         **os.environ,
         "ROS_VERSION": "1",
