@@ -32,11 +32,11 @@ from benchmarks.processes import (
 from benchmarks.report import Bar, Result, Table, milliseconds, paragraph
 from benchmarks.robots import Notebook, configuration_for, run_robot
 from benchmarks.turns import Asker, decided_in_process, recorded_turns
+from holdfast.journal.journal import Journal
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, digest, encode_checkpoint
 from holdfast.protocol.messages import DIGEST_SIZE, encode_floats
 from holdfast.protocol.records import ActingRecord, PerformedRecord
-from holdfast.recording.journal import Journal
 from holdfast.robot.session_configuration import session_configuration_of
 from holdfast.robot.trial import run_trial
 from holdfast_lab.testbed.processes import free_port

@@ -20,7 +20,7 @@ import msgspec
 import pandas as pd
 
 from holdfast.planning.settings import ActiveSensingSettings
-from holdfast.recording.compare import compare_runs
+from holdfast.reports.compare import compare_runs
 from holdfast.robot.links import RECOVERY_SERVICE
 from holdfast_lab.errors import NoProgressError, ProcessEndedError
 from holdfast_lab.testbed.driver import Script, Testbed, after

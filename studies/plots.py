@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from holdfast.recording.figure import STYLE
+from holdfast.reports.figure import STYLE
 from holdfast.runtime.files import write_atomically
 
 __all__ = [

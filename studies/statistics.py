@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast.errors import InvalidValueError
+from holdfast.journal.tables import wilson_interval
 from holdfast.numerics.arrays import BoolArray, FloatArray
-from holdfast.recording.tables import wilson_interval
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -17,7 +17,7 @@ from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 
 from holdfast.numerics.arrays import FloatArray
-from holdfast.recording.figure import STYLE
+from holdfast.reports.figure import STYLE
 from studies.plots import COLORS, MARKERS, figure_of, milliseconds
 
 __all__ = ["cloud_dies"]

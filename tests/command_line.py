@@ -39,7 +39,7 @@ def run_here(
         patch.setattr(sys, "excepthook", sys.excepthook)
         if not figures:
             patch.setitem(sys.modules, "matplotlib", None)
-            patch.delitem(sys.modules, "holdfast.recording.figure", raising=False)
+            patch.delitem(sys.modules, "holdfast.reports.figure", raising=False)
         os.chdir(directory)
         try:
             with pytest.raises(SystemExit) as ended:

@@ -35,7 +35,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 SOURCES = ROOT / "src"
 PARTS = ("numerics", "planning/belief", "planning/sensing", "planning/tracking", "protocol",
-         "robot/trial", "recording/journal", "recording/tables", "recording/export",
+         "robot/trial", "journal/journal", "journal/tables", "reports/csv_export",
          "transport/revocation", "transport/datagram_cipher", "transport/credentials")  # fmt: skip
 """What is mutated unless something else is named: how paths in the package begin."""
 

@@ -10,15 +10,15 @@ import msgspec
 import numpy as np
 
 from holdfast.config.loader import Configuration, load
+from holdfast.journal.journal import Journal
+from holdfast.journal.journal_file import START, Finished, decode_entry
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.belief import Belief, ObservationInfo
 from holdfast.planning.outcome import Decisions, TrialResult
 from holdfast.planning.planner import Planner, PlanningState, TaskInfo, digest
 from holdfast.planning.sensing import SensingInfo
 from holdfast.protocol.records import ActingRecord, ObservedRecord, PerformedRecord, Record
-from holdfast.recording.journal import Journal
-from holdfast.recording.journal_file import START, Finished, decode_entry
-from holdfast.recording.recorder import Recorder
+from holdfast.reports.recorder import Recorder
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 
 

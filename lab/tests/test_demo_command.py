@@ -22,7 +22,7 @@ from typing import Self
 
 import pytest
 
-from holdfast.recording.compare import compare_runs
+from holdfast.reports.compare import compare_runs
 from holdfast_lab.testbed.processes import marked_processes
 
 COMMAND = [sys.executable, "-c", "from holdfast.cli import main; main()"]

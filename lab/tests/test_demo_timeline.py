@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from holdfast.recording.compare import Comparison, Difference
+from holdfast.reports.compare import Comparison, Difference
 from holdfast_lab.demo.command import account
 from holdfast_lab.demo.narrator import Activity, Change, DemoState, Mark
 from holdfast_lab.demo.scenario import Findings

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
         SelectorSettings,
     )
     from holdfast.problems.problem import Problem, ProblemBase, Scene
-    from holdfast.recording.reading import open_run
+    from holdfast.reports.reading import open_run
     from holdfast.robot.environment import LATER, Environment, SimulatedEnvironment
     from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
     from holdfast.robot.late_sensing import SenseInBackground
@@ -134,7 +134,7 @@ _PLACES = {
     "load_configuration": "config.loader.load",
     "make": "config.registry.make_problem",
     "make_problem": "config.registry.make_problem",
-    "open_run": "recording.reading.open_run",
+    "open_run": "reports.reading.open_run",
     "run_trial": "robot.trial.run_trial",
     "run_trials": "tuning.simulated_trials.run_trials",
     "tune": "tuning.tune.tune",

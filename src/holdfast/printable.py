@@ -11,9 +11,9 @@ run a program. An apostrophe before it says that it is a text.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
-__all__ = ["cell", "did_you_mean", "one_line", "printable"]
+__all__ = ["cell", "cells", "csv_rows", "did_you_mean", "one_line", "printable"]
 
 
 def printable(text: str, *, keep: str = "\n\t") -> str:
@@ -53,3 +53,24 @@ def cell(value: object) -> object:
     except ValueError:
         return f"'{value}"
     return value if numbers else f"'{value}"
+
+
+def csv_rows(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator[str]:
+    """Yield the lines of comma-separated values, the head first; only texts may need quotes.
+
+    None is an empty cell, a truth value 0 or 1.
+    """
+    yield ",".join(columns) + "\n"
+    for row in rows:
+        texts = ("" if value is None else str(value) for value in cells(row))
+        yield ",".join(map(_quoted, texts)) + "\n"
+
+
+def cells(row: Iterable[object]) -> list[object]:
+    """Return values as a CSV table has them: a truth value as 0 or 1, no text that is a formula."""
+    return [int(value) if isinstance(value, bool) else cell(value) for value in row]
+
+
+def _quoted(text: str) -> str:
+    """Return a cell as RFC 4180 writes it."""
+    return '"' + text.replace('"', '""') + '"' if set(text) & set(',"\r\n') else text

@@ -172,7 +172,7 @@ for name in ("studies/light_dark.py", "holdfast/planning/belief.py", "holdfast_l
             "studies.trial_batches",
             "holdfast",
         } <= names
-        others = ("holdfast.cli", "holdfast.recording", "holdfast_lab")
+        others = ("holdfast.cli", "holdfast.reports", "holdfast_lab")
         assert not [name for name in names if name.startswith(others)]
         assert "studies.tasks" not in names
 

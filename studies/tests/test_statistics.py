@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from holdfast.errors import InvalidValueError
-from holdfast.recording.tables import wilson_interval
+from holdfast.journal.tables import wilson_interval
 from studies.statistics import (
     Interval,
     across_problems,

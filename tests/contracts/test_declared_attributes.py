@@ -14,10 +14,10 @@ from tests.line_problem import Line
 
 import holdfast as hf
 from holdfast.problems.attributes import check_problem
-from holdfast.recording.belief_remarks import belief_remarks
-from holdfast.recording.csv_export import state_labels
-from holdfast.recording.poses import pose_layout
-from holdfast.recording.recorder import Recorder
+from holdfast.reports.belief_remarks import belief_remarks
+from holdfast.reports.csv_export import state_labels
+from holdfast.reports.poses import pose_layout
+from holdfast.reports.recorder import Recorder
 from holdfast.robot.problem_env import ProblemEnv
 
 SETTINGS = hf.PlanningSettings(
@@ -144,7 +144,7 @@ def test_a_size_that_cannot_be_set() -> None:
 
 
 def test_a_figure(tmp_path: Path) -> None:
-    figure = pytest.importorskip("holdfast.recording.figure")
+    figure = pytest.importorskip("holdfast.reports.figure")
     example = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
     configuration = hf.load_configuration(example)
     pictures = []

@@ -17,7 +17,7 @@ import yaml
 from tests.deploy.docker import ROOT, USER, Engine, Images, give_to, holdfast, wait_until
 from tests.ports import free_port
 
-from holdfast.recording.journal import Journal
+from holdfast.journal.journal import Journal
 
 COMPOSE = ROOT / "deploy/compose"
 TRIALS = 60

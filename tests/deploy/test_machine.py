@@ -23,7 +23,7 @@ CLOUD, ROBOT = "holdfast-cloud", "holdfast-robot"
 RUN = "/var/lib/private/holdfast/run"
 OTHER_BOOT = f"""/opt/holdfast/robot/bin/python -c '
 from pathlib import Path
-from holdfast.recording.journal import Journal
+from holdfast.journal.journal import Journal
 with Journal.open(Path("{RUN}/journal.bin")) as journal:
     journal.set_meta(boot="another")'"""
 """Command that lets the robot have moved in another boot."""

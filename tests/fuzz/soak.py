@@ -28,8 +28,8 @@ from tests.fuzz.measuring import Watch, flatness
 from tests.processes.faults import PROBLEMS, Robot, Service, Site, document_of, events_of
 
 from holdfast.config.loader import load
+from holdfast.journal.journal import Journal
 from holdfast.planning.planner import Planner
-from holdfast.recording.journal import Journal
 from holdfast.robot.trial import run_trial
 
 __all__ = ["main", "run_soak"]

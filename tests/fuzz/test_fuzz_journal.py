@@ -22,8 +22,8 @@ from tests.fuzz.examples import always, examples
 from tests.unit.test_journal import TRIAL, all_records, records_of, result_of
 
 from holdfast.errors import InvalidValueError, OutputError
-from holdfast.recording.journal import Journal
-from holdfast.recording.journal_file import START, JournalFile
+from holdfast.journal.journal import Journal
+from holdfast.journal.journal_file import START, JournalFile
 
 STEPS = 6
 META = {"configuration": "x" * 100}

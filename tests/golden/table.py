@@ -23,9 +23,9 @@ from typing import Any, NamedTuple, get_args, get_type_hints
 
 from holdfast.config import registry
 from holdfast.config.loader import Configuration, load
+from holdfast.journal.tables import SummaryBuilder
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.settings import SelectorSettings
-from holdfast.recording.tables import SummaryBuilder
 from holdfast.robot.trials import run_trials
 from studies.cases import CASES
 

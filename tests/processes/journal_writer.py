@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.unit.test_journal import records_of, result_of
 
 from holdfast.errors import OutputError
-from holdfast.recording.journal import Journal
+from holdfast.journal.journal import Journal
 
 
 def main(path: Path, says: int) -> None:

@@ -11,7 +11,7 @@ from tests import mountain_car
 from tests.processes.faults import events_of, holdfast, rows_of, summary_of
 
 import holdfast as hf
-from holdfast.recording.journal import Journal
+from holdfast.journal.journal import Journal
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

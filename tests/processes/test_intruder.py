@@ -23,7 +23,7 @@ from tests.questions import questions_of
 from tests.wire import GOODBYE, HELLO, RawLink, hello_of
 
 from holdfast.config.loader import load
-from holdfast.recording.journal import Journal
+from holdfast.journal.journal import Journal
 from holdfast.robot.session_configuration import session_configuration_of
 
 DOCUMENT = document_of("peg_in_hole_2d")

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from tests.unit.test_journal import all_records, records_of
 
-from holdfast.recording.journal import Journal
+from holdfast.journal.journal import Journal
 
 _CALLS = "pwrite64,fsync,fdatasync,ftruncate,unlink,link,flock"
 

@@ -31,7 +31,7 @@ from tests.processes.faults import (
     wait_for_end,
 )
 
-from holdfast.recording.journal import Journal
+from holdfast.journal.journal import Journal
 
 PEG = "peg_in_hole_2d"
 PEG_AND_SLOWLY_ALL = [

@@ -13,7 +13,7 @@ import yaml
 from tests.processes.faults import LOST, Service, Site, assert_identical, events_of, summary_of
 from tests.processes.rover import NO_READING, NOT_LATE_EITHER
 
-from holdfast.recording.reading import open_run
+from holdfast.reports.reading import open_run
 
 ROVER = Path(__file__).parent / "rover.py"
 STEPS = 40

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from tests.processes.faults import events_of, holdfast, rows_of, summary_of
 
-from holdfast.recording.journal import Journal
+from holdfast.journal.journal import Journal
 
 BEFORE_OUTCOMES = Path(__file__).parents[1] / "unit" / "data" / "journal_before_outcomes.sqlite"
 """Of a robot killed at step 21 of trial 2, when results said only whether a trial succeeded."""

@@ -18,8 +18,8 @@ import numpy as np
 from tests.ports import free_port
 
 from holdfast.config.loader import Configuration
+from holdfast.journal.journal import Journal
 from holdfast.planning.outcome import TaskDecision
-from holdfast.recording.journal import Journal
 from holdfast.robot.environment import SimulatedEnvironment
 
 PATIENCE_S = 180.0

@@ -21,7 +21,7 @@ from tests.ros.ros2_processes import ObservedProcess
 
 from holdfast.config.loader import load
 from holdfast.planning.planner import Planner
-from holdfast.recording.poses import pose_layout
+from holdfast.reports.poses import pose_layout
 from holdfast.robot.trial import run_trial
 
 ROOT = Path(__file__).parents[2]

@@ -22,12 +22,12 @@ from tests.simulation.edits import Defect, Edit, applied
 from tests.unit.test_journal import all_records, records_of
 
 from holdfast.errors import OutputError
+from holdfast.journal import journal as journal_module
+from holdfast.journal import journal_file, journal_reader
+from holdfast.journal.journal import Journal
+from holdfast.journal.journal_file import START, JournalFile
+from holdfast.journal.journal_reader import JournalReader
 from holdfast.protocol.records import Record
-from holdfast.recording import journal as journal_module
-from holdfast.recording import journal_file, journal_reader
-from holdfast.recording.journal import Journal
-from holdfast.recording.journal_file import START, JournalFile
-from holdfast.recording.journal_reader import JournalReader
 
 SECTOR = 512
 LIMIT = 400

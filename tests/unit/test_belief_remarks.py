@@ -17,8 +17,8 @@ from holdfast.numerics.arrays import FloatArray, IntArray
 from holdfast.numerics.randomness import Stream
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
-from holdfast.recording.belief_remarks import belief_remarks
-from holdfast.recording.recorder import Recorder
+from holdfast.reports.belief_remarks import belief_remarks
+from holdfast.reports.recorder import Recorder
 from holdfast.robot.trial import SensingStep, run_trial
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

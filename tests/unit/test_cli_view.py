@@ -10,7 +10,7 @@ import pytest
 from rerun.chunk import RrdReader
 from tests.command_line import Said, run_here
 
-from holdfast.recording import rerun_streams
+from holdfast.reports import rerun_streams
 
 RUN = """
 problem: peg_in_hole_2d

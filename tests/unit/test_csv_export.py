@@ -9,8 +9,8 @@ import numpy as np
 from tests.recordings import a_sensing_step, a_task_step, configuration_of, result_of
 
 from holdfast.planning.belief import Belief
-from holdfast.recording.csv_export import TABLES, CsvSink, state_labels
-from holdfast.recording.facts import (
+from holdfast.reports.csv_export import TABLES, CsvSink, state_labels
+from holdfast.reports.facts import (
     Decider,
     EventFact,
     SensingFact,

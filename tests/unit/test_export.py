@@ -30,12 +30,12 @@ import holdfast as hf
 from holdfast.config.loader import Configuration, load
 from holdfast.config.registry import BUILT_IN
 from holdfast.errors import UntrustedCodeError
+from holdfast.journal.journal import Journal
 from holdfast.planning.belief import Belief
 from holdfast.planning.outcome import SensingDecision, TaskDecision, TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.protocol.records import ActingRecord, ObservedRecord
-from holdfast.recording.journal import Journal
-from holdfast.recording.poses import PoseLayout, pose_layout
+from holdfast.reports.poses import PoseLayout, pose_layout
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 
 PEG = """\
@@ -807,7 +807,7 @@ class TestNothingHalfWritten:
         tmp_path: Path,
         monkeypatch: pytest.MonkeyPatch,
     ) -> None:
-        from holdfast.recording.csv_export import CsvSink
+        from holdfast.reports.csv_export import CsvSink
 
         place.run(PEG)
 

@@ -15,7 +15,7 @@ from tests.recordings import record_trial
 
 from holdfast.config.loader import load
 from holdfast.numerics import wrapped
-from holdfast.recording.figure import _draw_entropies, _draw_workspace, _follow_turns, trial_figure
+from holdfast.reports.figure import _draw_entropies, _draw_workspace, _follow_turns, trial_figure
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

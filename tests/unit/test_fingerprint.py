@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from tests.recordings import configuration_of
 
-from holdfast.recording.fingerprint import difference, fingerprint
+from holdfast.journal.fingerprint import difference, fingerprint
 
 
 def test_the_same_code_is_no_difference(tmp_path: Path) -> None:

@@ -16,15 +16,15 @@ from tests.line_problem import Line
 
 import holdfast as hf
 from holdfast.config.loader import load
+from holdfast.journal.tables import SummaryBuilder
 from holdfast.numerics.arrays import FloatArray, IntArray
 from holdfast.numerics.floating_mode import as_caller, in_own_mode
 from holdfast.planning.belief import standard_deviation
 from holdfast.planning.planner import decode_checkpoint, encode_checkpoint
 from holdfast.planning.settings import ActiveSensingSettings, PlanningSettings, SelectorSettings
-from holdfast.recording.belief_remarks import belief_remarks
-from holdfast.recording.figure import trial_figure
-from holdfast.recording.recorder import Recorder
-from holdfast.recording.tables import SummaryBuilder
+from holdfast.reports.belief_remarks import belief_remarks
+from holdfast.reports.figure import trial_figure
+from holdfast.reports.recorder import Recorder
 from holdfast.robot.trial import run_trial
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -16,6 +16,11 @@ from typing import Any
 import pytest
 
 from holdfast.errors import InvalidValueError, LostJournalError, OutputError
+from holdfast.journal import journal as journal_module
+from holdfast.journal import journal_reader
+from holdfast.journal.journal import Journal
+from holdfast.journal.journal_file import Survives
+from holdfast.journal.journal_reader import UnfinishedTrial
 from holdfast.planning.outcome import Decisions, TrialResult
 from holdfast.protocol.records import (
     ActingRecord,
@@ -24,11 +29,6 @@ from holdfast.protocol.records import (
     PerformedRecord,
     Record,
 )
-from holdfast.recording import journal as journal_module
-from holdfast.recording import journal_reader
-from holdfast.recording.journal import Journal
-from holdfast.recording.journal_file import Survives
-from holdfast.recording.journal_reader import UnfinishedTrial
 
 TRIAL = 3
 
@@ -79,7 +79,7 @@ import os, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from tests.unit.test_journal import TRIAL, records_of, result_of
-from holdfast.recording.journal import Journal
+from holdfast.journal.journal import Journal
 
 journal = Journal.create(Path(sys.argv[2]), {"configuration": "x" * 100}, survives=sys.argv[3])
 for trial in range(TRIAL):

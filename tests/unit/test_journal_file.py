@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from holdfast.errors import OutputError
-from holdfast.recording.journal import Journal
-from holdfast.recording.journal_file import START, JournalFile, find_journal
+from holdfast.journal.journal import Journal
+from holdfast.journal.journal_file import START, JournalFile, find_journal
 
 
 class TestFinding:

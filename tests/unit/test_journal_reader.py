@@ -11,14 +11,14 @@ from tests.recordings import failed, result_of, without_decisions
 
 from holdfast.config.loader import load
 from holdfast.errors import OutputError
+from holdfast.journal.journal import Journal
+from holdfast.journal.journal_file import Finished, Notes, Steps, packed
+from holdfast.journal.journal_reader import JournalReader
 from holdfast.planning.outcome import Decisions
 from holdfast.planning.planner import Planner
 from holdfast.protocol.records import (
     replay,
 )
-from holdfast.recording.journal import Journal
-from holdfast.recording.journal_file import Finished, Notes, Steps, packed
-from holdfast.recording.journal_reader import JournalReader
 from holdfast.robot.trial import run_trial
 
 BEFORE_OUTCOMES = Path(__file__).parent / "data" / "journal_before_outcomes.sqlite"

@@ -32,7 +32,7 @@ WITHOUT_TESTS = {
     "master/__main__": "one line, which calls the command",
     "master/errors": "types without behaviour",
     "protocol/events": "types without behaviour",
-    "recording/facts": "types without behaviour",
+    "reports/facts": "types without behaviour",
     "robot/health": "tests/processes/test_unattended.py asks it over HTTP",
     "ros/ros2/__main__": "one line, which tests/ros runs",
     "robot/session_configuration": "one function; tests/unit/test_reference_decisions.py calls it",

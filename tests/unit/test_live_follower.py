@@ -11,6 +11,8 @@ import pytest
 from tests.recordings import configuration_of
 
 from holdfast.config.loader import Configuration
+from holdfast.journal.journal import Journal
+from holdfast.journal.timings import EventTable
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.outcome import Ending
 from holdfast.planning.planner import Planner, digest
@@ -24,7 +26,7 @@ from holdfast.protocol.records import (
     Record,
     TrialHistory,
 )
-from holdfast.recording.facts import (
+from holdfast.reports.facts import (
     EventFact,
     LateFact,
     SensingFact,
@@ -32,9 +34,7 @@ from holdfast.recording.facts import (
     TrialBeginFact,
     TrialEndFact,
 )
-from holdfast.recording.journal import Journal
-from holdfast.recording.live_follower import Follower, RunFiles
-from holdfast.recording.timings import EventTable
+from holdfast.reports.live_follower import Follower, RunFiles
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 

@@ -14,10 +14,10 @@ import pytest
 from tests.recordings import configuration_of
 
 from holdfast.errors import ViewError
-from holdfast.recording import live_view
-from holdfast.recording.live_follower import FollowerReport
-from holdfast.recording.live_view import LiveView
-from holdfast.recording.view_target import ViewTarget
+from holdfast.reports import live_view
+from holdfast.reports.live_follower import FollowerReport
+from holdfast.reports.live_view import LiveView
+from holdfast.reports.view_target import ViewTarget
 
 
 def report(connection: Connection, *fields: Any) -> None:
@@ -64,19 +64,19 @@ def views(tmp_path: Path, notes: list[str]) -> Iterator[Any]:
         target = ViewTarget(None, str(tmp_path / "file"))
         view = LiveView(configuration_of(tmp_path), target, tmp_path, notes.append, work)
         made.append(view)
-        view.start()
+        view.__enter__()
         return view
 
     yield make
     for view in made:
-        view.close()
+        view.__exit__()
 
 
 def test_what_was_left_out_is_told_at_the_end(views: Any, notes: list[str]) -> None:
     view = views(wait)
     assert notes == []
-    view.close()
-    view.close()
+    view.__exit__()
+    view.__exit__()
     assert notes == [
         "the view was too slow for 7 of 50 steps and left them out; holdfast view shows all of them"
     ]
@@ -86,7 +86,7 @@ def test_a_view_that_does_not_end_is_waited_for_so_long(
     views: Any, notes: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(live_view, "_CLOSE_S", 0.1)
-    views(hang).close()
+    views(hang).__exit__()
     assert notes[0] == "the view was not complete 0.1 s after the run"
 
 
@@ -98,7 +98,7 @@ def test_a_view_that_ends_is_told_once_and_the_run_goes_on(
 ) -> None:
     view = views(work)
     view._waiting.join()
-    view.close()
+    view.__exit__()
     assert notes == [f"the view has ended: {why}; the run goes on without it"]
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from holdfast.planning.belief import Belief
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.recording.markers import scene_markers, sensing_markers
-from holdfast.recording.poses import PoseLayout, pose_layout
+from holdfast.reports.markers import scene_markers, sensing_markers
+from holdfast.reports.poses import PoseLayout, pose_layout
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ from rosbags.highlevel import AnyReader
 
 from holdfast.config.loader import load
 from holdfast.planning.belief import Belief
-from holdfast.recording.facts import EventFact, TrialBeginFact, TrialEndFact
-from holdfast.recording.mcap_export import McapSink
+from holdfast.reports.facts import EventFact, TrialBeginFact, TrialEndFact
+from holdfast.reports.mcap_export import McapSink
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
 

@@ -13,7 +13,7 @@ import pytest
 from tests.unit.test_journal import TRIAL, all_records, result_of
 
 from holdfast.errors import OutputError
-from holdfast.recording.journal import Journal
+from holdfast.journal.journal import Journal
 
 KILLED = Path(__file__).parent / "data" / "killed"
 """What that code has left when it was killed: three trials, and six steps, of which the last are in

@@ -13,11 +13,11 @@ import pytest
 from scipy import stats
 
 from holdfast.errors import OutputError
+from holdfast.journal.journal import Journal
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.outcome import DecisionLog, TrialResult
-from holdfast.recording import outcome_comparison
-from holdfast.recording.journal import Journal
-from holdfast.recording.outcome_comparison import OutcomeEffect, compare_outcomes, effects_of
+from holdfast.reports import outcome_comparison
+from holdfast.reports.outcome_comparison import OutcomeEffect, compare_outcomes, effects_of
 
 LIMIT = 100
 

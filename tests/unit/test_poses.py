@@ -10,7 +10,7 @@ from holdfast.config.registry import BUILT_IN, problem_class
 from holdfast.errors import ProblemError
 from holdfast.planning.belief import Belief, estimate
 from holdfast.problems.problem import ProblemBase
-from holdfast.recording.poses import pose_layout
+from holdfast.reports.poses import pose_layout
 
 RANDOM = np.random.default_rng(7)
 

@@ -12,9 +12,9 @@ from msgspec import structs
 
 from holdfast.cli import _print_defect, main
 from holdfast.cli.terminal import print_summary, progress_line
+from holdfast.journal.tables import SummaryBuilder
 from holdfast.printable import cell, one_line, printable
 from holdfast.protocol.messages import Refused, decode_reply, encode
-from holdfast.recording.tables import SummaryBuilder
 from holdfast.runtime.log_lines import json_line, text_line
 from holdfast.runtime.logs import EventLog
 from holdfast.transport.frames import read_goodbye

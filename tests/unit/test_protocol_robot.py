@@ -39,7 +39,7 @@ from holdfast.protocol.records import (
     replay,
 )
 from holdfast.protocol.robot import Robot
-from holdfast.recording.recorder import Recorder
+from holdfast.reports.recorder import Recorder
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import run_trial
 

@@ -14,6 +14,8 @@ from tests.recordings import Journalling, configuration_of, record_trial
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import OutputError
+from holdfast.journal.fingerprint import EarlierCode
+from holdfast.journal.run_directory import RunDirectory
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import EnvironmentSettings
@@ -22,9 +24,8 @@ from holdfast.protocol.records import (
     ObservedRecord,
     Record,
 )
-from holdfast.recording import recomputing
-from holdfast.recording.fingerprint import EarlierCode
-from holdfast.recording.run_directory import RunDirectory
+from holdfast.robot import recomputing
+from holdfast.robot.recomputing import resume_run
 from holdfast.robot.trial import run_trial
 
 OLD = {"holdfast_version": "0.0.1", "holdfast_core": "0.0.1+abc"}
@@ -67,9 +68,7 @@ def test_a_run_of_another_version_goes_on_and_says_who_decided_what(tmp_path: Pa
     # Three decisions: a sensing action and two task actions, of which the last is pending.
     begin(tmp_path / "run", configuration, finished, records_of(configuration, 2, 4))
     told: list[tuple[int, int]] = []
-    with RunDirectory.resume(
-        tmp_path / "run", configuration, lambda *each: told.append(each)
-    ) as directory:
+    with resume_run(tmp_path / "run", configuration, lambda *each: told.append(each)) as directory:
         expected = EarlierCode(
             holdfast="0.0.1+abc", finished=((0, 1),), unfinished=(2, 3), computed_again=(0, 1, 2)
         )
@@ -84,11 +83,11 @@ def test_a_run_of_another_version_goes_on_and_says_who_decided_what(tmp_path: Pa
         directory.journal.set_meta(**OLD)
     total = sum(len(list(each.decisions or ())) for each in finished) + 3
     assert told == [(done, total) for done in range(1, total + 1)]
-    with RunDirectory.resume(tmp_path / "run", configuration) as directory:
+    with resume_run(tmp_path / "run", configuration) as directory:
         assert directory.before_upgrade == EarlierCode(
             holdfast="0.0.1+abc", finished=((2, 2),), computed_again=(0, 1, 2)
         )
-    with RunDirectory.resume(tmp_path / "run", configuration) as directory:
+    with resume_run(tmp_path / "run", configuration) as directory:
         assert directory.before_upgrade is None
         directory.write_tables(1.0)
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
@@ -106,7 +105,7 @@ def test_of_many_finished_trials_few_are_computed(
         monkeypatch.setattr(recomputing, "_FINISHED_S", seconds)
         out = tmp_path / f"run{computed}"
         begin(out, configuration, finished)
-        with RunDirectory.resume(out, configuration) as directory:
+        with resume_run(out, configuration) as directory:
             assert directory.before_upgrade == EarlierCode(
                 holdfast="0.0.1+abc", finished=((0, 2), (5, 6), (9, 9)), computed_again=computed
             )
@@ -115,7 +114,7 @@ def test_of_many_finished_trials_few_are_computed(
 def test_nothing_decided_is_nothing_to_compute(tmp_path: Path) -> None:
     configuration = configuration_of(tmp_path)
     begin(tmp_path / "run", configuration, [])
-    with RunDirectory.resume(tmp_path / "run", configuration) as directory:
+    with resume_run(tmp_path / "run", configuration) as directory:
         assert directory.before_upgrade is not None
         assert directory.before_upgrade.in_words() == "holdfast 0.0.1+abc decided nothing yet"
 
@@ -144,7 +143,7 @@ def test_another_decision_is_refused_and_named(tmp_path: Path) -> None:
         begin(out, configuration, [finished], records)
         for _ in range(2):  # nothing has changed by the first refusal
             with pytest.raises(OutputError, match=rf"by holdfast 0\.0\.1.*{words}.*--out"):
-                RunDirectory.resume(out, configuration)
+                resume_run(out, configuration)
 
 
 def test_a_run_without_observations_is_refused(tmp_path: Path) -> None:
@@ -154,4 +153,4 @@ def test_a_run_without_observations_is_refused(tmp_path: Path) -> None:
     )
     begin(tmp_path / "run", configuration, [result_of(configuration, 0)])
     with pytest.raises(OutputError, match=r"cannot be computed again: .*not kept its observations"):
-        RunDirectory.resume(tmp_path / "run", configuration)
+        resume_run(tmp_path / "run", configuration)

@@ -24,8 +24,8 @@ from holdfast.protocol.records import (
     Record,
     TrialHistory,
 )
-from holdfast.recording.figure import trial_figure
-from holdfast.recording.recorder import Recorder
+from holdfast.reports.figure import trial_figure
+from holdfast.reports.recorder import Recorder
 from holdfast.robot.recorded_trial import run_recorded_trial
 from holdfast.robot.trial import NULL_OBSERVER, run_trial
 

@@ -9,7 +9,7 @@ import pytest
 from tests.recordings import configuration_of, record_trial
 
 from holdfast.planning.planner import Planner
-from holdfast.recording.recorder import MAX_PARTICLES_KEPT, Recorder
+from holdfast.reports.recorder import MAX_PARTICLES_KEPT, Recorder
 from holdfast.robot.trial import run_trial
 
 

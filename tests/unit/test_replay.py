@@ -11,12 +11,12 @@ import pytest
 from tests.recordings import configuration_of, record_trial
 
 from holdfast.errors import HoldfastError, OutputError
+from holdfast.journal.run_directory import RunDirectory
 from holdfast.planning.outcome import TrialResult
-from holdfast.recording.csv_export import CsvSink
-from holdfast.recording.facts import SensingFact, TaskFact, TrialBeginFact, TrialEndFact
-from holdfast.recording.recorder import TrialRecord
-from holdfast.recording.replay import RecordedRun
-from holdfast.recording.run_directory import RunDirectory
+from holdfast.reports.csv_export import CsvSink
+from holdfast.reports.facts import SensingFact, TaskFact, TrialBeginFact, TrialEndFact
+from holdfast.reports.recorder import TrialRecord
+from holdfast.reports.replay import RecordedRun
 
 
 class Collected:

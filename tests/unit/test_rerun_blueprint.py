@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from holdfast.config.loader import load
-from holdfast.recording.rerun_blueprint import drawn_layout, is_flat
+from holdfast.reports.rerun_blueprint import drawn_layout, is_flat
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

@@ -17,7 +17,7 @@ from holdfast.config.loader import Configuration, load
 from holdfast.planning.belief import Belief
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.tracking import LateObservation
-from holdfast.recording.facts import (
+from holdfast.reports.facts import (
     Decider,
     EventFact,
     LateFact,
@@ -26,8 +26,8 @@ from holdfast.recording.facts import (
     TrialBeginFact,
     TrialEndFact,
 )
-from holdfast.recording.rerun_sink import MAX_PARTICLES, RerunSink
-from holdfast.recording.view_target import ViewTarget
+from holdfast.reports.rerun_sink import MAX_PARTICLES, RerunSink
+from holdfast.reports.view_target import ViewTarget
 from holdfast.robot.trial import LateStep
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -11,9 +11,9 @@ import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 
 from holdfast.errors import ViewError
-from holdfast.recording import rerun_streams
-from holdfast.recording.rerun_streams import RerunStreams
-from holdfast.recording.view_target import ViewTarget
+from holdfast.reports import rerun_streams
+from holdfast.reports.rerun_streams import RerunStreams
+from holdfast.reports.view_target import ViewTarget
 
 URL = "rerun+http://127.0.0.1:9876/proxy"
 

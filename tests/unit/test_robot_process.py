@@ -17,6 +17,7 @@ from tests.recordings import robot_configuration
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import HeldError, ProblemError, TrialError
+from holdfast.journal.run_directory import RunDirectory
 from holdfast.planning.outcome import SensingDecision, TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.protocol.events import (
@@ -35,7 +36,6 @@ from holdfast.protocol.events import (
 from holdfast.protocol.question import InProcessSource
 from holdfast.protocol.records import PausedRecord
 from holdfast.protocol.status import Status
-from holdfast.recording.run_directory import RunDirectory
 from holdfast.robot import own_planner
 from holdfast.robot import process as robot_process
 from holdfast.robot.environment_maker import EnvironmentMaker, load_environment

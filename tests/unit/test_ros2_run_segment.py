@@ -11,8 +11,8 @@ import pytest
 from tests.recordings import robot_configuration
 
 from holdfast.config.loader import Configuration
+from holdfast.journal import journal_file
 from holdfast.planning.planner import Planner
-from holdfast.recording import journal_file
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
 from holdfast.robot.trial import run_trial

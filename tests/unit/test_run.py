@@ -17,8 +17,8 @@ from tests.command_line import Said, run_here
 from tests.recordings import forget_steps, rewrite
 
 from holdfast.errors import HeldError
-from holdfast.recording import journal_file
-from holdfast.recording.journal_file import Notes
+from holdfast.journal import journal_file
+from holdfast.journal.journal_file import Notes
 from holdfast.robot.process import RobotProcess
 
 PEG = """
@@ -303,9 +303,9 @@ def test_a_figure_that_a_problem_fails_to_describe(
 @pytest.mark.parametrize(
     ("function", "says"),
     [
-        ("holdfast.recording.figure.trial_figure", "figure, because it cannot be drawn: "),
+        ("holdfast.reports.figure.trial_figure", "figure, because it cannot be drawn: "),
         ("holdfast.cli.run.print_summary", "summary, because of "),
-        ("holdfast.recording.belief_remarks.belief_remarks", "remarks on the beliefs, because of "),
+        ("holdfast.reports.belief_remarks.belief_remarks", "remarks on the beliefs, because of "),
     ],
 )
 def test_what_a_finished_run_can_do_without_may_fail(

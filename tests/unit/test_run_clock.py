@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 
-from holdfast.recording.run_clock import RunClock, Stamp, read_clocks
+from holdfast.journal.run_clock import RunClock, Stamp, read_clocks
 
 S = 1_000_000_000
 NOW = 1_790_000_000 * S

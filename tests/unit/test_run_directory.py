@@ -12,16 +12,17 @@ from tests.recordings import configuration_of, result_of
 
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import OutputError
-from holdfast.planning.settings import EnvironmentSettings
-from holdfast.protocol.records import (
-    PausedRecord,
-)
-from holdfast.recording.run_directory import (
+from holdfast.journal.run_directory import (
     OUTPUT_NAMES,
     RunDirectory,
     claim_default_directory,
     latest_default_directory,
 )
+from holdfast.planning.settings import EnvironmentSettings
+from holdfast.protocol.records import (
+    PausedRecord,
+)
+from holdfast.robot.recomputing import resume_run
 
 
 class TestRunDirectory:
@@ -41,7 +42,7 @@ class TestRunDirectory:
         with RunDirectory.create(tmp_path / "out", configuration) as directory:
             directory.add(result_of(0))
             directory.write_tables(wall_time_s=1.5)
-        with RunDirectory.resume(tmp_path / "out", configuration) as directory:
+        with resume_run(tmp_path / "out", configuration) as directory:
             assert directory.journal.finished() == {0}
             assert directory.write_tables(wall_time_s=2.0).wall_time_s == 3.5
 
@@ -62,17 +63,17 @@ class TestRunDirectory:
 
     def test_resuming_needs_a_run(self, tmp_path: Path) -> None:
         with pytest.raises(OutputError, match="no such directory, so no run to resume"):
-            RunDirectory.resume(tmp_path / "missing", configuration_of(tmp_path))
+            resume_run(tmp_path / "missing", configuration_of(tmp_path))
         (tmp_path / "empty").mkdir()
         with pytest.raises(OutputError, match=r"holds no journal\.bin, so no run to resume"):
-            RunDirectory.resume(tmp_path / "empty", configuration_of(tmp_path))
+            resume_run(tmp_path / "empty", configuration_of(tmp_path))
 
     def test_resuming_with_another_configuration_names_the_key(self, tmp_path: Path) -> None:
         RunDirectory.create(tmp_path / "out", configuration_of(tmp_path)).close()
         with pytest.raises(OutputError, match=r"simulator\.seed is 5 there and 6 here"):
-            RunDirectory.resume(tmp_path / "out", configuration_of(tmp_path, seed=6))
+            resume_run(tmp_path / "out", configuration_of(tmp_path, seed=6))
         with pytest.raises(OutputError, match=r"model\.hole_tolerance is 0\.1 there and 0\.2 here"):
-            RunDirectory.resume(tmp_path / "out", configuration_of(tmp_path, tolerance=0.2))
+            resume_run(tmp_path / "out", configuration_of(tmp_path, tolerance=0.2))
 
     @staticmethod
     def of_own_problem(tmp_path: Path, source: str) -> Configuration:
@@ -89,11 +90,11 @@ class TestRunDirectory:
         out = tmp_path / "out"
         configuration = self.of_own_problem(tmp_path, source)
         RunDirectory.create(out, configuration).close()
-        RunDirectory.resume(out, configuration).close()
+        resume_run(out, configuration).close()
         changed = self.of_own_problem(tmp_path, source + "# changed\n")
         with pytest.raises(OutputError, match=r"source has changed since \(module own_problem\)"):
-            RunDirectory.resume(out, changed)
-        RunDirectory.resume(out, self.of_own_problem(tmp_path, source)).close()
+            resume_run(out, changed)
+        resume_run(out, self.of_own_problem(tmp_path, source)).close()
 
     def test_resuming_may_ask_for_more_trials_but_not_for_fewer_than_finished(
         self, tmp_path: Path
@@ -104,12 +105,12 @@ class TestRunDirectory:
         with RunDirectory.create(out, load(path, num_trials=4)) as directory:
             directory.add(result_of(0))
             directory.add(result_of(2))
-        with RunDirectory.resume(out, load(path, num_trials=9)) as directory:
+        with resume_run(out, load(path, num_trials=9)) as directory:
             assert directory.write_tables(1.0).trials == 9
         assert load(out / "config.yaml").simulator.num_trials == 9
-        RunDirectory.resume(out, load(path, num_trials=3)).close()
+        resume_run(out, load(path, num_trials=3)).close()
         with pytest.raises(OutputError, match=r"trial 2 .* at least 3, not 2"):
-            RunDirectory.resume(out, load(path, num_trials=2))
+            resume_run(out, load(path, num_trials=2))
         assert load(out / "config.yaml").simulator.num_trials == 3
 
     def test_a_run_without_a_finished_trial_keeps_no_directory(self, tmp_path: Path) -> None:
@@ -129,7 +130,7 @@ class TestRunDirectory:
                 RunDirectory.create(out, other)  # in use by the run above
             directory.add(result_of(0))
         assert load(out / "config.yaml") == other
-        RunDirectory.resume(out, other).close()
+        resume_run(out, other).close()
         with pytest.raises(OutputError, match=r"--resume.*--out"):
             RunDirectory.create(out, other)
 
@@ -142,8 +143,8 @@ class TestRunDirectory:
             RunDirectory.create(path, configuration)
         assert claim_default_directory(configuration, tmp_path / "runs").name == "peg-seed5-2"
         with pytest.raises(OutputError, match=r"trial 1 of that run is begun.* at least 2, not 1"):
-            RunDirectory.resume(path, load(tmp_path / "peg.yaml", num_trials=1))
-        with RunDirectory.resume(path, configuration) as directory:
+            resume_run(path, load(tmp_path / "peg.yaml", num_trials=1))
+        with resume_run(path, configuration) as directory:
             unfinished = directory.journal.unfinished()
             assert unfinished is not None
             assert (unfinished.trial, unfinished.records) == (1, [PausedRecord()])
@@ -162,10 +163,10 @@ class TestRunDirectory:
             "recovery: {journal_survives: power_cut}\n"
             "environment: {timeout_ms: 20}\n"
         )
-        with RunDirectory.resume(out, load(path)) as directory:
+        with resume_run(out, load(path)) as directory:
             assert directory.journal.survives == "power_cut"
         assert load(out / "config.yaml").offload.services == ("tcp/127.0.0.1:1",)
-        with RunDirectory.resume(out, configuration) as directory:
+        with resume_run(out, configuration) as directory:
             assert directory.journal.survives == "process_crash"
 
     def test_another_world_does_not_go_on_with_a_run(self, tmp_path: Path) -> None:
@@ -174,7 +175,7 @@ class TestRunDirectory:
         RunDirectory.create(out, configuration).close()
         robot = replace(configuration, environment=EnvironmentSettings(object="arm:Arm"))
         with pytest.raises(OutputError, match=r"environment.* is not given there .*arm:Arm"):
-            RunDirectory.resume(out, robot)
+            resume_run(out, robot)
 
     @pytest.mark.parametrize("name", ["gymnasium", "arm:Arm"])
     def test_other_arguments_of_the_environment_are_another_world(
@@ -192,10 +193,10 @@ class TestRunDirectory:
         with pytest.raises(
             OutputError, match=r"environment\.arguments\.gravity is -10\.0 there and -4\.0 here"
         ):
-            RunDirectory.resume(out, of(arguments={"id": "Moon-v0", "gravity": -4.0}))
+            resume_run(out, of(arguments={"id": "Moon-v0", "gravity": -4.0}))
         assert (out / "config.yaml").read_text() == text
         same = of(arguments={"id": "Moon-v0", "gravity": -10.0}, timeout_ms=20.0, directory="/srv")
-        RunDirectory.resume(out, same).close()
+        resume_run(out, same).close()
 
     @pytest.mark.parametrize("name", [*OUTPUT_NAMES, "recovery.log", "journal.sqlite"])
     def test_nothing_is_written_through_a_link(self, tmp_path: Path, name: str) -> None:
@@ -212,7 +213,7 @@ class TestRunDirectory:
         (out / "new").mkdir()
         (out / "new" / name).symlink_to(tmp_path / "missing")
         with pytest.raises(OutputError, match=rf"{name}: is no file but a link"):
-            RunDirectory.resume(out, configuration)
+            resume_run(out, configuration)
         with pytest.raises(OutputError, match=rf"{name}: is no file but a link"):
             RunDirectory.create(out / "new", configuration)
         assert mine.read_bytes() == before
@@ -225,7 +226,7 @@ class TestRunDirectory:
         damaged = (out / "journal.bin").read_bytes()[:-100]
         (out / "journal.bin").write_bytes(damaged)
         with pytest.raises(OutputError, match=r"the journal is damaged .*--out"):
-            RunDirectory.resume(out, configuration)
+            resume_run(out, configuration)
         with pytest.raises(OutputError, match=r"holds config"):
             RunDirectory.create(out, configuration)
         assert (out / "journal.bin").read_bytes() == damaged

@@ -14,13 +14,13 @@ from tests.recordings import configuration_of, record_trial
 
 from holdfast.cli.run_figure import repeat, service_that_decided
 from holdfast.errors import DecidedOtherwiseError
+from holdfast.journal.run_directory import RunDirectory
+from holdfast.journal.timings import EventTable
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.protocol.events import Timing
 from holdfast.protocol.question import OWN_PLANNER
-from holdfast.recording.recorder import Recorder
-from holdfast.recording.run_directory import RunDirectory
-from holdfast.recording.timings import EventTable
+from holdfast.reports.recorder import Recorder
 
 PEG = """
 problem: peg_in_hole_2d

@@ -16,10 +16,10 @@ from tests.unit.test_trial import configuration_of, one
 
 import holdfast as hf
 from holdfast.errors import HoldfastError, InvalidValueError, OutputError
+from holdfast.journal.tables import wilson_interval
 from holdfast.planning.outcome import SensingDecision
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.recording.outcome_comparison import effects_of
-from holdfast.recording.tables import wilson_interval
+from holdfast.reports.outcome_comparison import effects_of
 from holdfast.tuning.simulated_trials import Trials
 
 LIMIT = 60

@@ -19,7 +19,7 @@ from holdfast import _kernel
 from holdfast.config import registry
 from holdfast.config.imports import follow_imports
 from holdfast.config.source_digest import core_version, problem_digest, problem_sources
-from holdfast.recording.fingerprint import difference
+from holdfast.journal.fingerprint import difference
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = Path(holdfast.__file__).parent

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from holdfast.errors import OutputError
-from holdfast.recording.run_clock import RunClock
-from holdfast.recording.step_times import (
+from holdfast.journal.run_clock import RunClock
+from holdfast.journal.timings import TimingRow, rows_by_trial
+from holdfast.reports.step_times import (
     MOMENTS,
     NS_PER_S,
     StepClock,
@@ -19,7 +20,6 @@ from holdfast.recording.step_times import (
     read_events,
     trial_ends,
 )
-from holdfast.recording.timings import TimingRow, rows_by_trial
 
 
 def row(step: int, kind: str, time_ns: int) -> TimingRow:

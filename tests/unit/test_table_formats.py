@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from holdfast.errors import HoldfastError, OutputError
-from holdfast.recording.table_formats import Table
+from holdfast.reports.table_formats import Table
 
 
 class Prices(Table):

@@ -6,7 +6,7 @@ import pytest
 from tests.recordings import result_of
 
 from holdfast.cli.terminal import counted, duration, print_summary, progress_line
-from holdfast.recording.tables import SummaryBuilder
+from holdfast.journal.tables import SummaryBuilder
 
 
 @pytest.mark.parametrize(

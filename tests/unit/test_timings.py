@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 
 from holdfast.errors import OutputError
-from holdfast.protocol.events import Timing, VerificationNoted
-from holdfast.recording.timings import (
+from holdfast.journal.timings import (
     AnswerCounts,
     EventTable,
     VerificationCounts,
     count_answers,
     count_verified,
 )
+from holdfast.protocol.events import Timing, VerificationNoted
 from holdfast_lab.testbed.records import DecisionTable, time_of
 
 MOMENT_NS = 1_700_000_000_123_456_789

@@ -25,7 +25,7 @@ from holdfast.planning.outcome import (
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.recording.recorder import Recorder
+from holdfast.reports.recorder import Recorder
 from holdfast.robot.environment import Environment, SimulatedEnvironment
 from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
 from holdfast.robot.trial import run_trial

@@ -13,7 +13,7 @@ from tests.unit.test_trial import configuration_of, one
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import InvalidValueError, OutputError
 from holdfast.planning.outcome import TrialResult
-from holdfast.recording.outcome_comparison import compare_outcomes
+from holdfast.reports.outcome_comparison import compare_outcomes
 from holdfast.tuning.sweep import Sweep, SweptArm, arms_of
 
 

@@ -12,8 +12,8 @@ import pytest
 import holdfast as hf
 from holdfast.config.loader import load
 from holdfast.errors import InvalidValueError, WorkerDiedError
-from holdfast.recording.kept_trials import FRESH
 from holdfast.tuning.candidates import AS_CONFIGURED, RANDOM
+from holdfast.tuning.kept_trials import FRESH
 from holdfast.tuning.tune import Progress
 
 RUN = """

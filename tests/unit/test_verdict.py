@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from holdfast.recording.kept_trials import TrialRow
 from holdfast.tuning.candidates import AS_CONFIGURED, RANDOM
+from holdfast.tuning.kept_trials import TrialRow
 from holdfast.tuning.verdict import cost_of, judge, mean_difference
 
 LIMIT = 100

@@ -7,8 +7,8 @@ from importlib.metadata import PackageNotFoundError
 import pytest
 
 from holdfast.errors import InvalidValueError, ViewError
-from holdfast.recording import view_target
-from holdfast.recording.view_target import ViewTarget, require_rerun, viewer_url
+from holdfast.reports import view_target
+from holdfast.reports.view_target import ViewTarget, require_rerun, viewer_url
 
 
 @pytest.mark.parametrize(

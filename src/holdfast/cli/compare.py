@@ -62,7 +62,7 @@ def main(arguments: Sequence[str]) -> int:
     if options.outcomes:
         _compare_outcomes(runs, paired=not options.unpaired, json=options.json)
         return 0
-    from holdfast.recording.compare import compare_runs
+    from holdfast.reports.compare import compare_runs
 
     found = compare_runs(*runs)
     sys.stdout.write(found.to_json() if options.json else f"{printable(found.describe())}\n")
@@ -72,7 +72,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _compare_outcomes(runs: Sequence[Path], *, paired: bool, json: bool) -> None:
-    from holdfast.recording.outcome_comparison import compare_outcomes
+    from holdfast.reports.outcome_comparison import compare_outcomes
 
     found = compare_outcomes(runs, paired=paired)
     sys.stdout.write(found.to_json() if json else f"{printable(found.describe())}\n")

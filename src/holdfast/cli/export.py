@@ -26,8 +26,8 @@ from holdfast.runtime.command_line import (
 from holdfast.runtime.files import directory_beside, move_into_place, require_free, shown_path
 
 if TYPE_CHECKING:
-    from holdfast.recording.facts import FactSink
-    from holdfast.recording.replay import RecordedRun
+    from holdfast.reports.facts import FactSink
+    from holdfast.reports.replay import RecordedRun
 
 __all__ = [
     "chosen_trials",
@@ -117,7 +117,7 @@ def main(arguments: Sequence[str]) -> int:
 def _export(options: ExportOptions) -> None:
     path, mcap, tables, wanted = options.run, options.mcap, options.tables, options.trials
     if mcap is not None:
-        from holdfast.recording.mcap_export import require_rosbags
+        from holdfast.reports.mcap_export import require_rosbags
 
         require_rosbags()
         require_free(mcap, "--mcap", directory=False)
@@ -125,7 +125,7 @@ def _export(options: ExportOptions) -> None:
         require_free(tables, "--csv", directory=True)
         if mcap == tables:
             raise OptionError(f"--mcap and --csv are both {shown_path(mcap)}; give two places")
-    from holdfast.recording.replay import RecordedRun
+    from holdfast.reports.replay import RecordedRun
 
     with RecordedRun(path, problem_directory=options.problem_directory) as recorded:
         trials = chosen_trials(recorded, wanted)
@@ -152,7 +152,7 @@ def chosen_trials(recorded: RecordedRun, wanted: range | None) -> list[int]:
 
 def _write(recorded: RecordedRun, trials: Sequence[int], options: ExportOptions) -> list[str]:
     """Write all of it beside its places, and move it there when all is whole; return notes."""
-    from holdfast.recording.csv_export import CsvSink
+    from holdfast.reports.csv_export import CsvSink
 
     mcap, tables = options.mcap, options.tables
     notes = notes_about(recorded)
@@ -162,7 +162,7 @@ def _write(recorded: RecordedRun, trials: Sequence[int], options: ExportOptions)
         # What closes the files stands on a stack of its own: it comes before they are moved.
         with contextlib.ExitStack() as files:
             if mcap is not None:
-                from holdfast.recording.mcap_export import McapSink
+                from holdfast.reports.mcap_export import McapSink
 
                 bag = stack.enter_context(directory_beside(mcap)) / mcap.stem
                 about = _about(recorded)
@@ -215,8 +215,8 @@ def replay_trials(
 
 def notes_about(recorded: RecordedRun) -> list[str]:
     """Return what a reader of the facts should know."""
-    from holdfast.recording.run_directory import TIMINGS_NAME
-    from holdfast.recording.step_times import UNTIMED_STEP_S
+    from holdfast.journal.run_directory import TIMINGS_NAME
+    from holdfast.reports.step_times import UNTIMED_STEP_S
 
     notes = []
     if not recorded.has_times:
@@ -237,7 +237,7 @@ def notes_about(recorded: RecordedRun) -> list[str]:
 def _about(recorded: RecordedRun) -> dict[str, str]:
     """Return the metadata of a file about its run."""
     from holdfast.config.source_digest import core_version
-    from holdfast.recording.step_times import UNTIMED_STEP_S
+    from holdfast.reports.step_times import UNTIMED_STEP_S
 
     configuration = recorded.configuration
     times = "recorded" if recorded.has_times else f"{1.0 / UNTIMED_STEP_S:g} steps a second"

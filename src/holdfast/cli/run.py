@@ -29,14 +29,14 @@ from holdfast.cli.terminal import (
 )
 from holdfast.errors import HoldfastError, InvalidValueError, RunError, UnwritableOutputError
 from holdfast.printable import printable
-from holdfast.recording.view_target import require_rerun
+from holdfast.reports.view_target import require_rerun
 from holdfast.runtime.files import require_free, shown_path
 
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
+    from holdfast.journal.run_directory import RunDirectory
+    from holdfast.journal.tables import RunSummary
     from holdfast.planning.outcome import TrialResult
-    from holdfast.recording.run_directory import RunDirectory
-    from holdfast.recording.tables import RunSummary
     from holdfast.robot.environment_maker import EnvironmentMaker
     from holdfast.runtime.events import EventSink
     from holdfast.runtime.service_manager import ServiceManager
@@ -69,16 +69,17 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _run(options: RunOptions) -> int:
-    from holdfast.planning.planner import Planner
-    from holdfast.recording.belief_remarks import belief_remarks
-    from holdfast.recording.recorder import Recorder
-    from holdfast.recording.run_directory import (
+    from holdfast.journal.run_directory import (
         FIGURE_NAME,
         RunDirectory,
         claim_default_directory,
         latest_default_directory,
     )
+    from holdfast.planning.planner import Planner
+    from holdfast.reports.belief_remarks import belief_remarks
+    from holdfast.reports.recorder import Recorder
     from holdfast.robot.environment_maker import load_environment
+    from holdfast.robot.recomputing import resume_run, resume_run_if_begun
     from holdfast.robot.trials import available_cores, run_trials
     from holdfast.runtime.service_manager import ServiceManager
 
@@ -98,10 +99,10 @@ def _run(options: RunOptions) -> int:
     notes = _Notes(options)
     if options.resume_if_begun or options.resume:
         if options.resume_if_begun:
-            directory_path, open_run = _out_of_one_run(options), RunDirectory.resume_if_begun
+            directory_path, open_run = _out_of_one_run(options), resume_run_if_begun
         else:
             directory_path = options.out or latest_default_directory(configuration, runs)
-            open_run = RunDirectory.resume
+            open_run = resume_run
         with contextlib.closing(RecomputingDisplay(quiet=notes.is_quiet)) as recomputing:
 
             def on_progress(done: int, total: int) -> None:
@@ -281,8 +282,8 @@ def _run_as_robot(
     note: Callable[[str], None],
 ) -> RobotFindings:
     """Run the missing trials one after another, step by step, with services that may die."""
-    from holdfast.recording.robot_run import perform_trials
     from holdfast.robot.health import RobotWatch
+    from holdfast.robot.robot_run import perform_trials
     from holdfast.runtime.logs import EventLog
 
     def hint() -> None:
@@ -294,7 +295,7 @@ def _run_as_robot(
 
     view = None
     if (target := options.view_target()) is not None:
-        from holdfast.recording.live_view import LiveView
+        from holdfast.reports.live_view import LiveView
 
         view = LiveView(configuration, target, directory.path, note)
     findings = RobotFindings(hint)

@@ -22,10 +22,10 @@ from holdfast.errors import DecidedOtherwiseError
 
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
+    from holdfast.journal.journal_reader import JournalReader
+    from holdfast.journal.run_directory import RunDirectory
     from holdfast.planning.outcome import TrialResult
-    from holdfast.recording.journal_reader import JournalReader
-    from holdfast.recording.recorder import Recorder
-    from holdfast.recording.run_directory import RunDirectory
+    from holdfast.reports.recorder import Recorder
 
 __all__ = [
     "Remark",
@@ -67,7 +67,7 @@ def draw_figure(
 def _drawn(
     configuration: Configuration, directory: RunDirectory, recorder: Recorder
 ) -> Remark | None:
-    from holdfast.recording.run_directory import FIGURE_NAME
+    from holdfast.journal.run_directory import FIGURE_NAME
 
     trial, path = recorder.trial, directory.path / FIGURE_NAME
     if recorder.record.result is None:
@@ -82,7 +82,7 @@ def _drawn(
             )
     try:
         with own_backend():
-            from holdfast.recording.figure import trial_figure
+            from holdfast.reports.figure import trial_figure
     except ImportError as error:
         if error.name is None or error.name.split(".")[0] != "matplotlib":
             raise
@@ -117,7 +117,7 @@ def _remark_on(
     error: DecidedOtherwiseError, configuration: Configuration, directory: RunDirectory
 ) -> Remark:
     """Name the cause of other decisions when a trial was run again."""
-    from holdfast.recording.run_directory import TIMINGS_NAME
+    from holdfast.journal.run_directory import TIMINGS_NAME
 
     service = service_that_decided(error, directory.path / TIMINGS_NAME)
     if service is None:
@@ -137,7 +137,7 @@ def repeat(
 
     ``result`` has its decisions; another one raises DecidedOtherwiseError.
     """
-    from holdfast.recording.recomputing import ComparedTrial, RecordedTrials
+    from holdfast.robot.recomputing import ComparedTrial, RecordedTrials
 
     trials = RecordedTrials(
         journal, configuration, world_is_simulated=configuration.environment.object is None
@@ -147,8 +147,8 @@ def repeat(
 
 def service_that_decided(error: DecidedOtherwiseError, timings: Path) -> str | None:
     """Return the service whose decision differs, None if it was the robot's own."""
+    from holdfast.journal.timings import read_timings
     from holdfast.protocol.question import OWN_PLANNER
-    from holdfast.recording.timings import read_timings
 
     if error.kind is None:
         return None

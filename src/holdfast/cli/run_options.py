@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.cli.overrides import Override, combined, parse_assignment
 from holdfast.errors import InvalidValueError
-from holdfast.recording.view_target import ViewTarget, viewer_url
+from holdfast.reports.view_target import ViewTarget, viewer_url
 from holdfast.runtime.command_line import (
     MAX_TRIALS,
     Options,

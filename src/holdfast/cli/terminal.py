@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from holdfast.config.loader import Configuration
+    from holdfast.journal.tables import RunSummary
     from holdfast.planning.outcome import TrialResult
-    from holdfast.recording.tables import RunSummary
 
 __all__ = [
     "ProgressLine",
@@ -331,7 +331,7 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
 
 def print_files(directory: Path) -> None:
     """Print which files a run has left in its directory."""
-    from holdfast.recording.run_directory import OUTPUT_NAMES
+    from holdfast.journal.run_directory import OUTPUT_NAMES
 
     names = [name for name in OUTPUT_NAMES if (directory / name).exists()]
     sys.stdout.write(printable(f"\n{shown_path(directory)}/\n  {'  '.join(names)}\n"))

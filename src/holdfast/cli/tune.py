@@ -147,9 +147,9 @@ def main(arguments: Sequence[str]) -> int:
     """Tune and return the exit code."""
     options = TuneOptions.parse("tune", arguments)
     from holdfast.config.loader import load
-    from holdfast.recording.kept_trials import TRIALS_NAME
     from holdfast.tuning.check_process import require_right
     from holdfast.tuning.findings import Finding
+    from holdfast.tuning.kept_trials import TRIALS_NAME
     from holdfast.tuning.tune import Progress, tune
     from holdfast.tuning.tuning_report import CONFIGURATION_NAME, tuning_tables
 

@@ -16,7 +16,7 @@ from holdfast.cli.export import (
     trials_option,
 )
 from holdfast.errors import InvalidValueError, OptionError
-from holdfast.recording.view_target import ViewTarget, require_rerun, viewer_url
+from holdfast.reports.view_target import ViewTarget, require_rerun, viewer_url
 from holdfast.runtime.command_line import (
     Options,
     argument,
@@ -73,8 +73,8 @@ def _view(options: ViewOptions) -> None:
     require_rerun(ViewTarget(url))
     if save is not None:
         require_free(save, "--save", directory=False)
-    from holdfast.recording.replay import RecordedRun
-    from holdfast.recording.rerun_sink import RerunSink
+    from holdfast.reports.replay import RecordedRun
+    from holdfast.reports.rerun_sink import RerunSink
 
     own = options.problem_directory
     with RecordedRun(options.run, "view", problem_directory=own) as recorded, ExitStack() as stack:

@@ -448,7 +448,7 @@ class ProblemBase:
     motion_variance: FloatArray = np.array([0.01])
     state_labels: Sequence[str] = ()
     pose: Sequence[str | None] = ()
-    """Which coordinates of the state are a pose, for ROS: see :mod:`holdfast.recording.poses`."""
+    """Which coordinates of the state are a pose, for ROS: see :mod:`holdfast.reports.poses`."""
     up: str = "z"
     """Which axis of that pose points up: z, or y for a problem in a vertical plane."""
 

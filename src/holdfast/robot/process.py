@@ -88,7 +88,7 @@ class _TrialInProgress(Protocol):
 
 
 class StepJournal(Protocol):
-    """What a robot needs of a journal: :class:`holdfast.recording.journal.Journal` has it."""
+    """What a robot needs of a journal: :class:`holdfast.journal.journal.Journal` has it."""
 
     def session(self) -> bytes:
         """Return the run's identifier, 16 bytes."""

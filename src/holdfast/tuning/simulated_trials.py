@@ -2,7 +2,7 @@
 
 Seed and trial name every random number, so trial 7 of two planners happens in the same world if
 their seeds are the same. :func:`compare` compares such trials in pairs, by the statistics of
-``holdfast compare --outcomes`` (:mod:`holdfast.recording.outcome_comparison`).
+``holdfast compare --outcomes`` (:mod:`holdfast.reports.outcome_comparison`).
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ from typing import Any
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import InvalidValueError
+from holdfast.journal.run_directory import world_of
 from holdfast.numerics.arrays import whole
 from holdfast.planning.outcome import TRIAL_COLUMNS, SensingDecision, TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings, SimulatorSettings, check_settings
 from holdfast.problems.attributes import sensing_costs
 from holdfast.problems.problem import Problem
-from holdfast.recording.outcome_comparison import (
+from holdfast.reports.outcome_comparison import (
     ComparedRun,
     OutcomeComparison,
     compare_results,
@@ -28,8 +29,7 @@ from holdfast.recording.outcome_comparison import (
     read_outcomes,
     shown_estimate,
 )
-from holdfast.recording.run_directory import world_of
-from holdfast.recording.table_formats import Table
+from holdfast.reports.table_formats import Table
 from holdfast.robot.trial_pool import Arm, TrialPool, available_cores
 from holdfast.runtime.command_line import MAX_SEED, MAX_TRIALS
 from holdfast.validation import as_function, as_path

@@ -20,11 +20,12 @@ import msgspec
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import InvalidValueError, OutputError
+from holdfast.journal.run_directory import RunDirectory
+from holdfast.journal.tables import trial_row
 from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
-from holdfast.recording.outcome_comparison import ComparedRun, OutcomeComparison, compare_results
-from holdfast.recording.run_directory import RunDirectory
-from holdfast.recording.table_formats import csv_rows
-from holdfast.recording.tables import trial_row
+from holdfast.printable import csv_rows
+from holdfast.reports.outcome_comparison import ComparedRun, OutcomeComparison, compare_results
+from holdfast.robot.recomputing import resume_run_if_begun
 from holdfast.robot.trial_pool import Arm, TrialPool
 from holdfast.runtime.files import shown_path, write_atomically
 from holdfast.tuning.simulated_trials import arm_of, table_of
@@ -149,9 +150,7 @@ class Sweep:
         with ExitStack() as stack:
             begun = self._go_on()
             for arm in self.arms:
-                run = RunDirectory.resume_if_begun(
-                    self.directory / arm.directory, arm.configuration
-                )
+                run = resume_run_if_begun(self.directory / arm.directory, arm.configuration)
                 self._runs.append(stack.enter_context(run))
             content = msgspec.json.format(msgspec.json.encode(begun), indent=2)
             write_atomically(self.directory / _SWEEP, content)

@@ -26,9 +26,8 @@ import numpy as np
 
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import InvalidValueError, TrialCrashError, TrialError, WorkerDiedError
+from holdfast.journal.fingerprint import fingerprint
 from holdfast.numerics.arrays import FloatArray, real_number, whole
-from holdfast.recording.fingerprint import fingerprint
-from holdfast.recording.kept_trials import FRESH, TRIALS_NAME, KeptTrials, TrialRow
 from holdfast.robot.trial_pool import Arm, TrialPool, available_cores
 from holdfast.runtime.command_line import MAX_JOBS
 from holdfast.runtime.ray_workers import RayCluster
@@ -47,6 +46,7 @@ from holdfast.tuning.candidates import (
     later_candidates,
 )
 from holdfast.tuning.check_process import require_right
+from holdfast.tuning.kept_trials import FRESH, TRIALS_NAME, KeptTrials, TrialRow
 from holdfast.tuning.race import PILOT_TRIALS, MeasuredTrial, Standing, race
 from holdfast.tuning.tuning_report import CandidateRow, Tuning, write_report
 from holdfast.tuning.verdict import MUCH_SLOWER, cost_of, judge, mean_difference

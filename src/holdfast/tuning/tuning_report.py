@@ -16,7 +16,7 @@ import msgspec
 
 from holdfast.config.loader import Configuration
 from holdfast.config.yaml_document import read, write
-from holdfast.recording.table_formats import Table
+from holdfast.reports.table_formats import Table
 from holdfast.runtime.files import write_atomically
 from holdfast.tuning.candidates import Objective
 from holdfast.tuning.verdict import FAMILY_LEVEL, Comparison
@@ -193,7 +193,7 @@ def tuning_figure(found: Tuning) -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from holdfast.recording.figure import STYLE
+    from holdfast.reports.figure import STYLE
 
     raced: list[tuple[Any, ...]] = [
         (

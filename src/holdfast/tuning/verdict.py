@@ -18,9 +18,9 @@ import msgspec
 import numpy as np
 
 from holdfast.numerics.arrays import FloatArray
-from holdfast.recording.kept_trials import TrialRow
-from holdfast.recording.outcome_comparison import bootstrap_interval
+from holdfast.reports.outcome_comparison import bootstrap_interval
 from holdfast.tuning.candidates import AS_CONFIGURED, RANDOM, Objective
+from holdfast.tuning.kept_trials import TrialRow
 
 __all__ = ["FAMILY_LEVEL", "MUCH_SLOWER", "Comparison", "cost_of", "judge", "mean_difference"]
 

@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import msgspec
 
 from holdfast.errors import HoldfastError
-from holdfast.recording.compare import Comparison, compare_runs
+from holdfast.reports.compare import Comparison, compare_runs
 from holdfast.runtime.files import write_atomically
 from holdfast_lab.chaos.schedule import Schedule, Wire
 from holdfast_lab.errors import CancelledTrialError, NoProgressError, ProcessEndedError

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from holdfast.cli.terminal import counted
 from holdfast.protocol.status import Status
-from holdfast.recording.compare import Comparison, compare_runs
+from holdfast.reports.compare import Comparison, compare_runs
 from holdfast.robot.links import RECOVERY_SERVICE
 from holdfast_lab.demo.narrator import DemoState, Line, Narrator
 from holdfast_lab.errors import NoProgressError

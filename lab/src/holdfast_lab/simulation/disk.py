@@ -3,7 +3,7 @@
 The end of a process loses nothing that was appended. The end of the machine loses a tail of it,
 unless each append was forced out (``journal_survives: power_cut``). Whoever opens the journal
 afterwards is told whether a tail may be missing. This is what the real journal promises
-(:mod:`holdfast.recording.journal`), without a file.
+(:mod:`holdfast.journal.journal`), without a file.
 """
 
 from __future__ import annotations

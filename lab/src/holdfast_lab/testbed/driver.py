@@ -15,7 +15,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Self, TypeAlias
 
-from holdfast.recording.run_directory import TIMINGS_NAME
+from holdfast.journal.run_directory import TIMINGS_NAME
 from holdfast.runtime.parent_death import parent_death_prefix
 from holdfast.runtime.process_ends import signal_name
 from holdfast_lab.errors import NoProgressError, ProcessEndedError

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import yaml
 
 from holdfast.config.loader import Configuration, load
+from holdfast.journal.run_directory import RunDirectory
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
-from holdfast.recording.run_directory import RunDirectory
 from holdfast.robot.trial import run_trial
 from holdfast.runtime.files import write_atomically
 from holdfast_lab.testbed.world import WitnessedWorld

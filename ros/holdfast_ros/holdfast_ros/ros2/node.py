@@ -36,9 +36,9 @@ from holdfast.errors import HoldfastError
 from holdfast.planning.planner import PlanningState
 from holdfast.problems.attributes import sensing_labels
 from holdfast.protocol.events import Act, Sense
-from holdfast.recording.poses import PoseLayout, pose_layout
-from holdfast.recording.run_directory import RunDirectory
+from holdfast.reports.poses import PoseLayout, pose_layout
 from holdfast.robot.links import check_services
+from holdfast.robot.recomputing import resume_run_if_begun
 from holdfast.runtime.log_lines import fields_as_text
 from holdfast_ros.executive import DecideCode, DecideRequest
 from holdfast_ros.ros2 import messages
@@ -212,7 +212,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             layout = pose_layout(read.configuration.problem)
             make_world(self._robot, read)
             # Whether a run can begin there, or go on.
-            RunDirectory.resume_if_begun(read.run_directory, read.configuration).close()
+            resume_run_if_begun(read.run_directory, read.configuration).close()
         except Exception as error:  # noqa: BLE001 - rclpy would hide it
             self.get_logger().error(f"not configured: {_in_words(error)}")
             return TransitionCallbackReturn.FAILURE

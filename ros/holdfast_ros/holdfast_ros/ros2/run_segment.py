@@ -26,14 +26,15 @@ from holdfast.errors import (
     StaleEpochError,
     UnknownPerformanceError,
 )
+from holdfast.journal.run_directory import RunDirectory
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import PlanningState
 from holdfast.protocol.events import Act, Sense, Timing
-from holdfast.recording.robot_run import RobotObserver, perform_trials
-from holdfast.recording.run_directory import RunDirectory
 from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
 from holdfast.robot.health import Condition
 from holdfast.robot.process import RobotProcess
+from holdfast.robot.recomputing import resume_run_if_begun
+from holdfast.robot.robot_run import RobotObserver, perform_trials
 from holdfast.runtime.events import EventSink
 from holdfast_ros.executive import DecideCode, DecisionHandover, ExecutiveEnvironment
 from holdfast_ros.ros2.parameters import NodeParameters, in_parameters
@@ -134,7 +135,7 @@ class RunSegment:
     """Runs the remaining trials of the run in the directory ``path``, once it is started.
 
     ``on_order`` and ``on_timing`` are those of a
-    :class:`~holdfast.recording.robot_run.RobotObserver`; ``on_end`` gets the result, on the
+    :class:`~holdfast.robot.robot_run.RobotObserver`; ``on_end`` gets the result, on the
     segment's thread. ``outcome`` is there when ``ended`` is set.
     """
 
@@ -213,7 +214,7 @@ class RunSegment:
     def _work(self) -> None:
         trials: tuple[TrialResult, ...] = ()
         try:
-            with RunDirectory.resume_if_begun(self.path, self.configuration) as directory:
+            with resume_run_if_begun(self.path, self.configuration) as directory:
                 try:
                     self._run(directory)
                 finally:

@@ -1,0 +1,1 @@
+"""What a run keeps: its journal, its tables, its directory, and which code made it."""

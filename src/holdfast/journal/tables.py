@@ -1,0 +1,230 @@
+"""``trials.csv``, a row for each trial, and ``summary.json``, one page about all of them.
+
+Results are added one at a time, in the order of their trials, so that a run of millions of trials
+needs no more memory than its sensing times.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from array import array
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from holdfast.journal.fingerprint import EarlierCode
+from holdfast.journal.timings import AnswerCounts, VerificationCounts
+from holdfast.numerics.floating_mode import in_own_mode
+from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
+from holdfast.printable import csv_rows
+
+__all__ = ["RunSummary", "SummaryBuilder", "csv_lines", "trial_row", "wilson_interval"]
+
+_NORMAL_QUANTILE_975 = 1.959963984540054
+
+
+class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """The content of ``summary.json``.
+
+    Attributes
+    ----------
+    holdfast_version : str
+        Of the last part, if the run was resumed.
+    trials : int
+        Trials that the configuration asks for.
+    finished : int
+        Trials that are finished; all other numbers are about these.
+    successes, failures : int
+        Trials that reached the goal, and that the environment ended as failed; the rest ran out of
+        steps.
+    success_rate_interval_95 : tuple of float, or None
+        Wilson's interval.
+    mean_reward : float or None
+        None if a finished trial has no reward.
+    mean_reward_of_successes : float or None
+        Earlier work reports this one.
+    mean_steps : float or None
+        Arithmetic mean; ``compare --outcomes`` takes the geometric one, of which it shows ratios.
+    missing_observations : int
+        Sensing actions without an observation.
+    unexplained_observations : int
+        Observations that no particle explains.
+    lost, suspect_sensors : int
+        Times that the robot was found lost, and a sensing action suspect.
+    fewest_distinct_particles : int or None
+        The least number of different particles that an observation weighed, in any trial.
+    recoveries : int
+        Times that the local service took over, in all processes of the run.
+    sensing_decisions_by_service, task_answers_by_service, longest_wait_ms
+        See :class:`holdfast.journal.timings.AnswerCounts`; None without services.
+    verified_answers, wrong_answers, not_deterministic, unverified_answers
+        See :class:`holdfast.journal.timings.VerificationCounts`; None without services.
+    sensing_ms_median, sensing_ms_p99 : float or None
+        Wall time of choosing a sensing action. Each decision counts once, as it was carried out,
+        also those of earlier processes of a run that was resumed.
+    wall_time_s : float
+        Over all parts of the run, without those that were killed.
+    earlier_code : tuple of EarlierCode
+        What other versions of holdfast decided before this one went on; only if one did.
+    digest : str
+        BLAKE2b-256 over the digests of the trials in order: equal exactly if all decisions of two
+        runs are.
+    """
+
+    problem: str
+    seed: int
+    holdfast_version: str
+    trials: int
+    finished: int
+    successes: int
+    failures: int
+    success_rate: float | None
+    success_rate_interval_95: tuple[float, float] | None
+    mean_reward: float | None
+    mean_reward_of_successes: float | None
+    mean_steps: float | None
+    sensing_decisions: int
+    missing_observations: int = 0
+    unexplained_observations: int
+    lost: int = 0
+    suspect_sensors: int = 0
+    fewest_distinct_particles: int | None = None
+    recoveries: int
+    sensing_decisions_by_service: dict[str, int] | None = None
+    task_answers_by_service: dict[str, int] | None = None
+    longest_wait_ms: float | None = None
+    verified_answers: int | None = None
+    wrong_answers: dict[str, int] | None = None
+    not_deterministic: int | None = None
+    unverified_answers: int | None = None
+    sensing_ms_median: float | None
+    sensing_ms_p99: float | None
+    wall_time_s: float
+    earlier_code: tuple[EarlierCode, ...] | msgspec.UnsetType = msgspec.UNSET
+    digest: str
+
+    def to_json(self) -> str:
+        """Return the summary as indented JSON."""
+        return msgspec.json.format(msgspec.json.encode(self), indent=2).decode() + "\n"
+
+
+def csv_lines(results: Iterable[TrialResult]) -> Iterator[str]:
+    """Yield the lines of ``trials.csv``, the head first.
+
+    Reading a number back gives the same number. None, such as the reward of a trial without one, is
+    an empty cell.
+    """
+    yield from csv_rows(TRIAL_COLUMNS, map(trial_row, results))
+
+
+def trial_row(result: TrialResult) -> tuple[object, ...]:
+    """Return what a table has of a trial, in the order of ``TRIAL_COLUMNS``."""
+    return tuple(getattr(result, column) for column in TRIAL_COLUMNS)
+
+
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Return the 95 % interval for a rate, by Wilson's score.
+
+    It is right near 0 and 1, too, and never leaves them.
+    """
+    z_squared = _NORMAL_QUANTILE_975**2
+    rate = successes / trials
+    centre = rate + z_squared / (2 * trials)
+    spread = float(
+        _NORMAL_QUANTILE_975
+        * np.sqrt(rate * (1 - rate) / trials + z_squared / (4 * trials * trials))
+    )
+    scale = 1 + z_squared / trials
+    low = 0.0 if successes == 0 else (centre - spread) / scale
+    high = 1.0 if successes == trials else (centre + spread) / scale
+    return low, high
+
+
+def _mean(total: float | None, count: int) -> float | None:
+    return None if total is None or not count else total / count
+
+
+_COUNTS = (
+    "sensing_decisions",
+    "missing_observations",
+    "unexplained_observations",
+    "lost",
+    "suspect_sensors",
+    "recoveries",
+)
+"""What the summary has of a trial's counts, under the same names: their sums."""
+
+
+class SummaryBuilder:
+    """Adds up results, in the order of their trials."""
+
+    def __init__(self) -> None:
+        self._sums = dict.fromkeys((*_COUNTS, "success", "failed", "steps"), 0)
+        self._finished = 0
+        # Of all trials, and of the successful ones; None as soon as one has none.
+        self._rewards: dict[bool, float | None] = {False: 0.0, True: 0.0}
+        self._distinct: int | None = None
+        self._sensing_ms = array("f")
+        self._digest = hashlib.blake2b(digest_size=32)
+
+    def add(self, result: TrialResult) -> None:
+        """Add the next result."""
+        self._finished += 1
+        for name in self._sums:
+            self._sums[name] += getattr(result, name)
+        for of_successes in (False, True) if result.success else (False,):
+            total = self._rewards[of_successes]
+            if total is not None:
+                total = None if result.reward is None else total + result.reward
+            self._rewards[of_successes] = total
+        if (distinct := result.fewest_distinct_particles) is not None:
+            self._distinct = min(distinct, self._distinct or distinct)
+        self._sensing_ms.extend(result.sensing_ms)
+        self._digest.update(bytes.fromhex(result.digest))
+
+    @in_own_mode
+    def build(
+        self,
+        *,
+        problem: str,
+        seed: int,
+        version: str,
+        trials: int,
+        wall_time_s: float,
+        answers: AnswerCounts | None = None,
+        verified: VerificationCounts | None = None,
+        earlier_code: tuple[EarlierCode, ...] = (),
+    ) -> RunSummary:
+        """Return the summary."""
+        count, sums = self._finished, self._sums
+        successes = sums["success"]
+        counts: dict[str, Any] = {name: sums[name] for name in _COUNTS}
+        median = p99 = None
+        if self._sensing_ms:
+            quantiles = np.quantile(np.frombuffer(self._sensing_ms, dtype=np.float32), [0.5, 0.99])
+            median, p99 = (round(float(quantile), 4) for quantile in quantiles)
+        return RunSummary(
+            problem=problem,
+            seed=seed,
+            holdfast_version=version,
+            trials=trials,
+            finished=count,
+            successes=successes,
+            failures=sums["failed"],
+            success_rate=successes / count if count else None,
+            success_rate_interval_95=wilson_interval(successes, count) if count else None,
+            mean_reward=_mean(self._rewards[False], count),
+            mean_reward_of_successes=_mean(self._rewards[True], successes),
+            mean_steps=sums["steps"] / count if count else None,
+            **counts,
+            fewest_distinct_particles=self._distinct,
+            **{} if answers is None else answers._asdict(),
+            **{} if verified is None else verified._asdict(),
+            sensing_ms_median=median,
+            sensing_ms_p99=p99,
+            wall_time_s=round(wall_time_s, 3),
+            earlier_code=earlier_code or msgspec.UNSET,
+            digest=self._digest.hexdigest(),
+        )

@@ -1,0 +1,149 @@
+"""What happened in a recorded run, as a stream of facts in the order of their times.
+
+:class:`holdfast.reports.replay.RecordedRun` produces them, and a :class:`FactSink` writes them as
+tables, ROS messages or arrays. All times are on one clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol
+
+from holdfast.journal.run_clock import Stamp
+from holdfast.numerics.arrays import FloatArray, floats_or_none
+from holdfast.planning.belief import Belief
+from holdfast.planning.outcome import TrialResult
+from holdfast.robot.trial import LateStep, SensingStep, TaskStep
+
+SCORES = {
+    "action_entropy": "expected entropy of\nthe actions (nats)",
+    "path_entropy": "expected entropies of\nthe actions, sum (nats)",
+    "state_entropy": "expected entropy of\nthe state (nats)",
+    "action_covariance": "expected covariance\nof the actions (trace)",
+    "expected_return": "expected loss\n(minus the return)",
+}
+"""What a fact's entropies are, by the method that weighs them, in two lines."""
+
+
+class Decider(NamedTuple):
+    """Who made a decision, and how long it took; from ``timings.csv``.
+
+    Attributes
+    ----------
+    waited_ms : float
+        How long the robot stood still for it.
+    round_trip_ms, computed_ms : float or None
+        None for an action that came in the answer to an earlier request.
+    """
+
+    service: str
+    status: str
+    waited_ms: float
+    round_trip_ms: float | None
+    computed_ms: float | None
+
+    @classmethod
+    def of(cls, answer: Any) -> Decider:
+        """Return that of a ``Timing``, or of a row of the table."""
+        return cls(*(getattr(answer, name) for name in cls._fields))
+
+
+class TrialBeginFact(NamedTuple):
+    """A trial begins."""
+
+    trial: int
+    time_ns: int
+
+
+class SensingFact(NamedTuple):
+    """A sensing step, and who chose its action; the choice may be not to sense.
+
+    Attributes
+    ----------
+    decided_ns, observed_ns : int
+        When it was chosen, and when its observation was part of the belief.
+    """
+
+    step: SensingStep
+    decided_ns: int
+    observed_ns: int
+    decider: Decider | None
+
+
+class TaskFact(NamedTuple):
+    """A task action that was ordered or performed, and who chose it.
+
+    Attributes
+    ----------
+    true_state : array of shape (state_size,) or None
+        Before the action.
+    """
+
+    step: TaskStep
+    time_ns: int
+    decider: Decider | None
+    true_state: FloatArray | None = None
+
+    @property
+    def shown(self) -> tuple[FloatArray | None, FloatArray | None]:
+        """What the move has shown: its motion, and its observation."""
+        return floats_or_none(self.step.shown.motion), floats_or_none(self.step.shown.observation)
+
+
+class LateFact(NamedTuple):
+    """An observation that came late, and when."""
+
+    step: LateStep
+    time_ns: int
+
+
+class TrialEndFact(NamedTuple):
+    """A trial ends, or its records do.
+
+    Attributes
+    ----------
+    result : TrialResult or None
+        None if the trial is not finished.
+    belief, estimate, true_state
+        After the last action, and the state that stood for the belief; None where the records end
+        before that.
+    """
+
+    trial: int
+    time_ns: int
+    steps: int
+    result: TrialResult | None
+    belief: Belief | None = None
+    estimate: FloatArray | None = None
+    true_state: FloatArray | None = None
+
+
+class EventFact(NamedTuple):
+    """A line of ``events.jsonl``: its time, its name (such as ``status``) and its other fields."""
+
+    time_ns: int
+    name: str
+    fields: Mapping[str, Any]
+    stamp: Stamp | None = None
+
+
+class FactSink(Protocol):
+    """Writes facts in the order in which they come. They are read-only and need no copy."""
+
+    def trial_begins(self, fact: TrialBeginFact) -> None:
+        """Write that a trial begins."""
+
+    def sensed(self, fact: SensingFact) -> None:
+        """Write a sensing step."""
+
+    def acted(self, fact: TaskFact) -> None:
+        """Write a task action."""
+
+    def observed_late(self, fact: LateFact) -> None:
+        """Write an observation that came late."""
+
+    def trial_ends(self, fact: TrialEndFact) -> None:
+        """Write the end of a trial."""
+
+    def happened(self, fact: EventFact) -> None:
+        """Write an event of the services."""

@@ -1,0 +1,402 @@
+"""Comparing two runs: what is the same, and the first thing that is not."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from tests.command_line import run_here
+
+from holdfast.errors import HoldfastError, OutputError
+from holdfast.journal.journal import Journal
+from holdfast.planning.outcome import DecisionLog, TrialResult
+from holdfast.protocol.records import ActingRecord, ObservedRecord
+from holdfast.reports.compare import Comparison, compare_runs
+
+COMMAND = [sys.executable, "-m", "holdfast"]
+
+CONFIGURATION = """\
+problem: peg_in_hole_2d
+model: {hole_tolerance: 0.1}
+simulator: {num_trials: 3, seed: 5}
+offload: {lease_ms: 400.0}
+"""
+
+NAN = struct.unpack("<d", struct.pack("<Q", 0x7FF8000000000000))[0]
+OTHER_NAN = struct.unpack("<d", struct.pack("<Q", 0x7FF8000000000001))[0]
+
+Step = tuple[int | None, bytes, Sequence[float]]
+"""Sensing action (None: no sensing), state digest after it, task action."""
+
+STEPS: list[Step] = [
+    (2, b"\x01" * 32, (0.1, 0.0)),
+    (None, b"", (0.2, 1.0)),
+    (1, b"\x02" * 32, (0.3, 0.1 + 0.2)),
+]
+
+
+def result_of(
+    trial: int,
+    steps: Sequence[Step] = STEPS,
+    *,
+    reward: float = -1.0,
+    last: bytes = b"\x09" * 32,
+    action_size: int = 2,
+) -> TrialResult:
+    log = DecisionLog(action_size)
+    for step, (sensing_action, state_digest, action) in enumerate(steps):
+        if sensing_action is not None:
+            log.sensed(step, sensing_action, state_digest)
+        log.acted(step, np.array(action))
+    log.ended(len(steps), last)
+    decisions = log.decisions()
+    return TrialResult(
+        trial=trial,
+        seed=5,
+        success=True,
+        steps=len(steps),
+        reward=reward,
+        sensing_decisions=sum(step[0] is not None for step in steps),
+        mean_sensing_ms=float(trial),
+        recoveries=trial,
+        unexplained_observations=0,
+        digest=decisions.digest(),
+        sensing_ms=(),
+        decisions=decisions,
+    )
+
+
+def run_of(
+    directory: Path,
+    results: Sequence[TrialResult],
+    *,
+    configuration: str = CONFIGURATION,
+    version: str = "1.0",
+    unfinished: int | None = None,
+    action: bytes = b"\0" * 16,
+) -> Path:
+    directory.mkdir()
+    meta = {"configuration": configuration, "holdfast_version": version, "problem_sources": "{}"}
+    with Journal.create(directory / "journal.bin", meta) as journal:
+        for result in results:
+            journal.add(result)
+        if unfinished is not None:
+            journal.append(
+                unfinished,
+                [ObservedRecord(0, 1, b"\0" * 8, b"\0" * 32, 0.5), ActingRecord(0, action)],
+            )
+    return directory
+
+
+def changed(step: int, what: Step) -> list[Step]:
+    return [*STEPS[:step], what, *STEPS[step + 1 :]]
+
+
+class TestDecisions:
+    def compare(self, tmp_path: Path, second: TrialResult, trial: int = 1) -> Comparison:
+        same = [result_of(number) for number in range(trial)]
+        first = run_of(tmp_path / "first", [*same, result_of(trial)])
+        return compare_runs(first, run_of(tmp_path / "second", [*same, second]))
+
+    def differs(self, tmp_path: Path, second: TrialResult) -> tuple[str, int | None, str, str]:
+        found = self.compare(tmp_path, second)
+        assert not found.identical
+        assert found.trials == 1
+        assert found.difference is not None
+        assert found.difference.trial == 1
+        return (
+            found.difference.what,
+            found.difference.step,
+            found.difference.first,
+            found.difference.second,
+        )
+
+    def test_times_and_recoveries_do_not_matter(self, tmp_path: Path) -> None:
+        first = run_of(tmp_path / "first", [result_of(0), result_of(1), result_of(2)])
+        results = [result_of(trial) for trial in (2, 0, 1)]
+        found = compare_runs(first, run_of(tmp_path / "second", results) / "journal.bin")
+        assert found.identical
+        assert found.difference is None
+        assert found.notes == ()
+        assert (found.trials, found.sensing_actions, found.task_actions) == (3, 6, 9)
+        assert found.describe() == (
+            "identical: 3 trials, 6 sensing actions, 9 task actions and every state digest"
+        )
+
+    def test_sensing_action(self, tmp_path: Path) -> None:
+        second = result_of(1, changed(2, (3, b"\x05" * 32, (0.3, 0.3))))
+        assert self.differs(tmp_path, second) == ("sensing action", 2, "1", "3")
+
+    def test_state_digest(self, tmp_path: Path) -> None:
+        second = result_of(1, changed(0, (2, b"\x05" * 32, (0.1, 0.0))))
+        expected = ("state digest after sensing", 0, "01" * 32, "05" * 32)
+        assert self.differs(tmp_path, second) == expected
+
+    def test_the_last_bit_of_a_task_action(self, tmp_path: Path) -> None:
+        second = result_of(1, changed(2, (1, b"\x02" * 32, (0.3, 0.3))))
+        expected = ("task action[1]", 2, "0.30000000000000004", "0.3")
+        assert self.differs(tmp_path, second) == expected
+
+    def test_the_sign_of_a_zero(self, tmp_path: Path) -> None:
+        second = result_of(1, changed(0, (2, b"\x01" * 32, (0.1, -0.0))))
+        assert self.differs(tmp_path, second) == ("task action[1]", 0, "0.0", "-0.0")
+
+    def test_numbers_that_print_alike_are_shown_by_their_bits(self, tmp_path: Path) -> None:
+        assert math.isnan(NAN)
+        first = run_of(tmp_path / "first", [result_of(0, changed(1, (None, b"", (NAN, 1.0))))])
+        second = run_of(
+            tmp_path / "second", [result_of(0, changed(1, (None, b"", (OTHER_NAN, 1.0))))]
+        )
+        difference = compare_runs(first, second).difference
+        assert difference is not None
+        assert (difference.what, difference.step) == ("task action[0]", 1)
+        assert difference.first == "nan (0x7ff8000000000000)"
+        assert difference.second == "nan (0x7ff8000000000001)"
+
+    def test_sensing_where_the_other_does_not(self, tmp_path: Path) -> None:
+        second = result_of(1, changed(1, (4, b"\x05" * 32, (0.2, 1.0))))
+        expected = ("next decision", 1, "a task action at step 1", "sensing action 4 at step 1")
+        assert self.differs(tmp_path, second) == expected
+
+    def test_a_trial_that_ends_before_the_other(self, tmp_path: Path) -> None:
+        expected = ("next decision", 2, "sensing action 1 at step 2", "none, the trial ends")
+        assert self.differs(tmp_path, result_of(1, STEPS[:2])) == expected
+
+    def test_last_state(self, tmp_path: Path) -> None:
+        second = result_of(1, last=b"\x08" * 32)
+        expected = ("digest of the last state", 3, "09" * 32, "08" * 32)
+        assert self.differs(tmp_path, second) == expected
+
+    def test_size_of_the_actions(self, tmp_path: Path) -> None:
+        second = result_of(1, [(2, b"\x01" * 32, (0.1,))], action_size=1)
+        assert self.differs(tmp_path, second) == ("size of the task actions", None, "2", "1")
+
+    def test_the_first_difference_is_told(self, tmp_path: Path) -> None:
+        first = run_of(tmp_path / "first", [result_of(trial) for trial in range(4)])
+        other = result_of(2, changed(1, (None, b"", (0.2, 2.0))))
+        second = run_of(
+            tmp_path / "second", [result_of(0), result_of(1), other, result_of(3, STEPS[:1])]
+        )
+        found = compare_runs(first, second)
+        assert found.describe().splitlines() == [
+            "different: trial 2, step 1, task action[1]",
+            f"  {first}:  1.0",
+            f"  {second}: 2.0",
+        ]
+
+    def test_another_reward_is_noted(self, tmp_path: Path) -> None:
+        found = self.compare(tmp_path, result_of(1, reward=-2.0))
+        assert found.identical
+        assert found.notes == (
+            "the world answered otherwise: trial 1 has outcome succeeded, reward -1.0 in the first "
+            "run and outcome succeeded, reward -2.0 in the second",
+        )
+
+    def test_another_outcome_is_noted(self, tmp_path: Path) -> None:
+        failed = msgspec.structs.replace(result_of(1), success=False, failed=True)
+        found = self.compare(tmp_path, failed)
+        assert found.identical
+        (note,) = found.notes
+        assert note.endswith("and outcome failed, reward -1.0 in the second")
+
+
+class TestRuns:
+    @pytest.mark.parametrize(
+        ("configuration", "what", "value"),
+        [
+            (CONFIGURATION.replace("seed: 5", "seed: 6"), "seed", "6"),
+            (CONFIGURATION.replace("peg_in_hole_2d", "capsule_robot"), "problem", "capsule_robot"),
+            ("problem: peg_in_hole_2d\n", "seed", "not given"),
+        ],
+    )
+    def test_other_seeds_and_problems(
+        self, tmp_path: Path, configuration: str, what: str, value: str
+    ) -> None:
+        first = run_of(tmp_path / "first", [result_of(0)])
+        second = run_of(tmp_path / "second", [result_of(0)], configuration=configuration)
+        difference = compare_runs(first, second).difference
+        assert difference is not None
+        assert (difference.what, difference.second) == (what, value)
+        assert difference.trial is None
+
+    def test_a_class_that_has_moved_since_is_the_same_problem(self, tmp_path: Path) -> None:
+        texts = [
+            CONFIGURATION.replace("peg_in_hole_2d", f"{module}.testbed.pegs:Peg")
+            for module in ("holdfast.lab", "holdfast_lab")
+        ]
+        first, second = (
+            run_of(tmp_path / str(number), [result_of(0)], configuration=text)
+            for number, text in enumerate(texts)
+        )
+        assert compare_runs(first, second).difference is None
+
+    def test_other_versions_and_settings_are_noted(self, tmp_path: Path) -> None:
+        first = run_of(tmp_path / "first", [result_of(0)])
+        other = CONFIGURATION.replace("0.1", "0.2").replace("400.0", "500.0")
+        second = run_of(tmp_path / "second", [result_of(0)], configuration=other, version="2.0")
+        found = compare_runs(first, second)
+        assert found.identical
+        assert found.notes == (
+            "made by holdfast 1.0 and by holdfast 2.0",
+            "model.hole_tolerance is 0.1 in the first run and 0.2 in the second",
+        )
+
+    def test_a_trial_that_is_not_there(self, tmp_path: Path) -> None:
+        first = run_of(tmp_path / "first", [result_of(0), result_of(2)])
+        second = run_of(tmp_path / "second", [result_of(trial) for trial in range(3)])
+        difference = compare_runs(first, second).difference
+        assert difference is not None
+        assert (difference.what, difference.trial) == ("state of the trial", 1)
+        assert difference.first == "not in this run, which has 2 finished trials"
+        assert difference.second == "finished"
+
+    def test_an_unfinished_trial(self, tmp_path: Path) -> None:
+        first = run_of(tmp_path / "first", [result_of(0), result_of(1)])
+        second = run_of(tmp_path / "second", [result_of(0)], unfinished=1)
+        unfinished = "unfinished, 1 sensing action and 1 task action so far"
+        for one, other, states in (
+            (first, second, ("finished", unfinished)),
+            (second, first, (unfinished, "finished")),
+        ):
+            found = compare_runs(one, other)
+            assert found.trials == 1
+            assert found.difference is not None
+            assert found.difference.trial == 1
+            assert (found.difference.first, found.difference.second) == states
+
+    def test_a_trial_that_is_unfinished_in_both_runs(self, tmp_path: Path) -> None:
+        """A killed run decided the same as itself, as far as it goes."""
+        killed = run_of(tmp_path / "killed", [], unfinished=0)
+        found = compare_runs(killed, killed)
+        assert found.identical
+        assert (found.trials, found.sensing_actions, found.task_actions) == (0, 1, 1)
+        assert found.notes == ("trial 0 is unfinished in both runs: compared as far as it goes",)
+        other = run_of(tmp_path / "other", [], unfinished=0, action=bytes(15) + b"\x3f")
+        difference = compare_runs(killed, other).difference
+        assert difference is not None
+        assert (difference.what, difference.trial, difference.step) == ("task action[1]", 0, 0)
+        assert difference.first != difference.second
+
+    def test_runs_without_a_trial_are_not_the_same(self, tmp_path: Path) -> None:
+        found = compare_runs(run_of(tmp_path / "first", []), run_of(tmp_path / "second", []))
+        assert not found.identical
+        assert "nothing to compare" in found.describe()
+
+    def test_a_configuration_that_repeats_itself_is_refused(self, tmp_path: Path) -> None:
+        """A few lines of aliases stand for billions of values."""
+        lines = ["problem: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+        lines += [f"x{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 30)]
+        for number, text in enumerate(["\n".join(lines), "[" * 2000, "a: *nobody"]):
+            run = run_of(tmp_path / f"run{number}", [result_of(0)], configuration=text)
+            with pytest.raises(HoldfastError, match="the configuration in a journal"):
+                compare_runs(run, run)
+
+    def test_a_record_forges_no_line(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        forged = 'problem: "peg\\nidentical: 3 trials"\n'
+        first = run_of(tmp_path / "first", [result_of(0)], configuration=forged)
+        second = run_of(tmp_path / "second", [result_of(0)], version="1\nidentical: 3 trials")
+        third = run_of(tmp_path / "third", [result_of(0)])
+        for one, other in ((first, second), (second, third)):
+            said = run_here(capsys, tmp_path, "compare", str(one), str(other))
+            lines = (said.stdout + said.stderr).splitlines()
+            assert "identical: 3 trials" not in lines
+
+    def test_what_is_no_run_is_refused(self, tmp_path: Path) -> None:
+        run = run_of(tmp_path / "first", [result_of(0)])
+        (tmp_path / "empty").mkdir()
+        (tmp_path / "file").write_bytes(b"no database, but long enough to look like one" * 30)
+        for other, message in (
+            ("missing", "no such directory"),
+            ("empty", r"holds no journal\.bin"),
+            ("file", r"is not a journal; name the directory of a run, or its journal\.bin"),
+        ):
+            for pair in ((run, tmp_path / other), (tmp_path / other, run)):
+                with pytest.raises(OutputError, match=message):
+                    compare_runs(*pair)
+
+    def test_a_run_that_is_going_on_is_compared_as_it_is(self, tmp_path: Path) -> None:
+        first = run_of(tmp_path / "first", [result_of(0)])
+        second = run_of(tmp_path / "second", [result_of(0)])
+        with Journal.open(second / "journal.bin") as journal:
+            assert compare_runs(first, second).identical
+            journal.add(result_of(1))
+            assert not compare_runs(first, second).identical
+
+
+class TestCommand:
+    @staticmethod
+    def compare(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [*COMMAND, "compare", *map(str, arguments)],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+
+    def test_identical(self, tmp_path: Path) -> None:
+        first = run_of(tmp_path / "first", [result_of(0)])
+        second = run_of(tmp_path / "second", [result_of(0)], version="2.0")
+        done = self.compare(first, second)
+        assert done.returncode == 0
+        assert done.stdout == (
+            "identical: 1 trial, 2 sensing actions, 3 task actions and every state digest\n"
+        )
+        assert done.stderr == "note: made by holdfast 1.0 and by holdfast 2.0\n"
+
+    def test_different(self, tmp_path: Path) -> None:
+        first = run_of(tmp_path / "first", [result_of(0)])
+        second = run_of(tmp_path / "second", [result_of(0, STEPS[:2])])
+        done = self.compare(first, second)
+        assert (done.returncode, done.stderr) == (1, "")
+        assert done.stdout.startswith("different: trial 0, step 2, next decision\n")
+        done = self.compare(first, second, "--json")
+        assert done.returncode == 1
+        found = json.loads(done.stdout)
+        assert found["identical"] is False
+        assert found["difference"] == {
+            "what": "next decision",
+            "trial": 0,
+            "step": 2,
+            "first": "sensing action 1 at step 2",
+            "second": "none, the trial ends",
+        }
+
+    def test_what_cannot_be_read(self, tmp_path: Path) -> None:
+        done = self.compare(tmp_path, tmp_path / "missing")
+        assert (done.returncode, done.stdout) == (2, "")
+        assert done.stderr.startswith(f"holdfast: error: {tmp_path}: holds no journal.bin")
+
+    @pytest.mark.slow
+    def test_real_runs(self, tmp_path: Path) -> None:
+        configuration = tmp_path / "peg.yaml"
+        configuration.write_text(
+            "problem: peg_in_hole_2d\n"
+            "particle_filter: {num_particles: 30}\n"
+            "active_sensing: {num_observation_samples: 2, num_cores: 1}\n"
+            "simulator: {num_trials: 2, max_steps: 30, seed: 3}\n"
+        )
+        for name, seed in (("first", 3), ("second", 3), ("other", 4)):
+            subprocess.run(
+                [
+                    *(*COMMAND, "run", str(configuration), "--out", str(tmp_path / name)),
+                    *("--quiet", "--seed", str(seed), "--jobs", "1"),
+                ],
+                check=True,
+                timeout=60,
+            )
+        done = self.compare(tmp_path / "first", tmp_path / "second")
+        assert done.returncode == 0, done.stdout
+        done = self.compare(tmp_path / "first", tmp_path / "other")
+        assert done.returncode == 1
+        assert done.stdout.splitlines()[0] == "different: seed"
