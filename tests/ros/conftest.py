@@ -39,7 +39,7 @@ class Ros2:
     """A real ROS 2, as tests/ros/set_up_ros2 makes it."""
 
     def __init__(self, directory: Path) -> None:
-        prefix = directory / "kilted"
+        prefix = next(path for name in ("kilted", "jazzy") if (path := directory / name).is_dir())
         installed = sorted(path for path in (directory / "install").iterdir() if path.is_dir())
         self.python = prefix / "bin" / "python"
         site = [

@@ -1,21 +1,24 @@
 """The bring-up package as colcon installs it: node, robot and service as its launch file has them.
 
-Launch itself is not here: its file is read, and what it starts is started by the test.
+Launch itself has no wheel. Its file runs with a stand-in, and the tests start what it starts.
 """
 
 from __future__ import annotations
 
-import ast
 import json
 import os
+import platform
+import runpy
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import pytest
 from tests.ports import free_port
-from tests.ros.conftest import Ros2, left_out
+from tests.ros.conftest import ROOT, Ros2, left_out
 from tests.ros.domains import own_domain
 from tests.ros.ros2_processes import WAIT_S, Process
 
@@ -42,6 +45,7 @@ class BringUp:
         self._environment = {**ros2.environment, "ROS_DOMAIN_ID": str(domain)}
         self._started: list[Process] = []
         self.port = free_port()
+        self.namespace = ""
 
     def start(self, command: list[str]) -> Process:
         process = Process(command, self._environment, cwd=self.directory)
@@ -56,6 +60,7 @@ class BringUp:
             str(self.share / "config" / "holdfast.yaml"),
             "-p",
             f"configuration:={self.configuration}",
+            *("-r", f"__ns:={self.namespace or '/'}"),
         ]
         for key, value in more.items():
             command += ["-p", f"{key.replace('__', '.')}:={value}"]
@@ -86,7 +91,9 @@ class BringUp:
 
     def peer(self) -> Peer:
         script = Path(__file__).with_name("ros2_peer.py")
-        peer = Peer([str(self._ros2.python), str(script), "/holdfast"], self._environment)
+        peer = Peer(
+            [str(self._ros2.python), str(script), f"{self.namespace}/holdfast"], self._environment
+        )
         self._started.append(peer)
         assert json.loads(peer.next_line()) == {"ready": True}
         return peer
@@ -142,31 +149,114 @@ def in_process(configuration: Path) -> list[list[Any]]:
     return [[result.trial, result.outcome, result.steps, result.digest]]
 
 
-def test_the_launch_file_names_what_is_installed(bring_up: BringUp) -> None:
-    path = bring_up.share / "launch" / "holdfast.launch.py"
-    tree = ast.parse(path.read_text())
-    compile(tree, str(path), "exec")
-    nodes: list[dict[str, str]] = [
-        {
-            str(word.arg): str(word.value.value)
-            for word in call.keywords
-            if isinstance(word.value, ast.Constant)
-        }
-        for call in ast.walk(tree)
-        if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "Node"
+class Made(NamedTuple):
+    """What a launch file has made of launch, which has no wheel: the class, and its arguments."""
+
+    kind: str
+    given: tuple[Any, ...]
+    words: dict[str, Any]
+
+    def perform(self, context: dict[str, str]) -> str:
+        return context[self.given[0]]
+
+
+def launched(bring_up: BringUp, monkeypatch: pytest.MonkeyPatch, **arguments: str) -> list[Made]:
+    """Return what the launch file starts, with a stand-in for launch."""
+    names = {
+        "launch": "LaunchDescription",
+        "launch.actions": "DeclareLaunchArgument ExecuteProcess OpaqueFunction",
+        "launch.substitutions": "LaunchConfiguration PathJoinSubstitution",
+        "launch_ros": "",
+        "launch_ros.actions": "Node",
+        "launch_ros.substitutions": "FindPackageShare",
+    }
+    for module, kinds in names.items():
+        stand_in = ModuleType(module)
+        for kind in kinds.split():
+
+            def make(*given: Any, _kind: str = kind, **words: Any) -> Made:
+                return Made(_kind, given, words)
+
+            setattr(stand_in, kind, make)
+        monkeypatch.setitem(sys.modules, module, stand_in)
+    read = runpy.run_path(str(bring_up.share / "launch" / "holdfast.launch.py"))
+    *declared, started = read["generate_launch_description"]().given[0]
+    context = {each.given[0]: str(each.words["default_value"]) for each in declared}
+    assert arguments.keys() <= context.keys()
+    made: list[Made] = started.words["function"](context | arguments)
+    return made
+
+
+def test_the_launch_file_starts_what_is_installed(
+    bring_up: BringUp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node, robot, service = launched(bring_up, monkeypatch, parameters="p", configuration="c")
+    for each in (node, robot):
+        place = bring_up.prefixes[each.words["package"]] / "lib" / each.words["package"]
+        assert os.access(place / each.words["executable"], os.X_OK)
+        assert each.words["parameters"][:2] == ["p", {"configuration": "c", "use_sim_time": False}]
+    assert node.words["parameters"][2:] == [
+        {"autostart": True},
+        {"offload.services": ["tcp/127.0.0.1:7447"]},
     ]
-    ours = {(node.get("package", PACKAGE), node["executable"]) for node in nodes}
-    assert ours == {("holdfast_ros", "node"), (PACKAGE, "simulated_robot"), ("rviz2", "rviz2")}
-    for package, name in ours - {("rviz2", "rviz2")}:
-        assert os.access(bring_up.prefixes[package] / "lib" / package / name, os.X_OK)
-    files = [
-        [part.value for part in call.args if isinstance(part, ast.Constant)]
-        for call in ast.walk(tree)
-        if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "share"
+    assert service.words["cmd"] == ["holdfast", "serve", "--listen", "tcp/127.0.0.1:7447"]
+
+
+def test_the_launch_files_arguments_reach_the_nodes(
+    bring_up: BringUp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    more = {"namespace": "left", "use_sim_time": "true", "log_level": "debug", "respawn": "true"}
+    node, robot, manager, service, rviz = launched(
+        bring_up,
+        monkeypatch,
+        listen="tcp/127.0.0.1:9",
+        lifecycle_manager="true",
+        rviz="true",
+        **more,
+    )
+    for each in (node, robot, manager):
+        assert each.words["namespace"] == "left"
+        assert each.words["arguments"] == ["--ros-args", "--log-level", "debug"]
+    assert node.words["respawn"] is True
+    assert node.words["parameters"][1]["use_sim_time"] is True
+    assert node.words["parameters"][2:] == [
+        {"autostart": False},
+        {"offload.services": ["tcp/127.0.0.1:9"]},
     ]
-    assert len(files) == 3
-    for parts in files:
-        assert bring_up.share.joinpath(*map(str, parts)).is_file()
+    assert service.words["cmd"][-1] == "tcp/127.0.0.1:9"
+    (managed,) = manager.words["parameters"]
+    assert (managed["node_names"], managed["autostart"]) == (["holdfast"], True)
+    assert managed["bond_timeout"] == 4.0
+    files = [each.given[0][1:] for each in rviz.words["arguments"][1:]]
+    assert all(bring_up.share.joinpath(*parts).is_file() for parts in files)
+    elsewhere = launched(bring_up, monkeypatch, service="false", robot="false")
+    assert [each.words["parameters"][2:] for each in elsewhere] == [[{"autostart": True}]]
+
+
+def test_a_robot_in_a_namespace(bring_up: BringUp) -> None:
+    bring_up.namespace = "/left"
+    bring_up.robot()
+    bring_up.node()
+    peer = bring_up.peer()
+    assert peer.do("goal")
+    assert peer.do("result")["trials"] == in_process(bring_up.configuration)
+    assert peer.do("get", names=["rate_hz", "environment.kind"]) == [0.0, "ros"]
+    diagnostics = peer.do("seen")["diagnostics"]
+    assert {name for *_, name, _ in diagnostics} == {"left/holdfast: active sensing"}
+    assert {hardware for *_, hardware in diagnostics} == {platform.node()}
+
+
+def test_colcon_tests_the_package(bring_up: BringUp) -> None:
+    """What a user's workspace would run, over what was built."""
+    command = ["colcon", "--log-base", "log", "test", "--packages-select", "holdfast_ros"]
+    places = [
+        *("--base-paths", str(ROOT / "ros"), "--build-base", "build"),
+        *("--install-base", str(bring_up.prefixes["holdfast_ros"].parent)),
+    ]
+    process = bring_up.start([*command, *places, "--return-code-on-test-failure"])
+    assert process.wait() == 0
+    (report,) = (bring_up.directory / "build" / "holdfast_ros").glob("pytest.xml")
+    assert 'tests="5"' in report.read_text()
 
 
 class TestTheExample:

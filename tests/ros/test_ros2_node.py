@@ -195,12 +195,18 @@ class TestARun:
         assert {tuple(cloud) for cloud in seen["clouds"]} == {("task", 500)}
 
         belief = peer.do("belief")
-        states = np.reshape(belief["states"], (-1, belief["size"]))
+        table = np.reshape(belief["data"], (belief["rows"], -1))
+        states, weights = table[:, :-1], table[:, -1]
+        assert belief["columns"] == "x (m); y (m); θ (rad); weight"
         layout = pose_layout(load(CONFIGURATION).problem)
         assert layout is not None
         np.testing.assert_array_equal(peer.do("cloud"), layout.poses(states))
-        assert sum(belief["weights"]) == pytest.approx(1.0)
+        assert sum(weights) == pytest.approx(1.0)
         assert node.interrupt() == 0
+        # Before its end a bond is ended, which a lifecycle manager would take for a death.
+        bonds = peer.wait_seen(lambda seen: seen["bonds"] and not seen["bonds"][-1][2])["bonds"]
+        assert {(name, instance) for name, instance, *_ in bonds} == {("holdfast", bonds[0][1])}
+        assert [active for *_, active, _ in bonds[:-1]] == [True] * (len(bonds) - 1)
 
     def test_a_goal_is_cancelled_and_a_new_one_goes_on(self, ros: Ros) -> None:
         ros.node(rate_hz=100.0)
@@ -327,6 +333,7 @@ class TestARobot:
         while peer.do("goal") and (result := peer.do("result"))["code"] == "HELD":
             assert "nobody offers" in result["message"]
         assert trials(result) == in_process()
+        peer.wait_seen(lambda seen: "finished" in seen["statuses"])
 
     def test_has_parameters_that_are_checked_at_once(self, ros: Ros) -> None:
         node = ros.node(wait=False, environment__kind="ros", environment__act="topic")
@@ -337,7 +344,7 @@ class TestARobot:
 def statuses(seen: dict[str, Any]) -> list[str]:
     """Return the statuses of the diagnostics, without repetitions."""
     found: list[str] = []
-    for _, _, values in seen["diagnostics"]:
+    for _, _, values, *_ in seen["diagnostics"]:
         status = values["status"]
         if status and (not found or found[-1] != status):
             found.append(status)
@@ -376,7 +383,7 @@ class TestFaults:
 
     def test_nobody_decides(self, ros: Ros) -> None:
         port = free_port()
-        ros.node(
+        node = ros.node(
             environment__kind="executive",
             offload__services=f"['tcp/127.0.0.1:{port}']",
             recovery__launch="never",
@@ -388,6 +395,8 @@ class TestFaults:
             lambda seen: any(item[2]["holding"] == "true" for item in seen["diagnostics"])
         )
         assert seen["diagnostics"][-1][:2] == [2, "holding still"]
+        (said,) = (line for line in node.errors if "]: holding: " in line)
+        assert said.startswith("[WARN]")
         ros.service(port)
         peer.drive()
         assert peer.do("goal")
@@ -469,6 +478,10 @@ class TestLifecycle:
     def test_nothing_is_published_while_inactive(self, ros: Ros) -> None:
         node = ros.node(environment__kind="executive")
         peer = ros.peer()
+        assert peer.do("set", speed=3) == [[False, "speed is no parameter of this node"]]
+        (frame,) = peer.wait_seen(lambda seen: seen["frames"])["frames"]
+        assert frame[:2] == ["map", "task"]
+        assert frame[2:] == pytest.approx(pose_layout(load(CONFIGURATION).problem).upright)
         peer.drive(20)
         peer.wait_seen(lambda seen: len(seen["decisions"]) >= 20)
         assert peer.do("change", transition="deactivate")
@@ -510,6 +523,8 @@ class TestLifecycle:
         peer = ros.peer()
         assert peer.do("goal")
         assert trials(peer.do("result")) == in_process()
+        names = ["simulator.seed", "rate_hz", "offload.tls", "model.peg_width", "frame_id"]
+        assert peer.do("get", names=names) == [SEED, 0.0, "", 1.0, "task"]
         (refused,) = peer.do("set", **{"simulator.seed": 6})
         assert refused == [
             False,
@@ -523,6 +538,7 @@ class TestLifecycle:
             assert peer.do("change", transition=transition)
         assert peer.do("goal")
         assert trials(peer.do("result")) == in_process(seed=6)
+        assert peer.do("get", names=names) == [6, 0.0, "", 1.0, "task"]
 
 
 class TestParameters:
