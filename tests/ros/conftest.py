@@ -41,6 +41,7 @@ class Ros2:
     def __init__(self, directory: Path) -> None:
         prefix = next(path for name in ("kilted", "jazzy") if (path := directory / name).is_dir())
         installed = sorted(path for path in (directory / "install").iterdir() if path.is_dir())
+        self.distribution = prefix.name
         self.python = prefix / "bin" / "python"
         site = [
             str(place) for path in installed for place in path.glob("lib/python3*/site-packages")

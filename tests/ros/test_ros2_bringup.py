@@ -10,7 +10,6 @@ import os
 import platform
 import runpy
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -20,7 +19,7 @@ import pytest
 from tests.ports import free_port
 from tests.ros.conftest import ROOT, Ros2, left_out
 from tests.ros.domains import own_domain
-from tests.ros.ros2_processes import WAIT_S, Process
+from tests.ros.ros2_processes import Process
 
 from holdfast.config.loader import load
 from holdfast.planning.planner import Planner
@@ -81,8 +80,7 @@ class BringUp:
         )
 
     def robot(self, **more: Any) -> Process:
-        log = self.directory / "performed.json"
-        return self.executable(PACKAGE, "simulated_robot", log=log, **more)
+        return self.executable(PACKAGE, "simulated_robot", **more)
 
     def service(self) -> Process:
         holdfast = self._ros2.python.with_name("holdfast")
@@ -98,16 +96,6 @@ class BringUp:
         assert json.loads(peer.next_line()) == {"ready": True}
         return peer
 
-    def num_performed(self) -> int:
-        log = self.directory / "performed.json"
-        return len(json.loads(log.read_text())["performed"]) if log.exists() else 0
-
-    def wait_until_performed(self, number: int) -> None:
-        deadline = time.monotonic() + WAIT_S
-        while self.num_performed() < number:
-            assert time.monotonic() < deadline, f"{self.num_performed()} task actions"
-            time.sleep(0.02)
-
     def kill(self) -> None:
         for process in self._started:
             process.kill()
@@ -121,12 +109,6 @@ class Peer(Process):
         answer = json.loads(self.next_line())
         assert "error" not in answer, answer["error"]
         return answer["answer"]
-
-    def wait_until_active(self) -> None:
-        deadline = time.monotonic() + WAIT_S
-        while self.do("state") != "active":
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
 
 
 @pytest.fixture
@@ -233,13 +215,16 @@ def test_the_launch_files_arguments_reach_the_nodes(
     assert [each.words["parameters"][2:] for each in elsewhere] == [[{"autostart": True}]]
 
 
-def test_a_robot_in_a_namespace(bring_up: BringUp) -> None:
+def test_the_example_decides_as_in_one_process_in_a_namespace_too(bring_up: BringUp) -> None:
     bring_up.namespace = "/left"
+    bring_up.service()
     bring_up.robot()
     bring_up.node()
     peer = bring_up.peer()
     assert peer.do("goal")
-    assert peer.do("result")["trials"] == in_process(bring_up.configuration)
+    result = peer.do("result")
+    assert result["code"] == "FINISHED", result["message"]
+    assert result["trials"] == in_process(bring_up.configuration)
     assert peer.do("get", names=["rate_hz", "environment.kind"]) == [0.0, "ros"]
     diagnostics = peer.do("seen")["diagnostics"]
     assert {name for *_, name, _ in diagnostics} == {"left/holdfast: active sensing"}
@@ -257,43 +242,3 @@ def test_colcon_tests_the_package(bring_up: BringUp) -> None:
     assert process.wait() == 0
     (report,) = (bring_up.directory / "build" / "holdfast_ros").glob("pytest.xml")
     assert 'tests="5"' in report.read_text()
-
-
-class TestTheExample:
-    def test_it_decides_as_in_one_process(self, bring_up: BringUp) -> None:
-        bring_up.service()
-        bring_up.robot()
-        bring_up.node()
-        peer = bring_up.peer()
-        assert peer.do("goal")
-        result = peer.do("result")
-        assert result["code"] == "FINISHED", result["message"]
-        assert result["trials"] == in_process(bring_up.configuration)
-
-    def test_killed_in_the_middle_of_a_task_action_it_goes_on(self, bring_up: BringUp) -> None:
-        bring_up.robot(motion_s=0.1)
-        node = bring_up.node()
-        peer = bring_up.peer()
-        assert peer.do("goal")
-        # Nearly all of its time the robot moves. It finishes its motion, and says so when asked.
-        bring_up.wait_until_performed(3)
-        time.sleep(0.05)
-        node.kill()
-        bring_up.node()
-        peer.wait_until_active()
-        assert peer.do("goal")
-        # The robot refuses a step that is not due; twice or not at all would be seen.
-        assert peer.do("result")["trials"] == in_process(bring_up.configuration)
-
-    def test_deactivated_in_the_middle_of_a_task_action_it_goes_on(self, bring_up: BringUp) -> None:
-        bring_up.robot(motion_s=0.1)
-        bring_up.node()
-        peer = bring_up.peer()
-        assert peer.do("goal")
-        bring_up.wait_until_performed(3)
-        time.sleep(0.05)
-        assert peer.do("change", transition="deactivate")
-        assert peer.do("result")["code"] == "PAUSED"
-        assert peer.do("change", transition="activate")
-        assert peer.do("goal")
-        assert peer.do("result")["trials"] == in_process(bring_up.configuration)

@@ -92,7 +92,7 @@ def test_a_run_that_is_killed_goes_on_where_the_arm_is(arm: Arm) -> None:
 
 
 def test_a_timeout_names_the_topic_that_is_silent(arm: Arm) -> None:
-    run = arm.run("--rate", "50", "--set", "environment.arguments.timeout_s=3.0")
+    run = arm.run("--rate", "50", "--set", "environment.arguments={timeout_s: 3.0}")
     arm.process.wait_for("trial 0, move 20")
     arm.process.kill()
     assert run.end() != 0

@@ -53,56 +53,30 @@ def processes(context):
     """Return the processes, by the arguments' values."""
     text = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     flag = {name: value.lower() in ("true", "1") for name, value in text.items()}
-    common = {
-        "namespace": text["namespace"],
-        "output": "screen",
-        "arguments": ["--ros-args", "--log-level", text["log_level"]],
-    }
-    parameters = [
-        text["parameters"],
-        {"configuration": text["configuration"], "use_sim_time": flag["use_sim_time"]},
-    ]
     managed = flag["lifecycle_manager"]
+    clock = {"use_sim_time": flag["use_sim_time"]}
+    parameters = [text["parameters"], {"configuration": text["configuration"], **clock}]
     services = [{"offload.services": [text["listen"]]}] if flag["service"] else []
-    started = [
-        Node(
-            package="holdfast_ros",
-            executable="node",
-            name="holdfast",
-            parameters=[*parameters, {"autostart": flag["autostart"] and not managed}, *services],
-            respawn=flag["respawn"],
-            respawn_delay=1.0,
-            **common,
-        )
-    ]
+
+    def node(package, executable, name, parameters, **words):
+        words |= {"namespace": text["namespace"], "output": "screen", "parameters": parameters}
+        level = ["--ros-args", "--log-level", text["log_level"]]
+        return Node(package=package, executable=executable, name=name, arguments=level, **words)
+
+    ours = [*parameters, {"autostart": flag["autostart"] and not managed}, *services]
+    started = [node("holdfast_ros", "node", "holdfast", ours, respawn=flag["respawn"])]
     if flag["robot"]:
-        started.append(
-            Node(
-                package=PACKAGE,
-                executable="simulated_robot",
-                name="simulated_robot",
-                parameters=parameters,
-                **common,
-            )
-        )
+        started.append(node(PACKAGE, "simulated_robot", "simulated_robot", parameters))
     if managed:
-        started.append(
-            Node(
-                package="nav2_lifecycle_manager",
-                executable="lifecycle_manager",
-                name="lifecycle_manager_holdfast",
-                parameters=[
-                    {
-                        "use_sim_time": flag["use_sim_time"],
-                        "autostart": flag["autostart"],
-                        "node_names": ["holdfast"],
-                        "bond_timeout": 4.0,
-                        "attempt_respawn_reconnection": flag["respawn"],
-                    }
-                ],
-                **common,
-            )
-        )
+        managing = {
+            "autostart": flag["autostart"],
+            "node_names": ["holdfast"],
+            "bond_timeout": 4.0,
+            "attempt_respawn_reconnection": flag["respawn"],
+            **clock,
+        }
+        manager = "nav2_lifecycle_manager", "lifecycle_manager", "lifecycle_manager_holdfast"
+        started.append(node(*manager, [managing]))
     if flag["service"]:
         command = ["holdfast", "serve", "--listen", text["listen"]]
         started.append(ExecuteProcess(cmd=command, output="screen"))

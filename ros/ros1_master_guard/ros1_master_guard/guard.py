@@ -221,25 +221,6 @@ class MasterGuard:
             return False
         return True
 
-    async def _silent(self) -> str:
-        """Wait until the master has been silent for too long."""
-        probe_s = min(_PROBE_S, self._settings.silent_s)
-        failed = 0.0
-        with contextlib.closing(Connection(self._uri)) as connection:
-            # Time actually waited counts, not the clock: the guard itself may have been stopped.
-            while failed < self._settings.silent_s:
-                asked_at = monotonic()
-                try:
-                    await connection.call("getPid", within_s=probe_s)
-                except GoneError:
-                    pass  # _closed() reports it
-                except CallError:
-                    failed += min(probe_s, monotonic() - asked_at)
-                else:
-                    failed = 0.0
-                await asyncio.sleep(_PROBE_EVERY_S if not failed else 0.01)
-        return f"it did not answer for {self._settings.silent_s:g} s"
-
     # -- what the master knows ---------------------------------------------------------------------
 
     async def _attach(self, connection: Connection, within_s: float = _PROBE_S) -> None:

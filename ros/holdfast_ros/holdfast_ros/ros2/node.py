@@ -30,6 +30,7 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.logging import get_logger
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64MultiArray, String
@@ -174,13 +175,8 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def log(self, text: str, level: str) -> None:
         """Log a line."""
-        # rclpy lets a place in the code have one level.
-        if level == "info":
-            self.get_logger().info(text)
-        elif level == "warning":
-            self.get_logger().warning(text)
-        else:
-            self.get_logger().error(text)
+        # A logger of rclpy's lets a place in the code have one level for ever.
+        getattr(get_logger(self.get_logger().name), level)(text)
 
     # -- parameters ------------------------------------------------------------------------------
 
