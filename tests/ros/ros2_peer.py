@@ -331,7 +331,7 @@ class Peer:
 
 def main() -> None:
     rclpy.init()
-    peer = Peer(sys.argv[1] if len(sys.argv) > 1 else "/holdfast")
+    peer = Peer(sys.argv[1])
     sys.stdout.write('{"ready": true}\n')
     sys.stdout.flush()
     for line in sys.stdin:

@@ -1,13 +1,12 @@
 """The executive for Nav2 with real messages and topics; Nav2 itself has no wheels.
 
-``nav2_msgs`` is built of its definitions; a node of the tests plays ``BasicNavigator`` and AMCL.
+``nav2_msgs`` is built of its definitions; the example's stand-in plays ``BasicNavigator`` and AMCL.
 """
 
 from __future__ import annotations
 
 import json
 import subprocess
-from pathlib import Path
 
 import numpy as np
 from tests.ros.conftest import ROOT, Ros2
@@ -15,7 +14,7 @@ from tests.ros.domains import own_domain
 
 
 def test_it_looks_until_the_particles_agree_and_goes_through_the_door(ros2: Ros2) -> None:
-    stand_in = Path(__file__).with_name("nav2")
+    stand_in = ROOT / "examples" / "nav2" / "stand_in"
     with own_domain() as domain:
         done = subprocess.run(
             [str(ros2.python), "examples/nav2/navigate.py"],

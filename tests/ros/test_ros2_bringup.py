@@ -5,7 +5,6 @@ Launch itself has no wheel. Its file runs with a stand-in, and the tests start w
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import runpy
@@ -19,96 +18,29 @@ import pytest
 from tests.ports import free_port
 from tests.ros.conftest import ROOT, Ros2, left_out
 from tests.ros.domains import own_domain
-from tests.ros.ros2_processes import Process
-
-from holdfast.config.loader import load
-from holdfast.planning.planner import Planner
-from holdfast.robot.trial import run_trial
+from tests.ros.test_ros2_node import Ros, in_process
 
 PACKAGE = "holdfast_bringup"
 
 
-class BringUp:
+class BringUp(Ros):
     """What the launch file starts, process by process."""
 
     def __init__(self, ros2: Ros2, domain: int, directory: Path) -> None:
+        super().__init__(ros2, domain, directory)
         prefixes = map(Path, ros2.environment["AMENT_PREFIX_PATH"].split(":"))
         self.prefixes = {prefix.name: prefix for prefix in prefixes}
         if not {PACKAGE, "holdfast_ros"} <= self.prefixes.keys():
             left_out("the packages of ros/ are older than this checkout: make test-ros builds them")
-        self.prefix = self.prefixes[PACKAGE]
-        self.share = self.prefix / "share" / PACKAGE
-        self.configuration = self.share / "config" / "peg_in_hole_2d.yaml"
-        self.directory = directory
-        self._ros2 = ros2
-        self._environment = {**ros2.environment, "ROS_DOMAIN_ID": str(domain)}
-        self._started: list[Process] = []
-        self.port = free_port()
-        self.namespace = ""
+        self.share = self.prefixes[PACKAGE] / "share" / PACKAGE
 
-    def start(self, command: list[str]) -> Process:
-        process = Process(command, self._environment, cwd=self.directory)
-        self._started.append(process)
-        return process
-
-    def executable(self, package: str, name: str, **more: Any) -> Process:
-        command = [
-            str(self.prefixes[package] / "lib" / package / name),
-            "--ros-args",
-            "--params-file",
-            str(self.share / "config" / "holdfast.yaml"),
-            "-p",
-            f"configuration:={self.configuration}",
-            *("-r", f"__ns:={self.namespace or '/'}"),
-        ]
-        for key, value in more.items():
-            command += ["-p", f"{key.replace('__', '.')}:={value}"]
-        return self.start(command)
-
-    def node(self, **more: Any) -> Process:
-        services = json.dumps([f"tcp/127.0.0.1:{self.port}"])
-        return self.executable(
-            "holdfast_ros",
-            "node",
-            **{
-                "autostart": "true",
-                "run_directory": self.directory / "run",
-                "offload__services": services,
-                "rate_hz": 0.0,
-                **more,
-            },
-        )
-
-    def robot(self, **more: Any) -> Process:
-        return self.executable(PACKAGE, "simulated_robot", **more)
-
-    def service(self) -> Process:
-        holdfast = self._ros2.python.with_name("holdfast")
-        listen = f"tcp/127.0.0.1:{self.port}"
-        return self.start([str(holdfast), "serve", "--listen", listen, "--workers", "1"])
-
-    def peer(self) -> Peer:
-        script = Path(__file__).with_name("ros2_peer.py")
-        peer = Peer(
-            [str(self._ros2.python), str(script), f"{self.namespace}/holdfast"], self._environment
-        )
-        self._started.append(peer)
-        assert json.loads(peer.next_line()) == {"ready": True}
-        return peer
-
-    def kill(self) -> None:
-        for process in self._started:
-            process.kill()
-
-
-class Peer(Process):
-    """A client of the node; see ros2_peer.py."""
-
-    def do(self, what: str, **arguments: Any) -> Any:
-        self.send(json.dumps({"do": what, **arguments}))
-        answer = json.loads(self.next_line())
-        assert "error" not in answer, answer["error"]
-        return answer["answer"]
+    def executable(self, package: str, name: str, *words: str) -> None:
+        """Start it in the namespace /left, with the parameters of the package."""
+        configuration = f"configuration:={self.share / 'config' / 'peg_in_hole_2d.yaml'}"
+        common = ("-r", "__ns:=/left", "-p", configuration)
+        parameters = str(self.share / "config" / "holdfast.yaml")
+        program = str(self.prefixes[package] / "lib" / package / name)
+        self.start(program, "--ros-args", "--params-file", parameters, *common, *words)
 
 
 @pytest.fixture
@@ -116,19 +48,7 @@ def bring_up(ros2: Ros2, tmp_path: Path) -> Iterator[BringUp]:
     with own_domain() as domain:
         made = BringUp(ros2, domain, tmp_path)
         yield made
-        made.kill()
-
-
-def in_process(configuration: Path) -> list[list[Any]]:
-    """Return what the trial comes to without ROS."""
-    read = load(configuration)
-    result = run_trial(
-        Planner(read.problem, read.planning),
-        read.simulator.seed,
-        0,
-        max_steps=read.simulator.max_steps,
-    )
-    return [[result.trial, result.outcome, result.steps, result.digest]]
+        made.close()
 
 
 class Made(NamedTuple):
@@ -216,15 +136,17 @@ def test_the_launch_files_arguments_reach_the_nodes(
 
 
 def test_the_example_decides_as_in_one_process_in_a_namespace_too(bring_up: BringUp) -> None:
-    bring_up.namespace = "/left"
-    bring_up.service()
-    bring_up.robot()
-    bring_up.node()
-    peer = bring_up.peer()
+    port = free_port()
+    bring_up.service(port)
+    bring_up.executable(PACKAGE, "simulated_robot")
+    given = ("autostart:=true", "rate_hz:=0.0", f"offload.services:=['tcp/127.0.0.1:{port}']")
+    words = [word for each in (*given, "run_directory:=run") for word in ("-p", each)]
+    bring_up.executable("holdfast_ros", "node", *words)
+    peer = bring_up.peer("/left/holdfast")
     assert peer.do("goal")
     result = peer.do("result")
     assert result["code"] == "FINISHED", result["message"]
-    assert result["trials"] == in_process(bring_up.configuration)
+    assert result["trials"] == in_process(1, 0)
     assert peer.do("get", names=["rate_hz", "environment.kind"]) == [0.0, "ros"]
     diagnostics = peer.do("seen")["diagnostics"]
     assert {name for *_, name, _ in diagnostics} == {"left/holdfast: active sensing"}
@@ -238,7 +160,7 @@ def test_colcon_tests_the_package(bring_up: BringUp) -> None:
         *("--base-paths", str(ROOT / "ros"), "--build-base", "build"),
         *("--install-base", str(bring_up.prefixes["holdfast_ros"].parent)),
     ]
-    process = bring_up.start([*command, *places, "--return-code-on-test-failure"])
-    assert process.wait() == 0
+    process = bring_up.start(*command, *places, "--return-code-on-test-failure")
+    assert process.end() == 0, process.said()
     (report,) = (bring_up.directory / "build" / "holdfast_ros").glob("pytest.xml")
     assert 'tests="5"' in report.read_text()

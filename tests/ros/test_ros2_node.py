@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -90,10 +89,14 @@ class Ros:
     """One domain of ROS 2, and the processes in it."""
 
     def __init__(self, ros2: Ros2, domain: int, directory: Path) -> None:
-        self._ros2 = ros2
+        self._python = str(ros2.python)
         self.directory = directory
         self.environment = {**ros2.environment, "ROS_DOMAIN_ID": str(domain)}
         self.started: list[ObservedProcess] = []
+
+    def start(self, *command: str) -> ObservedProcess:
+        self.started.append(ObservedProcess([*command], self.environment, self.directory))
+        return self.started[-1]
 
     def node(self, *, wait: bool = True, **parameters: Any) -> ObservedProcess:
         """Start the node; ``a__b`` stands for ``a.b``."""
@@ -106,15 +109,13 @@ class Ros:
             **{key.replace("__", "."): value for key, value in parameters.items()},
         }
         words = [word for key, value in values.items() for word in ("-p", f"{key}:={value}")]
-        command = [str(self._ros2.python), "-m", "holdfast_ros.ros2", "--ros-args", *words]
-        node = ObservedProcess(command, self.environment, self.directory)
-        self.started.append(node)
+        node = self.start(self._python, "-m", "holdfast_ros.ros2", "--ros-args", *words)
         if wait:
             node.wait_for("]: active" if values["autostart"] == "true" else "]: unconfigured")
         return node
 
-    def peer(self) -> Peer:
-        command = [str(self._ros2.python), str(ROOT / "tests" / "ros" / "ros2_peer.py")]
+    def peer(self, name: str = "/holdfast") -> Peer:
+        command = [self._python, str(ROOT / "tests" / "ros" / "ros2_peer.py"), name]
         peer = Peer(command, self.environment, self.directory)
         self.started.append(peer)
         assert peer.read() == {"ready": True}
@@ -127,16 +128,11 @@ class Ros:
         configuration.write_text(load(CONFIGURATION, seed=SEED).to_yaml())
         values = {"configuration": configuration, "motion_s": motion_s}
         words = [word for key, value in values.items() for word in ("-p", f"{key}:={value}")]
-        command = [str(self._ros2.python), str(script), "--ros-args", *words]
-        robot = ObservedProcess(command, self.environment, self.directory)
-        self.started.append(robot)
-        return robot
+        return self.start(self._python, str(script), "--ros-args", *words)
 
     def service(self, port: int) -> ObservedProcess:
         endpoint = f"tcp/127.0.0.1:{port}"
-        command = [str(self._ros2.python), "-m", "holdfast", "serve", "--listen", endpoint]
-        service = ObservedProcess(command, dict(os.environ), self.directory)
-        self.started.append(service)
+        service = self.start(self._python, "-m", "holdfast", "serve", "--listen", endpoint)
         assert "listening" in service.output.get(timeout=PATIENCE_S)
         return service
 
