@@ -15,7 +15,7 @@ from typing import Self
 __all__ = ["ECHO_BYTES", "EchoClient"]
 
 ECHO_BYTES = 120
-"""Of an echo; a request has about as many."""
+"""Bytes of an echo; a request has about as many."""
 
 
 class _Quick(asyncio.Protocol):

@@ -29,7 +29,7 @@ LOSS_BAR_MS = 105.0
 BYTES_BAR = 3.0
 
 ROUND_TRIP_MS = 87.0
-"""Of the thesis's cloud."""
+"""Round trip to the thesis's cloud."""
 
 LOSS = 0.05
 _TRANSPORTS: tuple[Transport, ...] = ("tls", "udp")

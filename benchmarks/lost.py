@@ -39,7 +39,7 @@ PROBLEMS = (
 )
 ON_LOST: tuple[OnLost, ...] = ("continue", "reinitialise")
 MAX_STEPS = 400
-"""Of a trial with trouble, which may never end."""
+"""Limit of a trial with trouble, which may never end."""
 
 
 class Seen(NamedTuple):

@@ -57,7 +57,7 @@ RIVALS = (
 
 
 class Choice(NamedTuple):
-    """Of one rival for one belief: nats lost, errors of the entropies, seconds."""
+    """What one rival does for one belief: nats lost, errors of the entropies, seconds."""
 
     lost: float
     errors: FloatArray

@@ -108,7 +108,7 @@ class ServiceProcess(ServiceCommand):
 
     @property
     def process_ids(self) -> list[int]:
-        """Of it and of the processes that it has started."""
+        """Return its process id and those of the processes that it has started."""
         own = self.process.pid
         children = Path(f"/proc/{own}/task/{own}/children").read_text()
         return [own, *map(int, children.split())]

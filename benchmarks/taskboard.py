@@ -34,10 +34,10 @@ COLUMNS = ("outcome", "contacts", "touches", "robot_seconds")
 METHODS = ("path_entropy", "random", "state_entropy")
 TOUCHES_THEN_SPIRAL, SPIRAL = "one touch of each kind, then a spiral", "a spiral"
 FEW_TRIALS = 12
-"""Of the spiral alone, which uses all contacts that a trial may have."""
+"""Trials of the spiral alone, which uses all contacts that a trial may have."""
 
 SPACING_M = 0.0005
-"""Of the spiral's turns, and of the presses along them: a press finds a hole within 0.35 mm."""
+"""Distance of turns, and of presses along them: a press finds a hole within 0.35 mm."""
 
 
 def configuration_of(seed: int, **changes: Any) -> Any:

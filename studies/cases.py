@@ -26,7 +26,7 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
     num_particles: int = 100
     max_steps: int = 500
     share: float = 1.0
-    """Of a study's trials that are run here: a problem that takes ten times as long has fewer."""
+    """Share of a study's trials that is run: a problem that takes ten times as long has fewer."""
     state_resolution: float | None = None
     """Standard deviation of the noise by which states are blurred for the entropy of a mixture,
     where the problem's motion noise has not as many coordinates as its states."""

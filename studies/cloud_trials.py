@@ -53,7 +53,7 @@ COLUMNS = (
     "computed_ms", "found_ms", "first_local_ms", "launch_ms", "away_ms", "failback_ms",
     "identical", "emulated_by", "load", "rate_hz", "carried_bytes",
 )  # fmt: skip
-"""Of the table of such trials: a row for each decision, each kill and, if wanted, each task action.
+"""Columns of such a table: a row for each decision, each kill and, if wanted, each task action.
 
 ``at_s`` counts from the run's first decision. A decision has what the robot's ``timings.csv`` has.
 A kill has, in milliseconds: ``found_ms``, from the kill until the robot logs the loss of the

@@ -53,7 +53,7 @@ _STUDIES: Mapping[str, str] = {
 _DEFAULT_DIRECTORY = Path("runs") / "experiments"
 
 _MOST_NUMBERS = 20
-"""Of a study, that are printed; numbers.csv has all."""
+"""Most numbers of a study that are printed; numbers.csv has all."""
 
 _NOTE = "all kept"
 """The note of the progress bar."""

@@ -57,7 +57,7 @@ class JudgedStudy(TrialStudy):
     """Those that name a cell."""
     num_trials: ClassVar[Mapping[str, int]]
     kind: ClassVar[str] = "trials"
-    """Of the tasks."""
+    """Kind of the tasks."""
     quick_trials: ClassVar[Mapping[str, int]] = {CHOICE: 2, CLAIM: 4}
 
     @abstractmethod

@@ -77,7 +77,7 @@ _RATES_HZ = (10.0, 50.0)
 _SENSING_INTERVAL = PlanningSettings().sensing_interval
 
 EXCHANGE_MS = 1.52
-"""Of asking over TCP, beside path and computation: "round trip without computation, cloud, same
+"""Time to ask over TCP, beside path and computation: "round trip without computation, cloud, same
 machine" of the study ``thesis_chapter_6``, with 100 to 500 particles. With 10,000, of which both
 ends take a digest, it was 1 ms more than with 100: less than the bounds of a break-even."""
 

@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 __all__ = ["COLUMNS", "WAYS", "PublishedWorlds", "Way", "published_planners", "run_vdp_tag"]
 
 COLUMNS = ("trial", "discounted_reward", "tagged", "steps", "looks", "mean_decision_ms")
-"""Of the table of a task: a row for each trial."""
+"""Columns of the table of a task: a row for each trial."""
 
 _FRACTIONS = ("discounted_reward", "mean_decision_ms")
 

@@ -44,7 +44,7 @@ INTERVALS = (0, 4, 8, 14)
 """Steps between two sensing steps."""
 
 LEVEL_OF_VERDICT = 0.05
-"""Of the tests whether a candidate is beaten."""
+"""Level of the tests whether a candidate is beaten."""
 
 
 def _by(method: Method, estimator: Estimator | None = None) -> SelectorSettings:

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 __all__ = ["NATS", "PRICES", "PROBLEMS", "RESOLUTIONS", "WAYS", "SensingPrice"]
 
 PRICES = (1.0, 4.0)
-"""Of a look, in steps."""
+"""Prices of a sensing action, in steps."""
 
 INTERVALS = (0.0, 2.0, 4.0, 8.0, 14.0, 29.0)
 """Steps between two looks."""
@@ -63,7 +63,7 @@ WAYS: Mapping[str, tuple[float, ...]] = {
 """With the numbers among which each chooses: intervals in steps, or nats."""
 
 RESOLUTIONS = (0.05, 0.1, 0.3, 0.6, 1.2)
-"""Of the boat, in metres; its motion noise is the first, half its goal's width the third."""
+"""In metres; the boat's motion noise is the first, half its goal's width the third."""
 
 _RANDOM = "random"
 _OF_BOAT: Mapping[str, SelectorSettings] = {
@@ -100,7 +100,7 @@ _WEAK = "boat, 80 steps"
 """The problem of the second question."""
 
 _BOAT_RESOLUTION = 0.6
-"""Of the boat of the first question: the width of its goal. No executed action is as large."""
+"""The width of the goal of the first question's boat. No executed action is as large."""
 
 
 class _Cell(NamedTuple):

@@ -50,7 +50,7 @@ beliefs are independent."""
 _SCHEDULING = Path("/proc/thread-self/schedstat")
 
 _FEWER = 2.0 / 3.0
-"""Of the beliefs, where there is no time for all: of nine six are left, enough for an interval."""
+"""Share of the beliefs where there is no time for all: six of nine, enough for an interval."""
 
 
 class Measurement(msgspec.Struct, frozen=True, kw_only=True):

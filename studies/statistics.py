@@ -213,7 +213,7 @@ class RandomEffects(NamedTuple):
     """What an effect is over problems of which those that were tried are a sample."""
 
     mean: Interval
-    """Of the effects over all such problems."""
+    """Mean of the effects over all such problems."""
     p_value: float
     """That this mean is zero."""
     deviation: float

@@ -47,7 +47,7 @@ class Scale(msgspec.Struct, frozen=True, kw_only=True):
     quick: bool = False
     """Few trials, to see that everything works; the results are no evidence."""
     seed: int = 0
-    """Of all trials, or of those by which something is chosen."""
+    """Seed of all trials, or of those by which something is chosen."""
 
     @property
     def claim_seed(self) -> int:

@@ -72,7 +72,7 @@ PATHS = (
         for loss in (0.0, 0.01, 0.05)
     ),
 )
-"""Of a full run; all with all numbers of particles."""
+"""Sizes of a full run; all with all numbers of particles."""
 
 _TIMES = (
     "at_s", "waited_ms", "round_trip_ms", "computed_ms", "found_ms", "first_local_ms", "launch_ms",

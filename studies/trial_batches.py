@@ -32,7 +32,7 @@ COLUMNS = (
     "unexplained_observations",
     "digest",
 )
-"""Of the table of a batch: a row for each trial.
+"""Columns of the table of a batch: a row for each trial.
 
 The ``steps`` of a trial that fails are its limit, whenever that was.
 """

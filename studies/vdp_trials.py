@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 _LARGEST_AREA = 0.01
-"""Of the target's uncertainty without a look, in the unit of the plane, squared."""
+"""Largest uncertainty of the target without a look: an area, in the unit of the plane, squared."""
 
 
 VdpTagPolicy: TypeAlias = Callable[[FloatArray, Sequence[Stream]], tuple[FloatArray, IntArray]]

@@ -62,7 +62,7 @@ _OTHERS_CALLS = 40
 """Calls of robots are counted from 1 on: so many of them are aimed at."""
 
 _QUESTION_MESSAGE, _REPLY_MESSAGE = 1, 2
-"""Of what goes as datagrams: which kind it is stands first."""
+"""Kinds of datagrams: the kind stands first."""
 
 _HALF = 40
 """Bytes of a frame that is begun and not ended."""

@@ -46,10 +46,10 @@ def frozen(group: Path) -> Iterator[None]:
 
 
 SEIZE, INTERRUPT, DETACH = 0x4206, 0x4207, 17
-"""Of ``ptrace``: which stops single threads, where signals stop processes."""
+"""Requests of ``ptrace``, which stops single threads, where signals stop processes."""
 
 WAIT_ALL = 0x40000000
-"""Of ``waitpid``: for threads, too."""
+"""Option of ``waitpid``: for threads, too."""
 
 trace = ctypes.CDLL(None, use_errno=True).ptrace
 trace.argtypes = [ctypes.c_long, ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p]

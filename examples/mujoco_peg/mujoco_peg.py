@@ -17,7 +17,7 @@ SUBSTEPS = 50
 """Physics steps of 2 ms in one task action: the servos have 0.1 s to follow."""
 
 AVERAGED = 10
-"""Of these, the last ones, over which the force is averaged."""
+"""The last steps, over which the force is averaged."""
 
 
 class MujocoPeg:

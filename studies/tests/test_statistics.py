@@ -158,7 +158,7 @@ def test_random_effects_are_those_of_statsmodels(spread: float) -> None:
 
 
 def test_intervals_over_problems_hold_what_they_promise() -> None:
-    """Of 2,000 drawn samples of eight problems, and of one more problem each."""
+    """2,000 drawn samples of eight problems, with one more problem each."""
     generator = np.random.default_rng(17)
     runs, covered, predicted = 2000, 0, 0
     for _ in range(runs):

@@ -300,7 +300,7 @@ class TestStrangers:
     def test_arbitrary_datagrams(
         self, data: list[bytes], tail: bytes, robot_tls: TlsFiles, service_tls: TlsFiles
     ) -> None:
-        """Of strangers, and of a robot that has keys and sends nonsense: its link alone may go."""
+        """Strangers send it, and a robot that has keys: its link alone may go."""
 
         async def run() -> None:
             wire = StreamWire("udp", Path(), robot_tls=robot_tls, service_tls=service_tls)

@@ -135,7 +135,7 @@ WHOLE: dict[str, tuple[Callable[[Any], Any], int]] = {
 """A call of each entry that takes a whole number, and a number that it takes."""
 
 NO_WHOLE = [True, 3.0, "3", np.ma.array(3, mask=True)]
-"""Of each kind one: unit/test_arrays.py has all, and here each entry has to look."""
+"""One of each kind: unit/test_arrays.py has all, and here each entry has to look."""
 
 
 def leaf(value: Any) -> Any:

@@ -42,7 +42,7 @@ BASE = "debian:bookworm-slim"
 TARGETS = ("cloud", "robot")
 
 USER = 10001
-"""Of what runs in the images."""
+"""User of what runs in the images."""
 
 PATIENCE_S = 120.0
 """For whatever must happen; only a hang takes so long."""

@@ -163,4 +163,4 @@ def _specimens() -> dict[str, list[bytes]]:
 
 
 SPECIMENS: Mapping[str, list[bytes]] = _specimens()
-"""Of each target, what it must let through."""
+"""What each target must let through."""

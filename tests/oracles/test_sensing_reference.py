@@ -386,7 +386,7 @@ def test_action_covariance(
 
 
 def test_action_covariance_counts_far_particles_of_small_weight() -> None:
-    """Of which an entropy estimate takes no notice: they are most of the variance here."""
+    """An entropy estimate takes no notice of them; they are most of the variance here."""
     selector = SelectorSettings(method="action_covariance")
     problem = Plane()
     states = some_belief(problem, 50, "uniform").states.copy()

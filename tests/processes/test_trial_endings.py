@@ -16,7 +16,7 @@ from tests.processes.faults import events_of, holdfast, rows_of, summary_of
 from holdfast.journal.journal import Journal
 
 BEFORE_OUTCOMES = Path(__file__).parents[1] / "unit" / "data" / "journal_before_outcomes.sqlite"
-"""Of a robot killed at step 21 of trial 2, when results said only whether a trial succeeded."""
+"""A robot was killed at step 21 of trial 2, when results said only whether a trial succeeded."""
 
 AS_BEFORE = "c8620a9f2dab01e3b944d3e864944901548b38b9229c531cbe512fff9a22123f"
 """The digest of that trial."""

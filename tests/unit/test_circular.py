@@ -230,7 +230,7 @@ class TestObservations:
         assert not info.explained
 
     def test_hypothetical_posteriors_are_those_of_an_update(self) -> None:
-        """Of one particle in front of the cut and one behind; both explain what is between them."""
+        """One particle is in front of the cut and one behind; both explain what is between them."""
         predicted = np.array([[3.1, -3.1, 0.0]])
         weights = np.full(3, 1.0 / 3.0)
         rows = (weights, [1], predicted, np.array([[0.01]]), 8, fresh().words)

@@ -106,7 +106,7 @@ class TestSealing:
     def test_none_beyond_the_bound_is_taken(
         self, ends: tuple[DatagramCipher, DatagramCipher], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        """Of an end that goes on all the same."""
+        """An end that goes on all the same."""
         robot, service = ends
         datagrams = [robot.encrypt(b"x") for _ in range(5)]
         monkeypatch.setattr(datagram_cipher, "MAX_DATAGRAMS", 3)

@@ -22,7 +22,7 @@ from holdfast.protocol.records import (
 from holdfast.robot.trial import run_trial
 
 BEFORE_OUTCOMES = Path(__file__).parent / "data" / "journal_before_outcomes.sqlite"
-"""Of a robot killed at step 21 of trial 2, when results said only whether a trial succeeded."""
+"""A robot was killed at step 21 of trial 2, when results said only whether a trial succeeded."""
 
 
 def finished(trial: int) -> Finished:

@@ -166,7 +166,7 @@ def test_progress(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_summary_is_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
-    """Of an address in brackets nothing is left out."""
+    """Nothing of an address in brackets is left out."""
     empty = SummaryBuilder().build(problem="", seed=0, version="", trials=0, wall_time_s=0.0)
     answers = {"tcp/[fe80::1]:7447": 3, HOSTILE: 4}
     print_summary(structs.replace(empty, sensing_decisions_by_service=answers))

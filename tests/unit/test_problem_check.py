@@ -428,7 +428,7 @@ def test_without_time_it_says_what_was_left_out() -> None:
 
 
 def test_no_problem_at_all() -> None:
-    for nothing in (None, 3, "peg_in_hole_2d", Rover, object()):
+    for nothing in (None, 3, Rover, object()):
         assert check(nothing)[0].severity == E
 
 
@@ -437,6 +437,8 @@ def test_arguments_are_checked() -> None:
         check_problem(Rover(), budget_s=0.0)
     with pytest.raises(InvalidValueError, match="max_steps"):
         check_problem(Rover(), max_steps=0)
+    with pytest.raises(InvalidValueError, match=r"'peg.yaml'.*load_configuration"):
+        check_problem("peg.yaml")
 
 
 def test_the_places_that_findings_name_are_there() -> None:

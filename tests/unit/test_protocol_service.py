@@ -70,7 +70,7 @@ PROBLEMS = tuple(BUILT_IN)
 
 
 CODE = core_version(), problem_digest(object)
-"""Of a problem that is one of holdfast's."""
+"""Digests of a problem that is one of holdfast's."""
 
 
 def planning_of(interval: int = 3, particles: int = 20, **sensing: Any) -> PlanningSettings:

@@ -112,7 +112,7 @@ def test_one_that_was_never_asked_is_silent_since_it_appeared() -> None:
 
 
 class TestLateReplies:
-    """Of a service that is further away than the timeout is long."""
+    """Replies of a service that is further away than the timeout is long."""
 
     @staticmethod
     def heard(*calls: tuple[float, float]) -> list[float | None]:
@@ -169,7 +169,7 @@ def test_patience_has_its_limit_and_is_never_shortened() -> None:
 
 
 def test_silence_before_something_is_awaited_asks_for_no_patience() -> None:
-    """Of an answer the longest silence counts, and that of the next begins anew."""
+    """The longest silence of an answer counts, and that of the next begins anew."""
     detector = present_detector()
     detector.extend_patience(16.0, 60.0)  # to 4 s
     detector.heard(100.0)

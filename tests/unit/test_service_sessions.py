@@ -287,7 +287,7 @@ class TestTheTable:
             table.add(session)
 
     def test_who_makes_room(self) -> None:
-        """Of those that hold at least half of the largest holding, who was used longest ago."""
+        """The one used longest ago, of those that hold at least half of the largest holding."""
         table = self.table(max_sessions=7)
         annas = [session_of(number) for number in range(4)]
         bertas = [session_of(number, "berta") for number in range(2)]

@@ -43,7 +43,7 @@ SERVICE = "holdfast_interfaces/srv/ActiveSensing"
 """The service's type."""
 
 MAX_BYTES = 16_000_000
-"""Of a message; a state of 100,000 particles in nine coordinates has half of it."""
+"""Largest message; a state of 100,000 particles in nine coordinates has half of it."""
 
 _PACKAGE = "holdfast_interfaces"
 _MESSAGES = ("Belief", "PlanningState")

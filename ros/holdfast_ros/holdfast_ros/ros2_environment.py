@@ -40,7 +40,7 @@ _Sense = holdfast_interfaces.srv.Sense
 _Trial = holdfast_interfaces.srv.Trial
 
 _PART = 0.45
-"""Of ``environment.timeout_ms``: it is for a task action and for asking whether it was the last."""
+"""Share of ``environment.timeout_ms``, for a task action and for asking whether it was the last."""
 
 _LOOK_S = 0.2
 """Interval at which a wait checks that the service is still there."""

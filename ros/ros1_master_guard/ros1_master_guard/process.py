@@ -33,7 +33,7 @@ from typing import Any, Dict, List, NoReturn, Tuple  # noqa: UP035 (older Python
 __all__ = ["HEAD", "MasterState", "decoded", "encoded"]
 
 Registrations = Dict[str, List[Tuple[str, str]]]  # noqa: UP006
-"""Of each topic or parameter the nodes: name and URI of the node's XML-RPC server."""
+"""Nodes of each topic or parameter: name and URI of the node's XML-RPC server."""
 
 HEAD = struct.Struct("<Q")
 """The size in bytes that precedes each message."""

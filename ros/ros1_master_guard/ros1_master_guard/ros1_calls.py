@@ -39,8 +39,8 @@ CALLER: Final = "/ros1_master_guard"
 _MAX_RESPONSE_BYTES: Final = 256 * 1024 * 1024
 
 MAX_SHORT_BYTES: Final = 16 * 1024
-"""Of what a node answers, or a master about one name. A malformed message may cost a square of its
-bytes: texts that are copied, mappings whose names have one hash."""
+"""Bound on an answer of a node, or of a master about one name. A malformed one may cost a square of
+its bytes: texts that are copied, mappings whose names have one hash."""
 
 
 class HttpHead(NamedTuple):

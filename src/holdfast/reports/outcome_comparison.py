@@ -21,7 +21,7 @@ from holdfast.journal.run_directory import first_difference, recorded_configurat
 from holdfast.journal.tables import wilson_interval
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.outcome import TrialResult
-from holdfast.reports.table_formats import TIMES, Table, aligned, decimals
+from holdfast.reports.table_formats import TIMES, Table, aligned, decimals, outward, rounded
 from holdfast.robot.environment_maker import BUILT_IN
 
 __all__ = [
@@ -186,7 +186,7 @@ class OutcomeComparison(Table, msgspec.Struct, frozen=True, kw_only=True):
         return f"trials {'paired by number' if self.paired else 'not paired'}"
 
     def _definitions(self) -> list[str]:
-        apart = "measured at different moments, so not compared (holdfast sweep takes turns)."
+        apart = "not judged: the runs may have been measured apart (a sweep's own table is not)."
         verdicts = {each.verdict for run in self.runs for each in run.effects}
         return [
             "steps: the geometric mean, which fits ratios (the summary has the mean of the steps "
@@ -536,14 +536,15 @@ def _texts_of(effect: OutcomeEffect) -> tuple[str, str, str, str]:
     bounds = [own * end for end in effect.interval]
     digits = decimals(bounds)
     # What does not have the value of no effect must not be rounded to it.
-    while none in (round(bounds[0], digits), round(bounds[1], digits)) and none not in bounds:
+    while none in outward(bounds, digits) and none not in bounds:
         digits += 1
-    change, low, high = (f"{each:{sign}.{digits}f}" for each in (own * effect.effect, *bounds))
+    ends = own * effect.effect, *outward(bounds, digits)
+    change, low, high = (f"{rounded(each, digits):{sign}.{digits}f}" for each in ends)
     # Of a ratio the values are as sure as their share of it.
     shares = [each / effect.effect if ratio and effect.effect else 1.0 for each in values]
+    places = [decimals([share * end for end in bounds]) for share in shares]
     baseline, value = (
-        f"{each:.{decimals([share * end for end in bounds])}f}"
-        for each, share in zip(values, shares, strict=True)
+        f"{rounded(each, at):.{at}f}" for each, at in zip(values, places, strict=True)
     )
     return baseline, value, f"{TIMES}{change}" if ratio else change, f"[{low}, {high}]"
 
@@ -555,5 +556,7 @@ def shown_estimate(estimate: OutcomeEstimate) -> tuple[str, str, str]:
     if estimate.interval is None:
         return title, f"{value:.4g}", "all alike"
     bounds = [scale * end for end in estimate.interval]
-    value_text, low, high = (f"{each:.{decimals(bounds)}f}" for each in (value, *bounds))
+    digits = decimals(bounds)
+    ends = rounded(value, digits), *outward(bounds, digits)
+    value_text, low, high = (f"{each:.{digits}f}" for each in ends)
     return title, value_text, f"[{low}, {high}]"

@@ -19,7 +19,7 @@ from holdfast.printable import csv_rows
 from holdfast.runtime.files import write_atomically
 from holdfast.validation import as_path
 
-__all__ = ["TIMES", "Table", "aligned", "decimals"]
+__all__ = ["TIMES", "Table", "aligned", "decimals", "outward", "rounded"]
 
 TIMES = "\N{MULTIPLICATION SIGN}"
 
@@ -156,6 +156,20 @@ def decimals(bounds: Sequence[float]) -> int:
     """Return how many decimals an interval leaves to a value: those of a quarter of its width."""
     width = 0.25 * (bounds[1] - bounds[0])
     return min(6, max(0, -math.floor(math.log10(width)))) if width > 0.0 else 3
+
+
+def rounded(value: float, digits: int) -> float:
+    """Return a value with so many decimals; a tie goes away from zero, as people expect."""
+    scale = 10.0**digits
+    return math.copysign(math.floor(abs(value) * scale * (1.0 + 1e-12) + 0.5) / scale, value)
+
+
+def outward(bounds: Sequence[float], digits: int) -> tuple[float, float]:
+    """Return an interval with so many decimals that holds the whole of the given one."""
+    scale = 10.0**digits
+    slack = 1e-9 * max(1.0, *(abs(scale * end) for end in bounds))
+    low, high = (scale * end for end in bounds)
+    return math.floor(low + slack) / scale, math.ceil(high - slack) / scale
 
 
 def _in_html(text: str) -> str:

@@ -125,12 +125,12 @@ def _work(
         tell(TrialCrashError(f"in the process of the check:\n{traceback.format_exc()}"))
 
 
-class _EndedError(BaseException):
+class ProcessEndError(BaseException):
     """The problem's code has called ``os._exit``; raised there, so that its lines are known."""
 
 
 def _refuse_to_end(status: int) -> NoReturn:
-    raise _EndedError(f"os._exit({status}) would end the process")
+    raise ProcessEndError(f"os._exit({status}) would end the process")
 
 
 @contextlib.contextmanager

@@ -8,6 +8,7 @@ all actions the same. :func:`check_problem` looks for these, and says what was s
 from __future__ import annotations
 
 import contextlib
+import os
 import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -72,8 +73,13 @@ def check_problem(
     Raises
     ------
     InvalidValueError
-        If an argument other than the problem is out of bounds.
+        If the problem is a name or a path, or another argument is out of bounds.
     """
+    if isinstance(problem, str | os.PathLike):
+        raise InvalidValueError(
+            f"problem is {str(problem)!r:.80}: check_problem takes an object; make_problem(NAME) "
+            "and load_configuration(FILE).problem return one, holdfast check takes a file"
+        )
     as_function("on_check", on_check)
     settings = PlanningSettings() if settings is None else settings
     settings = check_settings(settings, PlanningSettings)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -83,10 +84,12 @@ class Tuning(Table, msgspec.Struct, frozen=True, kw_only=True):
         """Return how to read the table."""
         return (
             "The race, from which the winner was chosen, so that its own numbers look too good. A "
-            "difference is over the trials of both; what is slow has had fewer."
+            "difference is over the trials of both; what is slow has had fewer. candidates.csv has "
+            "reasons whole."
         )
 
 
+_WIDEST_STATE = 60
 _COLUMNS = CandidateRow.__struct_fields__
 
 
@@ -96,8 +99,9 @@ def _in_its_unit(objective: Objective, *costs: float) -> list[float]:
 
 
 def _raced(each: CandidateRow, objective: Objective) -> tuple[str, ...]:
+    state = textwrap.shorten(each.state, _WIDEST_STATE, placeholder=" ...")
     if each.cost is None or each.difference is None or each.interval is None:
-        return (each.candidate, str(each.trials), *6 * ("",), each.state)
+        return (each.candidate, str(each.trials), *6 * ("",), state)
     (value,), (difference,) = (
         _in_its_unit(objective, cost) for cost in (each.cost, each.difference)
     )
@@ -111,7 +115,7 @@ def _raced(each: CandidateRow, objective: Objective) -> tuple[str, ...]:
         f"{100.0 * (each.success or 0.0):.3g}",
         f"{each.decision_ms or 0.0:.3g}",
         f"{each.trial_s:.3g}",
-        each.state,
+        state,
     )
 
 

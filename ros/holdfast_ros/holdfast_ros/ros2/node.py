@@ -69,10 +69,10 @@ _MOST_CALLS = 3
 """Calls of ``~/decide`` that may wait at once."""
 
 _DONE: Mapping[int, Any] = {0: False, 1: True, 2: "failed"}
-"""Of a call's ``done``; any other number is refused."""
+"""Values of a call's ``done``; any other number is refused."""
 
 NUM_THREADS = 4 + _MOST_CALLS
-"""Of the executor: a goal and the calls may keep theirs for a while, the rest is always free."""
+"""A goal and the calls may keep theirs for a while; the rest is always free."""
 
 _DIAGNOSTICS_S = 1.0
 

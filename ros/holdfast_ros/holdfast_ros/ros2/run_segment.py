@@ -42,7 +42,7 @@ from holdfast_ros.ros2.parameters import NodeParameters, in_parameters
 __all__ = ["MAX_TRIALS_TOLD", "Ending", "RunSegment", "SegmentResult", "World", "make_world"]
 
 MAX_TRIALS_TOLD = 10_000
-"""Of a result; ``trials.csv`` has all."""
+"""Most trials in a result; ``trials.csv`` has all."""
 
 _INTERRUPTED_S = 2.0
 """For a call of the environment that was interrupted to end."""
