@@ -89,10 +89,7 @@ class MasterGuard:
 
         ``ready`` is called once when a master answers, with ``started``, ``resumed`` or ``found``.
 
-        Raises
-        ------
-        GuardError
-            If nothing can be guarded.
+        Raises GuardError if nothing can be guarded.
         """
         directory = directory_for(self._settings.directory)
         self._journal = directory / f"master-{self._port}.journal"

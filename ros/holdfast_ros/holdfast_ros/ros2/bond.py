@@ -10,6 +10,7 @@ from __future__ import annotations
 import uuid
 from typing import Any
 
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 
 __all__ = ["Bond"]
@@ -37,10 +38,9 @@ class Bond:
         if period_s > 0.0 and self._timer is None:
             self._publisher = self._publisher or self._node.create_publisher(Status, "bond", 1)
             self._instance, self._period_s = str(uuid.uuid4()), period_s
-            # Simulated time may stand still, and the node lives.
-            clock = Clock(clock_type=ClockType.STEADY_TIME)
-            self._timer = self._node.create_timer(period_s, self._beat, clock=clock)
-            self._beat()
+            clock = Clock(clock_type=ClockType.STEADY_TIME)  # simulated time may stand still
+            group = MutuallyExclusiveCallbackGroup()  # no other callback delays it
+            self._timer = self._node.create_timer(period_s, self._beat, group, clock)
 
     def break_up(self) -> None:
         """Say that the bond has ended; may be repeated."""
@@ -50,12 +50,8 @@ class Bond:
             self._beat(active=False)
 
     def _beat(self, *, active: bool = True) -> None:
-        message = self._publisher.msg_type(
-            id=self._node.get_name(),
-            instance_id=self._instance,
-            active=active,
-            heartbeat_timeout=_TIMEOUT_S,
-            heartbeat_period=self._period_s,
-        )
+        message = self._publisher.msg_type(id=self._node.get_name(), instance_id=self._instance)
+        message.active, message.heartbeat_period = active, self._period_s
+        message.heartbeat_timeout = _TIMEOUT_S
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)

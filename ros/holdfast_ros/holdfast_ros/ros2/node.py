@@ -321,13 +321,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             self._diagnostics = None
 
     def end(self) -> bool:
-        """End in order, in any state, when the process is asked to end.
-
-        Returns
-        -------
-        bool
-            Whether the run has ended.
-        """
+        """End in order, in any state, when the process is asked to; return whether the run has."""
         is_asked = not self._goals_ended.is_set()
         if self._state_machine.current_state[1] in ("unconfigured", "inactive", "active"):
             self.trigger_shutdown()
