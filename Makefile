@@ -70,10 +70,13 @@ test-deploy: $(INSTALLED_DEV) ## images, tunnels and machines; root, and package
 test-deploy-slow: $(INSTALLED_DEV) ## those of them that take minutes
 	$(BIN)/pytest -q -m "deploy and slow" tests/deploy
 
-test-ros: $(INSTALLED_DEV) ## a real ROS 1 and ROS 2, which tests/ros/set_up_ros2 installs the first time
+test-ros: $(INSTALLED_DEV) ## a real ROS 1, and ROS 2 Kilted and Jazzy, which tests/ros/set_up_ros2 installs the first time
 	tests/ros/set_up_ros2 $(ROS2) $(PYTHON)
+	tests/ros/set_up_ros2 $(ROS2)-jazzy $(PYTHON) jazzy
 	if [ -e /usr/bin/rosmaster ]; then tests/ros/set_up_ros1 $(ROS1); fi
 	ROS1=$(ROS1) ROS2=$(ROS2) $(BIN)/pytest -q -m ros -n 2 --dist loadfile tests/ros
+	ROS2=$(ROS2)-jazzy $(BIN)/pytest -q -m ros -n 2 --dist loadfile tests/ros/test_*ros2*.py \
+	    tests/ros/test_topic_robot.py tests/ros/test_nav2_example.py
 
 test-ros1: $(INSTALLED_DEV) ## those of them that need Debian's ROS 1 alone, but for the slow ones
 	tests/ros/set_up_ros1 $(ROS1)

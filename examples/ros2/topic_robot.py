@@ -36,28 +36,34 @@ class TopicRobot:
         self._trial, self._timeout_s = trial, timeout_s
         self._state = self._touch = None
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        node.create_subscription(Int32MultiArray, "arm/state", self._take_state, latched)
-        node.create_subscription(PointStamped, "arm/touch", self._take_touch, 1)
+        self._states = node.create_subscription(
+            Int32MultiArray, "arm/state", self._take_state, latched
+        )
+        self._touches = node.create_subscription(PointStamped, "arm/touch", self._take_touch, 1)
         self._home = node.create_publisher(UInt32, "arm/home", 1)
         self._probe = node.create_publisher(UInt32, "arm/probe", 1)
         self._move = node.create_publisher(Vector3, "arm/move", 1)
         # What is published before the arm listens is lost.
         for publisher in (self._home, self._probe, self._move):
             listeners = f"listener on {publisher.topic_name}"
-            self._wait_for(listeners, publisher.get_subscription_count)
+            self._wait_for(listeners, None, publisher.get_subscription_count)
         if resumed:
             # An arm whose moves take time must also say here that it has come to a stop.
-            self._wait_for(f"state of trial {trial}", self._is_in_trial)
+            self._wait_for(f"state of trial {trial}", self._states, self._is_in_trial)
         else:
             self._home.publish(UInt32(data=trial))
-            self._wait_for(f"begin of trial {trial}", lambda: self._is_in_trial(moves=0))
+            self._wait_for(
+                f"begin of trial {trial}", self._states, lambda: self._is_in_trial(moves=0)
+            )
 
     def perform_sensing(self, sensing_action):
         """Have the arm touch along an axis, and return what it felt after it was asked."""
         asked = self._node.get_clock().now().nanoseconds
         self._touch = None
         self._probe.publish(UInt32(data=sensing_action))
-        self._wait_for("touch", lambda: self._touch is not None and _taken(self._touch) >= asked)
+        self._wait_for(
+            "touch", self._touches, lambda: self._touch is not None and _taken(self._touch) >= asked
+        )
         return np.array([self._touch.point.x])
 
     def perform(self, task_action):
@@ -66,7 +72,9 @@ class TopicRobot:
         x, y, angle = map(float, task_action)
         self._move.publish(Vector3(x=x, y=y, z=angle))
         # A command that is not answered is not sent again: the arm may have moved all the same.
-        self._wait_for(f"end of move {moves + 1}", lambda: self._is_in_trial(moves=moves + 1))
+        self._wait_for(
+            f"end of move {moves + 1}", self._states, lambda: self._is_in_trial(moves=moves + 1)
+        )
 
     def is_done(self):
         """Return whether the peg was in after the last move."""
@@ -92,10 +100,12 @@ class TopicRobot:
         state = self._state
         return state is not None and state[0] == self._trial and moves in (None, state[1])
 
-    def _wait_for(self, what, is_there):
+    def _wait_for(self, what, topic, is_there):
         deadline = time.monotonic() + self._timeout_s
         while not is_there():
             if time.monotonic() > deadline:
+                if topic is not None:
+                    what += f" on {topic.topic_name} ({topic.get_publisher_count()} publishers)"
                 raise TimeoutError(f"no {what} within {self._timeout_s:g} s (timeout_s)")
             self._executor.spin_once(timeout_sec=0.1)
 

@@ -13,6 +13,7 @@ setup(
     maintainer_email="holdfast@example.org",
     python_requires=">=3.11",
     install_requires=["holdfast-sensing==0.1.0", "ros1_master_guard==0.1.0", "rosbags>=0.11"],
+    extras_require={"test": ["pytest"]},  # so that colcon test takes pytest
     package_dir={"": "."},
     packages=[NAME, f"{NAME}.ros2"],
     package_data={NAME: ["interfaces/*/*"]},

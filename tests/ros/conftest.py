@@ -39,8 +39,9 @@ class Ros2:
     """A real ROS 2, as tests/ros/set_up_ros2 makes it."""
 
     def __init__(self, directory: Path) -> None:
-        prefix = directory / "kilted"
+        prefix = next(path for name in ("kilted", "jazzy") if (path := directory / name).is_dir())
         installed = sorted(path for path in (directory / "install").iterdir() if path.is_dir())
+        self.distribution = prefix.name
         self.python = prefix / "bin" / "python"
         site = [
             str(place) for path in installed for place in path.glob("lib/python3*/site-packages")
@@ -70,6 +71,8 @@ def ros1() -> dict[str, str]:
     """Return the environment for processes of Debian's ROS 1."""
     if shutil.which("rosmaster") is None:
         left_out("no ROS 1: apt-get install ros-core")
+    if not Path("/usr/lib/rosout/rosout").exists():
+        left_out("no /rosout for the guard: apt-get install rosout")
     return {
         **os.environ,
         "ROS_VERSION": "1",

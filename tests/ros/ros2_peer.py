@@ -13,6 +13,7 @@ import threading
 from time import monotonic, perf_counter, sleep
 from typing import Any
 
+import bond.msg
 import diagnostic_msgs.msg
 import geometry_msgs.msg
 import holdfast_interfaces.action
@@ -23,9 +24,10 @@ import rcl_interfaces.msg
 import rcl_interfaces.srv
 import rclpy
 import std_msgs.msg
+import tf2_msgs.msg
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from holdfast.config.loader import load
 from holdfast.robot.environment import SimulatedEnvironment
@@ -60,17 +62,23 @@ class Peer:
         self.node = rclpy.create_node("peer")
         self.seen: dict[str, list[Any]] = {
             topic: []
-            for topic in ("clouds", "beliefs", "decisions", "statuses", "diagnostics", "feedback")
+            for topic in (
+                *("clouds", "beliefs", "decisions", "statuses", "diagnostics", "feedback"),
+                *("frames", "bonds"),
+            )
         }
         self.last: dict[str, Any] = {}
         best_effort = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
         deep = QoSProfile(depth=1000)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         for topic, kind, key, quality in (
             (f"{name}/particle_cloud", geometry_msgs.msg.PoseArray, "clouds", best_effort),
-            (f"{name}/belief", holdfast_interfaces.msg.BeliefStamped, "beliefs", best_effort),
+            (f"{name}/belief", std_msgs.msg.Float64MultiArray, "beliefs", best_effort),
             (f"{name}/decision", holdfast_interfaces.msg.Decision, "decisions", deep),
             (f"{name}/status", std_msgs.msg.String, "statuses", deep),
             ("/diagnostics", diagnostic_msgs.msg.DiagnosticArray, "diagnostics", deep),
+            ("/tf_static", tf2_msgs.msg.TFMessage, "frames", latched),
+            (f"{name.rpartition('/')[0]}/bond", bond.msg.Status, "bonds", deep),
         ):
             self.node.create_subscription(kind, topic, self.taker(key), quality)
         self.decider = self.node.create_client(Decide, f"{name}/decide")
@@ -81,6 +89,9 @@ class Peer:
         self.getter = self.node.create_client(lifecycle_msgs.srv.GetState, f"{name}/get_state")
         self.setter = self.node.create_client(
             rcl_interfaces.srv.SetParameters, f"{name}/set_parameters"
+        )
+        self.getter_of_parameters = self.node.create_client(
+            rcl_interfaces.srv.GetParameters, f"{name}/get_parameters"
         )
         self.goal: Any = None
         self.outcome: Any = None
@@ -103,7 +114,16 @@ class Peer:
         if key == "clouds":
             return [message.header.frame_id, len(message.poses)]
         if key == "beliefs":
-            return [message.state.trial, message.state.step, len(message.state.belief.weights)]
+            return [[dimension.label, dimension.size] for dimension in message.layout.dim]
+        if key == "frames":
+            (transform,) = message.transforms
+            turn = transform.transform.rotation
+            return [
+                *(transform.header.frame_id, transform.child_frame_id),
+                *(turn.x, turn.y, turn.z, turn.w),
+            ]
+        if key == "bonds":
+            return [message.id, message.instance_id, message.active, message.heartbeat_period]
         if key in ("decisions", "feedback"):
             if key == "feedback":
                 message = message.feedback.decision
@@ -124,6 +144,8 @@ class Peer:
             status.level[0],
             status.message,
             {item.key: item.value for item in status.values},
+            status.name,
+            status.hardware_id,
         ]
 
     def wait(self, future: Any, within_s: float) -> Any:
@@ -168,6 +190,12 @@ class Peer:
         )
         answer = self.ask(self.setter, request, 30.0)
         return [[result.successful, result.reason] for result in answer.results]
+
+    def do_get(self, names: list[str]) -> list[Any]:
+        request = rcl_interfaces.srv.GetParameters.Request(names=names)
+        answer = self.ask(self.getter_of_parameters, request, 30.0)
+        values = [rclpy.parameter.parameter_value_to_python(value) for value in answer.values]
+        return [list(value) if hasattr(value, "typecode") else value for value in values]
 
     def do_goal(self, within_s: float = 60.0) -> bool:
         if not self.runner.wait_for_server(within_s):
@@ -296,19 +324,14 @@ class Peer:
         ]
 
     def do_belief(self) -> Any:
-        state = self.last["beliefs"].state
-        return {
-            "trial": state.trial,
-            "step": state.step,
-            "states": list(state.belief.states),
-            "weights": list(state.belief.weights),
-            "size": state.belief.state_size,
-        }
+        message = self.last["beliefs"]
+        rows, columns = message.layout.dim
+        return {"rows": rows.size, "columns": columns.label, "data": list(message.data)}
 
 
 def main() -> None:
     rclpy.init()
-    peer = Peer(sys.argv[1] if len(sys.argv) > 1 else "/holdfast")
+    peer = Peer(sys.argv[1])
     sys.stdout.write('{"ready": true}\n')
     sys.stdout.flush()
     for line in sys.stdin:

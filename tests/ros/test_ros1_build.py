@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
 from tests.ros.conftest import ROOT, left_out
-from tests.ros.ros1_processes import SYSTEM_PYTHON, Ros1, ros1_in
+from tests.ros.ros1_processes import Ros1, ros1_in
 
 from holdfast_ros.active_sensing import DecisionRequest, RequestKind
 from holdfast_ros.loop_thread import LoopThread
@@ -65,20 +66,16 @@ def done(*command: str, environment: Mapping[str, str], directory: Path) -> None
 def test_catkin_builds_it_and_roscpp_calls_it(around: Ros1, tmp_path: Path) -> None:
     if not Path("/usr/include/ros/ros.h").exists() or shutil.which("catkin_make") is None:
         left_out("no roscpp: apt-get install catkin ros-message-generation libroscpp-dev")
-    workspace = tmp_path / "workspace"
-    (workspace / "src").mkdir(parents=True)
-    (workspace / "src" / "holdfast_interfaces").symlink_to(ROOT / "ros" / "holdfast_interfaces")
-    # Without ours, which is a Python of its own.
+    page = (ROOT / "docs" / "ros.md").read_text(encoding="utf-8").splitlines()
+    (typed,) = (line for line in page if line.startswith("mkdir -p ~/catkin/src"))
+    # As the page has it, with the environment active that it made.
     plain = {**os.environ, "PATH": os.defpath}
-    done(
-        *("catkin_make", f"-DPYTHON_EXECUTABLE={SYSTEM_PYTHON}"),
-        environment=plain,
-        directory=workspace,
-    )
+    ours = {**plain, "PATH": f"{Path(sys.executable).parent}:{os.defpath}", "HOME": str(tmp_path)}
+    done("bash", "-c", typed, environment=ours, directory=ROOT)
     (tmp_path / "stock.cpp").write_text(STOCK)
     libraries = ("roscpp", "rosconsole", "roscpp_serialization", "rostime", "cpp_common")
     done(
-        *("g++", "-std=c++17", "-I", str(workspace / "devel" / "include"), "stock.cpp"),
+        *("g++", "-std=c++17", "-I", "catkin/devel/include", "stock.cpp"),
         *("-o", "stock", *(f"-l{name}" for name in libraries)),
         environment=plain,
         directory=tmp_path,

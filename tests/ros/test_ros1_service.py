@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import signal
 import socket
 import struct
@@ -15,7 +16,7 @@ from typing import Any
 import pytest
 from tests.process_states import stop
 from tests.ros.conftest import line_of
-from tests.ros.ros1_processes import SYSTEM_PYTHON, Ros1, ros1_in, wait_for
+from tests.ros.ros1_processes import HOLDFAST, SYSTEM_PYTHON, Ros1, ros1_in, wait_for
 from tests.unit.test_ros_client import in_process
 
 from holdfast.config.loader import Configuration, load
@@ -369,6 +370,37 @@ def test_who_watches_a_robot_is_told_the_status(around: Ros1, here: RosEnvironme
         client.decide(DecisionRequest(RequestKind.INITIALIZE, seed=4))
         assert client.decided_by == f"/{CLOUD}"
     assert "/arm" not in around.run("rosnode", "list").split()
+
+
+WAITING = """
+import rospy
+from holdfast_ros.active_sensing import DecisionRequest, RequestKind
+from holdfast_ros.ros1_client import Ros1Client
+
+rospy.init_node("waiting")
+with Ros1Client(deadline_s=0.01) as client:
+    try:
+        client.decide(DecisionRequest(RequestKind.INITIALIZE), give_up_s=0.2)
+    except Exception as error:
+        print(error)
+"""
+
+
+def test_a_node_in_rospy_says_on_its_terminal_what_it_waits_for(around: Ros1) -> None:
+    said = around.run("bash", "-c", 'exec "$0" -c "$1" 2>&1', around.python, WAITING).splitlines()
+    assert [line.split()[2] for line in said[:-1]] == ["status:", "holding:"]
+    assert all(line.startswith("[WARN]") for line in said[:-1])
+    assert said[-1].startswith("nobody has answered in 0.2 s: ")
+
+
+def test_it_serves_on_if_nobody_reads_what_it_says(around: Ros1) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write) as nobody:
+        command = (HOLDFAST, "ros1-serve", "--configuration", str(EXAMPLE))
+        around.start(*command, stdout=nobody, stderr=nobody)
+    wait_for(lambda: around.service_uri(CLOUD), "the master knows it")
+    assert "error: 0" in around.run("rosservice", "call", f"/{CLOUD}", "{kind: 0, seed: 3}")
 
 
 def place_of(around: Ros1) -> tuple[str, int]:

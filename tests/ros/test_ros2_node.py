@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -90,10 +89,14 @@ class Ros:
     """One domain of ROS 2, and the processes in it."""
 
     def __init__(self, ros2: Ros2, domain: int, directory: Path) -> None:
-        self._ros2 = ros2
+        self._python = str(ros2.python)
         self.directory = directory
         self.environment = {**ros2.environment, "ROS_DOMAIN_ID": str(domain)}
         self.started: list[ObservedProcess] = []
+
+    def start(self, *command: str) -> ObservedProcess:
+        self.started.append(ObservedProcess([*command], self.environment, self.directory))
+        return self.started[-1]
 
     def node(self, *, wait: bool = True, **parameters: Any) -> ObservedProcess:
         """Start the node; ``a__b`` stands for ``a.b``."""
@@ -106,15 +109,13 @@ class Ros:
             **{key.replace("__", "."): value for key, value in parameters.items()},
         }
         words = [word for key, value in values.items() for word in ("-p", f"{key}:={value}")]
-        command = [str(self._ros2.python), "-m", "holdfast_ros.ros2", "--ros-args", *words]
-        node = ObservedProcess(command, self.environment, self.directory)
-        self.started.append(node)
+        node = self.start(self._python, "-m", "holdfast_ros.ros2", "--ros-args", *words)
         if wait:
             node.wait_for("]: active" if values["autostart"] == "true" else "]: unconfigured")
         return node
 
-    def peer(self) -> Peer:
-        command = [str(self._ros2.python), str(ROOT / "tests" / "ros" / "ros2_peer.py")]
+    def peer(self, name: str = "/holdfast") -> Peer:
+        command = [self._python, str(ROOT / "tests" / "ros" / "ros2_peer.py"), name]
         peer = Peer(command, self.environment, self.directory)
         self.started.append(peer)
         assert peer.read() == {"ready": True}
@@ -127,16 +128,11 @@ class Ros:
         configuration.write_text(load(CONFIGURATION, seed=SEED).to_yaml())
         values = {"configuration": configuration, "motion_s": motion_s}
         words = [word for key, value in values.items() for word in ("-p", f"{key}:={value}")]
-        command = [str(self._ros2.python), str(script), "--ros-args", *words]
-        robot = ObservedProcess(command, self.environment, self.directory)
-        self.started.append(robot)
-        return robot
+        return self.start(self._python, str(script), "--ros-args", *words)
 
     def service(self, port: int) -> ObservedProcess:
         endpoint = f"tcp/127.0.0.1:{port}"
-        command = [str(self._ros2.python), "-m", "holdfast", "serve", "--listen", endpoint]
-        service = ObservedProcess(command, dict(os.environ), self.directory)
-        self.started.append(service)
+        service = self.start(self._python, "-m", "holdfast", "serve", "--listen", endpoint)
         assert "listening" in service.output.get(timeout=PATIENCE_S)
         return service
 
@@ -195,12 +191,18 @@ class TestARun:
         assert {tuple(cloud) for cloud in seen["clouds"]} == {("task", 500)}
 
         belief = peer.do("belief")
-        states = np.reshape(belief["states"], (-1, belief["size"]))
+        table = np.reshape(belief["data"], (belief["rows"], -1))
+        states, weights = table[:, :-1], table[:, -1]
+        assert belief["columns"] == "x (m); y (m); θ (rad); weight"
         layout = pose_layout(load(CONFIGURATION).problem)
         assert layout is not None
         np.testing.assert_array_equal(peer.do("cloud"), layout.poses(states))
-        assert sum(belief["weights"]) == pytest.approx(1.0)
+        assert sum(weights) == pytest.approx(1.0)
         assert node.interrupt() == 0
+        # Before its end a bond is ended, which a lifecycle manager would take for a death.
+        bonds = peer.wait_seen(lambda seen: seen["bonds"] and not seen["bonds"][-1][2])["bonds"]
+        assert {(name, instance) for name, instance, *_ in bonds} == {("holdfast", bonds[0][1])}
+        assert [active for *_, active, _ in bonds[:-1]] == [True] * (len(bonds) - 1)
 
     def test_a_goal_is_cancelled_and_a_new_one_goes_on(self, ros: Ros) -> None:
         ros.node(rate_hz=100.0)
@@ -327,6 +329,7 @@ class TestARobot:
         while peer.do("goal") and (result := peer.do("result"))["code"] == "HELD":
             assert "nobody offers" in result["message"]
         assert trials(result) == in_process()
+        peer.wait_seen(lambda seen: "finished" in seen["statuses"])
 
     def test_has_parameters_that_are_checked_at_once(self, ros: Ros) -> None:
         node = ros.node(wait=False, environment__kind="ros", environment__act="topic")
@@ -337,7 +340,7 @@ class TestARobot:
 def statuses(seen: dict[str, Any]) -> list[str]:
     """Return the statuses of the diagnostics, without repetitions."""
     found: list[str] = []
-    for _, _, values in seen["diagnostics"]:
+    for _, _, values, *_ in seen["diagnostics"]:
         status = values["status"]
         if status and (not found or found[-1] != status):
             found.append(status)
@@ -376,7 +379,7 @@ class TestFaults:
 
     def test_nobody_decides(self, ros: Ros) -> None:
         port = free_port()
-        ros.node(
+        node = ros.node(
             environment__kind="executive",
             offload__services=f"['tcp/127.0.0.1:{port}']",
             recovery__launch="never",
@@ -388,6 +391,8 @@ class TestFaults:
             lambda seen: any(item[2]["holding"] == "true" for item in seen["diagnostics"])
         )
         assert seen["diagnostics"][-1][:2] == [2, "holding still"]
+        (said,) = (line for line in node.errors if "]: holding: " in line)
+        assert said.startswith("[WARN]")
         ros.service(port)
         peer.drive()
         assert peer.do("goal")
@@ -422,7 +427,7 @@ class TestFaults:
 
 
 class TestLifecycle:
-    def test_every_order(self, ros: Ros) -> None:
+    def test_every_order(self, ros: Ros, ros2: Ros2) -> None:
         node = ros.node(autostart="false", environment__kind="executive")
         node.wait_for("ros2 lifecycle set /holdfast configure, then ros2 lifecycle set /holdfast a")
         peer = ros.peer()
@@ -440,6 +445,8 @@ class TestLifecycle:
         state = "unconfigured"
         for transition in " ".join(words).split():
             following = states[state].get(transition)
+            if following is None and ros2.distribution == "jazzy":
+                continue  # its rclpy does not answer what is impossible
             assert peer.do("change", transition=transition) is (following is not None)
             state = following or state
             assert peer.do("state") == state
@@ -469,6 +476,12 @@ class TestLifecycle:
     def test_nothing_is_published_while_inactive(self, ros: Ros) -> None:
         node = ros.node(environment__kind="executive")
         peer = ros.peer()
+        assert peer.do("set", speed=3) == [[False, "speed is no parameter of this node"]]
+        (frame,) = peer.wait_seen(lambda seen: seen["frames"])["frames"]
+        assert frame[:2] == ["map", "task"]
+        layout = pose_layout(load(CONFIGURATION).problem)
+        assert layout is not None
+        assert frame[2:] == pytest.approx(layout.upright)
         peer.drive(20)
         peer.wait_seen(lambda seen: len(seen["decisions"]) >= 20)
         assert peer.do("change", transition="deactivate")
@@ -510,6 +523,8 @@ class TestLifecycle:
         peer = ros.peer()
         assert peer.do("goal")
         assert trials(peer.do("result")) == in_process()
+        names = ["simulator.seed", "rate_hz", "offload.tls", "model.peg_width", "frame_id"]
+        assert peer.do("get", names=names) == [SEED, 0.0, "", 1.0, "task"]
         (refused,) = peer.do("set", **{"simulator.seed": 6})
         assert refused == [
             False,
@@ -523,6 +538,7 @@ class TestLifecycle:
             assert peer.do("change", transition=transition)
         assert peer.do("goal")
         assert trials(peer.do("result")) == in_process(seed=6)
+        assert peer.do("get", names=names) == [6, 0.0, "", 1.0, "task"]
 
 
 class TestParameters:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -88,6 +89,16 @@ def test_a_run_that_is_killed_goes_on_where_the_arm_is(arm: Arm) -> None:
     run = arm.run("--resume")
     assert run.end() == 0, run.said()
     assert arm.digests() == in_process()
+
+
+def test_a_timeout_names_the_topic_that_is_silent(arm: Arm) -> None:
+    run = arm.run("--rate", "50", "--set", "environment.arguments={timeout_s: 3.0}")
+    arm.process.wait_for("trial 0, move 20")
+    arm.process.kill()
+    assert run.end() != 0
+    assert re.search(
+        r"no (touch|end of move \d+) on /arm/(touch|state) \(\d publishers\) within 3 s", run.said()
+    )
 
 
 @pytest.mark.usefixtures("arm")

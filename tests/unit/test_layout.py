@@ -36,6 +36,7 @@ WITHOUT_TESTS = {
     "robot/health": "tests/processes/test_unattended.py asks it over HTTP",
     "ros/ros2/__main__": "one line, which tests/ros runs",
     "robot/session_configuration": "one function; tests/unit/test_reference_decisions.py calls it",
+    "ros/ros2/bond": "needs ROS 2; tests/ros/test_ros2_node.py",
     "ros/ros2/messages": "converts rclpy's messages, which only tests/ros has",
     "tuning/check_process": "tests/processes/test_cli_check.py",
     "tuning/contract_check": WRONG_PROBLEMS,

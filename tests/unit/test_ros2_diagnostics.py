@@ -83,6 +83,20 @@ def test_to_hold_is_an_error_at_once_where_nothing_is_started() -> None:
     assert said.tell(Running("holding still", "standard")).level == Level.ERROR
 
 
+def test_an_alarm_is_a_warning_until_the_belief_is_a_new_one() -> None:
+    said, running = Said(), Running("standard", "standard")
+    assert said.tell(running).level == Level.OK
+    for event, later in (("lost", "reinitialised"), ("sensor_suspect", "trial")):
+        said.diagnostics.event(event)
+        assert (said.tell(running).level, said.tell(running).facts[event]) == (Level.WARN, "true")
+        said.diagnostics.event(later)
+        assert said.tell(running).level == Level.OK
+    said.diagnostics.event("wrong_answer")
+    said.diagnostics.event("trial")
+    assert said.tell(running).facts["wrong_answer"] == "true"
+    assert said.tell(running).level == Level.WARN
+
+
 def test_what_was_known_last_is_still_said_after_the_end() -> None:
     said = Said()
     said.tell(Running("standard", "standard", 1))

@@ -14,9 +14,11 @@ from holdfast_ros.ros2.parameters import (
     OWN,
     OWN_DEFAULTS,
     NodeParameters,
+    in_force,
     in_parameters,
     known_parameters,
     read_parameters,
+    refusal_of_name,
 )
 
 CONFIGURATION = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
@@ -146,6 +148,34 @@ def test_what_is_wrong_is_said(values: dict[str, Any], message: str) -> None:
     with pytest.raises(HoldfastError) as raised:
         read(**values)
     assert message in str(raised.value)
+
+
+def test_what_is_in_force_is_what_was_read() -> None:
+    shown = in_force(read(particle_filter__num_particles=50, rate_hz=2, offload__tls=""))
+    assert (shown["particle_filter.num_particles"], shown["rate_hz"]) == (50, 2.0)
+    assert (shown["offload.tls"], shown["frame_id"], shown["model.peg_width"]) == ("", "task", 1)
+    assert shown["run_directory"].endswith("/runs/peg_in_hole_2d-seed0")
+    # ROS has no empty lists, and lists of one kind alone.
+    assert "offload.services" not in shown
+    again = {key: value for key, value in shown.items() if key != "run_directory"}
+    assert (
+        read_parameters(again).configuration.plain()
+        == read(particle_filter__num_particles=50).configuration.plain()
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("speed", "speed is no parameter of this node"),
+        ("particle_filter.num_particle", "did you mean particle_filter.num_particles?"),
+        *((name, "") for name in ("rate_hz", "model.any", "use_sim_time", "qos_overrides.a")),
+        *((name, "") for name in ("environment.arguments.any", "offload.services")),
+    ],
+)
+def test_a_name_that_is_none_is_refused(name: str, reason: str) -> None:
+    assert refusal_of_name(name).endswith(reason)
+    assert bool(refusal_of_name(name)) == bool(reason)
 
 
 def test_each_is_described() -> None:

@@ -1,9 +1,14 @@
-"""What the page about ROS shows of its example is what stands there."""
+"""What the page about ROS shows of its example is what stands there; layouts show all there is."""
 
 from __future__ import annotations
 
 import ast
+import json
 from pathlib import Path
+
+import pytest
+from rosbags.highlevel import AnyReader
+from tests.command_line import run_here
 
 ROOT = Path(__file__).parents[2]
 
@@ -25,3 +30,24 @@ def test_the_method_shown_is_the_examples() -> None:
     assert list(shown) == ["perform_sensing"]
     assert shown.items() <= example.items()
     assert {"perform_sensing", "perform", "is_done", "steps_performed"} <= example.keys()
+
+
+def test_the_layouts_show_all_that_is_exported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example = str(ROOT / "examples" / "peg_in_hole_2d.yaml")
+    for words in (
+        ("run", example, "--trials", "1", "--out", "run", "-q"),
+        ("export", "run", "--mcap", "run.mcap", "-q"),
+    ):
+        assert run_here(capsys, tmp_path, *words).code == 0
+    with AnyReader([tmp_path / "run.mcap"]) as reader:
+        kinds = {each.topic: each.msgtype.partition("/")[0] for each in reader.connections}
+    layouts = ROOT / "ros" / "holdfast_bringup"
+    rviz = (layouts / "rviz" / "holdfast.rviz").read_text(encoding="utf-8")
+    drawn = {topic for topic, of in kinds.items() if of.startswith(("geometry", "nav", "visual"))}
+    assert len(drawn) == 7
+    assert {topic for topic in drawn if f"Value: {topic}\n" not in rviz} == set()
+    foxglove = json.dumps(json.loads((layouts / "foxglove" / "holdfast.json").read_bytes()))
+    # Foxglove takes the frames without being told.
+    assert {topic for topic in kinds if topic not in foxglove} == {"/tf", "/tf_static"}

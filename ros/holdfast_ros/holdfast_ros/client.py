@@ -112,7 +112,7 @@ class ActiveSensingClient:
     on_event : callable or None
         Gets each change as ``on_event(name, **fields)``, on that thread: ``status`` (``status``,
         ``reason``) and ``holding`` (``reason``) while no service answers. By default they are
-        logged as warnings of ``holdfast_ros``.
+        logged as warnings of ``rosout.holdfast_ros``.
 
     Attributes
     ----------
@@ -241,4 +241,5 @@ class ActiveSensingClient:
 def log_event(name: str, **fields: object) -> None:
     """Log an event, by default as a line on the standard error."""
     words = " ".join(f"{key}={value}" for key, value in fields.items() if value)
-    logging.getLogger("holdfast_ros").warning("%s: %s", name, words)
+    # A node of rospy shows what is below rosout, on its terminal and in /rosout.
+    logging.getLogger("rosout.holdfast_ros").warning("%s: %s", name, words)

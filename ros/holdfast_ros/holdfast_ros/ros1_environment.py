@@ -51,10 +51,7 @@ class RosEnvironment(NamedTuple):
     def of(cls, environment: Mapping[str, str] = os.environ) -> Self:
         """Read ``ROS_MASTER_URI``, ``ROS_HOSTNAME``, ``ROS_IP`` and ``ROS_NAMESPACE``.
 
-        Raises
-        ------
-        TransportError
-            If the master's URI is malformed.
+        Raises TransportError if the master's URI is malformed.
         """
         master = environment.get("ROS_MASTER_URI") or "http://localhost:11311"
         if host_and_port_of(master, "http") is None:

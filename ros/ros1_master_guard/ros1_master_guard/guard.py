@@ -89,10 +89,7 @@ class MasterGuard:
 
         ``ready`` is called once when a master answers, with ``started``, ``resumed`` or ``found``.
 
-        Raises
-        ------
-        GuardError
-            If nothing can be guarded.
+        Raises GuardError if nothing can be guarded.
         """
         directory = directory_for(self._settings.directory)
         self._journal = directory / f"master-{self._port}.journal"
@@ -220,25 +217,6 @@ class MasterGuard:
         except OSError:
             return False
         return True
-
-    async def _silent(self) -> str:
-        """Wait until the master has been silent for too long."""
-        probe_s = min(_PROBE_S, self._settings.silent_s)
-        failed = 0.0
-        with contextlib.closing(Connection(self._uri)) as connection:
-            # Time actually waited counts, not the clock: the guard itself may have been stopped.
-            while failed < self._settings.silent_s:
-                asked_at = monotonic()
-                try:
-                    await connection.call("getPid", within_s=probe_s)
-                except GoneError:
-                    pass  # _closed() reports it
-                except CallError:
-                    failed += min(probe_s, monotonic() - asked_at)
-                else:
-                    failed = 0.0
-                await asyncio.sleep(_PROBE_EVERY_S if not failed else 0.01)
-        return f"it did not answer for {self._settings.silent_s:g} s"
 
     # -- what the master knows ---------------------------------------------------------------------
 

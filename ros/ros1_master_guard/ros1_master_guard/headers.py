@@ -45,13 +45,7 @@ def encode_message(payload: bytes) -> bytes:
 
 
 def decode_header(data: bytes) -> dict[str, str]:
-    """Decode a connection header, without its length.
-
-    Raises
-    ------
-    ProtocolError
-        If it is malformed; the message continues a sentence about its sender.
-    """
+    """Decode a connection header, without its length; raise ProtocolError if it is malformed."""
     fields: dict[str, str] = {}
     place = 0
     while place < len(data):

@@ -109,17 +109,10 @@ class MasterProcess:
     """A process that is a master, or waits to become one; it survives this one.
 
     It inherits ``listening``, which need not be bound yet. The standard library's subprocess
-    coroutines would end it with the loop.
+    coroutines would end it with the loop. ``ended`` is its exit code, or the negative number of the
+    signal that ended it.
 
-    Attributes
-    ----------
-    ended : asyncio.Future of int
-        Its exit code, or the negative number of the signal that ended it.
-
-    Raises
-    ------
-    GuardError
-        If it cannot be started.
+    Raises GuardError if it cannot be started.
     """
 
     def __init__(self, settings: GuardSettings, listening: socket.socket) -> None:

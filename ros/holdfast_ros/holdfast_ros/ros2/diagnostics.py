@@ -53,8 +53,11 @@ class Diagnostics:
 
     def event(self, name: str) -> None:
         """Take note of an event of the robot's, from its thread."""
-        if name in ("lost", "sensor_suspect"):
+        if name in ("lost", "sensor_suspect", "wrong_answer"):
             self._alarms.add(name)
+        elif name in ("reinitialised", "trial"):
+            # The belief is a new one. A service that has answered wrongly is asked no more.
+            self._alarms &= {"wrong_answer"}
         elif name == "holding":
             self._holding_since = self._clock()
             self._launch_failed = False
@@ -97,6 +100,7 @@ class Diagnostics:
             "unexplained_observations": 0 if segment is None else segment.unexplained_observations,
             "lost": str("lost" in self._alarms).lower(),
             "sensor_suspect": str("sensor_suspect" in self._alarms).lower(),
+            "wrong_answer": str("wrong_answer" in self._alarms).lower(),
             "decisions_not_published": 0 if telemetry is None else telemetry.dropped_decisions,
             "last_error": "" if last is None or level != Level.ERROR else last.message[:500],
         }

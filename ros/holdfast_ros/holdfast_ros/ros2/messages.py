@@ -4,28 +4,32 @@ from __future__ import annotations
 
 import array
 import struct
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from builtin_interfaces.msg import Time
-from holdfast_interfaces.msg import (
-    Belief,
-    BeliefStamped,
-    Decision,
-    PlanningState,
-    TrialOutcome,
-)
-from std_msgs.msg import Header
+from geometry_msgs.msg import Quaternion, Transform, TransformStamped
+from holdfast_interfaces.msg import Decision, TrialOutcome
+from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, MultiArrayLayout
 
 from holdfast.numerics.arrays import FloatArray
-from holdfast.planning import planner as planning
+from holdfast.planning.belief import Belief
 from holdfast.planning.outcome import TrialResult
 from holdfast.problems.attributes import sensing_labels
 from holdfast.problems.problem import Problem
+from holdfast.reports.csv_export import state_labels
 from holdfast_ros.ros2.telemetry import PublishedDecision
 
-__all__ = ["belief_message", "decision_message", "floats", "outcome_message", "pose_array"]
+__all__ = [
+    "belief_message",
+    "decision_message",
+    "floats",
+    "frame_message",
+    "outcome_message",
+    "pose_array",
+]
 
 
 def floats(values: npt.ArrayLike) -> array.array[float]:
@@ -33,23 +37,25 @@ def floats(values: npt.ArrayLike) -> array.array[float]:
     return array.array("d", np.ascontiguousarray(values, dtype=np.float64).tobytes())
 
 
-def belief_message(state: planning.PlanningState, frame_id: str, stamp: Time) -> Any:
-    """Return a state as a message."""
-    belief = Belief(
-        state_size=state.belief.states.shape[1],
-        states=floats(state.belief.states.ravel()),
-        weights=floats(state.belief.weights),
-    )
-    return BeliefStamped(
-        header=Header(frame_id=frame_id, stamp=stamp),
-        state=PlanningState(
-            seed=state.seed,
-            trial=state.trial,
-            step=state.step,
-            stage=state.stage,
-            sensed=state.sensed,
-            belief=belief,
-        ),
+def belief_message(belief: Belief, problem: Problem) -> Any:
+    """Return a belief as it is exported: a row for each particle, its state and its weight."""
+    table = np.column_stack([belief.states, belief.weights])
+    columns = "; ".join([*state_labels(problem), "weight"])
+    (rows, width), dimension = table.shape, MultiArrayDimension
+    dimensions = [dimension(label="particle", size=rows, stride=table.size),
+                  dimension(label=columns, size=width, stride=width)]  # fmt: skip
+    return Float64MultiArray(layout=MultiArrayLayout(dim=dimensions), data=floats(table.ravel()))
+
+
+def frame_message(parent: str, child: str, turn: Iterable[float], stamp: Time) -> Any:
+    """Return the transform of a frame that is only turned in its parent, as ``tf2`` has it."""
+    from tf2_msgs.msg import TFMessage
+
+    x, y, z, w = turn
+    transform = Transform(rotation=Quaternion(x=x, y=y, z=z, w=w))
+    header = Header(frame_id=parent, stamp=stamp)
+    return TFMessage(
+        transforms=[TransformStamped(header=header, child_frame_id=child, transform=transform)]
     )
 
 

@@ -12,6 +12,8 @@ deadline, except the running goal's, which keeps one thread of the executor.
 
 from __future__ import annotations
 
+import contextlib
+import platform
 import threading
 import time
 from collections.abc import Mapping
@@ -22,15 +24,16 @@ import holdfast_interfaces.srv
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseArray
-from holdfast_interfaces.msg import BeliefStamped, Decision
+from holdfast_interfaces.msg import Decision
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.logging import get_logger
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from std_msgs.msg import String
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Float64MultiArray, String
 
 from holdfast.errors import HoldfastError
 from holdfast.planning.planner import PlanningState
@@ -42,13 +45,16 @@ from holdfast.robot.recomputing import resume_run_if_begun
 from holdfast.runtime.log_lines import fields_as_text
 from holdfast_ros.executive import DecideCode, DecideRequest
 from holdfast_ros.ros2 import messages
+from holdfast_ros.ros2.bond import Bond
 from holdfast_ros.ros2.diagnostics import Diagnostics
 from holdfast_ros.ros2.parameters import (
     OWN_DEFAULTS,
     NodeParameters,
+    in_force,
     in_parameters,
     known_parameters,
     read_parameters,
+    refusal_of_name,
 )
 from holdfast_ros.ros2.run_segment import Ending, RunSegment, SegmentResult, make_world
 from holdfast_ros.ros2.telemetry import PublishedDecision, Telemetry
@@ -73,10 +79,8 @@ _DIAGNOSTICS_S = 1.0
 _RESULT_S = 0.5
 """At the end of the process: for the client that waits for its result to get it."""
 
-_LOGGED = {
-    *("status", "holding", "resumed", "lost", "sensor_suspect", "reinitialised", "wrong_answer"),
-    "stopped",
-}
+_WARNINGS = {"holding", "lost", "sensor_suspect", "wrong_answer"}
+_LOGGED = _WARNINGS | {"status", "resumed", "reinitialised", "stopped"}
 _TOLD_AT_ONCE = _LOGGED | {
     *("launch_failed", "recovery_exited", "unexplained", "service_vanished", "service_appeared"),
     "trial",
@@ -97,8 +101,8 @@ class _Events:
         if name in _TOLD_AT_ONCE:
             self._diagnostics.event(name)
             if name in _LOGGED:
-                words = in_parameters(fields_as_text(fields))
-                self._node.get_logger().info(f"{name.replace('_', ' ')}: {words}")
+                words = f"{name.replace('_', ' ')}: {in_parameters(fields_as_text(fields))}"
+                self._node.log(words, "warning" if name in _WARNINGS else "info")
             self._telemetry.notice()
 
     def close(self) -> None:
@@ -117,6 +121,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             automatically_declare_parameters_from_overrides=True,
         )
         self._declare()
+        self._shown: dict[str, Any] = {}
         self._robot = Connections(self)
         # Guards the fields below.
         self._changed = threading.RLock()
@@ -135,10 +140,17 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         publish = self.create_lifecycle_publisher
         self._cloud_publisher = publish(PoseArray, "~/particle_cloud", best_effort)
-        self._belief_publisher = publish(BeliefStamped, "~/belief", best_effort)
+        self._belief_publisher = publish(Float64MultiArray, "~/belief", best_effort)
         self._decision_publisher = publish(Decision, "~/decision", 100)
         self._status_publisher = publish(String, "~/status", 10)
         self._diagnostics_publisher = publish(DiagnosticArray, "/diagnostics", 10)
+        self._frame_publisher = None
+        with contextlib.suppress(ImportError):  # in every ROS but that of the wheels
+            from tf2_msgs.msg import TFMessage
+
+            latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            self._frame_publisher = publish(TFMessage, "/tf_static", latched)
+        self._bond = Bond(self)
         self._group = ReentrantCallbackGroup()
         self._decide_server = self.create_service(
             _Decide, "~/decide", self._decide, callback_group=self._group
@@ -161,6 +173,11 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         )
         self.add_on_set_parameters_callback(self._judge_parameters)
 
+    def log(self, text: str, level: str) -> None:
+        """Log a line."""
+        # A logger of rclpy's lets a place in the code have one level for ever.
+        getattr(get_logger(self.get_logger().name), level)(text)
+
     # -- parameters ------------------------------------------------------------------------------
 
     def _declare(self) -> None:
@@ -174,6 +191,9 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
                 self.declare_parameter(name, None if default == [] else default, descriptor)
 
     def _judge_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        for each in parameters:
+            if refusal := refusal_of_name(each.name):
+                return SetParametersResult(successful=False, reason=refusal)
         known = known_parameters()
         ours = [each.name for each in parameters if each.name in known or "." in each.name]
         if self._parameters_read is None or not ours:
@@ -182,10 +202,18 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         return SetParametersResult(successful=False, reason=reason)
 
     def _values(self) -> Mapping[str, Any]:
-        return {
+        """Return what was given: not what the node itself has shown, and nobody has changed."""
+        values = {
             name: _plain(parameter.value)
             for name, parameter in self.get_parameters_by_prefix("").items()
         }
+        return {name: value for name, value in values.items() if self._shown.get(name) != value}
+
+    def _show_in_force(self, read: NodeParameters, given: Mapping[str, Any]) -> None:
+        """Set the parameters that were not given to the values in force, for ``ros2 param``."""
+        values = in_force(read)
+        self._shown = {key: value for key, value in values.items() if given.get(key) is None}
+        self.set_parameters([Parameter(key, value=value) for key, value in self._shown.items()])
 
     @property
     def autostart(self) -> bool:
@@ -207,12 +235,14 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Read the parameters, and check all that can be checked before a run."""
         try:
-            read = read_parameters(self._values())
+            given = self._values()
+            read = read_parameters(given)
             check_services(read.configuration)
             layout = pose_layout(read.configuration.problem)
             make_world(self._robot, read)
             # Whether a run can begin there, or go on.
             resume_run_if_begun(read.run_directory, read.configuration).close()
+            self._show_in_force(read, given)
         except Exception as error:  # noqa: BLE001 - rclpy would hide it
             self.get_logger().error(f"not configured: {_in_words(error)}")
             return TransitionCallbackReturn.FAILURE
@@ -232,10 +262,18 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         result = super().on_activate(state)
         with self._changed:
             self._active = True
+            read, layout = self._parameters_read, self._layout
+        if read is not None:
+            self._bond.form(read.own.bond_heartbeat_period)
+            if self._frame_publisher is not None and layout is not None and read.own.map_frame:
+                frames, now = (read.own.map_frame, read.own.frame_id), self.get_clock().now()
+                message = messages.frame_message(*frames, layout.upright, now.to_msg())
+                self._frame_publisher.publish(message)
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Hold the run, if there is one, and publish nothing more."""
+        self._bond.break_up()
         self._hold("the node was deactivated")
         return super().on_deactivate(state)
 
@@ -246,6 +284,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Hold the run and forget everything."""
+        self._bond.break_up()
         self._hold("the node was shut down")
         super().on_deactivate(state)
         self._forget()
@@ -254,6 +293,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Go back to the beginning after a defect."""
         self.get_logger().error("a transition has failed; the node is unconfigured again")
+        self._bond.break_up()
         self._hold("a transition of the node has failed")
         super().on_deactivate(state)
         self._forget()
@@ -281,13 +321,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             self._diagnostics = None
 
     def end(self) -> bool:
-        """End in order, in any state, when the process is asked to end.
-
-        Returns
-        -------
-        bool
-            Whether the run has ended.
-        """
+        """End in order, in any state, when the process is asked to; return whether the run has."""
         is_asked = not self._goals_ended.is_set()
         if self._state_machine.current_state[1] in ("unconfigured", "inactive", "active"):
             self.trigger_shutdown()
@@ -345,7 +379,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         if telemetry is not None:
             telemetry.close()
         level = "info" if outcome.ending in (Ending.FINISHED, Ending.PAUSED) else "error"
-        getattr(self.get_logger(), level)(f"{outcome.ending.name.lower()}: {outcome.message}")
+        self.log(f"{outcome.ending.name.lower()}: {outcome.message}", level)
         with self._changed:
             self._segment = None
         self._tell_diagnostics()
@@ -509,7 +543,8 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             return
         now = self.get_clock().now().to_msg()
         if self._belief_publisher.get_subscription_count():
-            self._belief_publisher.publish(messages.belief_message(state, read.own.frame_id, now))
+            problem = read.configuration.problem
+            self._belief_publisher.publish(messages.belief_message(state.belief, problem))
         if layout is not None and self._cloud_publisher.get_subscription_count():
             poses = layout.poses(state.belief.states)
             self._cloud_publisher.publish(messages.pose_array(poses, read.own.frame_id, now))
@@ -524,9 +559,9 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         facts = told.facts | {"run_directory": str(read.run_directory)}
         status = DiagnosticStatus(
             level=bytes((told.level,)),
-            name=f"{self.get_name()}: active sensing",
+            name=f"{self.get_fully_qualified_name()[1:]}: active sensing",
             message=told.word,
-            hardware_id=read.configuration.offload.name or "",
+            hardware_id=read.configuration.offload.name or platform.node(),
             values=[KeyValue(key=key, value=value) for key, value in facts.items()],
         )
         message = DiagnosticArray(status=[status])

@@ -29,12 +29,15 @@ __all__ = [
     "OWN",
     "OWN_DEFAULTS",
     "NodeParameters",
+    "in_force",
     "in_parameters",
     "known_parameters",
     "read_parameters",
+    "refusal_of_name",
 ]
 
 _SECTIONS_OF_PROBLEMS = ("model.", "state_space_planner.")
+_ARGUMENTS = "environment.arguments."
 _OF_ROS = ("use_sim_time", "start_type_description_service")
 _OF_ROS_SECTIONS = ("qos_overrides.",)
 
@@ -51,6 +54,7 @@ class OwnParameters(msgspec.Struct, frozen=True, kw_only=True):
     run_directory: _Text = ""
     rate_hz: Annotated[float, msgspec.Meta(ge=0.0, le=10_000.0)] = 0.0
     frame_id: _Text = "task"
+    map_frame: _Text = "map"
     autostart: bool = False
     after_reboot: bool = False
     environment: Literal["configuration", "ros", "executive"] = msgspec.field(
@@ -64,6 +68,7 @@ class OwnParameters(msgspec.Struct, frozen=True, kw_only=True):
     pause_timeout_s: Annotated[float, msgspec.Meta(ge=0.0, le=3600.0)] = 5.0
     belief_rate_hz: Annotated[float, msgspec.Meta(ge=0.0, le=1000.0)] = 10.0
     publish_entropies: bool = True
+    bond_heartbeat_period: Annotated[float, msgspec.Meta(ge=0.0, le=60.0)] = 0.1
 
 
 OWN: Mapping[str, str] = {
@@ -74,6 +79,7 @@ OWN: Mapping[str, str] = {
     "directory",
     "rate_hz": "task actions a second; 0: as fast as it goes",
     "frame_id": "frame of the poses: the problem's own coordinates",
+    "map_frame": "frame in which frame_id stands upright, for /tf_static; empty: publish none",
     "autostart": "whether the node configures and activates itself",
     "after_reboot": "whether a run goes on although the machine was rebooted since it last moved",
     "environment.kind": "what the robot acts on: configuration (what the file names, else a "
@@ -87,6 +93,8 @@ OWN: Mapping[str, str] = {
     "belief_rate_hz": "beliefs published a second, at most",
     "publish_entropies": "whether to compute the entropies of each decision once more, to publish "
     "them",
+    "bond_heartbeat_period": "period of the heartbeat for Nav2's lifecycle manager, s; 0: none. "
+    "It needs the package bond",
 }
 """What the node's own parameters mean."""
 
@@ -159,18 +167,17 @@ def read_parameters(values: Mapping[str, Any]) -> NodeParameters:
     if mismatch := find_mismatch(of_own, OwnParameters):
         raise ConfigurationError(f"{dotted(mismatch.path)} {mismatch.in_words()}")
     own = msgspec.convert(of_own, OwnParameters)
-    settings = _settings_keys()
     overrides: dict[str, Any] = {}
     for name, value in given.items():
         if name in OWN or name in _OF_ROS or name.startswith(_OF_ROS_SECTIONS):
             continue
-        if name in settings or name.startswith(_SECTIONS_OF_PROBLEMS):
-            overrides[name] = None if value == "" else value
-        elif name.startswith("environment.arguments."):
-            arguments = overrides.setdefault("environment.arguments", {})
-            arguments[name.removeprefix("environment.arguments.")] = value
+        if name.startswith(_ARGUMENTS):
+            arguments = overrides.setdefault(_ARGUMENTS[:-1], {})
+            arguments[name.removeprefix(_ARGUMENTS)] = value
+        elif refusal := refusal_of_name(name):
+            raise ConfigurationError(refusal)
         else:
-            raise _unknown(name)
+            overrides[name] = None if value == "" else value
     for index, assignment in enumerate(own.assignments):
         key, value = _assigned(index, assignment)
         overrides[key] = value
@@ -206,6 +213,27 @@ def _assigned(index: int, assignment: str) -> tuple[str, Any]:
     return f"{section}.{name}", read(text.encode(), f"assignments[{index}]").data
 
 
-def _unknown(name: str) -> ConfigurationError:
-    hint = close_match(name, known_parameters())
-    return ConfigurationError(f"{name} is no parameter of this node{hint}")
+def refusal_of_name(name: str) -> str:
+    """Return why there is no parameter of a name; empty if there is, or a problem may have it."""
+    known = known_parameters()
+    others = (*_OF_ROS_SECTIONS, *_SECTIONS_OF_PROBLEMS, _ARGUMENTS)
+    if name in known or name in _OF_ROS or name.startswith(others):
+        return ""
+    return f"{name} is no parameter of this node{close_match(name, known)}"
+
+
+def in_force(read: NodeParameters) -> dict[str, Any]:
+    """Return the values in force by the parameter's name, those that a parameter can hold."""
+    values = msgspec.to_builtins(read.own) | {"run_directory": str(read.run_directory)}
+    for section, settings in read.configuration.plain()["configuration"].items():
+        if isinstance(settings, Mapping):
+            values |= {f"{section}.{key}": value for key, value in settings.items()}
+    shown = {name: "" if value is None else value for name, value in values.items()}
+    return {name: value for name, value in shown.items() if _fits(value)}
+
+
+def _fits(value: Any) -> bool:
+    if isinstance(value, list | tuple):
+        kinds = {type(each) for each in value}
+        return len(kinds) == 1 and kinds <= {bool, int, float, str}
+    return isinstance(value, str | float) or (isinstance(value, int) and abs(value) < 2**63)
