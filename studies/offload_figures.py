@@ -65,9 +65,12 @@ def _lines(scaling: Scaling, cost_ms: float) -> list[tuple[list[float], plots.Do
 def break_even_lines(lines: pd.DataFrame) -> Figure:
     """Draw the break-even of all kinds of decisions, for a robot with one core."""
     lines = lines[(lines["robot_cores"] == 1) & lines["samples"].isin(SAMPLES_DRAWN)]
+    reached = lines.groupby(list(Kind._fields))["particles"].transform("count") > 0
+    never = len(lines[~reached].groupby(list(Kind._fields)))
+    lines = lines[reached]
     ends = {kind_of(row): row["measured_to"] for row in lines.to_dict("records")}
     figure, (panel,) = plots.stacked_panels(
-        [2 * len(ends)],
+        [round(1.5 * len(ends))],
         title="Beyond how many particles a service is faster than the robot's one core",
         width=9.2,
     )
@@ -89,6 +92,10 @@ def break_even_lines(lines: pd.DataFrame) -> Figure:
     plots.dot_rows(panel, [kind.label for kind in ends], dots, legend=False)
     for place, end in enumerate(ends.values()):
         panel.plot([end, end], [place - 0.4, place + 0.4], color="#8A9099", linewidth=1.2)
-    panel.set_xlabel("particles at break-even, with bounds; grey: measured up to here")
+    panel.set_xticks(ticks := [300, 1_000, 3_000, 10_000, 30_000], [f"{each:,}" for each in ticks])
+    panel.set_xlabel(
+        "particles at break-even, with bounds; grey: measured up to here\n"
+        f"(without one as far as measured: {never} kinds of decisions, by horizon H)"
+    )
     plots.legend_below(figure, panel, 4, frameon=False)
     return figure

@@ -19,14 +19,15 @@ from holdfast.reports.figure import _draw_entropies, _draw_workspace, _follow_tu
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
-EIGHT = """
+TWELVE = """
 from light_dark_room import LightDarkRoom
 
 
-class Eight(LightDarkRoom):
+class Twelve(LightDarkRoom):
     sensing_actions = (
         "camera in front", "camera at the left", "camera at the right", "lidar, coarse scan",
         "lidar, fine scan", "force-torque sensor", "ultrasonic range finder", "radio beacon",
+        "depth camera", "tactile array of the gripper", "inertial unit", "wheel odometry",
     )
 
     def observation_mean(self, states, sensing_action):
@@ -39,7 +40,7 @@ class TestFigure:
         "example", ["light_dark_room", "capsule_robot", "peg_in_hole_3d", "wrapping_heading"]
     )
     def test_nothing_is_cut_off(self, tmp_path: Path, example: str) -> None:
-        overrides = {"simulator.max_steps": 40, "particle_filter.num_particles": 200}
+        overrides = {"simulator.max_steps": 40, "particle_filter.num_particles": 50}
         configuration = load(EXAMPLES / f"{example}.yaml", overrides=overrides)
         recorder = record_trial(configuration, trial=0)
         trial_figure(configuration, recorder.record, tmp_path / "trial.png")
@@ -48,13 +49,13 @@ class TestFigure:
             assert (edge == 1.0).all()
         assert (picture < 1.0).any()
 
-    def test_eight_sensing_actions_have_room(
+    def test_twelve_sensing_actions_have_room(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.syspath_prepend(EXAMPLES)
-        (tmp_path / "eight_sensors.py").write_text(EIGHT)
-        (tmp_path / "eight.yaml").write_text(
-            "problem: eight_sensors:Eight\nsimulator: {max_steps: 60, sensing_intervals: 2}\n"
+        (tmp_path / "twelve.py").write_text(TWELVE)
+        (tmp_path / "twelve.yaml").write_text(
+            "problem: twelve:Twelve\nsimulator: {max_steps: 60, sensing_intervals: 2}\n"
         )
         drawn: list[Figure] = []
         saved = Figure.savefig
@@ -64,7 +65,7 @@ class TestFigure:
             saved(figure, *arguments, **options)
 
         monkeypatch.setattr(Figure, "savefig", savefig)
-        configuration = load(tmp_path / "eight.yaml")
+        configuration = load(tmp_path / "twelve.yaml")
         recorder = record_trial(configuration, trial=0)
         trial_figure(configuration, recorder.record, tmp_path / "trial.png")
         picture = imread(tmp_path / "trial.png")[..., :3]
@@ -72,10 +73,11 @@ class TestFigure:
             assert (edge == 1.0).all()
         (figure,) = drawn
         left, right = figure.subfigs
-        (legend,) = left.legends
+        legend = left.axes[0].get_legend()
+        assert legend is not None
         assert legend.get_window_extent().x1 <= left.bbox.x1
         labels = [each.get_window_extent() for each in right.axes[-2].get_yticklabels()]
-        assert len(labels) == 8
+        assert len(labels) == 12
         for upper, lower in itertools.pairwise(labels):
             assert upper.y0 >= lower.y1 - 1.0
 

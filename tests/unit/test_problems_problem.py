@@ -94,7 +94,10 @@ def test_a_scene_without_points_or_obstacles() -> None:
     assert (scene.obstacles.shape, scene.points.shape) == ((0, 4), (0, 2))
 
 
-@pytest.mark.parametrize("wrong", [{"axes": (0, 5)}, {"angle": 7}])
+@pytest.mark.parametrize(
+    "wrong",
+    [{"axes": (0, 5)}, {"angle": 7}, {"targets": [(0, 3)]}, {"walls": [((None, 3), (0, 0, 1, 1))]}],
+)
 def test_a_scene_of_coordinates_that_no_state_has(
     wrong: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

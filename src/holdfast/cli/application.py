@@ -35,6 +35,7 @@ COMMANDS = {
     "sweep": Command("holdfast.cli.sweep", "Compare settings: runs of a grid of values."),
     "compare": Command("holdfast.cli.compare", "Compare the decisions of two runs."),
     "export": Command("holdfast.cli.export", "Write a run for RViz, Foxglove, or as tables."),
+    "report": Command("holdfast.cli.report", "Write a run as one HTML file to send."),
     "view": Command("holdfast.cli.view", "See a run in Rerun's viewer."),
     "keys": Command("holdfast.cli.keys", "Make keys for robots and services."),
 }

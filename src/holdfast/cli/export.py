@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +37,7 @@ __all__ = [
     "problem_directory_option",
     "replay_trials",
     "trials_option",
+    "user_errors_told",
 ]
 
 _NOTE = "decided as recorded"
@@ -199,18 +200,26 @@ def replay_trials(
     line = progress_line(len(trials), quiet=quiet)
     line.start(f"{counted(len(trials), 'trial')} of {shown_path(recorded.path)}", 0, _NOTE)
     try:
-        for finished, _ in enumerate(recorded.replay(trials, sinks), start=1):
-            line.show(finished, _NOTE)
-    except (HoldfastError, KeyboardInterrupt):
-        raise
-    except BaseException as error:
-        account = account_of_user_error(error, recorded.configuration.problem_name)
-        if account is None:
-            raise
-        raise HoldfastError(account) from error
+        with user_errors_told(recorded.configuration.problem_name):
+            for finished, _ in enumerate(recorded.replay(trials, sinks), start=1):
+                line.show(finished, _NOTE)
     finally:
         with contextlib.suppress(OSError):
             line.stop()
+
+
+@contextlib.contextmanager
+def user_errors_told(problem: str) -> Iterator[None]:
+    """Turn an exception of the user's own code into a HoldfastError with its place."""
+    try:
+        yield
+    except (HoldfastError, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        account = account_of_user_error(error, problem)
+        if account is None:
+            raise
+        raise HoldfastError(account) from error
 
 
 def notes_about(recorded: RecordedRun) -> list[str]:

@@ -45,6 +45,7 @@ from holdfast.journal.tables import RunSummary, SummaryBuilder, csv_lines
 from holdfast.journal.timings import count_answers, count_verified
 from holdfast.planning.outcome import TrialResult
 from holdfast.runtime.files import write_atomically
+from holdfast.runtime.machine import machine_of_here
 
 CONFIGURATION_NAME = "config.yaml"
 EVENTS_NAME = "events.jsonl"
@@ -151,7 +152,8 @@ class RunDirectory:
             raise OutputError(f"{path}: cannot be made: {error.strerror}") from error
         _require_plain_files(path)
         text = configuration.to_yaml()
-        meta = {"configuration": text} | fingerprint(configuration) | dict(notes or {})
+        made = {"machine": ", ".join(f"{name} {is_}" for name, is_ in machine_of_here().items())}
+        meta = {"configuration": text} | fingerprint(configuration) | made | dict(notes or {})
         survives = configuration.recovery.journal_survives
         journal = _unused_journal(path)
         if taken and journal is None:

@@ -455,11 +455,17 @@ def scene(problem: Any) -> Any:
     drawn = _ask(problem, "scene")
     if drawn is None:
         return None
-    indices = (*drawn.axes, *(() if drawn.angle is None else (drawn.angle,)))
-    if len(drawn.axes) != 2 or not all(index in range(problem.state_size) for index in indices):
+    moved = [axes for axes, _ in drawn.walls]
+    known = range(problem.state_size)
+    if (
+        len(drawn.axes) != 2
+        or not all(index in known for each in (drawn.axes, *drawn.targets) for index in each)
+        or not all(index is None or index in known for index in (drawn.angle, *sum(moved, ())))
+    ):
         raise ProblemError(
-            f"scene of {name_of(problem)} has axes {drawn.axes} and angle {drawn.angle}: need "
-            f"two coordinates, and one or None, each from 0 to {problem.state_size - 1}"
+            f"scene of {name_of(problem)} has axes {drawn.axes}, angle {drawn.angle}, targets "
+            f"{drawn.targets} and walls moved by {moved}: need two coordinates each (of angle one "
+            f"or None, of a wall each may be None), from 0 to {problem.state_size - 1}"
         )
     return drawn
 

@@ -77,11 +77,24 @@ class Scene:
         Centre of the goal.
     points : array of shape (q, 2) or None
         Places of interest (via points, lamps); all of them are shown.
+    targets : sequence of (int, int)
+        What is somewhere else in the plane as a part of the state (somebody to follow, a landmark
+        that is searched for): its two coordinates of the state, horizontal first.
+    walls : sequence of ((int or None, int or None), rectangle)
+        Obstacles whose place is a part of the state: a rectangle as in ``obstacles``, moved by
+        these two coordinates of the state; None does not move it.
 
     Raises
     ------
     ProblemError
         If an argument has another shape.
+
+    Examples
+    --------
+    A door of one metre in the wall at x = 2, whose height is the fourth coordinate of the state:
+
+    >>> import holdfast as hf
+    >>> scene = hf.Scene((0, 1), (0, 0, 4, 3), walls=[((None, 3), (1.9, -0.5, 2.1, 0.5))])
     """
 
     def __init__(
@@ -93,6 +106,8 @@ class Scene:
         angle: int | None = None,
         goal: npt.ArrayLike | None = None,
         points: npt.ArrayLike | None = None,
+        targets: Sequence[tuple[int, int]] = (),
+        walls: Sequence[tuple[tuple[int | None, int | None], npt.ArrayLike]] = (),
     ) -> None:
         self.axes = axes
         _in_scene("limits", limits, (4,))
@@ -106,6 +121,8 @@ class Scene:
         self.angle = angle
         self.goal = None if goal is None else _in_scene("goal", goal, (2,))
         self.points = None if points is None else _in_scene("points", points, (None, 2))
+        self.targets = [(x, y) for x, y in targets]
+        self.walls = [((x, y), _in_scene("walls", wall, (4,))) for (x, y), wall in walls]
 
 
 def _in_scene(name: str, value: object, shape: tuple[int | None, ...]) -> FloatArray:

@@ -23,9 +23,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgba
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, Polygon
 from matplotlib.ticker import MaxNLocator
 
 from holdfast.config.loader import Configuration
@@ -38,6 +38,7 @@ from holdfast.problems.attributes import choice_labels, circular_states, state_l
 from holdfast.problems.problem import Problem, Scene
 from holdfast.reports.facts import SCORES
 from holdfast.reports.recorder import TrialRecord
+from holdfast.reports.scene_drawing import obstacles_within, outline, shown_part, walls_at
 from holdfast.robot.trial import SensingStep
 from holdfast.runtime.files import write_atomically
 
@@ -49,6 +50,7 @@ _OBSTACLE = "#C9CDD2"
 _OBSTACLE_EDGE = "#8A9099"
 _BODY = "#4A4F57"
 _GOAL = "#1E8A4C"
+_TARGET = "#C2571A"
 _ESTIMATED: Any = {"color": _BELIEF, "linestyle": (0, (4, 1.5))}
 
 # Ordered so that neighbours differ in lightness, too.
@@ -63,12 +65,7 @@ _OUTCOMES: dict[Outcome, str] = {
 
 _NUM_BODIES = 9
 _NUM_CLOUDS = 4
-_DISC_CORNERS = 48
-_NARROWEST, _WIDEST = 1.0, 1.35
 _HIGHEST_WORKSPACE = 8.0
-_ROOM_FOR_A_MARK = 0.02
-"""From its centre to the end of the drawn part, by the size of that."""
-
 _MAX_MARKS = 120
 """With more sensing steps than this, marks on the paths would hide them; the strip has them all."""
 
@@ -139,8 +136,9 @@ def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) 
                 2, 2, width_ratios=(1.08, 1.0), height_ratios=(filled, max(1.0 - filled, 1e-3))
             )
             left, right = figure.add_subfigure(grid[0, 0]), figure.add_subfigure(grid[:, 1])
-            _draw_workspace(left.subplots(), problem, scene, record)
-            _draw_workspace_legend(left, problem, scene, record)
+            panel = left.subplots()
+            _draw_workspace(panel, problem, scene, record)
+            _draw_workspace_legend(panel, scene, record)
         else:
             right = figure.add_subfigure(figure.add_gridspec(1, 1)[0, 0])
         panels = right.subplots(num_panels, 1, sharex=True, height_ratios=ratios)
@@ -213,19 +211,26 @@ def _draw_workspace(panel: Axes, problem: Problem, scene: Scene, record: TrialRe
         spine.set_visible(True)
 
     _draw_obstacles(panel, scene)
-    _draw_clouds(panel, record.sensing, axes)
+    for target in scene.targets:
+        _draw_clouds(panel, record.sensing, target, _TARGET)
+    _draw_clouds(panel, record.sensing, scene.axes, _BELIEF)
     estimates = _stacked(record.estimates, problem.state_size)
     truth = _stacked(record.true_states, problem.state_size)
     way = truth if len(truth) else estimates
     outlines = _outlines(scene, way)
-    x_min, y_min, x_max, y_max = _shown_part(scene, [estimates[:, axes], truth[:, axes], *outlines])
+    happened = [states[:, each] for states in (estimates, truth) for each in (axes, *scene.targets)]
+    x_min, y_min, x_max, y_max = shown_part(scene, [*happened, *outlines])
     panel.set_xlim(x_min, x_max)
     panel.set_ylim(y_min, y_max)
     _draw_bodies(panel, outlines)
-    if len(estimates):
-        panel.plot(*estimates[:, axes].T, **_ESTIMATED, linewidth=1.3)
-    if len(truth):
-        panel.plot(*truth[:, axes].T, color=_TRUE, linewidth=1.3)
+    for states, look in ((estimates, _ESTIMATED), (truth, {"color": _TRUE, "linestyle": "-"})):
+        for wall in walls_at(scene, states[-1]) if len(states) else ():
+            panel.add_patch(Polygon(_corners(wall), fill=False, linewidth=1.3, zorder=2, **look))
+        for x, y in scene.targets if len(states) else ():
+            panel.plot(*states[:, [x, y]].T, **{**look, "color": _TARGET}, linewidth=1.1)
+            panel.plot(*states[-1, [x, y]], "h", color=_TARGET, markeredgecolor="white", zorder=5)
+        if len(states):
+            panel.plot(*states[:, axes].T, **look, linewidth=1.3)
     for sensing in record.sensing if len(record.sensing) <= _MAX_MARKS else ():
         x, y = way[sensing.before.step, axes]
         _scatter_chosen(panel, x, y, sensing.sensing_action, record)
@@ -240,57 +245,8 @@ def _draw_workspace(panel: Axes, problem: Problem, scene: Scene, record: TrialRe
         panel.scatter(x, y, s=150, marker="*", color=_GOAL, edgecolor="white", zorder=5)
 
 
-def _shown_part(scene: Scene, points: Sequence[FloatArray]) -> FloatArray:
-    """Return the part of the plane that has all marks and all that happened within the limits."""
-    limits = _limits(scene)
-    low, high = limits[:2], limits[2:]
-    happened = np.concatenate([*points, _marks(scene)])
-    if not len(happened):
-        return limits
-    margin = 0.12 * (happened.max(axis=0) - happened.min(axis=0)).max()
-    lower = np.clip(happened.min(axis=0) - margin, low, high)
-    upper = np.clip(happened.max(axis=0) + margin, low, high)
-    # A flat part is made higher and a narrow one wider, to fill the space that there is.
-    width, height = upper - lower
-    for axis, missing in ((1, width / _WIDEST - height), (0, height * _NARROWEST - width)):
-        if missing > 0.0:
-            lower[axis] = max(lower[axis] - 0.5 * missing, low[axis])
-            upper[axis] = min(upper[axis] + 0.5 * missing, high[axis])
-    return np.concatenate([lower, upper]) if np.all(upper > lower) else limits
-
-
-def _marks(scene: Scene) -> FloatArray:
-    """Return the goal and the places of interest, shape ``(m, 2)``."""
-    places = [each for each in (scene.goal, scene.points) if each is not None]
-    return np.concatenate([np.empty((0, 2)), *(each.reshape(-1, 2) for each in places)])
-
-
-def _limits(scene: Scene) -> FloatArray:
-    """Return the scene's limits, made wider where a mark lies on them or beyond."""
-    limits = np.array(scene.limits, dtype=np.float64)
-    low, high = limits[:2], limits[2:]
-    marks = _marks(scene)
-    if len(marks):
-        low, high = np.minimum(low, marks.min(axis=0)), np.maximum(high, marks.max(axis=0))
-        room = _ROOM_FOR_A_MARK * (high - low).max()
-        low = np.minimum(low, marks.min(axis=0) - room)
-        high = np.maximum(high, marks.max(axis=0) + room)
-    return np.concatenate([low, high])
-
-
 def _draw_obstacles(panel: Axes, scene: Scene) -> None:
-    # Cut to a little more than what is shown: some obstacles reach to the end of the world.
-    x_min, y_min, x_max, y_max = _limits(scene)
-    reach = 0.05 * max(x_max - x_min, y_max - y_min)
-    low = np.array([x_min - reach, y_min - reach])
-    high = np.array([x_max + reach, y_max + reach])
-    lower = np.clip(scene.obstacles[:, :2], low, high)
-    upper = np.clip(scene.obstacles[:, 2:], low, high)
-    rectangles = [
-        [(left, bottom), (right, bottom), (right, top), (left, top)]
-        for (left, bottom), (right, top) in zip(lower, upper, strict=True)
-        if right > left and top > bottom
-    ]
+    rectangles = [_corners(each) for each in obstacles_within(scene)]
     # The faces are drawn over the edges, so that touching rectangles look like one.
     for width, face in ((1.4, "none"), (0.0, _OBSTACLE)):
         drawn = PolyCollection(
@@ -299,7 +255,9 @@ def _draw_obstacles(panel: Axes, scene: Scene) -> None:
         panel.add_collection(drawn, autolim=False)
 
 
-def _draw_clouds(panel: Axes, sensing: Sequence[SensingStep], axes: list[int]) -> None:
+def _draw_clouds(
+    panel: Axes, sensing: Sequence[SensingStep], axes: tuple[int, int], color: str
+) -> None:
     """Draw the particles of a few beliefs, the older the paler."""
     if not sensing:
         return
@@ -307,23 +265,19 @@ def _draw_clouds(panel: Axes, sensing: Sequence[SensingStep], axes: list[int]) -
     clouds: list[FloatArray] = [sensing[0].before.belief.states]
     clouds += [sensing[index].after.belief.states for index in chosen]
     for cloud, opacity in zip(clouds, np.linspace(0.3, 0.8, len(clouds)), strict=True):
-        x, y = cloud[:, axes].T
-        panel.scatter(x, y, s=9, color=_BELIEF, alpha=float(opacity), linewidth=0, zorder=2)
+        x, y = cloud[:, list(axes)].T
+        panel.scatter(x, y, s=9, color=color, alpha=float(opacity), linewidth=0, zorder=2)
 
 
 def _outlines(scene: Scene, way: FloatArray) -> list[FloatArray]:
     """Return the body's outlines at places spread evenly along the way, first and last included."""
     if scene.body is None or not len(way):
         return []
-    body = np.asarray(scene.body, dtype=np.float64)
-    if body.ndim == 0:
-        turn = np.linspace(0.0, 2.0 * np.pi, _DISC_CORNERS, endpoint=False)
-        body = body * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     places = way[:, list(scene.axes)]
     distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(places, axis=0).T))])
     wanted = np.linspace(0.0, distance[-1], _NUM_BODIES)
     indices = np.unique(np.append(np.searchsorted(distance, wanted[:-1]), len(way) - 1))
-    return [_outline(body, scene, way[index]) for index in indices]
+    return [outline(scene, way[index]) for index in indices]
 
 
 def _draw_bodies(panel: Axes, outlines: Sequence[FloatArray]) -> None:
@@ -338,17 +292,12 @@ def _draw_bodies(panel: Axes, outlines: Sequence[FloatArray]) -> None:
     panel.add_collection(lines, autolim=False)
 
 
-def _outline(body: FloatArray, scene: Scene, state: FloatArray) -> FloatArray:
-    angle = 0.0 if scene.angle is None else float(state[scene.angle])
-    cosine, sine = np.cos(angle), np.sin(angle)
-    x, y = body.T
-    turned = np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=1)
-    return np.asarray(turned + state[list(scene.axes)], dtype=np.float64)
+def _corners(rectangle: FloatArray) -> list[tuple[float, float]]:
+    left, bottom, right, top = rectangle.tolist()
+    return [(left, bottom), (right, bottom), (right, top), (left, top)]
 
 
-def _draw_workspace_legend(
-    figure: SubFigure, problem: Problem, scene: Scene, record: TrialRecord
-) -> None:
+def _draw_workspace_legend(panel: Axes, scene: Scene, record: TrialRecord) -> None:
     handles: list[Line2D | Patch] = []
     # Without a true path, the estimated one has the start, the bodies and the marks.
     of_estimate = "" if record.true_states else ", estimated"
@@ -367,20 +316,25 @@ def _draw_workspace_legend(
         handles.append(Line2D([], [], color=_BODY, linewidth=0.9, label=f"body{of_estimate}"))
     if len(scene.obstacles):
         handles.append(Patch(facecolor=_OBSTACLE, edgecolor=_OBSTACLE_EDGE, label="obstacle"))
-    handles += _action_handles(problem, record)
-    # Outside the axes, where the layout makes room for it however many rows it has. As many columns
-    # as are not cut off.
+    if scene.targets:
+        handles.append(_dot(_TARGET, "h", "target, and particles"))
+    if scene.walls:
+        handles.append(Patch(fill=False, **_ESTIMATED, label="wall, estimated at the end"))
+    if record.sensing:
+        handles.append(_dot(_style_of(0)[0], "o", "sensed; colours: rows on the right", size=5.5))
+    # Right beneath the axes, however high these are; as many columns as are not cut off.
     for columns in range(_MOST_COLUMNS, 0, -1):
-        legend = figure.legend(
+        legend = panel.legend(
             handles=handles,
-            loc="outside lower center",
+            loc="upper center",
+            bbox_to_anchor=(0.5, 0.0),
+            borderaxespad=4.5,
             ncols=columns,
             columnspacing=1.6,
             handletextpad=0.6,
         )
-        if columns == 1 or legend.get_window_extent().width <= _LEGEND_SHARE * figure.bbox.width:
+        if legend.get_window_extent().width <= _LEGEND_SHARE * panel.figure.bbox.width:
             return
-        legend.remove()
 
 
 def _choices(problem: Problem, record: TrialRecord) -> list[str]:
@@ -402,22 +356,6 @@ def _wrapped_choices(problem: Problem, record: TrialRecord) -> list[str]:
     choices = _choices(problem, record)
     width = _LABEL_WIDTH if len(choices) <= _FEW_CHOICES else _WIDE_LABEL
     return [fill(label, width) for label in choices]
-
-
-def _action_handles(problem: Problem, record: TrialRecord) -> list[Line2D]:
-    """Return a legend's entries for the actions that are drawn: chosen, or with an entropy."""
-    chosen = {sensing.sensing_action for sensing in record.sensing}
-    compared = any(sensing.sensing_info.entropies is not None for sensing in record.sensing)
-    handles = []
-    for action, name in enumerate(_choices(problem, record)):
-        if action in chosen:
-            is_sensed = action < len(problem.sensing_actions)
-            label = fill(f"sensed {name}", 30) if is_sensed else "did not sense"
-            handles.append(_dot(*_style_of(action), label, size=5.5))
-        elif compared:
-            label = fill(f"{name}, never sensed", 30)
-            handles.append(_dot(*_style_of(action), label, size=4.5, hollow=0.9))
-    return handles
 
 
 def _dot(color: str, marker: str, label: str, *, size: float = 6.0, hollow: float = 0.0) -> Line2D:
@@ -459,8 +397,6 @@ def _draw_coordinates(
         Line2D([], [], **_ESTIMATED, label="estimate"),
         Patch(facecolor=_BELIEF, alpha=0.22, label="± 2 standard deviations"),
     ]
-    if not all(sensing.observation_info.explained for sensing in record.sensing):
-        handles.append(_dot(_TRUE, "x", "far from every particle", size=7.0, hollow=1.0))
     above: Any = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": len(handles)}
     panels[0].legend(handles=handles, columnspacing=1.2, handletextpad=0.5, **above)
 
@@ -500,11 +436,32 @@ def _draw_choices(panel: Axes, problem: Problem, record: TrialRecord) -> None:
         x, y = zip(*unexplained, strict=True)
         size = 3.0 * _marker_size(record)
         panel.scatter(x, y, s=size, marker="x", color=_TRUE, linewidth=0.9, zorder=5)
+        _legend_above(panel, [_dot(_TRUE, "x", "far from every particle", hollow=1.0)])
     labels = _wrapped_choices(problem, record)
     size = 9.0 if max(map(len, labels), default=0) <= _LABEL_WIDTH else _SMALLEST
     panel.set_yticks(range(count), labels, fontsize=size)
+    panel.tick_params(axis="y", length=0, pad=14)
+    for action in range(count):
+        # The rows are the legend of the colours, which needs none for what was never chosen.
+        color, marker = _style_of(action)
+        look: Any = {"color": color, "marker": marker, "clip_on": False, "markersize": 5.0}
+        panel.plot(-0.022, action, transform=panel.get_yaxis_transform(), **look)
     panel.set_ylim(count - 0.4, -0.6)
     panel.set_ylabel("sensed")
+
+
+def _legend_above(panel: Axes, handles: list[Line2D]) -> None:
+    panel.legend(
+        handles=handles,
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        ncols=len(handles),
+        fontsize=_SMALLEST,
+        borderpad=0.1,
+        borderaxespad=0.1,
+        columnspacing=1.2,
+        handletextpad=0.3,
+    )
 
 
 def _draw_entropies(panel: Axes, configuration: Configuration, record: TrialRecord) -> None:
@@ -525,20 +482,11 @@ def _draw_entropies(panel: Axes, configuration: Configuration, record: TrialReco
     panel.vlines(
         steps, entropies.min(axis=1), entropies.max(axis=1), color="#B4B9C0", linewidth=0.8
     )
-    panel.legend(
-        handles=[
-            _dot(_BODY, "o", "chosen", size=4.5),
-            _dot(_BODY, "o", "not chosen (hollow)", size=3.5, hollow=0.7),
-        ],
-        loc="lower right",
-        bbox_to_anchor=(1.0, 1.0),
-        ncols=2,
-        fontsize=_SMALLEST,
-        borderpad=0.1,
-        borderaxespad=0.1,
-        columnspacing=1.2,
-        handletextpad=0.3,
-    )
+    chosen_or_not = [
+        _dot(_BODY, "o", "chosen", size=4.5),
+        _dot(_BODY, "o", "not chosen (hollow)", size=3.5, hollow=0.7),
+    ]
+    _legend_above(panel, chosen_or_not)
     for action in range(entropies.shape[1]):
         color, marker = _style_of(action)
         won = chosen == action

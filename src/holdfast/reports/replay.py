@@ -28,9 +28,7 @@ from holdfast.errors import (
 )
 from holdfast.journal.fingerprint import difference, fingerprint
 from holdfast.journal.journal_reader import JournalReader, UnfinishedTrial
-from holdfast.journal.run_clock import RunClock
-from holdfast.journal.run_directory import EVENTS_NAME, TIMINGS_NAME, recorded_configuration
-from holdfast.journal.timings import rows_by_trial
+from holdfast.journal.run_directory import recorded_configuration
 from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.planning.outcome import TaskDecision, TrialResult
@@ -50,8 +48,7 @@ from holdfast.reports.recorder import true_state
 from holdfast.reports.step_times import (
     StepClock,
     TrialTimes,
-    dated,
-    read_events,
+    read_times,
     trial_ends,
 )
 from holdfast.robot.environment import Environment
@@ -99,7 +96,6 @@ class RecordedRun:
         with contextlib.ExitStack() as stack:
             self._journal = stack.enter_context(JournalReader.read_run(run, purpose))
             path = self._journal.path
-            directory = path.parent
             self._meta = self._journal.meta()
             self.configuration, simulated = _configuration(
                 self._meta, path, purpose, problem_directory
@@ -113,21 +109,7 @@ class RecordedRun:
             if self.unfinished is not None:
                 trials.add(self.unfinished)
             self.trials = tuple(sorted(trials))
-            rows = rows_by_trial(directory / TIMINGS_NAME)
-            events = read_events(directory / EVENTS_NAME)
-            clock = RunClock(
-                [(event.stamp, event.time_ns) for event in events]
-                + [(row.stamp, row.time_ns) for each in rows.values() for row in each.values()]
-            )
-            self.clock_notes = clock.notes
-            self._rows = {
-                trial: {
-                    key: row._replace(time_ns=clock.time_ns(row.stamp, row.time_ns))
-                    for key, row in each.items()
-                }
-                for trial, each in rows.items()
-            }
-            self._events = dated(events, clock)
+            self._rows, self._events, self.clock_notes = read_times(path.parent)
             self._ends = trial_ends(self._events)
             # All facts have one clock: if one trial has no times, those of the others are of no
             # use. A trial in which nothing was decided needs none.

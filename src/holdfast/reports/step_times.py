@@ -15,7 +15,8 @@ import numpy as np
 
 from holdfast.errors import OutputError
 from holdfast.journal.run_clock import RunClock, Stamp
-from holdfast.journal.timings import TimingRow, nanoseconds
+from holdfast.journal.run_directory import EVENTS_NAME, TIMINGS_NAME
+from holdfast.journal.timings import TimingRow, nanoseconds, rows_by_trial
 from holdfast.numerics.arrays import IntArray
 from holdfast.reports.facts import Decider, EventFact
 from holdfast.runtime.files import bounded_lines
@@ -90,6 +91,35 @@ class StepClock:
         times = np.maximum.accumulate(np.maximum(times, floor) - ramp) + ramp
         self._last_ns = int(times[MOMENTS * steps])
         return np.asarray(times, dtype=np.int64)
+
+
+class RunTimes(NamedTuple):
+    """What a run has recorded of its times, on one clock: rows of decisions, by trial, and events.
+
+    ``notes`` say how the robot's wall clock was set meanwhile.
+    """
+
+    rows: dict[int, dict[tuple[int, str], TimingRow]]
+    events: list[EventFact]
+    notes: tuple[str, ...]
+
+
+def read_times(directory: Path) -> RunTimes:
+    """Return what the directory of a run has of times; OutputError if it cannot be read."""
+    rows = rows_by_trial(directory / TIMINGS_NAME)
+    events = read_events(directory / EVENTS_NAME)
+    clock = RunClock(
+        [(event.stamp, event.time_ns) for event in events]
+        + [(row.stamp, row.time_ns) for each in rows.values() for row in each.values()]
+    )
+    on_clock = {
+        trial: {
+            key: row._replace(time_ns=clock.time_ns(row.stamp, row.time_ns))
+            for key, row in each.items()
+        }
+        for trial, each in rows.items()
+    }
+    return RunTimes(on_clock, dated(events, clock), clock.notes)
 
 
 def read_events(path: Path) -> list[EventFact]:

@@ -24,7 +24,6 @@ pay for their own start. Each worker holds trials for a tenth of a second, at mo
 from __future__ import annotations
 
 import multiprocessing
-import os
 import pickle
 import traceback
 from collections import deque
@@ -52,6 +51,7 @@ from holdfast.planning.settings import LostSettings, PlanningSettings
 from holdfast.problems.problem import Problem
 from holdfast.robot.trial import NULL_OBSERVER, TrialObserver, run_trial
 from holdfast.runtime.command_line import MAX_JOBS
+from holdfast.runtime.machine import available_cores
 from holdfast.runtime.ray_workers import RayCluster, RayProcess
 from holdfast.runtime.workers import WorkerProcess, end_workers
 
@@ -323,11 +323,6 @@ class TrialPool:
         error.arm, error.trial = arm, trial
         error.how, error.killed, error.overdue = how, killed, overdue
         raise error
-
-
-def available_cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @dataclass

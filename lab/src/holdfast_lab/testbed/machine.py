@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import platform
 import re
 import subprocess
 from datetime import UTC, datetime
 from pathlib import Path
 
-import numpy as np
-
 import holdfast
 from holdfast import __version__, _kernel
 from holdfast.config.source_digest import machines
-from holdfast.robot.trials import available_cores
+from holdfast.runtime.machine import machine_of_here
 
 __all__ = ["commit", "describe", "kernel_hash"]
 
@@ -27,14 +23,8 @@ _SOURCES = ("src", "cpp", "cmake", "CMakeLists.txt")
 def describe() -> dict[str, str]:
     """Return the machine and the software, by name."""
     return {
-        "processor": _processor(),
-        "cores": f"{available_cores()} of {os.cpu_count()} usable",
-        "memory": _memory(),
-        "system": f"{platform.system()} {_major_version(platform.release())}, {platform.machine()}",
-        "Python": f"{platform.python_implementation()} {platform.python_version()}",
-        "NumPy": np.__version__,
+        **machine_of_here(),
         "compiler of the kernel": _compiler(),
-        "instruction set": _kernel.simd(),
         "state machines": machines(),
         "holdfast": f"{__version__}, {commit()}",
         "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
@@ -49,26 +39,6 @@ def kernel_hash() -> str:
 def _kernel_bytes() -> bytes:
     path = _kernel.__file__
     return Path(path).read_bytes() if path else b""
-
-
-def _processor() -> str:
-    try:
-        content = Path("/proc/cpuinfo").read_text()
-    except OSError:
-        return platform.processor() or "unknown"
-    fields: dict[str, str] = dict(re.findall(r"^([\w ]+?)\s*: (.*)$", content, re.MULTILINE))
-    name = fields.get("model name", platform.machine())
-    if {"cpu family", "model"} <= fields.keys():
-        name += f" (family {fields['cpu family']}, model {fields['model']})"
-    return name
-
-
-def _memory() -> str:
-    try:
-        size = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (ValueError, OSError):
-        return "unknown"
-    return f"{size / 2**30:.1f} GiB"
 
 
 def _compiler() -> str:
@@ -99,7 +69,3 @@ def commit() -> str:
     except (OSError, subprocess.SubprocessError):
         return "commit unknown"
     return f"commit {name}" + (" with uncommitted changes" if changed else "")
-
-
-def _major_version(release: str) -> str:
-    return ".".join(release.split(".")[:2])
