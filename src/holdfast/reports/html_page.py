@@ -22,7 +22,7 @@ from typing import Any, TypeAlias
 
 import msgspec
 
-from holdfast.errors import HoldfastError, OutputError
+from holdfast.errors import HoldfastError, OutputError, how_to_install
 from holdfast.printable import printable
 
 __all__ = ["MAX_BYTES", "Chart", "HtmlPage", "chart_part", "require_vega"]
@@ -42,7 +42,8 @@ def require_vega() -> None:
     try:
         import vl_convert  # noqa: F401
     except ImportError as error:
-        raise HoldfastError("a report needs vl-convert: pip install 'holdfast[report]'") from error
+        advice = how_to_install("vl-convert-python", "report")
+        raise HoldfastError(f"a report needs vl-convert: {advice}") from error
 
 
 @functools.cache
