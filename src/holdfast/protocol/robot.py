@@ -54,9 +54,6 @@ from holdfast.protocol.records import (
 )
 from holdfast.protocol.status import Status
 
-_FROM_ENVIRONMENT = (Sensed, Acted, EnvironmentFailed)
-"""Events that complete an order to the environment."""
-
 _TICKS_INTERVAL_S = 1.0
 """Missed ticks are reported at most this often."""
 
@@ -230,7 +227,7 @@ class Robot:
         now: float,
     ) -> list[RobotEffect]:
         """Handle an event."""
-        if isinstance(event, _FROM_ENVIRONMENT):
+        if isinstance(event, Sensed | Acted | EnvironmentFailed):
             # Between trials, or after a stop, whatever comes late is of no use.
             if self._history is not None and self._awaits_environment and not self._stopped:
                 self._awaits_environment = False
