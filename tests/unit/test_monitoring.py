@@ -19,11 +19,11 @@ from holdfast.service.options import http_address
 PATIENCE_S = 30.0
 
 
-async def ready() -> Page:
+def ready() -> Page:
     return Page.of(None)
 
 
-async def draining() -> Page:
+def draining() -> Page:
     return Page.of("draining")
 
 

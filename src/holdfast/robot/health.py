@@ -68,23 +68,20 @@ class RobotWatch:
     async def _offer(self, condition: Callable[[], Condition], robot: Robot) -> None:
         from holdfast.runtime.monitoring import MonitoringServers, Page
 
-        async def alive() -> Page:
-            return Page.of(None)
-
-        async def ready() -> Page:
+        def ready() -> Page:
             now = condition()
             return Page(200 if now.is_deciding else 503, f"{now.word}\n".encode())
 
         offered: dict[str, tuple[HttpAddress, Pages]] = {}
         if self._health is not None:
-            offered["health"] = self._health, {"/livez": alive, "/readyz": ready}
+            offered["health"] = self._health, {"/livez": lambda: Page.of(None), "/readyz": ready}
         if self._metrics_address is not None:
             from holdfast.robot.metrics import RobotMetrics
             from holdfast.runtime.exposition import CONTENT_TYPE
 
             self._metrics = counted = RobotMetrics()
 
-            async def metrics() -> Page:
+            def metrics() -> Page:
                 text = counted.text(robot, is_deciding=condition().is_deciding)
                 return Page(200, text, CONTENT_TYPE)
 

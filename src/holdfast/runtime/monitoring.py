@@ -13,7 +13,7 @@ import asyncio
 import errno
 import functools
 import socket
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 from holdfast.errors import HealthError
@@ -55,7 +55,7 @@ class Page(NamedTuple):
         return cls(200 if trouble is None else 503, f"{trouble or 'ok'}\n".encode())
 
 
-Pages: TypeAlias = Mapping[str, Callable[[], Awaitable[Page]]]
+Pages: TypeAlias = Mapping[str, Callable[[], Page]]
 """A function for each path."""
 
 
@@ -75,7 +75,7 @@ class MonitoringServers:
         HealthError
             If it cannot listen at an address; the message names it.
         """
-        pages: dict[HttpAddress, dict[str, Callable[[], Awaitable[Page]]]] = {}
+        pages: dict[HttpAddress, dict[str, Callable[[], Page]]] = {}
         for address, own in offered.values():
             pages.setdefault(address, {}).update(own)
         found = {address: await self._listen(address, own) for address, own in pages.items()}
@@ -150,7 +150,7 @@ async def _response(reader: asyncio.StreamReader, pages: Pages) -> bytes:
         elif words[0] not in (b"GET", b"HEAD"):
             page = Page(405, b"GET and HEAD are answered\n")
         elif make := pages.get(words[1].partition(b"?")[0].decode("latin-1")):
-            page = await make()
+            page = make()
         else:
             page = Page(404, f"there are {', '.join(sorted(pages))}\n".encode())
     told = (

@@ -422,22 +422,22 @@ async def _watched(
         return
     from holdfast.runtime.monitoring import MonitoringServers, Page
 
-    async def alive() -> Page:
-        return Page.of(why_not_alive())
-
-    async def ready() -> Page:
-        return Page.of(why_not_ready())
-
     offered: dict[str, tuple[HttpAddress, Pages]] = {}
     if options.health is not None:
-        offered["health"] = options.health, {"/livez": alive, "/readyz": ready}
+        offered["health"] = (
+            options.health,
+            {
+                "/livez": lambda: Page.of(why_not_alive()),
+                "/readyz": lambda: Page.of(why_not_ready()),
+            },
+        )
     if options.metrics is not None:
         from holdfast.runtime.exposition import CONTENT_TYPE, require_prometheus
         from holdfast.service.metrics import service_exposition
 
         require_prometheus()
 
-        async def metrics() -> Page:
+        def metrics() -> Page:
             is_ready = why_not_ready() is None
             text = service_exposition(options.name, report(), processes(), is_ready=is_ready)
             return Page(200, text, CONTENT_TYPE)
