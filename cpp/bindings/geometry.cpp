@@ -219,27 +219,29 @@ bool roll_out_batch(
     return true;
 }
 
-nb::tuple beliefs_without_truth_batch(
+/// The means and the particles drawn, or None if a posterior gives its true state no weight.
+nb::object beliefs_without_truth_batch(
     InPlace<double, 3> weights, const Input<2>& states,
     const nb::ndarray<const std::int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>& truths,
-    const Input<2>& at, double negligible) {
+    const StreamWords& stream, std::size_t members, double negligible) {
     const std::size_t actions = weights.shape(0), samples = weights.shape(1),
-                      count = weights.shape(2), dimension = states.shape(1), members = at.shape(1);
-    require(states.shape(0) == count && truths.shape(0) == samples && at.shape(0) == samples,
-            "shapes differ");
+                      count = weights.shape(2), dimension = states.shape(1);
+    require(states.shape(0) == count && truths.shape(0) == samples, "shapes differ");
     for (std::size_t i = 0; i < samples; ++i) {
         const std::int64_t truth = truths.data()[i];
         require(truth >= 0 && static_cast<std::size_t>(truth) < count, "there is no such particle");
     }
-    double* means;
-    std::int64_t* drawn;
+    double *means, *drawn;
     auto estimates = make_array<double>({actions, samples, dimension}, means);
-    auto clouds = make_array<std::int64_t>({actions, samples, members}, drawn);
+    auto clouds = make_array<double>({actions, samples, members, dimension}, drawn);
+    bool likely;
     {
         WithoutInterpreter released;
-        beliefs_without_truth(actions, samples, count, dimension, members, states.data(),
-                              truths.data(), at.data(), negligible, weights.data(), means, drawn);
+        likely = beliefs_without_truth(actions, samples, count, dimension, members, states.data(),
+                                       truths.data(), to_stream(stream), negligible, weights.data(),
+                                       means, drawn);
     }
+    if (!likely) return nb::none();
     return nb::make_tuple(estimates, clouds);
 }
 
