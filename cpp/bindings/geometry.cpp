@@ -98,9 +98,8 @@ bool collides_batch(const World& world, const Input<2>& states, InPlace<bool, 1>
     require(states.shape(1) == World::dimension && result.shape(0) == count, "shapes differ");
     const double* state = states.data();
     if (!all_finite(state, count * World::dimension)) return false;
-    bool* out = result.data();
     ReleaseForLongWork release(count, world.num_obstacles());
-    for (std::size_t n = 0; n < count; ++n) out[n] = world.collides(state + n * World::dimension);
+    world.collide_each(state, count, reinterpret_cast<std::uint8_t*>(result.data()));
     return true;
 }
 

@@ -84,7 +84,8 @@ class Samples {
             if (step > 0 && step % input_.interval == 0) sense(step / input_.interval);
             std::erase_if(active_, [&](std::size_t i) {
                 const auto own = robots_.begin() + static_cast<std::ptrdiff_t>(i * input_.actions);
-                return std::none_of(own, own + static_cast<std::ptrdiff_t>(input_.actions), goes_on);
+                return std::none_of(own, own + static_cast<std::ptrdiff_t>(input_.actions),
+                                    goes_on);
             });
             if (active_.empty() || factor_ == 0.0) return;
             act(streams_[step]);
@@ -256,14 +257,22 @@ class Samples {
         policy_.executed(believed.data(), robot.stage, robot.action.data());
         const std::size_t own = robot.sample * particles_;
         for (std::size_t l = 0; l < input_.members; ++l) {
-            movers_.push_back({&clouds_[r * input_.members + l], &robot.action, own + 1 + l});
+            add_mover(clouds_[r * input_.members + l], robot.action, own + 1 + l);
         }
         robot.before = robot.state;
         // The same action in the same state, and the same noise.
         robot.alike = alike_of(robot, [&](const Robot& other) {
             return other.before == robot.before && other.action == robot.action;
         });
-        if (robot.alike == nullptr) movers_.push_back({&robot.state, &robot.action, own});
+        if (robot.alike == nullptr) add_mover(robot.state, robot.action, own);
+    }
+
+    // In place: what is copied right after it was written makes the processor wait.
+    void add_mover(State& state, const State& action, std::size_t noise) {
+        Mover& own = movers_.emplace_back();
+        own.state = &state;
+        own.action = &action;
+        own.noise = noise;
     }
 
     double reward(const State& state, const State& action) const {
@@ -299,28 +308,21 @@ class Samples {
                 const double fraction = 0.5 * (own.reached + own.blocked);
                 const bool ends = own.blocked - own.reached <= input_.tolerance ||
                                   fraction <= own.reached || fraction >= own.blocked;
-                candidates_.push_back(along(own, ends ? own.reached : fraction));
-                if (!ends) return true;
-                own.next = candidates_.back();
-                candidates_.pop_back();
-                return false;
+                go(own, ends ? own.reached : fraction,
+                   ends ? own.next : candidates_.emplace_back());
+                return !ends;
             });
             if (pending_.empty()) return;
             test_candidates();
             keep_pending([&](std::size_t p, Mover& own) {
-                (collides_[p] != 0 ? own.blocked : own.reached) =
-                    0.5 * (own.reached + own.blocked);
+                (collides_[p] != 0 ? own.blocked : own.reached) = 0.5 * (own.reached + own.blocked);
                 return true;
             });
         }
     }
 
-    static State along(const Mover& own, double fraction) {
-        State state;
-        for (std::size_t c = 0; c < d; ++c) {
-            state[c] = (*own.state)[c] + fraction * (*own.action)[c];
-        }
-        return state;
+    static void go(const Mover& own, double fraction, State& to) {
+        for (std::size_t c = 0; c < d; ++c) to[c] = (*own.state)[c] + fraction * (*own.action)[c];
     }
 
     // Adds noise that leads to no collision. Attempts after the first are rare.
@@ -422,9 +424,9 @@ class Samples {
     const std::vector<StepStreams>& streams_;
     std::size_t first_, particles_;  // the first sample; particles with noise of their own in each
     bool noisy_;
-    std::vector<std::size_t> active_;  // samples, from 0
-    std::vector<Robot> robots_;        // [sample][action]
-    std::vector<State> clouds_;        // [sample][action][member]
+    std::vector<std::size_t> active_;             // samples, from 0
+    std::vector<Robot> robots_;                   // [sample][action]
+    std::vector<State> clouds_;                   // [sample][action][member]
     std::vector<std::vector<State>> noise_;       // [sample][particle][attempt]
     std::vector<std::vector<State>> free_noise_;  // [sample][step]
     std::vector<Mover> movers_;
@@ -459,8 +461,7 @@ void roll_out(const World& world, const Policy& policy, const RolloutInput& inpu
     const double work = nanoseconds_of_a_move * static_cast<double>(moves);
     const std::size_t most = (input.samples + least_samples - 1) / least_samples;
     const auto wanted = static_cast<std::size_t>(threads_for(work, most, threads));
-    const std::size_t size =
-        std::min((input.samples + wanted - 1) / wanted, most_samples);
+    const std::size_t size = std::min((input.samples + wanted - 1) / wanted, most_samples);
     parallel_for((input.samples + size - 1) / size, static_cast<int>(wanted), [&](std::size_t i) {
         const std::size_t begin = i * size, count = std::min(size, input.samples - begin);
         Samples<World, Policy>(world, policy, input, streams, begin, count, returns).run();
@@ -496,15 +497,14 @@ bool beliefs_without_truth(std::size_t actions, std::size_t samples, std::size_t
         std::size_t n = 0, last = 0;
         double cumulated = 0.0;
         for (std::size_t l = 0; l < members_each; ++l) {
-            const double place = (static_cast<double>(l) + at[row % samples]) /
-                                 static_cast<double>(members_each);
+            const double place =
+                (static_cast<double>(l) + at[row % samples]) / static_cast<double>(members_each);
             while (n < count && cumulated + own[n] <= place) {
                 if (own[n] > 0.0) last = n;
                 cumulated += own[n++];
             }
             const double* member = states + (n < count ? n : last) * dimension;
-            std::copy(member, member + dimension,
-                      clouds + (row * members_each + l) * dimension);
+            std::copy(member, member + dimension, clouds + (row * members_each + l) * dimension);
         }
     }
     return true;

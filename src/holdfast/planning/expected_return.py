@@ -122,16 +122,14 @@ def expected_returns(
         stream = hypotheses if not rounds else hypotheses.substream(_ROUNDS).substream(len(rounds))
         truths, weights = posteriors(contenders, size, stream)
         begun = _after_sensing(problem, settings, belief, truths, weights, stream)
-        returns = roll_out(*begun, stage, stream.substream(_MOTION))
-        returns = returns - costs[contenders, np.newaxis]
+        returns = roll_out(*begun, stage, stream.substream(_MOTION)) - costs[contenders, np.newaxis]
         if not numerics.all_finite(returns):
             raise ProblemError(
                 f"the rewards of {problem.name} add up to more than a number can hold in "
                 f"{settings.selector.rollout_steps} steps of expected_return"
             )
-        found = np.full((count, size), np.nan)
-        found[contenders] = returns
-        rounds.append(found)
+        rounds.append(np.full((count, size), np.nan))
+        rounds[-1][contenders] = returns
         drawn += size
         samples = np.concatenate(rounds, axis=1)
         contenders = _contenders(samples, contenders)
@@ -153,9 +151,8 @@ def _after_sensing(
     The shapes are those of :func:`rollout_returns`.
     """
     kind, circular = settings.particle_filter.estimate, circular_states(problem)
-    states = belief.states
+    states, words = belief.states, stream.substream(_CLOUDS).words
     members = _KERNEL_CLOUD if has_own_rollouts(problem) else _CLOUD
-    words = stream.substream(_CLOUDS).words
     found = _kernel.beliefs_without_truth(weights, states, truths, words, members, _NEGLIGIBLE)
     if found is None:
         raise ProblemError(
@@ -422,16 +419,12 @@ def _contenders(samples: FloatArray, among: Sequence[int]) -> list[int]:
     best = max(among, key=lambda j: means[j])
     close = []
     for j in among:
-        differences = samples[best] - samples[j]
-        mean = means[best] - means[j]
+        differences, mean = samples[best] - samples[j], means[best] - means[j]
+        away = differences - mean
+        squared_error = numerics.sum(away * away) / (count * (count - 1))
         # More samples of equal returns are equal, too.
-        if j == best:
+        if j == best or (differences.any() and mean * mean < _CLOSE * _CLOSE * squared_error):
             close.append(j)
-        elif differences.any():
-            away = differences - mean
-            squared_error = numerics.sum(away * away) / (count * (count - 1))
-            if mean * mean < _CLOSE * _CLOSE * squared_error:
-                close.append(j)
     return close
 
 

@@ -163,8 +163,7 @@ def choose_sensing_action(
     points = sets.reshape(-1, sets.shape[-1])
     threads = settings.active_sensing.num_cores
     size = settings.active_sensing.num_observation_samples
-    every = range(count)
-    hypothetical = _hypotheses_of(problem, belief, every)(every, size, hypotheses)
+    hypothetical = _hypotheses_of(problem, belief)(range(count), size, hypotheses)
     entropies, samples, likelihoods, visits = hypothetical.entropies(
         scaled(points, estimator), estimator, threads, factors, selector.sensing_is_optional
     )
@@ -240,7 +239,7 @@ def _greatest_return(
 ) -> tuple[int, SensingInfo]:
     likelihoods = 0
     not_sensing = len(problem.sensing_actions)
-    hypotheses_of = _hypotheses_of(problem, belief, range(not_sensing))
+    hypotheses_of = _hypotheses_of(problem, belief)
 
     def posteriors(
         actions: Sequence[int], samples: int, stream: Stream
@@ -418,14 +417,12 @@ class _GeneralHypotheses(NamedTuple):
 
 
 def _hypotheses_of(
-    problem: Problem, belief: Belief, every: Sequence[int]
+    problem: Problem, belief: Belief
 ) -> Callable[[Sequence[int], int, Stream], _GaussianHypotheses | _GeneralHypotheses]:
-    """Return what draws hypothetical observations of some sensing actions, so many of each.
-
-    What the problem predicts is asked once, for ``every`` sensing action.
-    """
+    """Return what draws hypothetical observations of some sensing actions, so many of each."""
     if has_general_observations(problem):
         return functools.partial(_general_hypotheses, problem, belief)
+    every = range(len(problem.sensing_actions))
     sizes, predicted, variances = checked.predictions(problem, belief.states, every)
     angles: list[int] = []
     if has_circular_observations(problem):
@@ -439,9 +436,9 @@ def _hypotheses_of(
             ends = np.cumsum(sizes)
             rows = [row for j in actions for row in range(ends[j] - sizes[j], ends[j])]
             own_angles = [angles[row] for row in rows] if angles else angles
-            chosen, means, own_variances = [sizes[j] for j in actions], predicted[rows], variances
             if variances.shape[1] == 1:
-                own_variances = variances[rows]
+                chosen = [sizes[j] for j in actions]
+                means, own_variances = predicted[rows], variances[rows]
             else:  # Alone, some may have variances that do not depend on the state: other bits.
                 chosen, means, own_variances = checked.predictions(problem, belief.states, actions)
         return _GaussianHypotheses(
