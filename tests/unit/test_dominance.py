@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -29,15 +31,12 @@ class Sensors(ProblemBase):
         self.motion_variance = np.full(size, 1e-3)
 
     def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray:
-        coordinate, _ = self.shown[sensing_action]
-        return states[..., coordinate : coordinate + 1]
+        return states[..., [self.shown[sensing_action][0]]]
 
     def observation_variance(self, states: FloatArray, sensing_action: int) -> FloatArray:
-        del states
         return np.array([self.shown[sensing_action][1] ** 2])
 
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
-        del stage
         return -states[..., :-1]
 
 
@@ -83,11 +82,7 @@ def test_no_dull_and_no_useless_sensor_wins(size: int) -> None:
     ],
 )
 def test_dominated(
-    sizes: list[int],
-    means: list[FloatArray],
-    variances: list[float],
-    prices: FloatArray,
-    expected: list[int],
+    sizes: list[int], means: Any, variances: Any, prices: FloatArray, expected: list[int]
 ) -> None:
     spread = np.array(variances).reshape(sum(sizes), -1)
-    assert dominated(sizes, np.array(means), spread, prices).tolist() == [bool(i) for i in expected]
+    assert dominated(sizes, np.array(means), spread, prices).astype(int).tolist() == expected

@@ -26,18 +26,11 @@ def dominated(
 ) -> BoolArray:
     """Return which of J sensing actions another one dominates that is no dearer, shape (J,).
 
-    Each coordinate of the worse observation is a coordinate of the better one, in all particles
-    scaled and shifted alike, with noise added; together they are fewer, or one of them is noisier.
-
-    Parameters
-    ----------
-    sizes, means, variances
-        Sizes of the J observations, D in all; their means, shape (D, N), and variances, (D, N) or
-        (D, 1), as :func:`holdfast.problems.checked.predictions` has them.
-    prices : array of shape (J,)
+    Each coordinate of the worse observation is one of the better one, in all particles scaled and
+    shifted alike, with noise added; they are fewer, or noisier. ``sizes``, ``means`` and
+    ``variances`` are what :func:`holdfast.problems.checked.predictions` returns.
     """
-    ends = np.cumsum(sizes).tolist()
-    rows = [range(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+    rows = [range(end - size, end) for end, size in zip(np.cumsum(sizes), sizes, strict=True)]
     # Three particles rule out nearly all pairs.
     some = means[:, [0, means.shape[1] // 2, -1]]
     one, two = (some[:, 1:] - some[:, :1]).T
@@ -59,12 +52,9 @@ def dominated(
                 return False
         return noisier or bool(left)
 
-    return np.array(
-        [
-            any(makes(j, i) for j in range(len(sizes)) if j != i and prices[j] <= prices[i])
-            for i in range(len(sizes))
-        ]
-    )
+    every = range(len(sizes))
+    no_dearer = [[j for j in every if j != i and prices[j] <= prices[i]] for i in every]
+    return np.array([any(makes(j, i) for j in no_dearer[i]) for i in every])
 
 
 def _added_variance(means: FloatArray, variances: FloatArray) -> float:

@@ -29,7 +29,7 @@ import numpy as np
 from holdfast import _kernel
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.numerics import reproducible as numerics
-from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray, in_brief
+from holdfast.numerics.arrays import FloatArray, IntArray, in_brief
 from holdfast.numerics.circular import embedded, unwrapped
 from holdfast.numerics.randomness import Stream, Words
 from holdfast.planning import interruption
@@ -180,9 +180,15 @@ def choose_sensing_action(
         entropies = _row_means(samples)
     prices = _prices(problem, settings)
     scores = entropies if prices is None else entropies + prices
-    if selector.estimator == "prior_neighbors_undominated":
-        worse = hypothetical.dominated(prices)
-        scores = np.where(np.append(worse, [False] * (choices - count)), np.inf, scores)
+    if selector.estimator == "prior_neighbors_undominated" and isinstance(
+        hypothetical, _GaussianHypotheses
+    ):
+        _, sizes, means, variances, _, _, angles = hypothetical.arguments
+        if not any(angles):
+            worse = dominated(
+                sizes, means, variances, np.zeros(count) if prices is None else prices
+            )
+            scores = np.where(np.append(worse, [False] * (choices - count)), np.inf, scores)
     index = _least(scores, optional=selector.sensing_is_optional)
     if entropies[index] != entropies[index]:
         raise ProblemError(
@@ -378,13 +384,6 @@ class _GaussianHypotheses(NamedTuple):
         _, sizes, _, _, samples, _, _ = self.arguments
         return weights.reshape(len(sizes), samples, -1)
 
-    def dominated(self, prices: FloatArray | None) -> BoolArray:
-        """Return which sensing actions another one dominates; none where there are angles."""
-        _, sizes, means, variances, _, _, angles = self.arguments
-        prices = np.zeros(len(sizes)) if prices is None else prices
-        none = np.zeros(len(sizes), dtype=np.bool_)
-        return none if any(angles) else dominated(sizes, means, variances, prices)
-
 
 class _GeneralHypotheses(NamedTuple):
     """The same for a problem that gives ``log_likelihood`` and ``sample_observation``.
@@ -425,10 +424,6 @@ class _GeneralHypotheses(NamedTuple):
     def weights(self, drop_negligible: bool) -> FloatArray:
         rows = [_kernel.normalize(row, drop_negligible)[0] for row in self.log_weights]
         return np.array(rows).reshape(-1, self.samples, self.log_weights.shape[1])
-
-    def dominated(self, prices: FloatArray | None) -> BoolArray:
-        del prices
-        return np.zeros(len(self.log_weights) // self.samples, dtype=np.bool_)
 
 
 def _hypotheses_of(

@@ -107,7 +107,7 @@ Estimator = Literal[
     "gaussian_mixture_upper",
     "gaussian_mixture_lower",
 ]
-"""How an entropy is estimated: :mod:`holdfast.planning.estimators` has a class for each."""
+"""How an entropy is estimated: :mod:`holdfast.planning.estimators` has a class for each kind."""
 
 PRIOR_ESTIMATORS: frozenset[Estimator] = frozenset(
     {"prior_neighbors", "prior_neighbors_undominated"}
