@@ -199,6 +199,13 @@ void holdfast::bind_entropy(nb::module_& module) {
                return nb::make_tuple(means, result, counts.likelihoods, counts.visits);
            });
 
+    define(module, "stratified",
+           [](const Input<1>& weights, std::size_t samples, const StreamWords& stream) {
+               std::int64_t* out;
+               auto result = make_array<std::int64_t>({samples}, out);
+               stratified(weights.data(), weights.shape(0), samples, to_stream(stream), out);
+               return result;
+           });
     define(module, "hypothetical_weights",
            [](const Input<1>& weights, const std::vector<std::uint32_t>& sizes,
               const Input<2>& predicted, const Input<2>& variance, std::size_t samples,

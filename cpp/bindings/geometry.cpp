@@ -98,9 +98,8 @@ bool collides_batch(const World& world, const Input<2>& states, InPlace<bool, 1>
     require(states.shape(1) == World::dimension && result.shape(0) == count, "shapes differ");
     const double* state = states.data();
     if (!all_finite(state, count * World::dimension)) return false;
-    bool* out = result.data();
     ReleaseForLongWork release(count, world.num_obstacles());
-    for (std::size_t n = 0; n < count; ++n) out[n] = world.collides(state + n * World::dimension);
+    world.collide_each(state, count, reinterpret_cast<std::uint8_t*>(result.data()));
     return true;
 }
 
@@ -219,27 +218,29 @@ bool roll_out_batch(
     return true;
 }
 
-nb::tuple beliefs_without_truth_batch(
+/// The means and the particles drawn, or None if a posterior gives its true state no weight.
+nb::object beliefs_without_truth_batch(
     InPlace<double, 3> weights, const Input<2>& states,
     const nb::ndarray<const std::int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>& truths,
-    const Input<2>& at, double negligible) {
+    const StreamWords& stream, std::size_t members, double negligible) {
     const std::size_t actions = weights.shape(0), samples = weights.shape(1),
-                      count = weights.shape(2), dimension = states.shape(1), members = at.shape(1);
-    require(states.shape(0) == count && truths.shape(0) == samples && at.shape(0) == samples,
-            "shapes differ");
+                      count = weights.shape(2), dimension = states.shape(1);
+    require(states.shape(0) == count && truths.shape(0) == samples, "shapes differ");
     for (std::size_t i = 0; i < samples; ++i) {
         const std::int64_t truth = truths.data()[i];
         require(truth >= 0 && static_cast<std::size_t>(truth) < count, "there is no such particle");
     }
-    double* means;
-    std::int64_t* drawn;
+    double *means, *drawn;
     auto estimates = make_array<double>({actions, samples, dimension}, means);
-    auto clouds = make_array<std::int64_t>({actions, samples, members}, drawn);
+    auto clouds = make_array<double>({actions, samples, members, dimension}, drawn);
+    bool likely;
     {
         WithoutInterpreter released;
-        beliefs_without_truth(actions, samples, count, dimension, members, states.data(),
-                              truths.data(), at.data(), negligible, weights.data(), means, drawn);
+        likely = beliefs_without_truth(actions, samples, count, dimension, members, states.data(),
+                                       truths.data(), to_stream(stream), negligible, weights.data(),
+                                       means, drawn);
     }
+    if (!likely) return nb::none();
     return nb::make_tuple(estimates, clouds);
 }
 

@@ -6,6 +6,7 @@
 #include <utility>
 
 #include "deterministic_math.hpp"
+#include "vector_kernels.hpp"
 
 namespace holdfast {
 
@@ -87,6 +88,11 @@ bool DiscWorld::collides(const double* state) const {
     return false;
 }
 
+void DiscWorld::collide_each(const double* states, std::size_t count, std::uint8_t* out) const {
+    const DiscShape shape{radius_squared_, &obstacles_.data()->x_min, obstacles_.size()};
+    vector_kernels().discs_collide(shape, states, count, out);
+}
+
 double DiscWorld::clearance(const double* state) const {
     return gap_around(state, radius_, obstacles_);
 }
@@ -156,6 +162,13 @@ bool RectangleWorld::collides(const double* state) const {
         return true;
     }
     return false;
+}
+
+void RectangleWorld::collide_each(const double* states, std::size_t count,
+                                  std::uint8_t* out) const {
+    const RectangleShape shape{half_width_, half_height_, bounding_radius_,
+                               &obstacles_.data()->x_min, obstacles_.size()};
+    vector_kernels().rectangles_collide(shape, states, count, out);
 }
 
 double RectangleWorld::clearance(const double* state) const {

@@ -14,6 +14,7 @@
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
 #include <vector>
 
 namespace holdfast {
@@ -32,6 +33,9 @@ class DiscWorld {
     std::size_t num_obstacles() const { return obstacles_.size(); }
 
     bool collides(const double* state) const;
+
+    // The same for each of `count` states.
+    void collide_each(const double* states, std::size_t count, std::uint8_t* out) const;
 
     // How far the state may move along each axis, and turn as it likes, without a collision. Zero
     // or less tells nothing.
@@ -52,6 +56,9 @@ class RectangleWorld {
     std::size_t num_obstacles() const { return obstacles_.size(); }
 
     bool collides(const double* state) const;
+
+    // The same for each of `count` states.
+    void collide_each(const double* states, std::size_t count, std::uint8_t* out) const;
 
     // How far the state may move along each axis, and turn as it likes, without a collision. Zero
     // or less tells nothing.

@@ -111,6 +111,10 @@ bool BoxWorld::collides(const double* state) const {
     return false;
 }
 
+void BoxWorld::collide_each(const double* states, std::size_t count, std::uint8_t* out) const {
+    for (std::size_t n = 0; n < count; ++n) out[n] = collides(states + n * dimension) ? 1 : 0;
+}
+
 double BoxWorld::clearance(const double* state) const {
     double gap = std::numeric_limits<double>::infinity();
     for (const AxisAlignedBox& box : obstacles_) {

@@ -12,6 +12,7 @@
 
 #include <array>
 #include <cstddef>
+#include <cstdint>
 #include <vector>
 
 namespace holdfast {
@@ -30,6 +31,9 @@ class BoxWorld {
     std::size_t num_obstacles() const { return obstacles_.size(); }
 
     bool collides(const double* state) const;
+
+    // The same for each of `count` states.
+    void collide_each(const double* states, std::size_t count, std::uint8_t* out) const;
 
     // How far the state may move along each axis, and turn as it likes, without a collision. Zero
     // or less tells nothing.

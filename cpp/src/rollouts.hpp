@@ -44,11 +44,11 @@ void roll_out(const World& world, const Policy& policy, const RolloutInput& inpu
 
 /// Leaves out of each posterior, weights[J][M][count], its own true state `truths[M]`, unless its
 /// weight is all but `negligible`, and normalises the others. Then `means` are [J][M][dimension]
-/// and `members` [J][M][L], drawn at the places at[M][L] of the cumulated weight, in ascending
-/// order.
-void beliefs_without_truth(std::size_t actions, std::size_t samples, std::size_t count,
+/// and `clouds` [J][M][L][dimension]: one particle of each L-th of the cumulated weight, at a place
+/// that a sample's draw of the stream names. False if a posterior gives its true state no weight.
+bool beliefs_without_truth(std::size_t actions, std::size_t samples, std::size_t count,
                            std::size_t dimension, std::size_t members_each, const double* states,
-                           const std::int64_t* truths, const double* at, double negligible,
-                           double* weights, double* means, std::int64_t* members);
+                           const std::int64_t* truths, const Stream& stream, double negligible,
+                           double* weights, double* means, double* clouds);
 
 }  // namespace holdfast

@@ -41,21 +41,8 @@ class Hypotheses {
             }
         }
 
-        // Stratified: sample i lies in [i, i + 1) / M of the cumulated weight.
-        std::vector<std::size_t> particle(input.samples);
-        double cumulated = 0.0;
-        std::size_t n = 0, last_with_weight = 0;
-        for (std::size_t i = 0; i < input.samples; ++i) {
-            const double at = (static_cast<double>(i) + uniform(input.stream, i)) /
-                              static_cast<double>(input.samples);
-            while (n < input.count && cumulated + input.weights[n] <= at) {
-                if (input.weights[n] > 0.0) last_with_weight = n;
-                cumulated += input.weights[n++];
-            }
-            // Rounding can leave the total a little below `at`; then the last particle with weight
-            // is meant.
-            particle[i] = n < input.count ? n : last_with_weight;
-        }
+        std::vector<std::int64_t> particle(input.samples);
+        stratified(input.weights, input.count, input.samples, input.stream, particle.data());
         const Stream noise_stream = substream(input.stream, 1);
         std::vector<double> noise(input.samples * largest);
         normals(noise_stream, 0, noise.size(), noise.data());
@@ -64,12 +51,13 @@ class Hypotheses {
             for (std::size_t i = 0; i < input.samples; ++i) {
                 for (std::size_t c = 0; c < input.observation_size[j]; ++c) {
                     const std::size_t row = first_coordinate_[j] + c;
+                    const auto own = static_cast<std::size_t>(particle[i]);
                     const double variance = input.varying_variance
-                                                ? input.variance[row * input.count + particle[i]]
+                                                ? input.variance[row * input.count + own]
                                                 : input.variance[row];
                     observations_[first_coordinate_[j] * input.samples +
                                   i * input.observation_size[j] + c] =
-                        input.predicted[row * input.count + particle[i]] +
+                        input.predicted[row * input.count + own] +
                         std::sqrt(variance) * noise[i * largest + c];
                 }
             }
@@ -136,6 +124,23 @@ void hypothetical_entropies(const HypothesisInput& input, const PointSets& sets,
             return index < posteriors ? hypotheses(index, weights) : hypotheses.belief(weights);
         },
         settings, out, counts);
+}
+
+void stratified(const double* weights, std::size_t count, std::size_t samples, const Stream& stream,
+                std::int64_t* particles) {
+    double cumulated = 0.0;
+    std::size_t n = 0, last_with_weight = 0;
+    for (std::size_t i = 0; i < samples; ++i) {
+        const double at =
+            (static_cast<double>(i) + uniform(stream, i)) / static_cast<double>(samples);
+        while (n < count && cumulated + weights[n] <= at) {
+            if (weights[n] > 0.0) last_with_weight = n;
+            cumulated += weights[n++];
+        }
+        // Rounding can leave the total a little below `at`; then the last particle with weight is
+        // meant.
+        particles[i] = static_cast<std::int64_t>(n < count ? n : last_with_weight);
+    }
 }
 
 void hypothetical_weights(const HypothesisInput& input, double* out) {

@@ -41,6 +41,10 @@ void hypothetical_entropies(const HypothesisInput& input, const PointSets& sets,
                             const EntropySettings& settings, bool unchanged, double* out,
                             EntropyCounts& counts);
 
+/// Draws one particle from each `samples`-th of the cumulated weight: particles[samples].
+void stratified(const double* weights, std::size_t count, std::size_t samples, const Stream& stream,
+                std::int64_t* particles);
+
 /// The posterior weights themselves: out[J][M][count]; for horizons above 1.
 void hypothetical_weights(const HypothesisInput& input, double* out);
 

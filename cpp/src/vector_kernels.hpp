@@ -73,6 +73,20 @@ struct PriorGroup {
     NearestNeighborConstants constants;
 };
 
+/// A disc among `num_obstacles` rectangles of four limits each: x_min, y_min, x_max, y_max.
+struct DiscShape {
+    double radius_squared;
+    const double* obstacles;
+    std::size_t num_obstacles;
+};
+
+/// A rectangle among such obstacles.
+struct RectangleShape {
+    double half_width, half_height, bounding_radius;
+    const double* obstacles;
+    std::size_t num_obstacles;
+};
+
 struct VectorKernels {
     const char* name;
     void (*exp)(const double* in, double* out, std::size_t count);
@@ -80,12 +94,17 @@ struct VectorKernels {
     void (*sin)(const double* in, double* out, std::size_t count);
     void (*cos)(const double* in, double* out, std::size_t count);
     void (*normals)(const Stream&, std::uint64_t first, std::size_t count, double* out);
-    /// Draws of several streams at the same place: out[stream][count].
-    void (*normals_of_each)(const Stream* streams, std::size_t number, std::uint64_t first,
+    /// Draws firsts[i], ..., firsts[i] + count - 1 of each of several streams: out[stream][count].
+    void (*normals_of_each)(const Stream* streams, const std::uint64_t* firsts, std::size_t number,
                             std::size_t count, double* out);
     /// out[i] = substream numbers[i] of parents[i].
     void (*substreams)(const Stream* parents, const std::uint32_t* numbers, std::size_t count,
                        Stream* out);
+    /// Which of the states, [count][2] or [count][3], are in collision: out[count].
+    void (*discs_collide)(const DiscShape&, const double* states, std::size_t count,
+                          std::uint8_t* out);
+    void (*rectangles_collide)(const RectangleShape&, const double* states, std::size_t count,
+                               std::uint8_t* out);
     double (*sum)(const double* in, std::size_t count);
     /// Sum of weights[i] * in[i], in the order of `sum`, as each of the next.
     double (*weighted_sum)(const double* weights, const double* in, std::size_t count);

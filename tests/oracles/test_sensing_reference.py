@@ -26,7 +26,7 @@ from holdfast import _kernel
 from holdfast.numerics.arrays import FloatArray, IntArray
 from holdfast.numerics.randomness import Purpose, Stream, stream
 from holdfast.planning.belief import Belief
-from holdfast.planning.sensing import _stratified, choose_sensing_action
+from holdfast.planning.sensing import choose_sensing_action
 from holdfast.planning.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
@@ -568,7 +568,7 @@ def test_both_paths_imagine_from_the_same_particles(kind: str, samples: int) -> 
             True,
         ).reshape(samples, count)
         assert (posteriors.max(axis=1) == 1.0).all()
-        drawn = _stratified(weights, samples, hypotheses)
+        drawn = _kernel.stratified(weights, samples, hypotheses.words).tolist()
         assert posteriors.argmax(axis=1).tolist() == drawn
         assert (weights[drawn] > 0.0).all()
         if kind == "equal" and samples == 97:

@@ -110,42 +110,44 @@ HOLDFAST_INLINE Lanes unit_interval(const IntLanes& high, const IntLanes& low) {
            0x1p-53;
 }
 
-/// Draws [first, first + count) of each of several streams, one stream below the other.
-static void normals_of_each(const Stream* streams, std::size_t number, std::uint64_t first,
+/// Draws [firsts[i], firsts[i] + count) of each of several streams, one stream below the other.
+static void normals_of_each(const Stream* streams, const std::uint64_t* firsts, std::size_t number,
                             std::size_t count, double* out) {
-    const std::uint64_t first_block = first >> 1, end = first + count;
-    const std::size_t blocks = static_cast<std::size_t>((end + 1) / 2 - first_block);
-    for (std::size_t begin = 0; begin < number * blocks; begin += lane_count) {
-        const std::size_t left = number * blocks - begin;
-        const std::size_t used = left < lane_count ? left : lane_count;
+    if (number == 0 || count == 0) return;
+    std::size_t s = 0;
+    std::uint64_t next_block = firsts[0] >> 1;
+    while (s < number) {
         const Stream* own[lane_count];
         std::uint32_t block[lane_count];
-        std::uint64_t index[lane_count];
-        for (std::size_t lane = 0, s = begin / blocks, b = begin % blocks; lane < lane_count;
-             ++lane) {
-            own[lane] = &streams[s];
-            block[lane] = static_cast<std::uint32_t>(first_block + b);
-            index[lane] = 2 * (first_block + b);
-            if (lane + 1 < used && ++b == blocks) {
-                b = 0;
-                ++s;
-            }
+        std::size_t of_stream[lane_count];
+        std::size_t used = 0;
+        for (; used < lane_count && s < number; ++used) {
+            own[used] = &streams[s];
+            block[used] = static_cast<std::uint32_t>(next_block);
+            of_stream[used] = s;
+            if (2 * ++next_block >= firsts[s] + count && ++s < number) next_block = firsts[s] >> 1;
+        }
+        for (std::size_t lane = used; lane < lane_count; ++lane) {
+            own[lane] = own[used - 1];
+            block[lane] = block[used - 1];
         }
         const PhiloxLanes drawn = philox_lanes(own, block);
         Lanes even, odd;
         box_muller(unit_interval(drawn.words[0], drawn.words[1]),
                    unit_interval(drawn.words[2], drawn.words[3]), even, odd);
         for (std::size_t lane = 0; lane < used; ++lane) {
-            double* row = out + static_cast<std::size_t>(own[lane] - streams) * count;
-            if (index[lane] >= first) row[index[lane] - first] = even[lane];
-            if (index[lane] + 1 < end) row[index[lane] + 1 - first] = odd[lane];
+            double* row = out + of_stream[lane] * count;
+            // Before the first one this wraps to a large number.
+            const std::uint64_t at = 2 * std::uint64_t{block[lane]} - firsts[of_stream[lane]];
+            if (at < count) row[at] = even[lane];
+            if (at + 1 < count) row[at + 1] = odd[lane];
         }
     }
 }
 
 static void normals_array(const Stream& stream, std::uint64_t first, std::size_t count,
                           double* out) {
-    normals_of_each(&stream, 1, first, count, out);
+    normals_of_each(&stream, &first, 1, count, out);
 }
 
 /// out[i] = substream numbers[i] of parents[i]. `out` may be `parents`.

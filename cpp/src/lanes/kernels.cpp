@@ -5,6 +5,7 @@
 
 #define HOLDFAST_LAMBDA __attribute__((always_inline))
 
+#include "collisions.hpp"
 #include "compact_entropy.hpp"
 #include "elementwise.hpp"
 #include "group_entropy.hpp"
@@ -15,10 +16,10 @@ namespace holdfast::inline HOLDFAST_ISA {
 
 extern const VectorKernels table;
 const VectorKernels table = {
-    HOLDFAST_ISA_NAME, exp_array,       log_array,   sin_array,       cos_array,
-    normals_array,     normals_of_each, substreams,  sum_array,       weighted_sum,
-    weighted_sums,     posterior,       normalize,   compact_nearest, compact_mixture,
-    group_nearest,     group_mixture,   prior_block,
+    HOLDFAST_ISA_NAME, exp_array,       log_array,     sin_array,     cos_array,
+    normals_array,     normals_of_each, substreams,    discs_collide, rectangles_collide,
+    sum_array,         weighted_sum,    weighted_sums, posterior,     normalize,
+    compact_nearest,   compact_mixture, group_nearest, group_mixture, prior_block,
 };
 
 }  // namespace holdfast::inline HOLDFAST_ISA

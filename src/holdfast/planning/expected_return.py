@@ -36,7 +36,7 @@ them lead to the same actions, and a return is the sum of a hundred noisy steps.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -57,9 +57,10 @@ from holdfast.problems.problem import Problem, ProblemBase
 __all__ = ["Posteriors", "Returns", "expected_returns", "has_own_rollouts", "rollout_returns"]
 
 
-Posteriors = Callable[[Sequence[int], int, Stream], tuple[Sequence[int], FloatArray]]
+Posteriors = Callable[[Sequence[int], int, Stream], tuple[IntArray, FloatArray]]
 """Called with sensing actions, a number M of samples and a stream. Returns the M particles that are
-the true states, and the weights of the posteriors, shape ``(len(sensing_actions), M, N)``."""
+the true states, and the weights of the posteriors, shape ``(len(sensing_actions), M, N)``, an array
+of the caller's own."""
 
 # Substreams of the stream of hypotheses (1 to 3 are those of holdfast.planning.sensing and the
 # kernel). Further rounds of samples have substreams of the first one.
@@ -113,23 +114,22 @@ def expected_returns(
     count = costs.shape[0]
     size = settings.active_sensing.num_observation_samples
     limit = max(size, settings.selector.max_observation_samples)
+    roll_out = _rollouts_of(problem, settings, costs)
     contenders = list(range(count))
     rounds: list[FloatArray] = []
     drawn = 0
     while True:
         stream = hypotheses if not rounds else hypotheses.substream(_ROUNDS).substream(len(rounds))
         truths, weights = posteriors(contenders, size, stream)
-        found = np.full((count, size), np.nan)
-        found[contenders] = (
-            _sampled_returns(problem, settings, belief, stage, truths, weights, stream)
-            - costs[contenders, np.newaxis]
-        )
-        if not numerics.all_finite(np.ascontiguousarray(found[contenders])):
+        begun = _after_sensing(problem, settings, belief, truths, weights, stream)
+        returns = roll_out(*begun, stage, stream.substream(_MOTION)) - costs[contenders, np.newaxis]
+        if not numerics.all_finite(returns):
             raise ProblemError(
                 f"the rewards of {problem.name} add up to more than a number can hold in "
                 f"{settings.selector.rollout_steps} steps of expected_return"
             )
-        rounds.append(found)
+        rounds.append(np.full((count, size), np.nan))
+        rounds[-1][contenders] = returns
         drawn += size
         samples = np.concatenate(rounds, axis=1)
         contenders = _contenders(samples, contenders)
@@ -138,41 +138,32 @@ def expected_returns(
             return Returns(_paired_means(samples), samples)
 
 
-def _sampled_returns(
+def _after_sensing(
     problem: Problem,
     settings: PlanningSettings,
     belief: Belief,
-    stage: int,
-    truths: Sequence[int],
+    truths: IntArray,
     weights: FloatArray,
     stream: Stream,
-) -> FloatArray:
-    """Return the return after each hypothetical observation, shape ``(actions, samples)``."""
-    actions, samples, _ = weights.shape
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the true states, the estimates after each observation, and particles of the beliefs.
+
+    The shapes are those of :func:`rollout_returns`.
+    """
     kind, circular = settings.particle_filter.estimate, circular_states(problem)
-    states, particles = belief.states, np.asarray(truths)
-    # A comparison with NaN is false.
-    if not (weights[:, np.arange(samples), particles] >= 0.0).all():
+    states, words = belief.states, stream.substream(_CLOUDS).words
+    members = _KERNEL_CLOUD if has_own_rollouts(problem) else _CLOUD
+    found = _kernel.beliefs_without_truth(weights, states, truths, words, members, _NEGLIGIBLE)
+    if found is None:
         raise ProblemError(
             f"a hypothetical observation of {problem.name} had no likelihood under any particle"
         )
-    members = _KERNEL_CLOUD if has_own_rollouts(problem) else _CLOUD
-    at = (np.arange(members) + stream.substream(_CLOUDS).uniform((samples, 1))) / members
-    own = weights.copy()
-    estimates, drawn = _kernel.beliefs_without_truth(own, states, particles, at, _NEGLIGIBLE)
+    estimates, clouds = found
     if kind != "mean" or circular:
-        for j, i in np.ndindex(actions, samples):
+        for j, i in np.ndindex(*weights.shape[:2]):
             interruption.check()
-            estimates[j, i] = estimate(Belief(states, own[j, i]), kind, circular)
-    return rollout_returns(
-        problem,
-        settings,
-        states[particles],
-        estimates,
-        states[drawn],
-        stage,
-        stream.substream(_MOTION),
-    )
+            estimates[j, i] = estimate(Belief(states, weights[j, i]), kind, circular)
+    return states[truths], estimates, clouds
 
 
 def has_own_rollouts(problem: Problem) -> bool:
@@ -207,6 +198,14 @@ def rollout_returns(
         The noise of the motion, the same for all J.
     """
     costs = sensing_costs(problem, optional=settings.selector.sensing_is_optional)
+    roll_out = _rollouts_of(problem, settings, costs)
+    return roll_out(true_states, estimates, clouds, stage, motion)
+
+
+def _rollouts_of(
+    problem: Problem, settings: PlanningSettings, costs: FloatArray
+) -> Callable[[FloatArray, FloatArray, FloatArray, int, Stream], FloatArray]:
+    """Return :func:`rollout_returns` with what all samples of a decision share."""
     price = numerics.sum(costs) / costs.shape[0]
     own_rewards = getattr(type(problem), "reward", None) is not ProblemBase.reward
     counts_steps = settings.selector.rollout_reward == "steps" or not own_rewards
@@ -218,22 +217,28 @@ def rollout_returns(
         price,
         counts_steps,
     )
-    begun = (true_states, estimates, clouds, stage)
     if has_own_rollouts(problem):
         threads = settings.active_sensing.num_cores
-        return checked.rollout_returns(problem, *begun, motion, own, threads)
-    rollouts = _Rollouts(problem, own, *begun)
-    for step in range(own.steps):
-        interruption.check()
-        later, between = divmod(step, own.interval)
-        if between == 0 and later > 0:
-            rollouts.pay(price)
-            if later <= own.looks:
-                rollouts.fork(1.0 if later == own.looks else 1.0 / own.looks)
-            rollouts.drop_decided()
-        if not rollouts.advance(motion.substream(step)):
-            break
-    return rollouts.returns
+        return lambda *begun_and_motion: checked.rollout_returns(
+            problem, *begun_and_motion, own, threads
+        )
+
+    def roll_out(*begun_and_motion: Any) -> FloatArray:
+        *begun, motion = begun_and_motion
+        rollouts = _Rollouts(problem, own, *begun)
+        for step in range(own.steps):
+            interruption.check()
+            later, between = divmod(step, own.interval)
+            if between == 0 and later > 0:
+                rollouts.pay(price)
+                if later <= own.looks:
+                    rollouts.fork(1.0 if later == own.looks else 1.0 / own.looks)
+                rollouts.drop_decided()
+            if not rollouts.advance(motion.substream(step)):
+                break
+        return rollouts.returns
+
+    return roll_out
 
 
 class _Rollouts:
@@ -407,21 +412,18 @@ def _means(clouds: FloatArray) -> FloatArray:
 
 def _contenders(samples: FloatArray, among: Sequence[int]) -> list[int]:
     """Return the sensing actions whose difference from the best one is undecided."""
-    rows = {j: samples[j] for j in among}
     count = samples.shape[1]
     if count < 2:
         return list(among)  # One sample has no standard error.
-    means = {j: numerics.sum(row) / count for j, row in rows.items()}
+    means = {j: numerics.sum(samples[j]) / count for j in among}
     best = max(among, key=lambda j: means[j])
     close = []
     for j in among:
-        differences = rows[best] - rows[j]
-        mean = means[best] - means[j]
+        differences, mean = samples[best] - samples[j], means[best] - means[j]
         away = differences - mean
         squared_error = numerics.sum(away * away) / (count * (count - 1))
         # More samples of equal returns are equal, too.
-        equal = not differences.any() and j != best
-        if j == best or (not equal and mean * mean < _CLOSE * _CLOSE * squared_error):
+        if j == best or (differences.any() and mean * mean < _CLOSE * _CLOSE * squared_error):
             close.append(j)
     return close
 

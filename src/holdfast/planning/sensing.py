@@ -20,6 +20,7 @@ minimization", IEEE Access, 2019; Algorithm 2 of the thesis that the configurati
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -28,11 +29,12 @@ import numpy as np
 from holdfast import _kernel
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.numerics import reproducible as numerics
-from holdfast.numerics.arrays import FloatArray, in_brief
+from holdfast.numerics.arrays import FloatArray, IntArray, in_brief
 from holdfast.numerics.circular import embedded, unwrapped
 from holdfast.numerics.randomness import Stream, Words
 from holdfast.planning import interruption
 from holdfast.planning.belief import Belief, estimate
+from holdfast.planning.dominance import dominated
 from holdfast.planning.estimators import (
     LARGEST,
     TOTAL_VARIANCE,
@@ -162,7 +164,7 @@ def choose_sensing_action(
     points = sets.reshape(-1, sets.shape[-1])
     threads = settings.active_sensing.num_cores
     size = settings.active_sensing.num_observation_samples
-    hypothetical = _hypotheses(problem, belief, range(count), size, hypotheses)
+    hypothetical = _hypotheses_of(problem, belief)(range(count), size, hypotheses)
     entropies, samples, likelihoods, visits = hypothetical.entropies(
         scaled(points, estimator), estimator, threads, factors, selector.sensing_is_optional
     )
@@ -178,6 +180,15 @@ def choose_sensing_action(
         entropies = _row_means(samples)
     prices = _prices(problem, settings)
     scores = entropies if prices is None else entropies + prices
+    if selector.estimator == "prior_neighbors_undominated" and isinstance(
+        hypothetical, _GaussianHypotheses
+    ):
+        _, sizes, means, variances, _, _, angles = hypothetical.arguments
+        if not any(angles):
+            worse = dominated(
+                sizes, means, variances, np.zeros(count) if prices is None else prices
+            )
+            scores = np.where(np.append(worse, [False] * (choices - count)), np.inf, scores)
     index = _least(scores, optional=selector.sensing_is_optional)
     if entropies[index] != entropies[index]:
         raise ProblemError(
@@ -238,17 +249,18 @@ def _greatest_return(
 ) -> tuple[int, SensingInfo]:
     likelihoods = 0
     not_sensing = len(problem.sensing_actions)
+    hypotheses_of = _hypotheses_of(problem, belief)
 
     def posteriors(
         actions: Sequence[int], samples: int, stream: Stream
-    ) -> tuple[list[int], FloatArray]:
+    ) -> tuple[IntArray, FloatArray]:
         nonlocal likelihoods
         sensing = [action for action in actions if action != not_sensing]
         likelihoods += len(sensing) * samples * belief.weights.shape[0]
-        weights = _hypotheses(problem, belief, sensing, samples, stream).weights(False)
+        weights = hypotheses_of(sensing, samples, stream).weights(False)
         if len(sensing) < len(actions):
             weights = _with_unchanged(weights, belief.weights)
-        return _stratified(belief.weights, samples, stream), weights
+        return _kernel.stratified(belief.weights, samples, stream.words), weights
 
     returns = expected_returns(problem, settings, belief, stage, hypotheses, posteriors)
     # What is least: as for the other methods.
@@ -414,28 +426,43 @@ class _GeneralHypotheses(NamedTuple):
         return np.array(rows).reshape(-1, self.samples, self.log_weights.shape[1])
 
 
-def _hypotheses(
-    problem: Problem, belief: Belief, actions: Sequence[int], samples: int, stream: Stream
-) -> _GaussianHypotheses | _GeneralHypotheses:
-    """Return the hypothetical observations of some sensing actions, ``samples`` each."""
+def _hypotheses_of(
+    problem: Problem, belief: Belief
+) -> Callable[[Sequence[int], int, Stream], _GaussianHypotheses | _GeneralHypotheses]:
+    """Return what draws hypothetical observations of some sensing actions, so many of each."""
     if has_general_observations(problem):
-        return _general_hypotheses(problem, belief, actions, samples, stream)
-    sizes, predicted, variances = checked.predictions(problem, belief.states, actions)
+        return functools.partial(_general_hypotheses, problem, belief)
+    every = range(len(problem.sensing_actions))
+    sizes, predicted, variances = checked.predictions(problem, belief.states, every)
     angles: list[int] = []
     if has_circular_observations(problem):
-        for action, size in zip(actions, sizes, strict=True):
+        for action, size in zip(every, sizes, strict=True):
             own = circular_observation(problem, action, size)
             angles += [int(coordinate in own) for coordinate in range(size)]
-    return _GaussianHypotheses(
-        (belief.weights, sizes, predicted, variances, samples, stream.words, angles)
-    )
+
+    def draw(actions: Sequence[int], samples: int, stream: Stream) -> _GaussianHypotheses:
+        chosen, means, own_variances, own_angles = sizes, predicted, variances, angles
+        if len(actions) < len(sizes):
+            ends = np.cumsum(sizes)
+            rows = [row for j in actions for row in range(ends[j] - sizes[j], ends[j])]
+            own_angles = [angles[row] for row in rows] if angles else angles
+            if variances.shape[1] == 1:
+                chosen = [sizes[j] for j in actions]
+                means, own_variances = predicted[rows], variances[rows]
+            else:  # Alone, some may have variances that do not depend on the state: other bits.
+                chosen, means, own_variances = checked.predictions(problem, belief.states, actions)
+        return _GaussianHypotheses(
+            (belief.weights, chosen, means, own_variances, samples, stream.words, own_angles)
+        )
+
+    return draw
 
 
 def _general_hypotheses(
     problem: Problem, belief: Belief, actions: Sequence[int], samples: int, stream: Stream
 ) -> _GeneralHypotheses:
     log_prior = numerics.log(belief.weights)
-    particles = _stratified(belief.weights, samples, stream)
+    particles = _kernel.stratified(belief.weights, samples, stream.words)
     streams = stream.substream(_GENERAL_OBSERVATIONS)
     together = has_batched_likelihoods(problem)
     rows = np.empty((len(actions), samples, len(log_prior)))
@@ -453,15 +480,6 @@ def _general_hypotheses(
             own_rows[:] = checked.log_likelihoods(problem, belief.states, action, observations)
         own_rows += log_prior
     return _GeneralHypotheses(rows.reshape(-1, len(log_prior)), log_prior, samples)
-
-
-def _stratified(weights: FloatArray, samples: int, stream: Stream) -> list[int]:
-    """Draw one particle from each ``samples``-th of the cumulated weight."""
-    positions = (np.arange(samples) + stream.anew().uniform(samples)) / samples
-    # np.cumsum adds one by one, in order, unlike np.sum.
-    found = np.searchsorted(np.cumsum(weights), positions, side="right")
-    last = int(np.flatnonzero(weights)[-1])
-    return [min(index, last) for index in found.tolist()]
 
 
 def _later_entropies(

@@ -101,11 +101,20 @@ UNINFORMED_METHODS: frozenset[Method] = frozenset({"random", "fixed"})
 """Those that use no belief."""
 
 Estimator = Literal[
-    "nearest_neighbor", "prior_neighbors", "gaussian_mixture_upper", "gaussian_mixture_lower"
+    "nearest_neighbor",
+    "prior_neighbors",
+    "prior_neighbors_undominated",
+    "gaussian_mixture_upper",
+    "gaussian_mixture_lower",
 ]
-"""How an entropy is estimated: :mod:`holdfast.planning.estimators` has a class for each."""
+"""How an entropy is estimated: :mod:`holdfast.planning.estimators` has a class for each kind."""
 
-NEIGHBOR_ESTIMATORS: frozenset[Estimator] = frozenset({"nearest_neighbor", "prior_neighbors"})
+PRIOR_ESTIMATORS: frozenset[Estimator] = frozenset(
+    {"prior_neighbors", "prior_neighbors_undominated"}
+)
+"""Those that count nearest neighbours before the observation."""
+
+NEIGHBOR_ESTIMATORS: frozenset[Estimator] = PRIOR_ESTIMATORS | {"nearest_neighbor"}
 """Those that count nearest neighbours."""
 
 
@@ -181,7 +190,9 @@ class SelectorSettings(_Section, frozen=True, forbid_unknown_fields=True, kw_onl
         costs counts 1 for each sensing action. With 0 no cost counts.
     estimator : Estimator or None
         ``prior_neighbors`` has less bias where a sharp observation leaves few particles: 300 choose
-        about as well as 1,000 with ``nearest_neighbor``. A mixture takes few particles for
+        about as well as 1,000 with ``nearest_neighbor``. ``prior_neighbors_undominated`` is the
+        same, and never takes a sensing action of which another one shows the same more sharply, and
+        is no dearer. A mixture takes few particles for
         certainty: use it with so many that they lie closer than its noise (docs/results.md).
         None: see :func:`estimator_of`.
     actions : {"commanded", "executed"}
@@ -429,9 +440,9 @@ def unfit_for_the_method(settings: PlanningSettings) -> tuple[tuple[str, str], s
                 f"is {neighbors}; the {estimator} estimator needs it below "
                 f"particle_filter.num_particles, which is {particles}"
             )
-        if estimator == "prior_neighbors" and particles > MAX_PRIOR_NEIGHBORS_POINTS:
+        if estimator in PRIOR_ESTIMATORS and particles > MAX_PRIOR_NEIGHBORS_POINTS:
             return ("particle_filter", "num_particles"), (
-                f"is {particles}; the prior_neighbors estimator allows {MAX_PRIOR_NEIGHBORS_POINTS}"
+                f"is {particles}; the {estimator} estimator allows {MAX_PRIOR_NEIGHBORS_POINTS}"
             )
     if method == "expected_return":
         first = settings.active_sensing.num_observation_samples

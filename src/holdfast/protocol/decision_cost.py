@@ -21,6 +21,7 @@ from typing import NamedTuple
 from holdfast.planning.expected_return import has_own_rollouts
 from holdfast.planning.settings import (
     ENTROPY_METHODS,
+    PRIOR_ESTIMATORS,
     UNINFORMED_METHODS,
     PlanningSettings,
     estimator_of,
@@ -235,7 +236,7 @@ class _Sizes:
             point += _NEIGHBOR * max(0.0, neighbors - 5.0)
             point += _SQUARED_NEIGHBOR * neighbors * neighbors
             found = posteriors * sets * particles * point * wide
-        elif kind == "prior_neighbors":
+        elif kind in PRIOR_ESTIMATORS:
             pair = _PRIOR_PAIR + min(0.45 * neighbors, 9.0 * math.log2(1.0 + neighbors))
             pieces = math.ceil(posteriors / _PRIOR_LANES)
             members = particles * particles
@@ -255,7 +256,7 @@ class _Sizes:
         batch = min(posteriors, max(float(_GROUP), (_WEIGHTS_BYTES >> 3) / particles))
         together = max(particles, min(sets * particles, float(_BLOCK)))
         kept = sets * particles * (8.0 * dimension + 64.0)
-        if estimator_of(self.planning.selector, int(particles)) == "prior_neighbors":
+        if estimator_of(self.planning.selector, int(particles)) in PRIOR_ESTIMATORS:
             # The posteriors once more, point by point, and what they gain at each of these.
             gains = min(8.0 * sets * batch * particles, float(_GAINS_BYTES))
             return 8.0 * batch * particles + kept + 2.0 * gains

@@ -1,0 +1,93 @@
+// Collision tests of many states side by side (one compilation per instruction set).
+//
+// Operation by operation those of `collides` in geometry_2d.cpp, so the answers are the same.
+
+#pragma once
+
+#include "../vector_kernels.hpp"
+
+namespace holdfast::inline HOLDFAST_ISA {
+
+/// As std::min and std::max of `a` and `b`.
+HOLDFAST_INLINE void least_and_greatest(Lanes a, Lanes b, Lanes& least, Lanes& greatest) {
+    least = b;
+    greatest = a;
+    order(least, greatest);
+}
+
+HOLDFAST_INLINE Lanes size_of(const Lanes& x) {
+    return select(x < 0.0, -x, x);
+}
+
+/// Coordinate `c` of eight states; behind the last one this is repeated.
+HOLDFAST_INLINE Lanes coordinate(const double* states, std::size_t count, std::size_t begin,
+                                 std::size_t dimension, std::size_t c) {
+    Lanes result{};
+    for (std::size_t lane = 0; lane < lane_count; ++lane) {
+        const std::size_t i = begin + lane < count ? begin + lane : count - 1;
+        result[lane] = states[i * dimension + c];
+    }
+    return result;
+}
+
+HOLDFAST_INLINE void put(std::uint8_t* out, std::size_t count, unsigned bits) {
+    for (std::size_t lane = 0; lane < lane_count && lane < count; ++lane) {
+        out[lane] = static_cast<std::uint8_t>(bits >> lane & 1u);
+    }
+}
+
+static void discs_collide(const DiscShape& shape, const double* states, std::size_t count,
+                          std::uint8_t* out) {
+    for (std::size_t begin = 0; begin < count; begin += lane_count) {
+        const Lanes x = coordinate(states, count, begin, 2, 0);
+        const Lanes y = coordinate(states, count, begin, 2, 1);
+        unsigned hits = 0;
+        for (std::size_t o = 0; o < shape.num_obstacles && hits != 0xffu; ++o) {
+            const double* limits = shape.obstacles + 4 * o;
+            Lanes nearest_x, nearest_y, unused;
+            least_and_greatest(x, splat(limits[0]), unused, nearest_x);
+            least_and_greatest(nearest_x, splat(limits[2]), nearest_x, unused);
+            least_and_greatest(y, splat(limits[1]), unused, nearest_y);
+            least_and_greatest(nearest_y, splat(limits[3]), nearest_y, unused);
+            const Lanes dx = x - nearest_x, dy = y - nearest_y;
+            hits |= bits_of(dx * dx + dy * dy < shape.radius_squared);
+        }
+        put(out + begin, count - begin, hits);
+    }
+}
+
+static void rectangles_collide(const RectangleShape& shape, const double* states, std::size_t count,
+                               std::uint8_t* out) {
+    const double radius = shape.bounding_radius;
+    for (std::size_t begin = 0; begin < count; begin += lane_count) {
+        const Lanes x = coordinate(states, count, begin, 3, 0);
+        const Lanes y = coordinate(states, count, begin, 3, 1);
+        const auto turn = sine_cosine_of(coordinate(states, count, begin, 3, 2));
+        const Lanes& sine = turn.sine;
+        const Lanes& cosine = turn.cosine;
+        const Lanes s = size_of(sine), c = size_of(cosine);
+        const Lanes reach_x = c * shape.half_width + s * shape.half_height;
+        const Lanes reach_y = s * shape.half_width + c * shape.half_height;
+        unsigned hits = 0;
+        for (std::size_t o = 0; o < shape.num_obstacles && hits != 0xffu; ++o) {
+            const double* limits = shape.obstacles + 4 * o;
+            const Lanes left = limits[0] - x, bottom = limits[1] - y;
+            const Lanes right = limits[2] - x, top = limits[3] - y;
+            IntLanes apart = (left >= radius) | (right <= -radius) | (bottom >= radius) |
+                             (top <= -radius) | (left >= reach_x) | (right <= -reach_x) |
+                             (bottom >= reach_y) | (top <= -reach_y);
+            if ((hits | bits_of(apart)) == 0xffu) continue;
+            Lanes low, high, lower, higher;
+            least_and_greatest(left * cosine, right * cosine, low, high);
+            least_and_greatest(bottom * sine, top * sine, lower, higher);
+            apart |= (low + lower >= shape.half_width) | (high + higher <= -shape.half_width);
+            least_and_greatest(left * -sine, right * -sine, low, high);
+            least_and_greatest(bottom * cosine, top * cosine, lower, higher);
+            apart |= (low + lower >= shape.half_height) | (high + higher <= -shape.half_height);
+            hits |= ~bits_of(apart) & 0xffu;
+        }
+        put(out + begin, count - begin, hits);
+    }
+}
+
+}  // namespace holdfast::inline HOLDFAST_ISA
