@@ -100,7 +100,7 @@ def test_a_robot_in_a_trial_that_nobody_decides_for() -> None:
 
 def test_the_alerts_watch_what_is_told() -> None:
     watched = set(re.findall(r"\bholdfast_robot_\w+", RULES.read_text(encoding="utf-8")))
-    assert len(watched) == 3
+    assert len(watched) == 5
     assert watched <= {name for name, _ in told(RobotMetrics(), world_of())}
 
 
