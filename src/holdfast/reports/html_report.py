@@ -335,7 +335,7 @@ def results_page(directory: Path) -> tuple[bytes, list[str]]:
     OutputError
         If there is nothing of these in it.
     """
-    page = HtmlPage(directory.absolute().name)
+    page = HtmlPage(f"Results in {directory.absolute().name}")
     found = {path.name: path for path in sorted(directory.glob("*"))}
     for name in ("tune.md", "table.md"):
         if name in found:
@@ -351,10 +351,9 @@ def results_page(directory: Path) -> tuple[bytes, list[str]]:
             page.table(columns, rows)
         elif path.suffix == ".svg":
             page.picture(path.read_bytes(), path.stem.replace("_", " "))
-    for name in ("tuned.yaml", "tune.json", "sweep.json", "origin.json"):
-        if name in found:
-            page.section("Settings" if name != "origin.json" else "Machine and versions")
-            page.code(_text_of(found[name]))
+    for name in [each for each in ("tuned.yaml", *_RESULTS) if each in found]:
+        page.section("Machine and versions" if name == "origin.json" else name)
+        page.code(_text_of(found[name]), summary="All settings" if name == "tune.json" else "")
     if not page.sections:
         raise OutputError(f"{directory}: has neither a run nor results of tune, sweep or a study")
     return page.html(), []
@@ -381,9 +380,9 @@ def _add_effects(page: HtmlPage, columns: Sequence[str], rows: Iterable[Sequence
         height = 26 * len(values) + 10
         none = 1.0 if what.startswith("ratio") else 0.0
         title = f"{what.replace('_', ' ')} to the baseline, 95 % intervals"
-        page.chart(
-            chart_part("effects", values=values, height=height, none=none, title=title, axis=what)
-        )
+        letters = max(len(str(each["name"])) for each in values)
+        looks = {"height": height, "none": none, "letters": letters}
+        page.chart(chart_part("effects", values=values, title=title, axis=what, **looks))
 
 
 def _number(value: object) -> float | None:
