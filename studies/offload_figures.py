@@ -65,9 +65,9 @@ def _lines(scaling: Scaling, cost_ms: float) -> list[tuple[list[float], plots.Do
 def break_even_lines(lines: pd.DataFrame) -> Figure:
     """Draw the break-even of all kinds of decisions, for a robot with one core."""
     lines = lines[(lines["robot_cores"] == 1) & lines["samples"].isin(SAMPLES_DRAWN)]
-    reached = lines.groupby(list(Kind._fields))["particles"].transform("count") > 0
-    never = len(lines[~reached].groupby(list(Kind._fields)))
-    lines = lines[reached]
+    kinds = lines.groupby(list(Kind._fields))
+    never = int((kinds["particles"].count() == 0).sum())
+    lines = lines[kinds["particles"].transform("count") > 0]
     ends = {kind_of(row): row["measured_to"] for row in lines.to_dict("records")}
     figure, (panel,) = plots.stacked_panels(
         [round(1.5 * len(ends))],
@@ -93,9 +93,7 @@ def break_even_lines(lines: pd.DataFrame) -> Figure:
     for place, end in enumerate(ends.values()):
         panel.plot([end, end], [place - 0.4, place + 0.4], color="#8A9099", linewidth=1.2)
     panel.set_xticks(ticks := [300, 1_000, 3_000, 10_000, 30_000], [f"{each:,}" for each in ticks])
-    panel.set_xlabel(
-        "particles at break-even, with bounds; grey: measured up to here\n"
-        f"(without one as far as measured: {never} kinds of decisions, by horizon H)"
-    )
+    bounds = "particles at break-even, with bounds; grey: measured up to here"
+    panel.set_xlabel(f"{bounds}\n({never} kinds of decisions with a horizon H: none is known)")
     plots.legend_below(figure, panel, 4, frameon=False)
     return figure

@@ -336,12 +336,11 @@ def _draw(summary: pd.DataFrame, together: pd.DataFrame) -> Figure:
     rows = {case: changed[changed["problem"] == case] for case in _CASES}
     rows["mean of all five"] = mean.set_index(mean.index + len(summary))
     every = pd.concat(rows.values())
-    # The way is named once, above its first row, and the panels have the room.
-    first = ~every.duplicated(["problem", "way"])
     names = every["parameter"] + " " + every["value"].str.replace("resampling ", "")
     return plots.ratio_grid(
         rows,
-        names.where(~first, every["way"] + ":\n" + names),
+        # The way is named once, above its first row, so that the panels have room.
+        names.where(every.duplicated(["problem", "way"]), every["way"] + ":\n" + names),
         columns=len(rows),
         title="Steps, against each way's reference (95 % intervals)",
         width=9.6,

@@ -311,8 +311,7 @@ class VdpTag(ProblemBase):
         near, far, thin = BARRIER_START, BARRIER_END, 0.01
         barriers = [(near, -thin, far, thin), (-thin, near, thin, far)]
         barriers += [(-far, -thin, -near, thin), (-thin, -far, thin, -near)]
-        limits = (-4.0, -4.0, 4.0, 4.0)
-        return Scene((0, 1), limits, barriers, body=TAG_RADIUS, targets=[(2, 3)])
+        return Scene((0, 1), (-4, -4, 4, 4), barriers, body=TAG_RADIUS, targets=[(2, 3)])
 
 
 def moved(states: FloatArray, actions: FloatArray, noise: FloatArray) -> FloatArray:

@@ -87,10 +87,10 @@ def house() -> str:
         text(LEFT, 88, "import the product, which imports none of them.", 'fill="#57606a"')
     )
     parts.append(text(LEFT, TOP - 12, "A room imports only rooms below it.", 'fill="#57606a"'))
+    end = TOP + ROW * len(floors) - 4
     parts += [
-        f'<line x1="{column}" y1="{TOP - 6}" x2="{column}" y2="{TOP + ROW * len(floors) - 4}" '
-        'stroke="#eef0f2"/>'
-        for column in (MATRIX + COLUMN * at + 12 for at in range(len(floors)))
+        f'<line x1="{x}" y1="{TOP - 6}" x2="{x}" y2="{end}" stroke="#eef0f2"/>'
+        for x in (MATRIX + COLUMN * at + 12 for at in range(len(floors)))
     ]
     for at, name in enumerate(floors):
         y, column = TOP + ROW * at, MATRIX + COLUMN * at + 12

@@ -12,7 +12,10 @@ const eachView = (view, change) => {
 
 const draw = (place) => {
   const spec = structuredClone(charts[Number(place.dataset.chart)]);
-  const labels = (spec.usermeta || {}).labels || 110;
+  const { labels: fixed, letters, widest = 170 } = spec.usermeta || {};
+  const limit = place.clientWidth < 500 ? 105 : widest;
+  spec.config.axis.labelLimit = limit;
+  const labels = fixed || 75 + Math.min(limit, 7 * letters);
   const columns = spec.columns === 2 && place.clientWidth >= 820 ? 2 : 1;
   if (spec.columns) spec.columns = columns;
   if (place.clientWidth < 500) spec.config.legend.columns = 1;

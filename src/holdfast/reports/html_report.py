@@ -47,6 +47,10 @@ _TRIALS, _DECISIONS, _EVENTS = 2_000, 2_000, 600
 _RESULTS = ("tune.json", "sweep.json", "origin.json")
 """What the directories of a tuning, a sweep and a study have, and a run's has not."""
 
+_SHOWN = ("candidates.csv", "table.csv", "trials.csv")  # as charts, or too long
+_ROWS = 30
+_MOST = 10**9  # a number of a trial or step; a damaged table may have any
+
 _COUNTS = {
     "sensing_decisions": "sensing actions",
     "missing_observations": "missing observations",
@@ -198,7 +202,9 @@ def _add_timeline(
             "waited": round(row.waited_ms, 3),
             "service": one_line(row.service)[:40],
             "status": one_line(row.status)[:40],
-            **{name: getattr(row, name) for name in ("trial", "step", "kind")},
+            "trial": min(row.trial, _MOST),
+            "step": min(row.step, _MOST),
+            "kind": one_line(row.kind)[:40],
         }
         for row in shown.values()
     ]
@@ -293,7 +299,7 @@ def _add_origin(page: HtmlPage, meta: Mapping[str, str]) -> None:
     made = meta.get("holdfast_core") or meta.get("holdfast_version") or "of an unknown version"
     rows = [("run by holdfast", made), ("run on", meta.get("machine", "not recorded"))]
     if "wall_time_s" in meta:
-        rows.append(("computing time (s)", f"{float(meta['wall_time_s']):,.1f}"))
+        rows.append(("computing time (s)", one_line(meta["wall_time_s"])[:8]))
     rows += [("before", each.in_words()) for each in read_earlier(meta.get("earlier_code"))]
     rows.append(("report by holdfast", f"{core_version()}, Python {platform.python_version()}"))
     page.table([], rows)
@@ -335,26 +341,28 @@ def results_page(directory: Path) -> tuple[bytes, list[str]]:
     OutputError
         If there is nothing of these in it.
     """
-    page = HtmlPage(directory.absolute().name)
+    page = HtmlPage(f"Results in {directory.absolute().name}")
     found = {path.name: path for path in sorted(directory.glob("*"))}
     for name in ("tune.md", "table.md"):
         if name in found:
             page.section("Finding")
             page.markdown(_text_of(found.pop(name)))
-    for name, path in found.items():
-        if name in ("candidates.csv", "table.csv"):
-            columns, *rows = _rows_of(path)
-            _add_effects(page, columns, rows)
-        elif path.suffix == ".csv" and name != "trials.csv":
-            page.section(path.stem.replace("_", " "))
-            columns, *rows = _rows_of(path)
-            page.table(columns, rows)
-        elif path.suffix == ".svg":
-            page.picture(path.read_bytes(), path.stem.replace("_", " "))
-    for name in ("tuned.yaml", "tune.json", "sweep.json", "origin.json"):
+    for name in ("candidates.csv", "table.csv"):
         if name in found:
-            page.section("Settings" if name != "origin.json" else "Machine and versions")
-            page.code(_text_of(found[name]))
+            columns, *rows = _rows_of(found[name])
+            _add_effects(page, columns, rows)
+    for name in [each for each in found if each.endswith(".svg")]:
+        page.section(name.removesuffix(".svg").replace("_", " "))
+        page.picture(found[name].read_bytes(), name)
+    for name in [each for each in found if each.endswith(".csv") and each not in _SHOWN]:
+        page.section(name)
+        columns, *rows = _rows_of(found[name])
+        page.table(columns, [list(map(_readable, row)) for row in rows[:_ROWS]])
+        if len(rows) > _ROWS:
+            page.paragraph(f"The first {_ROWS} of {len(rows):,} rows.", muted=True)
+    for name in [each for each in ("tuned.yaml", *_RESULTS) if each in found]:
+        page.section("Machine and versions" if name == "origin.json" else name)
+        page.code(_text_of(found[name]), summary="All settings" if name == "tune.json" else "")
     if not page.sections:
         raise OutputError(f"{directory}: has neither a run nor results of tune, sweep or a study")
     return page.html(), []
@@ -381,9 +389,9 @@ def _add_effects(page: HtmlPage, columns: Sequence[str], rows: Iterable[Sequence
         height = 26 * len(values) + 10
         none = 1.0 if what.startswith("ratio") else 0.0
         title = f"{what.replace('_', ' ')} to the baseline, 95 % intervals"
-        page.chart(
-            chart_part("effects", values=values, height=height, none=none, title=title, axis=what)
-        )
+        letters = max(len(str(each["name"])) for each in values)
+        looks = {"height": height, "none": none, "letters": letters}
+        page.chart(chart_part("effects", values=values, title=title, axis=what, **looks))
 
 
 def _number(value: object) -> float | None:
@@ -391,6 +399,11 @@ def _number(value: object) -> float | None:
         return float(str(value))
     except ValueError:
         return None
+
+
+def _readable(cell: str) -> str:
+    number = _number(cell) if "." in cell else None
+    return cell if number is None else f"{number:.4g}"
 
 
 def _thinned(items: Sequence[Any], most: int) -> Sequence[Any]:

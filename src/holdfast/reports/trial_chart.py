@@ -62,7 +62,7 @@ class TrialChart:
 
     def __init__(self, configuration: Configuration, result: TrialResult, most: int) -> None:
         self._problem = configuration.problem
-        self._score = SCORES.get(configuration.planning.selector.method, "").replace("\n", " ")
+        self._score = SCORES.get(configuration.planning.selector.method, "").split("\n")
         scene: Scene | None = checked.scene(self._problem)
         self._scene = scene
         size = self._problem.state_size
@@ -191,7 +191,7 @@ class TrialChart:
         first = next((row["k"] for row in self._rows if row["sensed"]), 0)
         chart = chart_part("whole", first=first, last=len(self._rows) - 1)
         longest = max(len(each) for row in self._rows for each in (row["by"] or "", *self._choices))
-        chart["usermeta"] = {"labels": 75 + min(105, 7 * longest)}
+        chart["usermeta"] = {"letters": longest}
         panels = self._panels()
         chart["params"][0]["views"] = [
             layer["name"] for panel in panels for layer in panel["layer"] if "name" in layer
@@ -201,7 +201,8 @@ class TrialChart:
             "beliefs": self._beliefs,
             "entropies": self._entropies,
         }
-        left = [self._plane(), chart_part("caption"), *self._scores()]
+        lines = max(len(row["note"]) for row in self._rows)
+        left = [self._plane(), chart_part("caption", height=14 * lines + 6), *self._scores()]
         apart = {"resolve": {"scale": {"color": "independent"}}}
         chart["concat"] = [
             {"vconcat": left, "spacing": 12, **apart},
@@ -222,9 +223,10 @@ class TrialChart:
             if points is not None:
                 values = [{"x": x, "y": y} for x, y in points.reshape(-1, 2).tolist()]
                 layers.append(chart_part(name, values=values))
+        clouds = [(_BELIEF, "particles"), *[(_TARGET, "of a target")] * len(scene.targets)]
         layers += [
-            chart_part("cloud", i=index, color=_TARGET if index else _BELIEF)
-            for index in reversed(range(len(self._planes)))
+            chart_part("cloud", i=index, color=color, title=title)
+            for index, (color, title) in reversed([*enumerate(clouds)])
         ]
         for index, plane in enumerate(self._planes):
             for kind in "mt" if self._has_truth else "m":
