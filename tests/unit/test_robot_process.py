@@ -18,6 +18,7 @@ from tests.recordings import robot_configuration
 from holdfast.config.loader import Configuration
 from holdfast.errors import HeldError, ProblemError, TrialError
 from holdfast.journal.run_directory import RunDirectory
+from holdfast.planning.inputs import PausedRecord
 from holdfast.planning.outcome import SensingDecision, TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.protocol.events import (
@@ -34,7 +35,6 @@ from holdfast.protocol.events import (
     TransportEvent,
 )
 from holdfast.protocol.question import InProcessSource
-from holdfast.protocol.records import PausedRecord
 from holdfast.protocol.status import Status
 from holdfast.robot import own_planner
 from holdfast.robot import process as robot_process

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Sequence
 
-from holdfast.protocol.messages import Input
+from holdfast.planning.inputs import CatchUpInput
 from holdfast.protocol.question import Question
 
 _LATE_IN_A_ROW = 3
@@ -287,7 +287,7 @@ class Replica:
 
     def catch_up(
         self, question: Question, *, whole_state: bool
-    ) -> tuple[tuple[Input, ...], bytes | None]:
+    ) -> tuple[tuple[CatchUpInput, ...], bytes | None]:
         """Return what a request must carry for the service to reach the question's state.
 
         The inputs since the state that it holds; or, where that is better, the whole state.

@@ -51,10 +51,7 @@ _Difference: TypeAlias = tuple[int, str, str]
 
 
 class Verification:
-    """Takes answers, has some recomputed and finds the service that was wrong.
-
-    It alone writes into the answer of a question that services answer.
-    """
+    """Takes answers, has some recomputed and finds the service that was wrong."""
 
     def __init__(
         self,
@@ -96,7 +93,7 @@ class Verification:
         actions, provenance = self._within_limits(question, actions, provenance)
         followed = question.task_actions
         if followed is None:
-            question.task_actions, question.task_provenance = actions, provenance
+            question.follow_tasks(actions, provenance)
             self._sample(question, "task", provenance.service)
         elif not same_actions(followed, actions):
             self._two_answers(question, "task", provenance.service)
@@ -107,7 +104,7 @@ class Verification:
         """Take a sensing action of a service; the robot follows the first that comes."""
         followed = question.sensing
         if followed is None:
-            question.sensing, question.sensing_provenance = answer, provenance
+            question.follow_sensing(answer, provenance)
             self._sample(question, "sensing", provenance.service)
         elif (followed.sensing_action, followed.digest) != (answer.sensing_action, answer.digest):
             self._two_answers(question, "sensing", provenance.service)
@@ -180,7 +177,7 @@ class Verification:
         """Have a share of the questions answered by the own planner, too."""
         if question.own is not None:
             if not self._compare(question, kind, question.own):
-                _use(question, question.own)
+                question.follow_own(question.own, question.own.computed_s)
         elif service != self._exempt and self._is_drawn(question):
             self.check(question)
 
@@ -221,7 +218,7 @@ class Verification:
         performed = question.num_ordered
         if not same_actions((question.task_actions or [])[:performed], event.actions[:performed]):
             return False
-        _use(question, event)
+        question.follow_own(event, event.computed_s)
         return True
 
     def _decided_again(self, question: Question, first: OwnAnswer, second: OwnAnswer) -> None:
@@ -267,17 +264,6 @@ class Verification:
     def _note(self, question: Question, service: str, kind: str, verdict: str) -> None:
         state = question.state
         self._effects.append(VerificationNoted(state.trial, state.step, service, kind, verdict))
-
-
-def _use(question: Question, own: OwnAnswer) -> None:
-    """Make the own planner's answer the one that the robot follows."""
-    provenance = Provenance(OWN_PLANNER, own.computed_s, own.computed_s)
-    if question.task_count:
-        question.task_actions, question.task_provenance = list(own.actions), provenance
-    if question.sensing_step is not None and own.sensing_action is not None:
-        digest = own.ahead_digest[:DIGEST_SIZE]
-        question.sensing = SensingAnswer(0, question.sensing_step, own.sensing_action, digest, 0)
-        question.sensing_provenance = provenance
 
 
 def _sensing_differs(question: Question, own: OwnAnswer) -> _Difference | None:

@@ -197,7 +197,7 @@ class _Collector:
 
     def observed_late(self, fact: LateFact) -> None:
         """Keep a late observation."""
-        self._late[fact.step.late.step] = fact.step.late.observation
+        self._late[fact.step.late.taken] = fact.step.late.numbers()
 
     def trial_ends(self, fact: TrialEndFact) -> None:
         """Keep the end."""
