@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from holdfast.numerics.arrays import FloatArray
-from holdfast.planning.inputs import ActingRecord, Record, Sensed, encode_floats, numbers_of
+from holdfast.planning.inputs import ActingRecord, Moved, Record, Sensed, encode_floats, numbers_of
 from holdfast.planning.outcome import MoveResult, TrialResult, ending_of
 from holdfast.planning.planner import Planner, PlanningState, decode_checkpoint, digest
 from holdfast.planning.settings import (
@@ -358,12 +358,9 @@ class World:
         result = shown if isinstance(shown, MoveResult) else MoveResult(shown)
         self.on_act(effect.step)
         ending = ending_of(self.environment.is_done())
-        motion, observation = (
-            None if each is None else np.asarray(each)
-            for each in (result.motion, result.observation)
-        )
-        acted = Acted(effect.step, result.reward, ending, motion, observation)
-        self.after(0.01, self.later(acted))
+        shows = encode_floats(result.motion), encode_floats(result.observation)
+        moved = Moved(effect.step, result.reward, *shows)
+        self.after(0.01, self.later(Acted(moved, ending)))
 
     def launch(self, effect: Launch) -> None:
         self.kill(LOCAL)

@@ -325,8 +325,8 @@ _defect(
     Edit(
         Robot,
         "_fold_move",
-        "self._unwritten.append(self._current_history.take(record))",
-        "self._current_history.take(record)",
+        "self._unwritten.append(self._current_history.take(moved))",
+        "self._current_history.take(moved)",
     ),
 )
 _defect(

@@ -120,8 +120,8 @@ _defect(
     Edit(
         Robot,
         "_settle_pending_action",
-        "begun.last or Acted(known, None, None)",
-        "Acted(known, None, None)",
+        "begun.last or Moved(known, None)",
+        "Moved(known, None)",
     ),
 )
 _defect(
@@ -130,9 +130,9 @@ _defect(
     Edit(
         Robot,
         "_fold_move",
-        "self._unwritten.append(self._current_history.take(record))",
-        "self._current_history.take(record)\n"
-        "self._unwritten.append(Moved(event.step, event.reward))",
+        "self._unwritten.append(self._current_history.take(moved))",
+        "self._current_history.take(moved)\n"
+        "self._unwritten.append(Moved(moved.step, moved.reward))",
     ),
 )
 

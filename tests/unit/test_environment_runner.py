@@ -15,7 +15,7 @@ import pytest
 from holdfast.errors import EnvironmentFailedError, InvalidValueError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.randomness import Stream
-from holdfast.planning.inputs import Late, Sensed, encode_floats
+from holdfast.planning.inputs import Late, Moved, Sensed, encode_floats
 from holdfast.planning.outcome import Ending, MoveResult, ending_of
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
@@ -204,11 +204,11 @@ class TestEvents:
         assert isinstance(sensed, Sensed)
         assert sensed == Sensed(0, 2, encode_floats([0.5]))
         runner.perform(0, ACTION)
-        assert bench.event() == Acted(0, -1.0, None)
+        assert bench.event() == Acted(Moved(0, -1.0))
         robot.answers.update(perform=None, is_done=np.True_)
         runner.perform(1, ACTION)
         acted = bench.event()
-        assert acted == Acted(1, None, Ending("succeeded"))
+        assert acted == Acted(Moved(1, None), Ending("succeeded"))
         assert isinstance(acted, Acted)
         assert type(acted.ending) is Ending
         assert [method for method, _ in robot.calls] == [
@@ -230,7 +230,7 @@ class TestEvents:
         assert bench.event() == EnvironmentReady(Ending("failed"), None)
         runner.perform(0, ACTION)
         acted = bench.event()
-        assert acted == Acted(0, -1.0, Ending("failed"))
+        assert acted == Acted(Moved(0, -1.0), Ending("failed"))
         assert isinstance(acted, Acted)
         assert type(acted.ending) is Ending
 
@@ -269,7 +269,7 @@ class TestEvents:
         runner.perform(0, action)
         reward = world.perform(action)
         assert not isinstance(reward, MoveResult)
-        assert bench.event() == Acted(0, reward, ending_of(world.is_done()))
+        assert bench.event() == Acted(Moved(0, reward), ending_of(world.is_done()))
 
 
 class TestFailures:
@@ -312,7 +312,7 @@ class TestFailures:
                 runner.perform(5, ACTION)
         failed = bench.failure()
         assert (failed.step, failed.what, failed.action_in_doubt) == (5, method, unknown)
-        assert failed.performed == (Acted(5, -1.0, None) if performed else None)
+        assert failed.performed == (Acted(Moved(5, -1.0)) if performed else None)
         assert failed.text.startswith(
             f"robot: {method} raised ValueError: the motor is hot\n  File"
         )
@@ -440,7 +440,7 @@ class TestThreads:
         assert moving.wait(PATIENCE_S)
         assert threaded.queue.empty()
         arrived.set()
-        assert threaded.event() == Acted(0, -1.0, None)
+        assert threaded.event() == Acted(Moved(0, -1.0))
 
     def test_one_call_at_a_time(self, threaded: Bench) -> None:
         arrived = threading.Event()
@@ -452,7 +452,7 @@ class TestThreads:
         ):
             runner.sense(1, 0)
         arrived.set()
-        assert threaded.event() == Acted(0, None, None)
+        assert threaded.event() == Acted(Moved(0, None))
         assert "perform_sensing" not in [method for method, _ in robot.calls]
 
     def test_it_is_made_called_and_closed_on_one_thread(self, threaded: Bench) -> None:
@@ -515,7 +515,7 @@ class TestStalls:
             method,
             f"robot: {method} has not returned within 1000 ms, which is environment.timeout_ms",
             unknown,
-            *((Acted(7, -1.0, None),) if method == "is_done" else ()),
+            *((Acted(Moved(7, -1.0)),) if method == "is_done" else ()),
         )
         runner.perform(8, ACTION)
         assert threaded.failure()[:2] == (8, method)
@@ -560,7 +560,7 @@ class TestStalls:
         runner = threaded.begin(robot, timeout_ms=1000.0)
         for step in range(25):
             runner.perform(step, ACTION)
-            assert threaded.event() == Acted(step, 0.0, None)
+            assert threaded.event() == Acted(Moved(step, 0.0))
 
 
 class TestMakePerformer:
@@ -620,12 +620,7 @@ class TestShown:
         runner.perform(0, ACTION)
         acted = bench.event()
         assert isinstance(acted, Acted)
-        assert acted.reward == -2.0
-        for came, expected in ((acted.motion, [0.1, 0.2]), (acted.observation, [3.0])):
-            assert came is not None
-            assert came.tolist() == expected
-            assert came.dtype == np.float64
-            assert not came.flags.writeable
+        assert acted.moved == Moved(0, -2.0, encode_floats([0.1, 0.2]), encode_floats([3.0]))
         assert acted.ending is None
 
     def test_an_ending_has_a_reason_of_one_line(self, bench: Bench) -> None:
@@ -725,4 +720,4 @@ class TestShown:
         assert message in failed.text
         assert failed.what == "late_observations"
         assert not failed.action_in_doubt
-        assert failed.performed == Acted(0, -1.0, None)
+        assert failed.performed == Acted(Moved(0, -1.0))

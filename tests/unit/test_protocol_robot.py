@@ -164,16 +164,16 @@ def test_what_cannot_be_folded_in_is_not_written_down() -> None:
     sense(history, 0, np.array([0.0]), 1.0)
     history.pending, _ = planner.choose_task_action(history.state)
 
-    def begin(last: Acted) -> list[RobotEffect]:
+    def begin(last: Moved) -> list[RobotEffect]:
         robot = Robot(planner, SimulatorSettings(), InProcessSource())
         begun = EnvironmentReady(None, 1, last)
         return robot.begin_trial(0, history, begun, 0.0, tail_is_certain=True)
 
-    effects = begin(Acted(0, None, None, np.array([0.5])))
+    effects = begin(Moved(0, None, encode_floats([0.5])))
     assert isinstance(effects[-1], Halt)
     assert "has no move_by_measurement" in str(effects[-1].error)
     assert not any(isinstance(effect, WriteRecords) for effect in effects)
-    effects = begin(Acted(0, None, None))
+    effects = begin(Moved(0, None))
     written = [effect.records for effect in effects if isinstance(effect, WriteRecords)]
     assert written == [(Moved(0, None),)]
 
@@ -198,8 +198,8 @@ def test_what_comes_with_a_move_is_written_before_a_lost_robot_holds_still(lost_
     robot = Robot(planner, SimulatorSettings(), InProcessSource(), lost=lost)
     robot.begin_trial(0, history, EnvironmentReady(None, 3), 0.0, tail_is_certain=True)
     late = (Late(4, 2, encode_floats([1e3])), Late(4, 0, bytes(8)))
-    shown = np.array([0.0]) if lost_by == "move" else None
-    effects = robot.handle(Acted(3, None, None, None, shown, late), 0.0)
+    moved = Moved(3, None, b"", bytes(8) if lost_by == "move" else b"")
+    effects = robot.handle(Acted(moved, None, late), 0.0)
     assert isinstance(effects[-1], Halt)
     written = [r for effect in effects if isinstance(effect, WriteRecords) for r in effect.records]
     assert [type(record) for record in written] == [Moved, Late, Late]
@@ -277,7 +277,7 @@ def test_what_fails_after_an_action_was_performed_leaves_it_in_the_journal(count
     def act_and_fail(effect: Act) -> None:
         act(effect)
         if effect.step == 5:
-            failure = EnvironmentFailed(5, "is_done", "returned None", False, Acted(5, -2.5, None))
+            failure = EnvironmentFailed(5, "is_done", "returned None", False, Acted(Moved(5, -2.5)))
             world.heap = []
             world.after(0.1, lambda: world.robot.handle(failure, world.now))
 
@@ -436,7 +436,7 @@ def test_an_answer_for_another_step_than_was_asked_of_the_environment_stops_the_
 
     def spoil(event: Sensed | NoReading | Acted) -> Callable[[], list[RobotEffect]]:
         if isinstance(event, Acted) and event.step == 6:
-            event = event._replace(step=5)
+            event = event._replace(moved=Moved(5, None))
         return later(event)
 
     world.later = spoil  # type: ignore[method-assign]

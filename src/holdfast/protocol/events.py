@@ -15,7 +15,7 @@ from typing import Generic, Literal, NamedTuple, TypeAlias, TypeVar
 
 from holdfast.errors import HoldfastError
 from holdfast.numerics.arrays import FloatArray
-from holdfast.planning.inputs import Late, Record, Sensed
+from holdfast.planning.inputs import Late, Moved, Record, Sensed
 from holdfast.planning.outcome import Ending, TrialResult
 from holdfast.planning.planner import PlanningState
 
@@ -59,15 +59,16 @@ class NoReading(NamedTuple):
 class Acted(NamedTuple):
     """A task action was performed; all numbers are finite."""
 
-    step: int
-    reward: float | None  # None if the environment gives none
-    ending: Ending | None
-    # motion, observation: what the move has shown.
-    motion: FloatArray | None = None
-    observation: FloatArray | None = None
+    moved: Moved
+    ending: Ending | None = None
     late: tuple[Late, ...] = ()  # observations of earlier steps that have come meanwhile
     # Earlier steps of which it is known now that no observation will come.
     no_reading: tuple[int, ...] = ()
+
+    @property
+    def step(self) -> int:
+        """Its step."""
+        return self.moved.step
 
 
 class EnvironmentReady(NamedTuple):
@@ -77,7 +78,7 @@ class EnvironmentReady(NamedTuple):
     # Task actions performed in this trial, counted by the environment; None if it does not count.
     steps_performed: int | None
     # What the last of these has shown; of a resumed trial, if the environment can still tell.
-    last: Acted | None = None
+    last: Moved | None = None
     # Of a resumed trial: observations that have come meanwhile.
     late: tuple[Late, ...] = ()
 

@@ -322,9 +322,12 @@ class ReplicaSet:
         startup_timeout_s: float = 0.0,
         distrusted: Collection[str] = (),  # services that answered wrongly earlier in this run
     ) -> None:
-        timeout_s = detection_timeout_s
-        self.cloud = [Replica(name, timeout_s, late_after_s=timeout_s) for name in cloud]
-        self.local = None if local is None else Replica(local, _LOCAL_PATIENCE * timeout_s)
+        self.cloud = [
+            Replica(name, detection_timeout_s, late_after_s=detection_timeout_s) for name in cloud
+        ]
+        self.local = (
+            None if local is None else Replica(local, _LOCAL_PATIENCE * detection_timeout_s)
+        )
         self._by_name = {replica.name: replica for replica in self.cloud}
         if self.local is not None:
             self._by_name[self.local.name] = self.local

@@ -214,7 +214,7 @@ class Robot:
             )
         if history.pending is not None and performed == known + 1:
             self._effects.report("performed_unseen", trial=self._trial, step=known)
-            self._fold_move(begun.last or Acted(known, None, None))
+            self._fold_move(begun.last or Moved(known, None))
             return None
         if performed != known:
             raise UnknownPerformanceError(
@@ -330,7 +330,7 @@ class Robot:
     def _performed(self, event: Acted) -> None:
         self._ending = event.ending
         try:
-            self._fold_move(event)
+            self._fold_move(event.moved)
             for late in event.late:
                 self._take_late_observation(late)
             for step in event.no_reading:
@@ -339,14 +339,12 @@ class Robot:
         except HoldfastError as error:
             self._stop(error)
 
-    def _fold_move(self, event: Acted) -> None:
+    def _fold_move(self, moved: Moved) -> None:
         """Fold in what a performed task action has shown."""
-        motion, shown = encode_floats(event.motion), encode_floats(event.observation)
-        record = Moved(event.step, event.reward, motion, shown)
         self.num_performed += 1
         # Before it is written: what cannot be folded in now can never be.
-        self._unwritten.append(self._current_history.take(record))
-        self._judge(event.step, of="move")
+        self._unwritten.append(self._current_history.take(moved))
+        self._judge(moved.step, of="move")
 
     def _take_late_observation(self, late: Late) -> None:
         """Fold in an observation of an earlier step."""

@@ -25,7 +25,7 @@ from holdfast.numerics.arrays import (
 )
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.numerics.randomness import Purpose, Stream, seed_and_trial, stream
-from holdfast.planning.inputs import Late, Sensed, encode_floats
+from holdfast.planning.inputs import Late, Moved, Sensed, encode_floats
 from holdfast.planning.outcome import Done, Ending, MoveResult, ending_of
 from holdfast.planning.settings import EnvironmentSettings
 from holdfast.problems import checked
@@ -271,7 +271,7 @@ class CheckedEnvironment:
         if resumed and callable(ask):
             self.method = "steps_performed"
             count = self._count(ask())
-        last: Acted | None = None
+        last: Moved | None = None
         late: tuple[Late, ...] = ()
         if resumed:
             ask = getattr(environment, "last_move", None)
@@ -306,21 +306,21 @@ class CheckedEnvironment:
         self.method = "perform"
         # A copy: the robot's own record of the action must stay what it is.
         action = np.array(task_action, dtype=np.float64)
-        acted = self.performed = self._moved(step, self._environment.perform(action))
+        acted = self.performed = Acted(self._moved(step, self._environment.perform(action)))
         late, no_reading = self._late(step + 1)
         acted = self.performed = acted._replace(late=late, no_reading=no_reading)
         return acted._replace(ending=self._is_done())
 
-    def _moved(self, step: int, shown: object) -> Acted:
+    def _moved(self, step: int, shown: object) -> Moved:
         """Return what a task action has shown."""
         if not isinstance(shown, MoveResult):
-            return Acted(step, self._reward(shown), None)
+            return Moved(step, self._reward(shown))
         need = f"a MoveResult whose {{}} is an array of 1 to {MAX_ACTION_SIZE} {_NUMBERS}"
         motion, observation = (
-            None if value is None else self._array(value, value, need.format(what))
+            b"" if value is None else encode_floats(self._array(value, value, need.format(what)))
             for value, what in ((shown.motion, "motion"), (shown.observation, "observation"))
         )
-        return Acted(step, self._reward(shown.reward), None, motion, observation)
+        return Moved(step, self._reward(shown.reward), motion, observation)
 
     @property
     def called(self) -> str:

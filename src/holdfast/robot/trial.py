@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from holdfast.errors import HeldError, InvalidValueError
 from holdfast.numerics.arrays import FloatArray, whole
-from holdfast.planning.inputs import Late, Moved, Reinitialised, Sensed, encode_floats
+from holdfast.planning.inputs import Late, Moved, Reinitialised, Sensed
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import ObservationInfo, Planner, PlanningState, SensingInfo, TaskInfo
 from holdfast.planning.settings import (
@@ -174,11 +174,10 @@ def run_trial(
         if planner.needs_sensing(track.state):
             _sense(track, world, observer)
             _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
-        step, (executed, task_info) = track.state.step, planner.choose_task_action(track.state)
-        acted = world.perform(step, executed)
+        executed, task_info = planner.choose_task_action(track.state)
+        acted = world.perform(track.state.step, executed)
         track.pending = executed
-        shown = encode_floats(acted.motion), encode_floats(acted.observation)
-        take_move(track, Moved(step, acted.reward, *shown), task_info, observer, environment)
+        take_move(track, acted.moved, task_info, observer, environment)
         if track.found is not None:
             _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
         for late in acted.late:

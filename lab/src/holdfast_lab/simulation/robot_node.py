@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.errors import HoldfastError, UnknownPerformanceError
 from holdfast.numerics.arrays import FloatArray
-from holdfast.planning.inputs import Late, Record, Sensed, encode_floats
+from holdfast.planning.inputs import Late, Moved, Record, Sensed, encode_floats
 from holdfast.planning.outcome import ending_of
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import (
@@ -467,7 +467,7 @@ class RobotNode:
         ending = ending_of(environment.done)
         last = None
         if performed and resumed.last is not None:
-            last = _acted(performed - 1, resumed.last)
+            last = _moved(performed - 1, resumed.last)
         begun = EnvironmentReady(ending, performed, last, resumed.late)
         self._world.note("robot", "begins trial %s at step %s", trial, known)
         self._note_late(resumed.late)
@@ -506,9 +506,9 @@ class RobotNode:
         shown = self._environment.act(step, action)
         late = self._environment.come()
         self._note_late(late)
-        event = _acted(step, shown)._replace(late=late)
+        event = Acted(_moved(step, shown), ending_of(shown.done), late)
         self._queue.after(self._run.act_s, self._happens, process, self._heard, event)
 
 
-def _acted(step: int, done: ReferenceStep) -> Acted:
-    return Acted(step, done.reward, ending_of(done.done), done.motion, done.shown)
+def _moved(step: int, done: ReferenceStep) -> Moved:
+    return Moved(step, done.reward, encode_floats(done.motion), encode_floats(done.shown))
