@@ -33,10 +33,10 @@ from benchmarks.report import Bar, Result, Table, milliseconds, paragraph
 from benchmarks.robots import Notebook, configuration_for, run_robot
 from benchmarks.turns import Asker, decided_in_process, recorded_turns
 from holdfast.journal.journal import Journal
+from holdfast.planning.inputs import ActingRecord, Moved, encode_floats
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, digest, encode_checkpoint
-from holdfast.protocol.messages import DIGEST_SIZE, encode_floats
-from holdfast.protocol.records import ActingRecord, PerformedRecord
+from holdfast.protocol.messages import DIGEST_SIZE
 from holdfast.robot.session_configuration import session_configuration_of
 from holdfast.robot.trial import run_trial
 from holdfast_lab.testbed.processes import free_port
@@ -336,7 +336,7 @@ def _journal_rows(directory: Path, number: int) -> list[list[str]]:
         with Journal.create(path, {}, survives=survives) as journal:
             for step in range(number if survives == "process_crash" else number // 10):
                 records = (
-                    PerformedRecord(step, -0.1),
+                    Moved(step, -0.1),
                     ActingRecord(step + 1, encode_floats([0.1, 0.1, 0.1])),
                 )
                 start = time.perf_counter()

@@ -12,6 +12,7 @@ from time import perf_counter
 from typing import NamedTuple, Self
 
 from benchmarks.beliefs import MAX_STEPS, SEED
+from holdfast.planning.inputs import Sensed, decode_floats, encode_floats
 from holdfast.planning.planner import Planner, PlanningState, digest, encode_checkpoint
 from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
@@ -19,16 +20,13 @@ from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared, 
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
     PROTOCOL_VERSION,
-    Observed,
     Reply,
     Request,
     SensingAnswer,
     SessionConfiguration,
     TaskAnswer,
-    decode_floats,
     decode_reply,
     encode,
-    encode_floats,
 )
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.transport.endpoints import TlsFiles
@@ -48,7 +46,7 @@ class Turn(NamedTuple):
         In which it is asked: before the first sensing action of a trial, else after one.
     digest : bytes
         Of the state, as it is sent.
-    observations : tuple of Observed
+    observations : tuple of Sensed
         All of the trial that led to the state.
     before : PlanningState or None
         Before the last of them.
@@ -63,7 +61,7 @@ class Turn(NamedTuple):
     state: PlanningState
     digest: bytes
     checkpoint: bytes
-    observations: tuple[Observed, ...]
+    observations: tuple[Sensed, ...]
     before: PlanningState | None
     actions: bytes
     sensing_step: int
@@ -87,14 +85,14 @@ def recorded_turns(problem: Problem, settings: PlanningSettings, trial: int) -> 
     environment = SimulatedEnvironment(problem, SEED, trial)
     planner = Planner(problem, settings)
     state = planner.init(SEED, trial)
-    observations: tuple[Observed, ...] = ()
+    observations: tuple[Sensed, ...] = ()
     turns = [_turn(problem, settings, state, observations, None)]
     while not environment.is_done() and state.step < MAX_STEPS:
         if planner.needs_sensing(state):
             before, sensing_action = state, turns[-1].sensing_action
             observation = environment.perform_sensing(sensing_action)
             state, _ = planner.observe(state, sensing_action, observation)
-            last = Observed(state.step, sensing_action, encode_floats(observation))
+            last = Sensed(state.step, sensing_action, encode_floats(observation))
             observations = (*observations, last)
             turns.append(_turn(problem, settings, state, observations, before))
         action, _ = planner.choose_task_action(state)
@@ -107,7 +105,7 @@ def _turn(
     problem: Problem,
     settings: PlanningSettings,
     state: PlanningState,
-    observations: tuple[Observed, ...],
+    observations: tuple[Sensed, ...],
     before: PlanningState | None,
 ) -> Turn:
     ahead, actions = _rolled(problem, settings, state)
@@ -247,7 +245,7 @@ class Asker(Caller):
         self,
         state: PlanningState,
         state_digest: bytes,
-        observations: tuple[Observed, ...] = (),
+        observations: tuple[Sensed, ...] = (),
         checkpoint: bytes | None = None,
     ) -> Asked:
         """Ask, and wait for the end of the call."""

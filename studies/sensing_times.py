@@ -16,14 +16,14 @@ import gc
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
 import pandas as pd
 
 from holdfast.errors import InvalidValueError
-from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.inputs import ActingRecord, Record, Sensed, encode_floats
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.settings import (
     ActiveSensingSettings,
@@ -31,12 +31,13 @@ from holdfast.planning.settings import (
     PlanningSettings,
     SelectorSettings,
 )
+from holdfast.planning.tracking import Trial
 from holdfast.problems.problem import Problem
-from holdfast.robot.environment import SimulatedEnvironment
+from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 from studies.cost_model import parallel_share
 from studies.trial_batches import problem_of
 
-__all__ = ["Measurement", "Sensed", "history_of", "measure_sensing", "state_in"]
+__all__ = ["Measurement", "history_of", "measure_sensing", "state_in"]
 
 _HISTORY_PARTICLES = 500
 """Particles of the trials whose history is replayed."""
@@ -72,11 +73,16 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
     particles is left out, and all above it."""
 
 
-class Sensed(NamedTuple):
-    """A sensing action and its observation."""
+class _Kept(TrialObserver):
+    def __init__(self) -> None:
+        self.records: list[Record] = []
 
-    sensing_action: int
-    observation: FloatArray
+    def sensed(self, step: SensingStep) -> None:
+        self.records.append(step.sensed)
+
+    def acted(self, step: TaskStep) -> None:
+        acting = ActingRecord(step.state.step, encode_floats(step.executed))
+        self.records += [acting, step.moved]
 
 
 def measure_sensing(**measurement: Any) -> pd.DataFrame:
@@ -124,25 +130,11 @@ def measure_sensing(**measurement: Any) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True)
 
 
-def history_of(
-    problem: Problem, settings: PlanningSettings, seed: int, trial: int
-) -> list[Sensed | FloatArray]:
-    """Run a trial; return its observations and actions, in order."""
-    planner = Planner(problem, settings)
-    state = planner.init(seed, trial)
-    environment = SimulatedEnvironment(problem, seed, trial)
-    history: list[Sensed | FloatArray] = []
-    while not environment.is_done() and state.step < _MAX_STEPS:
-        if planner.needs_sensing(state):
-            sensing_action, _ = planner.choose_sensing_action(state)
-            observation = environment.perform_sensing(sensing_action)
-            history.append(Sensed(sensing_action, observation))
-            state, _ = planner.observe(state, sensing_action, observation)
-        action, _ = planner.choose_task_action(state)
-        environment.perform(action)
-        history.append(action)
-        state = planner.advance(state, action)
-    return history
+def history_of(problem: Problem, settings: PlanningSettings, seed: int, trial: int) -> list[Record]:
+    """Run a trial; return its observations and moves, in order."""
+    kept = _Kept()
+    run_trial(Planner(problem, settings), seed, trial, max_steps=_MAX_STEPS, observer=kept)
+    return kept.records
 
 
 def state_in(
@@ -150,26 +142,19 @@ def state_in(
     settings: PlanningSettings,
     seed: int,
     trial: int,
-    history: Sequence[Sensed | FloatArray],
+    history: Sequence[Record],
 ) -> PlanningState:
     """Replay a trial's history to another belief; return its state before one sensing decision.
 
     By the trial's number it is a quarter, half or three quarters through: neither the first belief,
     which nothing has narrowed yet, nor the last.
     """
-    decisions = sum(isinstance(event, Sensed) for event in history)
-    left = int(_PLACES[trial % len(_PLACES)] * decisions)
-    planner = Planner(problem, settings)
-    state = planner.init(seed, trial)
-    for event in history:
-        if not isinstance(event, Sensed):
-            state = planner.advance(state, event)
-            continue
-        if left == 0:
-            break
-        state, _ = planner.observe(state, *event)
-        left -= 1
-    return state
+    sensed = [at for at, record in enumerate(history) if isinstance(record, Sensed)]
+    left = int(_PLACES[trial % len(_PLACES)] * len(sensed))
+    track = Trial(Planner(problem, settings), seed, trial)
+    for record in history[: sensed[left]]:
+        track.take(record)
+    return track.state
 
 
 def _settings(wanted: Measurement, particles: int, threads: int) -> PlanningSettings:

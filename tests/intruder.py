@@ -40,6 +40,7 @@ from tests.wire import (
 )
 
 from holdfast.errors import MessageError
+from holdfast.planning.inputs import encode_floats
 from holdfast.protocol.messages import (
     NeedState,
     Progress,
@@ -50,7 +51,6 @@ from holdfast.protocol.messages import (
     TaskAnswer,
     decode_reply,
     encode,
-    encode_floats,
 )
 
 __all__ = ["MOMENTS", "Impostor", "Intruder", "Message", "messages", "wrong_actions"]

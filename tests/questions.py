@@ -6,15 +6,9 @@ from typing import Any
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import MessageError
+from holdfast.planning.inputs import Sensed, encode_floats
 from holdfast.planning.planner import Planner, PlanningState, digest
-from holdfast.protocol.messages import (
-    DIGEST_SIZE,
-    PROTOCOL_VERSION,
-    Observed,
-    Request,
-    decode_request,
-    encode_floats,
-)
+from holdfast.protocol.messages import DIGEST_SIZE, PROTOCOL_VERSION, Request, decode_request
 from holdfast.robot.environment import SimulatedEnvironment
 
 __all__ = ["questions_of", "received", "request_of"]
@@ -57,7 +51,7 @@ def questions_of(configuration: Configuration, session: bytes) -> list[Request]:
         if planner.needs_sensing(state):
             action, _ = planner.choose_sensing_action(state)
             shown = environment.perform_sensing(action)
-            observed = Observed(state.step, action, encode_floats(shown))
+            observed = Sensed(state.step, action, encode_floats(shown))
             state, _ = planner.observe(state, action, shown)
             found.append(request_of(state, session, len(found) + 1, inputs=(observed,)))
         task, _ = planner.choose_task_action(state)

@@ -14,10 +14,10 @@ from holdfast.journal.journal import Journal
 from holdfast.journal.journal_file import START, Finished, decode_entry
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.belief import Belief, ObservationInfo
+from holdfast.planning.inputs import ActingRecord, Moved, Record, Sensed, encode_floats
 from holdfast.planning.outcome import Decisions, TrialResult
-from holdfast.planning.planner import Planner, PlanningState, TaskInfo, digest
+from holdfast.planning.planner import Planner, PlanningState, TaskInfo
 from holdfast.planning.sensing import SensingInfo
-from holdfast.protocol.records import ActingRecord, ObservedRecord, PerformedRecord, Record
 from holdfast.reports.recorder import Recorder
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 
@@ -119,10 +119,10 @@ def a_sensing_step(
     """Return a step whose observation has left the belief as it was."""
     state = PlanningState(5, trial, step, 0, sensed=False, belief=belief)
     info = SensingInfo(values.pop("entropies", None), None, 0, 0)
-    observation = values.pop("observation", None)
+    sensed = Sensed(step, sensing_action, encode_floats(values.pop("observation", None)))
     found = ObservationInfo(**{"effective_sample_size": 1.5, "explained": True,
                                "resampled": False, **values})  # fmt: skip
-    return SensingStep(state, sensing_action, info, observation, state, found)
+    return SensingStep(state, sensed, info, state, found)
 
 
 def a_task_step(
@@ -131,7 +131,7 @@ def a_task_step(
     """Return the first step of a trial of a world that nothing asks."""
     state = PlanningState(5, trial, 0, 0, sensed=True, belief=belief)
     nobody: Any = None
-    return TaskStep(nobody, state, TaskInfo(estimate, action, 0), action, None)
+    return TaskStep(nobody, state, TaskInfo(estimate, action, 0), action, Moved(0, None))
 
 
 class Journalling(TrialObserver):
@@ -141,11 +141,9 @@ class Journalling(TrialObserver):
         self.records: list[Record] = []
 
     def sensed(self, step: SensingStep) -> None:
-        data = np.asarray(step.observation, dtype="<f8").tobytes()
-        record = ObservedRecord(step.before.step, step.sensing_action, data, digest(step.after), 0)
-        self.records.append(record)
+        self.records.append(msgspec.structs.replace(step.sensed, sensing_ms=0.0))
 
     def acted(self, step: TaskStep) -> None:
         data = np.asarray(step.executed, dtype="<f8").tobytes()
         self.records.append(ActingRecord(step.state.step, data))
-        self.records.append(PerformedRecord(step.state.step, step.reward))
+        self.records.append(step.moved)

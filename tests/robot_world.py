@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.inputs import ActingRecord, Moved, Record, Sensed, encode_floats, numbers_of
 from holdfast.planning.outcome import MoveResult, TrialResult, ending_of
 from holdfast.planning.planner import Planner, PlanningState, decode_checkpoint, digest
 from holdfast.planning.settings import (
@@ -20,6 +21,7 @@ from holdfast.planning.settings import (
     RecoverySettings,
     SimulatorSettings,
 )
+from holdfast.planning.tracking import replay
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.events import (
@@ -33,6 +35,7 @@ from holdfast.protocol.events import (
     Halt,
     Launch,
     LogEvent,
+    NoReading,
     OwnAnswer,
     Paused,
     RecoveryExited,
@@ -40,7 +43,6 @@ from holdfast.protocol.events import (
     RobotEffect,
     Send,
     Sense,
-    Sensed,
     ServiceAppeared,
     ServiceVanished,
     VerificationNoted,
@@ -50,7 +52,6 @@ from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_TASK_ACTIONS,
     NeedState,
-    Observed,
     Progress,
     Reply,
     Request,
@@ -59,10 +60,7 @@ from holdfast.protocol.messages import (
     TaskAnswer,
     decode_request,
     encode,
-    encode_floats,
-    numbers_of,
 )
-from holdfast.protocol.records import ActingRecord, Record, replay
 from holdfast.protocol.robot import Robot
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import run_trial
@@ -130,7 +128,7 @@ class SmallService:
                 kept = planner.init(SIMULATOR.seed, request.trial)
             state = kept
             for item in request.inputs:
-                assert isinstance(item, Observed)
+                assert isinstance(item, Sensed)
                 while state.step < item.step:
                     action, _ = planner.choose_task_action(state)
                     state = planner.advance(state, action)
@@ -321,8 +319,8 @@ class World:
                 self.calls.pop(effect.call, None)
             elif isinstance(effect, Sense):
                 shown: FloatArray | None = self.environment.perform_sensing(effect.sensing_action)
-                sensed = Sensed(effect.step, shown, no_reading=shown is None)
-                self.after(0.001, self.later(sensed))
+                sensed = Sensed(effect.step, effect.sensing_action, encode_floats(shown))
+                self.after(0.001, self.later(NoReading(effect.step) if shown is None else sensed))
             elif isinstance(effect, Act):
                 self.act(effect)
             elif isinstance(effect, Launch):
@@ -349,7 +347,7 @@ class World:
         actions, sensing_action, ahead = self.planner.decide(effect.state, MAX_TASK_ACTIONS)
         return OwnAnswer(effect.number, actions, sensing_action, digest(ahead), self.own_s)
 
-    def later(self, event: Sensed | Acted) -> Callable[[], list[RobotEffect]]:
+    def later(self, event: Sensed | NoReading | Acted) -> Callable[[], list[RobotEffect]]:
         return lambda: self.robot.handle(event, self.now)
 
     def act(self, effect: Act) -> None:
@@ -361,12 +359,9 @@ class World:
         result = shown if isinstance(shown, MoveResult) else MoveResult(shown)
         self.on_act(effect.step)
         ending = ending_of(self.environment.is_done())
-        motion, observation = (
-            None if each is None else np.asarray(each)
-            for each in (result.motion, result.observation)
-        )
-        acted = Acted(effect.step, result.reward, ending, motion, observation)
-        self.after(0.01, self.later(acted))
+        shows = encode_floats(result.motion), encode_floats(result.observation)
+        moved = Moved(effect.step, result.reward, *shows)
+        self.after(0.01, self.later(Acted(moved, ending)))
 
     def launch(self, effect: Launch) -> None:
         self.kill(LOCAL)

@@ -11,8 +11,8 @@ from holdfast.numerics.randomness import Stream
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import PlanningSettings
+from holdfast.planning.tracking import Trial
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.protocol.records import TrialHistory
 from holdfast_lab.errors import Violation
 from holdfast_lab.simulation.checked_memo import CheckedPlanner
 from holdfast_lab.simulation.checkers import StatusChecker, WireChecker, check_size
@@ -207,7 +207,7 @@ class TestWireChecker:
 
 def test_what_grows_is_found_wherever_it_is() -> None:
     planner = Planner(PegInHole2D(), PlanningSettings())
-    history = TrialHistory(planner, 1, 0)
+    history = Trial(planner, 1, 0)
     check_size("the robot", history)
     history.sensing_ms += [1.0] * 600
     with pytest.raises(Violation, match="the robot holds a list of 600 entries"):

@@ -10,13 +10,14 @@ import pytest
 from holdfast.errors import InvalidValueError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.belief import Belief
+from holdfast.planning.inputs import Sensed
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
 from studies import offload_break_even
 from studies.executors import LocalExecutor
 from studies.offload_break_even import OffloadBreakEven
 from studies.running import Workload, compute, write_report
-from studies.sensing_times import Sensed, history_of, measure_sensing, state_in
+from studies.sensing_times import history_of, measure_sensing, state_in
 from studies.study import Scale
 from studies.trial_batches import problem_of
 

@@ -11,6 +11,15 @@ from tests.questions import request_of
 
 from holdfast.config import registry
 from holdfast.config.source_digest import core_version, problem_digest
+from holdfast.planning.inputs import (
+    ActingRecord,
+    LocalTookOverRecord,
+    Moved,
+    PausedRecord,
+    Record,
+    Sensed,
+    encode_floats,
+)
 from holdfast.planning.planner import Planner, PlanningState, encode_checkpoint
 from holdfast.planning.settings import (
     ActiveSensingSettings,
@@ -23,7 +32,6 @@ from holdfast.protocol.messages import (
     DIGEST_SIZE,
     Busy,
     NeedState,
-    Observed,
     Progress,
     Refused,
     Reply,
@@ -32,15 +40,6 @@ from holdfast.protocol.messages import (
     SessionConfiguration,
     TaskAnswer,
     encode,
-    encode_floats,
-)
-from holdfast.protocol.records import (
-    ActingRecord,
-    LocalTookOverRecord,
-    ObservedRecord,
-    PausedRecord,
-    PerformedRecord,
-    Record,
 )
 from holdfast.robot.environment import SimulatedEnvironment
 
@@ -86,7 +85,7 @@ class Turn(NamedTuple):
     """A robot that has sensed so often: its state, and the observations that led to it."""
 
     state: PlanningState
-    observed: tuple[Observed, ...]
+    observed: tuple[Sensed, ...]
 
 
 def session_configuration_of(
@@ -116,13 +115,13 @@ def turns(name: str = PROBLEM, count: int = 6, trial: int = 0) -> tuple[Turn, ..
     planner = Planner(problem, PLANNING)
     state = planner.init(SEED, trial)
     environment = SimulatedEnvironment(problem, SEED, trial)
-    observed: tuple[Observed, ...] = ()
+    observed: tuple[Sensed, ...] = ()
     found = [Turn(state, observed)]
     while len(found) < count:
         if planner.needs_sensing(state):
             action, _ = planner.choose_sensing_action(state)
             shown = environment.perform_sensing(action)
-            observed = (*observed, Observed(state.step, action, encode_floats(shown)))
+            observed = (*observed, Sensed(state.step, action, encode_floats(shown)))
             state, _ = planner.observe(state, action, shown)
             found.append(Turn(state, observed))
         else:
@@ -169,10 +168,10 @@ def replies() -> list[Reply]:
 def records() -> list[Record]:
     """Return a record of each kind."""
     return [
-        ObservedRecord(8, 1, encode_floats([0.5]), bytes(range(32)), 1.5),
+        Sensed(8, 1, encode_floats([0.5]), bytes(range(32)), 1.5),
         ActingRecord(8, encode_floats([0.25, -0.5])),
-        PerformedRecord(8, -1.0),
-        PerformedRecord(9, None),
+        Moved(8, -1.0),
+        Moved(9, None),
         PausedRecord(),
         LocalTookOverRecord(2),
     ]

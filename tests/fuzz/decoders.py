@@ -24,15 +24,16 @@ from tests.fuzz import message_pack, targets
 from tests.fuzz.mutations import Mutator
 
 from holdfast.config import yaml_document
+from holdfast.planning import inputs
 from holdfast.planning import planner as planning
-from holdfast.protocol import messages, records
+from holdfast.protocol import messages
 
 __all__ = ["main"]
 
 _INSTRUMENTED: dict[str, tuple[types.ModuleType, ...]] = {
     "request": (targets, message_pack, messages),
     "reply": (targets, message_pack, messages),
-    "record": (targets, message_pack, records),
+    "record": (targets, message_pack, inputs),
     "checkpoint": (targets, message_pack, planning),
     "configuration": (
         targets,

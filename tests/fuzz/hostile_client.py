@@ -13,12 +13,13 @@ from tests.fuzz import corpus
 from tests.fuzz.mutations import Mutator
 from tests.wire import frame_of, hello_of
 
+from holdfast.planning.inputs import MAX_INPUTS, Sensed
 from holdfast.planning.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,
 )
-from holdfast.protocol.messages import MAX_INPUTS, Observed, Request, encode, with_checksum
+from holdfast.protocol.messages import Request, encode, with_checksum
 
 __all__ = ["HostileMessages", "Message"]
 
@@ -109,7 +110,7 @@ class HostileMessages:
             return encode(msgspec.structs.replace(request, digest=chance.randbytes(16)))
         if field == "observations" and request.checkpoint is None:
             shown = chance.choice((b"", b"\0" * 8, b"\xff" * 8, bytes(8 * 4096)))
-            false = Observed(chance.choice(_WORDS), chance.choice((0, 1, 99)), shown)
+            false = Sensed(chance.choice(_WORDS), chance.choice((0, 1, 99)), shown)
             count = chance.choice((1, 2, MAX_INPUTS - len(request.inputs)))
             if len(shown) > 100:
                 count = 1

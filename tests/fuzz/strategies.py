@@ -10,6 +10,18 @@ from hypothesis import strategies as st
 from tests.fuzz.mutations import Mutator
 
 from holdfast.planning.belief import Belief
+from holdfast.planning.inputs import (
+    MAX_INPUTS,
+    ActingRecord,
+    Late,
+    LocalTookOverRecord,
+    Moved,
+    PausedRecord,
+    Record,
+    Reinitialised,
+    Sensed,
+    encode_floats,
+)
 from holdfast.planning.planner import PlanningState
 from holdfast.planning.settings import (
     ActiveSensingSettings,
@@ -19,13 +31,10 @@ from holdfast.planning.settings import (
 )
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
-    MAX_INPUTS,
     MAX_TASK_ACTIONS,
     PROTOCOL_VERSION,
     Busy,
-    Moved,
     NeedState,
-    Observed,
     Progress,
     Refused,
     Reply,
@@ -33,17 +42,6 @@ from holdfast.protocol.messages import (
     SensingAnswer,
     SessionConfiguration,
     TaskAnswer,
-    encode_floats,
-)
-from holdfast.protocol.records import (
-    ActingRecord,
-    LateRecord,
-    LocalTookOverRecord,
-    ObservedRecord,
-    PausedRecord,
-    PerformedRecord,
-    Record,
-    ReinitialisedRecord,
 )
 
 __all__ = ["records", "replies", "requests", "spoilt", "states"]
@@ -94,7 +92,7 @@ session_configurations = st.builds(
     planning=plannings,
     seed=st.integers(0, 2**63 - 1),
 )
-observed = st.builds(Observed, step=words, sensing_action=words, observation=numbers)
+observed = st.builds(Sensed, step=words, sensing_action=words, observation=numbers)
 moved = st.builds(Moved, step=words, motion=numbers, observation=numbers)
 _asked = {
     "version": st.just(PROTOCOL_VERSION),
@@ -138,7 +136,7 @@ replies: st.SearchStrategy[Reply] = st.one_of(
 
 records: st.SearchStrategy[Record] = st.one_of(
     st.builds(
-        ObservedRecord,
+        Sensed,
         step=words,
         sensing_action=words,
         observation=numbers,
@@ -147,20 +145,20 @@ records: st.SearchStrategy[Record] = st.one_of(
     ),
     st.builds(ActingRecord, step=words, action=numbers),
     st.builds(
-        PerformedRecord,
+        Moved,
         step=words,
         reward=st.none() | finite,
         motion=numbers,
         observation=numbers,
     ),
     st.builds(
-        LateRecord,
+        Late,
         step=words,
         taken=words,
         observation=numbers,
         digest=st.binary(min_size=32, max_size=32),
     ),
-    st.builds(ReinitialisedRecord, step=words, digest=st.binary(min_size=32, max_size=32)),
+    st.builds(Reinitialised, step=words, digest=st.binary(min_size=32, max_size=32)),
     st.just(PausedRecord()),
     st.builds(LocalTookOverRecord, times=words),
 )

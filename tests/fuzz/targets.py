@@ -24,10 +24,10 @@ from holdfast.errors import (
     MessageError,
     RecordError,
 )
+from holdfast.planning.inputs import MAX_INPUTS, decode_record, encode_record
 from holdfast.planning.planner import Planner, decode_checkpoint, digest, encode_checkpoint
 from holdfast.problems.problem import Problem
 from holdfast.protocol.messages import (
-    MAX_INPUTS,
     MAX_TASK_ACTIONS,
     PROTOCOL_VERSION,
     decode_reply,
@@ -35,7 +35,6 @@ from holdfast.protocol.messages import (
     encode,
     with_checksum,
 )
-from holdfast.protocol.records import decode_record, encode_record
 from holdfast.transport.frames import WIRE_VERSION, decode_hello
 
 __all__ = ["SPECIMENS", "TARGETS"]

@@ -12,10 +12,10 @@ from tests.fuzz.examples import always, examples
 from tests.fuzz.mutations import Mutator
 from tests.fuzz.targets import SPECIMENS, TARGETS
 
+from holdfast.planning.inputs import Record, decode_record, encode_record
 from holdfast.planning.planner import PlanningState, decode_checkpoint, digest, encode_checkpoint
 from holdfast.printable import one_line
 from holdfast.protocol.messages import Refused, Reply, Request, decode_reply, decode_request, encode
-from holdfast.protocol.records import Record, decode_record, encode_record
 
 DECODED = sorted(TARGETS)
 

@@ -18,6 +18,7 @@ from tests.fuzz.examples import always, examples
 from tests.fuzz.mutations import Mutator
 from tests.robot_world import LOCAL, World
 
+from holdfast.planning.inputs import encode_floats
 from holdfast.planning.settings import SimulatorSettings
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.events import (
@@ -38,7 +39,6 @@ from holdfast.protocol.messages import (
     SensingAnswer,
     TaskAnswer,
     encode,
-    encode_floats,
     with_checksum,
 )
 

@@ -26,9 +26,9 @@ from tests.fuzz.attack_messages import hostile_settings, odd_requests
 from tests.fuzz.targets import SPECIMENS
 from tests.unit.test_protocol_service import Bench, Robot, content, planning_of
 
+from holdfast.planning.inputs import Sensed
 from holdfast.protocol.messages import (
     MAX_WORD,
-    Observed,
     Request,
     SessionConfiguration,
     encode,
@@ -151,7 +151,7 @@ class HostileRobots(RuleBasedStateMachine):
                     kept = list(request.inputs)
                     chance.shuffle(kept)
                     shown = chance.choice((b"", b"\0" * 8, b"\xff" * 8, bytes(8 * 4096)))
-                    kept.append(Observed(chance.choice(words), chance.choice((0, 1, 99)), shown))
+                    kept.append(Sensed(chance.choice(words), chance.choice((0, 1, 99)), shown))
                     request = msgspec.structs.replace(request, inputs=tuple(kept))
                 case "own":
                     planning = planning_of(chance.choice((0, 5, 10**6)), chance.choice((1, 4, 150)))

@@ -22,16 +22,15 @@ from tests.questions import request_of
 from tests.unit.test_protocol_service import Bench, make_problem, planning_of
 
 import holdfast as hf
+from holdfast.planning.inputs import Sensed, encode_floats
 from holdfast.planning.planner import Planner, encode_checkpoint
 from holdfast.protocol.messages import (
     NeedState,
-    Observed,
     SensingAnswer,
     SessionConfiguration,
     TaskAnswer,
     decode_reply,
     encode,
-    encode_floats,
 )
 from holdfast.robot.environment import SimulatedEnvironment
 
@@ -127,7 +126,7 @@ def requests() -> list[bytes]:
             state = planner.advance(state, action)
         sensing, _ = planner.choose_sensing_action(state)
         shown = world.perform_sensing(sensing)
-        observed = Observed(state.step, sensing, encode_floats(shown))
+        observed = Sensed(state.step, sensing, encode_floats(shown))
         state, _ = planner.observe(state, sensing, shown)
         found.append(request_of(state, session, number, inputs=(observed,)))
     found.append(

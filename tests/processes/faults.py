@@ -30,8 +30,8 @@ from tests.processes.world import Hook as Hook
 from holdfast.config.loader import load
 from holdfast.config.registry import BUILT_IN
 from holdfast.journal.journal import Journal
+from holdfast.planning.inputs import ActingRecord
 from holdfast.planning.outcome import TaskDecision
-from holdfast.protocol.records import ActingRecord
 from holdfast.reports.compare import compare_runs
 from holdfast_lab.testbed import processes as lab
 from holdfast_lab.testbed.driver import ServiceCommand

@@ -317,7 +317,12 @@ _defect(
 _defect(
     "performance_not_written",
     "The journal does not record that an action was performed; the next action implies it.",
-    Edit(Robot, "_fold_move", "self._unwritten.append(record)", "pass"),
+    Edit(
+        Robot,
+        "_fold_move",
+        "self._unwritten.append(self._current_history.take(moved))",
+        "self._current_history.take(moved)",
+    ),
 )
 _defect(
     "pending_action_assumed_done",

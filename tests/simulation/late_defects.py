@@ -5,9 +5,8 @@ from __future__ import annotations
 from tests.simulation.edits import Change, Defect, Edit
 
 from holdfast.planning.tracking import Trial
-from holdfast.protocol import records
+from holdfast.protocol import messages
 from holdfast.protocol.question import Question
-from holdfast.protocol.records import TrialHistory
 from holdfast.protocol.robot import Robot
 
 __all__ = ["LATE_DEFECTS"]
@@ -19,15 +18,15 @@ def _defect(name: str, story: str, *changes: Change) -> None:
     LATE_DEFECTS[name] = Defect(name, story, changes)
 
 
-_FOLDED_AGAIN = "state = self._folded(state, self._inputs[at])"
+_FOLDED_AGAIN = "state = fold(self.planner, state, *self._inputs[at])[0]"
 
 # -- the fold --------------------------------------------------------------------------------------
 
 _defect(
     "late_folded_in_now",
     "A late observation is folded in where the robot is, not where it was taken.",
-    Edit(Trial, "observe_late", "state = self._before[position]", "state = self.state"),
-    Edit(Trial, "observe_late", _FOLDED_AGAIN, "pass"),
+    Edit(Trial, "_take_late", "self._before[position], sensed", "self.state, sensed"),
+    Edit(Trial, "_take_late", _FOLDED_AGAIN, "pass"),
 )
 _defect(
     "moves_not_folded_again",
@@ -35,23 +34,23 @@ _defect(
     "only the step is set right.",
     Edit(
         Trial,
-        "observe_late",
+        "_take_late",
         "self.state = state",
         "self.state = self.state._replace(belief=state.belief)",
     ),
-    Edit(Trial, "observe_late", _FOLDED_AGAIN, "pass"),
+    Edit(Trial, "_take_late", _FOLDED_AGAIN, "pass"),
 )
 _defect(
     "observations_not_folded_again",
     "After a late observation the moves are folded again, but not what was sensed since.",
     Edit(
         Trial,
-        "observe_late",
+        "_take_late",
         _FOLDED_AGAIN,
-        "given = self._inputs[at]\n"
+        "given, action = self._inputs[at]\n"
         "if hasattr(given, 'sensing_action'):\n"
-        "    given = given._replace(observation=None)\n"
-        "state = self._folded(state, given)",
+        "    given = msgspec.structs.replace(given, observation=b'')\n"
+        "state = fold(self.planner, state, given, action)[0]",
     ),
 )
 _defect(
@@ -59,8 +58,8 @@ _defect(
     "Observations are taken to come in the order in which they were awaited.",
     Edit(
         Trial,
-        "observe_late",
-        "next((at for at, state in self._before.items() if state.step == late.step), None)",
+        "_take_late",
+        "next((at for at, each in self._before.items() if each.step == late.taken), None)",
         "next(iter(self._before), None)",
     ),
 )
@@ -70,21 +69,21 @@ _defect(
     "it is not folded again.",
     Edit(
         Trial,
-        "observe_late",
-        "self._inputs[position] = _Sensed(sensed.sensing_action, late.observation)",
+        "_take_late",
+        "self._inputs[position] = sensed, None",
         "pass",
     ),
 )
 _defect(
     "states_before_not_renewed",
     "A late observation does not change the states that are kept for those still awaited.",
-    Edit(Trial, "observe_late", "self._before |= again", "pass"),
+    Edit(Trial, "_take_late", "self._before |= again", "pass"),
 )
 _defect(
     "late_folded_in_twice",
     "An observation that has come is still awaited: when the environment tells it again, after a "
     "crash of the robot, it is folded in again.",
-    Edit(Trial, "observe_late", "del self._before[position]", "pass"),
+    Edit(Trial, "_take_late", "del self._before[position]", "pass"),
 )
 
 # -- the robot and its journal ---------------------------------------------------------------------
@@ -92,16 +91,21 @@ _defect(
 _defect(
     "late_not_written",
     "The journal does not get late observations.",
-    Edit(Robot, "_take_late_observation", "self._unwritten.append(record)", "pass"),
+    Edit(
+        Robot,
+        "_take_late_observation",
+        "self._unwritten.append(history.take(given))",
+        "history.take(given)",
+    ),
 )
 _defect(
     "late_between_order_and_performance",
     "A journal that has a late observation between an action and its performance cannot be read.",
     Edit(
-        records,
-        "_replay_record",
-        "isinstance(record, ObservedRecord | ActingRecord) and history.pending is not None",
-        "not isinstance(record, PerformedRecord) and history.pending is not None",
+        Trial,
+        "_take",
+        "isinstance(given, Sensed | ActingRecord) and pending is not None",
+        "not isinstance(given, Moved) and pending is not None",
     ),
 )
 _defect(
@@ -116,8 +120,8 @@ _defect(
     Edit(
         Robot,
         "_settle_pending_action",
-        "begun.last or Acted(known, None, None)",
-        "Acted(known, None, None)",
+        "begun.last or Moved(known, None)",
+        "Moved(known, None)",
     ),
 )
 _defect(
@@ -126,8 +130,9 @@ _defect(
     Edit(
         Robot,
         "_fold_move",
-        "self._unwritten.append(record)",
-        "self._unwritten.append(PerformedRecord(event.step, event.reward))",
+        "self._unwritten.append(self._current_history.take(moved))",
+        "self._current_history.take(moved)\n"
+        "self._unwritten.append(Moved(moved.step, moved.reward))",
     ),
 )
 
@@ -137,14 +142,21 @@ _defect(
     Edit(
         Robot,
         "_reinitialise",
-        "self._write(history.fold_reinitialisation())",
-        "history.fold_reinitialisation()",
+        "self._write(history.take(Reinitialised(history.state.step)))",
+        "history.take(Reinitialised(history.state.step))",
     ),
 )
 _defect(
     "new_belief_not_folded_again",
     "A late observation that was taken before the belief was begun anew brings the old one back.",
-    Edit(Trial, "_folded", "return self.planner.reinitialise(state)", "return state"),
+    Edit(
+        Trial,
+        "_take_late",
+        _FOLDED_AGAIN,
+        "given, action = self._inputs[at]\n"
+        "if not isinstance(given, Reinitialised):\n"
+        "    state = fold(self.planner, state, given, action)[0]",
+    ),
 )
 
 # -- questions and services ------------------------------------------------------------------------
@@ -181,20 +193,20 @@ _defect(
     "late_not_told",
     "To a service that knows everything up to a late observation the robot sends the input before.",
     Edit(
-        TrialHistory,
-        "_add",
-        "() if given is None else (*self.inputs, given)[-MAX_INPUTS:]",
-        "(*self.inputs, *((given,) if given else ()))[-MAX_INPUTS:]",
+        Trial,
+        "_note_input",
+        "(*self.inputs, given)[-MAX_INPUTS:] if isinstance(given, Sensed | Moved) else ()",
+        "(*self.inputs, *((given,) if isinstance(given, Sensed | Moved) else ()))[-MAX_INPUTS:]",
     ),
 )
 _defect(
     "motion_not_told",
     "Services get the observation that came with a move, but not the measured motion.",
     Edit(
-        TrialHistory,
-        "fold_move",
-        "Moved(record.step, motion, observation)",
-        "Moved(record.step, b'', observation)",
+        messages,
+        "_sent",
+        "_SentMoved(given.step, given.motion, given.observation)",
+        "_SentMoved(given.step, b'', given.observation)",
     ),
 )
 _defect(

@@ -27,7 +27,7 @@ from holdfast.journal import journal_file, journal_reader
 from holdfast.journal.journal import Journal
 from holdfast.journal.journal_file import START, JournalFile
 from holdfast.journal.journal_reader import JournalReader
-from holdfast.protocol.records import Record
+from holdfast.planning.inputs import Record
 
 SECTOR = 512
 LIMIT = 400

@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 
 from holdfast.numerics.randomness import Stream, stream
-from holdfast.protocol.records import (
-    ActingRecord,
-    LateRecord,
-    ObservedRecord,
-    PerformedRecord,
-    Record,
-)
+from holdfast.planning.inputs import ActingRecord, Late, Moved, Record, Sensed
 from holdfast_lab.errors import Violation
 from holdfast_lab.simulation.checkers import WireChecker
 from holdfast_lab.simulation.environment_model import EnvironmentModel
@@ -33,8 +27,8 @@ def simulator() -> Simulator:
     return Simulator()
 
 
-def observed(step: int, sensing_action: int, shown: bytes = b"") -> ObservedRecord:
-    return ObservedRecord(step, sensing_action, shown, bytes(32), 0.0)
+def observed(step: int, sensing_action: int, shown: bytes = b"") -> Sensed:
+    return Sensed(step, sensing_action, shown, bytes(32), 0.0)
 
 
 class Body:
@@ -60,13 +54,13 @@ class Body:
                 )
             self.journal.append(ActingRecord(at, reference.action))
             self.world.act(at, np.frombuffer(reference.action))
-            self.journal.append(PerformedRecord(at, None))
-            came += [each.step for each in self.world.come()]
+            self.journal.append(Moved(at, None))
+            came += [each.taken for each in self.world.come()]
         return came
 
     def resume(self, **lacks: bool) -> list[int]:
         resumed = self.world.resumed(self.journal, may_lack=lacks.get("may_lack", False))
-        return [each.step for each in resumed.late]
+        return [each.taken for each in resumed.late]
 
 
 class TestEnvironmentModel:
@@ -87,7 +81,7 @@ class TestEnvironmentModel:
     def test_what_never_came(self) -> None:
         body = Body(8)
         body.go_to(4)
-        body.journal.append(LateRecord(4, 0, bytes(8), bytes(32)))
+        body.journal.append(Late(4, 0, bytes(8), bytes(32)))
         with pytest.raises(Violation, match="step 0, which never came"):
             body.resume()
 

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 import pytest
+from tests.trial_inputs import sense
 
 from holdfast.errors import ProblemError
 from holdfast.numerics.arrays import FloatArray, IntArray
@@ -26,9 +27,9 @@ from holdfast.planning.settings import (
     SelectorSettings,
     SimulatorSettings,
 )
+from holdfast.planning.tracking import Trial
 from holdfast.problems.attributes import sensing_costs
 from holdfast.problems.problem import ProblemBase
-from holdfast.protocol.records import TrialHistory
 from holdfast.robot.trial import run_trial
 
 HYPOTHESES = stream(43, 0, 0, Purpose.HYPOTHESES)
@@ -457,10 +458,10 @@ class TestSensingCosts:
 
     def test_a_robot_pays_for_each_look(self) -> None:
         planner = Planner(Priced(), settings_of(method="random", particles=30))
-        history = TrialHistory(planner, 0, 0)
+        history = Trial(planner, 0, 0)
         observation = np.array([0.5])
         for sensing_action, total in ((0, -0.5), (1, -0.75), (2, -0.75)):
-            history.fold_observation(sensing_action, observation, 0.0)
+            sense(history, sensing_action, observation, 0.0)
             assert history.rewards.total == total
 
     def test_a_price_alone_is_a_reward(self) -> None:
@@ -487,7 +488,7 @@ class TestSensingCosts:
                 ).reward
                 == reward
             )
-            assert TrialHistory(Planner(problem, settings), 0, 0).rewards.total == reward
+            assert Trial(Planner(problem, settings), 0, 0).rewards.total == reward
 
     @pytest.mark.parametrize("kind", [Dock, Sonar])
     def test_not_to_sense_is_as_an_observation_that_says_nothing(self, kind: type[Dock]) -> None:

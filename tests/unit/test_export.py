@@ -32,9 +32,9 @@ from holdfast.config.registry import BUILT_IN
 from holdfast.errors import UntrustedCodeError
 from holdfast.journal.journal import Journal
 from holdfast.planning.belief import Belief
+from holdfast.planning.inputs import ActingRecord, Moved, Sensed
 from holdfast.planning.outcome import SensingDecision, TaskDecision, TrialResult
 from holdfast.planning.planner import Planner
-from holdfast.protocol.records import ActingRecord, ObservedRecord
 from holdfast.reports.poses import PoseLayout, pose_layout
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 
@@ -691,16 +691,15 @@ class TestUnfinished:
         with Journal.read(run / "journal.bin") as journal:
             meta, first = journal.meta(), next(iter(journal.results(with_decisions=True)))
         (run / "journal.bin").unlink()
-        from holdfast.planning.planner import digest
-
         records: list[Any] = []
         sensed = {step.before.step: step for step in seen.sensed_steps}
         for step in seen.steps[:7]:
             if step.step in sensed:
-                records.append(observed(sensed[step.step], digest(sensed[step.step].after)))
+                records.append(sensed[step.step].sensed)
             if step.step < 6:
                 records.append(ActingRecord(step.step, step.action.tobytes()))
-        assert isinstance(records[-1], ObservedRecord) == (6 in sensed)
+                records.append(Moved(step.step, None))
+        assert isinstance(records[-1], Sensed) == (6 in sensed)
         with Journal.create(run / "journal.bin", meta) as journal:
             journal.add(first)
             journal.append(1, records)
@@ -725,11 +724,6 @@ class TestUnfinished:
         said = place.export("--csv", "tables", code=2)
         assert "no trial of that run is finished or begun" in said.stderr
         assert not (tmp_path / "tables").exists()
-
-
-def observed(step: SensingStep, digest: bytes) -> ObservedRecord:
-    values = np.ascontiguousarray(step.observation, dtype="<f8").tobytes()
-    return ObservedRecord(step.before.step, step.sensing_action, values, digest, 0.1)
 
 
 class TestRefusals:

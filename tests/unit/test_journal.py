@@ -21,14 +21,8 @@ from holdfast.journal import journal_reader
 from holdfast.journal.journal import Journal
 from holdfast.journal.journal_file import Survives
 from holdfast.journal.journal_reader import UnfinishedTrial
+from holdfast.planning.inputs import ActingRecord, Moved, PausedRecord, Record, Sensed
 from holdfast.planning.outcome import Decisions, TrialResult
-from holdfast.protocol.records import (
-    ActingRecord,
-    ObservedRecord,
-    PausedRecord,
-    PerformedRecord,
-    Record,
-)
 
 TRIAL = 3
 
@@ -37,8 +31,8 @@ def records_of(step: int) -> list[Record]:
     """What a robot writes at one step, with numbers that tell the step."""
     action = struct.pack("<3d", step, -0.0, 1.0 / (step + 1))
     shown, reached = struct.pack("<d", step / 7), bytes([100 + step]) * 32
-    observed = ObservedRecord(step, step % 5, shown, reached, step / 3)
-    performed = [PerformedRecord(step - 1, -float(step))] if step else []
+    observed = Sensed(step, step % 5, shown, reached, step / 3)
+    performed = [Moved(step - 1, -float(step))] if step else []
     return [*performed, observed, ActingRecord(step, action)]
 
 
@@ -402,7 +396,7 @@ class TestDamage:
             assert isinstance(self.outcome(path, read=read), str), offset
 
     def test_where_it_is_damaged_is_named(self, killed: bytes, path: Path) -> None:
-        observed = [record for record in all_records(6) if isinstance(record, ObservedRecord)]
+        observed = [record for record in all_records(6) if isinstance(record, Sensed)]
         for what, named in (
             (b"x" * 100, "after its notes, at byte 64"),
             (bytes([1]) * 200, "after the result of trial 0, at byte"),

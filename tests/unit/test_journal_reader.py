@@ -16,9 +16,7 @@ from holdfast.journal.journal_file import Finished, Notes, Steps, packed
 from holdfast.journal.journal_reader import JournalReader
 from holdfast.planning.outcome import Decisions
 from holdfast.planning.planner import Planner
-from holdfast.protocol.records import (
-    replay,
-)
+from holdfast.planning.tracking import replay
 from holdfast.robot.trial import run_trial
 
 BEFORE_OUTCOMES = Path(__file__).parent / "data" / "journal_before_outcomes.sqlite"

@@ -70,7 +70,7 @@ class Noting(TrialObserver):
         self.actions.append(step.executed.tobytes())
 
     def observed_late(self, step: LateStep) -> None:
-        self.late.append((step.late.step, step.after.step))
+        self.late.append((step.late.taken, step.after.step))
 
 
 def run(environment: Environment, max_steps: int = 30) -> tuple[TrialResult, Noting]:

@@ -9,23 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.recordings import configuration_of
+from tests.trial_inputs import come_late, sense
 
 from holdfast.config.loader import Configuration
 from holdfast.journal.journal import Journal
 from holdfast.journal.timings import EventTable
 from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.inputs import ActingRecord, Moved, Record, encode_floats
 from holdfast.planning.outcome import Ending
 from holdfast.planning.planner import Planner, digest
-from holdfast.planning.tracking import LateObservation
+from holdfast.planning.tracking import Trial
 from holdfast.protocol.events import Timing
-from holdfast.protocol.messages import encode_floats
-from holdfast.protocol.records import (
-    ActingRecord,
-    LateRecord,
-    PerformedRecord,
-    Record,
-    TrialHistory,
-)
 from holdfast.reports.facts import (
     EventFact,
     LateFact,
@@ -65,11 +59,11 @@ class Steps(TrialObserver):
         self.acting.append(step)
 
 
-def a_trial(configuration: Configuration, number: int) -> tuple[list[Record], TrialHistory]:
+def a_trial(configuration: Configuration, number: int) -> tuple[list[Record], Trial]:
     """Run a trial, and return its records as a robot journals them."""
     seed, max_steps = configuration.simulator.seed, configuration.simulator.max_steps
     planner = Planner(configuration.problem, configuration.planning)
-    history = TrialHistory(planner, seed, number)
+    history = Trial(planner, seed, number)
     world = SimulatedEnvironment(configuration.problem, seed, number)
     records: list[Record] = []
     while not world.is_done() and history.state.step < max_steps:
@@ -77,14 +71,14 @@ def a_trial(configuration: Configuration, number: int) -> tuple[list[Record], Tr
         if planner.needs_sensing(state):
             sensing_action, _ = planner.choose_sensing_action(state)
             shown = np.asarray(world.perform_sensing(sensing_action), dtype=np.float64)
-            records.append(history.fold_observation(sensing_action, shown, 0.0)[1])
+            records.append(sense(history, sensing_action, shown, 0.0))
         action, _ = planner.choose_task_action(history.state)
         reward = world.perform(action)
         assert reward is None or isinstance(reward, float)
-        performed = PerformedRecord(state.step, reward)
+        performed = Moved(state.step, reward)
         records += [ActingRecord(state.step, encode_floats(action)), performed]
         history.pending = action
-        history.fold_move(performed)
+        history.take(performed)
     return records, history
 
 
@@ -203,18 +197,15 @@ def test_the_files_of_a_run_that_goes_on(configuration: Configuration, tmp_path:
 def test_an_observation_that_comes_late(configuration: Configuration) -> None:
     planner = Planner(configuration.problem, configuration.planning)
     seed = configuration.simulator.seed
-    history = TrialHistory(planner, seed, 0)
+    history = Trial(planner, seed, 0)
     world = SimulatedEnvironment(configuration.problem, seed, 0)
     shown = np.asarray(world.perform_sensing(1), dtype=np.float64)
-    _, observed = history.fold_observation(1, None, 0.0)
+    observed = sense(history, 1, None)
     action, _ = planner.choose_task_action(history.state)
     history.pending = action
-    performed = PerformedRecord(0, None)
-    history.fold_move(performed)
-    came = history.fold_late_observation(LateObservation(0, shown))
-    assert came is not None
-    late = came[1]
-    assert isinstance(late, LateRecord)
+    performed = Moved(0, None)
+    history.take(performed)
+    late, found = come_late(history, 0, shown), history.found
     facts = Facts()
     follower = Follower(configuration, facts, clock=lambda: 0)
     acting = ActingRecord(0, encode_floats(action))
@@ -225,7 +216,7 @@ def test_an_observation_that_comes_late(configuration: Configuration) -> None:
     assert sensed.step.observation_info.explained
     (came_late,) = facts.of(LateFact)
     taken, after, info = came_late.step
-    assert (after.step, taken.step, info) == (1, 0, came[0])
-    assert taken.observation.tobytes() == shown.tobytes()
+    assert (after.step, taken.taken, info) == (1, 0, found)
+    assert taken.observation == shown.tobytes()
     assert digest(after) == digest(history.state)
     assert facts.all[-1].belief.states.tobytes() == history.state.belief.states.tobytes()

@@ -11,14 +11,14 @@ from tests.robot_world import PLANNING, PROBLEM, World
 
 from holdfast.errors import HeldError
 from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.inputs import Record, Reinitialised, Sensed
 from holdfast.planning.lost import MOVE, Verdict
 from holdfast.planning.outcome import MoveResult, TrialResult
 from holdfast.planning.planner import ObservationInfo, Planner
 from holdfast.planning.settings import LostSettings, OnLost, SimulatorSettings
-from holdfast.planning.tracking import Trial
+from holdfast.planning.tracking import Trial, replay
 from holdfast.protocol.events import Effects, Halt, LogEvent, RobotEffect, WriteRecords
 from holdfast.protocol.observation_reports import ObservationReports
-from holdfast.protocol.records import ObservedRecord, Record, ReinitialisedRecord, replay
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import run_trial
 
@@ -93,7 +93,7 @@ def test_a_lost_robot_is_told_and_goes_on() -> None:
     assert told[0]["false_alarm_rate"] == 1e-4
     assert 5 <= told[0]["outside"] <= told[0]["observations"]  # type: ignore[operator]
     assert not world.reports("reinitialised")
-    assert not any(isinstance(record, ReinitialisedRecord) for record in world.journal)
+    assert not any(isinstance(record, Reinitialised) for record in world.journal)
 
 
 def test_a_lost_robot_begins_its_belief_anew() -> None:
@@ -120,8 +120,8 @@ def test_a_robot_killed_anywhere_near_begins_it_anew_once() -> None:
     """Also between the observation and the record of the new belief."""
     whole = world_of("reinitialise")
     records = written(whole)
-    at = next(i for i, record in enumerate(records) if isinstance(record, ReinitialisedRecord))
-    assert isinstance(records[at - 1], ObservedRecord)
+    at = next(i for i, record in enumerate(records) if isinstance(record, Reinitialised))
+    assert isinstance(records[at - 1], Sensed)
     for length in range(at - 2, at + 4):
         again = world_of("reinitialise", records[:length])
         assert again.results[0].digest == whole.results[0].digest
@@ -156,7 +156,8 @@ def test_a_suspect_sensor_is_named_and_the_robot_is_not_lost(action: int, named:
     reports = ObservationReports(effects, LostSettings(on_lost="hold"))
     trial = Trial(Planner(PROBLEM, PLANNING), 11, 0)
     trial.alarm = Verdict("sensor_suspect", action, 5, 6)
-    assert reports.observed(trial, 3, ObservationInfo(1.0, True, True)) is None
+    trial.found = ObservationInfo(1.0, True, True)
+    assert reports.observed(trial, 3) is None
     (told,) = effects.take()
     assert isinstance(told, LogEvent)
     assert told.name == "sensor_suspect"
@@ -174,7 +175,7 @@ def test_what_else_comes_at_once_does_not_find_a_lost_robot_again(
     found = iter(["hold", None])
     monkeypatch.setattr(robot.reports, "observed", lambda *_, **__: next(found))
     for step in (3, 2):
-        robot._judge(step, ObservationInfo(1.0, True, True))
+        robot._judge(step)
     robot._hold_if_lost()
     (halt,) = [each for each in robot._take() if isinstance(each, Halt)]
     assert "step 3" in str(halt.error)

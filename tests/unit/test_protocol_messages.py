@@ -17,17 +17,16 @@ from tests.fuzz.odd_values import STORMS, OddValues, replaced
 
 from holdfast.config import yaml_document
 from holdfast.errors import MessageError
+from holdfast.planning.inputs import MAX_INPUTS, Sensed, decode_floats, encode_floats
 from holdfast.planning.settings import PlanningSettings
 from holdfast.protocol.messages import (
     CHECKSUM_SIZE,
     DIGEST_SIZE,
     MAX_CONFIGURATION_BYTES,
-    MAX_INPUTS,
     MAX_TASK_ACTIONS,
     PROTOCOL_VERSION,
     Busy,
     NeedState,
-    Observed,
     Progress,
     Refused,
     Reply,
@@ -35,11 +34,9 @@ from holdfast.protocol.messages import (
     SensingAnswer,
     SessionConfiguration,
     TaskAnswer,
-    decode_floats,
     decode_reply,
     decode_request,
     encode,
-    encode_floats,
     settings_digest,
     unpack_configuration,
     with_checksum,
@@ -55,7 +52,7 @@ REQUEST = Request(
     40,
     True,
     b"d" * DIGEST_SIZE,
-    (Observed(36, 1, encode_floats([1.0, 2.0])),),
+    (Sensed(36, 1, encode_floats([1.0, 2.0])),),
     SessionConfiguration("peg_in_hole_2d", {"peg_width": 1.0}, {}, PlanningSettings(), 9),
 )
 REPLIES: list[Reply] = [
@@ -84,7 +81,7 @@ def test_another_version_is_named_even_if_its_fields_are_unknown() -> None:
         {"epoch": -1},
         {"step": 2**32},
         {"digest": b"d" * 32},
-        {"inputs": (Observed(1, 0, b""),) * (MAX_INPUTS + 1)},
+        {"inputs": (Sensed(1, 0, b""),) * (MAX_INPUTS + 1)},
         {"checkpoint": b"a checkpoint and observations"},
     ],
 )

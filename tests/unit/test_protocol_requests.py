@@ -6,6 +6,7 @@ import numpy as np
 from tests.robot_world import World, nth
 
 from holdfast.errors import StaleEpochError
+from holdfast.planning.inputs import encode_floats
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
     NeedState,
@@ -14,7 +15,6 @@ from holdfast.protocol.messages import (
     Request,
     SensingAnswer,
     TaskAnswer,
-    encode_floats,
 )
 
 

@@ -10,12 +10,14 @@ import msgspec
 import numpy as np
 import pytest
 from tests.robot_world import LOCAL, PLANNING, PROBLEM, FailingWorld, Misleading, World
+from tests.trial_inputs import begin_anew, sense
 
 from holdfast.errors import HeldError, UnknownPerformanceError
+from holdfast.planning.inputs import ActingRecord, Late, Moved, Record, Sensed, encode_floats
 from holdfast.planning.outcome import ending_of
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings, OnLost, SimulatorSettings
-from holdfast.planning.tracking import LateObservation
+from holdfast.planning.tracking import Trial, replay
 from holdfast.protocol.events import (
     Act,
     Acted,
@@ -23,22 +25,13 @@ from holdfast.protocol.events import (
     EnvironmentReady,
     Halt,
     LogEvent,
+    NoReading,
     RobotEffect,
-    Sensed,
     Timing,
     WriteRecords,
 )
 from holdfast.protocol.messages import Reply, SensingAnswer, TaskAnswer
 from holdfast.protocol.question import OWN_PLANNER, InProcessSource
-from holdfast.protocol.records import (
-    ActingRecord,
-    LateRecord,
-    ObservedRecord,
-    PerformedRecord,
-    Record,
-    TrialHistory,
-    replay,
-)
 from holdfast.protocol.robot import Robot
 from holdfast.reports.recorder import Recorder
 from holdfast.robot.environment import SimulatedEnvironment
@@ -138,27 +131,27 @@ def begin_after(
 def test_what_came_late_is_written_before_a_pending_action_is_ordered(on_lost: OnLost) -> None:
     """And a robot that is lost by it and holds still does not order it."""
     planner = Planner(PROBLEM, PLANNING)
-    history = TrialHistory(planner, 11, 0, 1.0)
-    history.fold_observation(0, None, 1.0)
+    history = Trial(planner, 11, 0, 1.0)
+    sense(history, 0, None, 1.0)
     history.pending, _ = planner.choose_task_action(history.state)
     lost = LostSettings(false_alarm_rate=1.0, on_lost=on_lost)
     robot = Robot(planner, SimulatorSettings(), InProcessSource(), lost=lost)
-    late = (LateObservation(0, np.array([1e3])),)
+    late = (Late(0, 0, encode_floats([1e3])),)
     begun = EnvironmentReady(None, 0, None, late)
     effects = robot.begin_trial(0, history, begun, 0.0, tail_is_certain=True)
     kinds = [type(effect) for effect in effects if not isinstance(effect, LogEvent)]
     assert kinds == ([WriteRecords, Halt] if on_lost == "hold" else [WriteRecords, Act])
     written = effects[[type(effect) for effect in effects].index(WriteRecords)]
     assert isinstance(written, WriteRecords)
-    assert isinstance(written.records[0], LateRecord)
+    assert isinstance(written.records[0], Late)
 
 
 def test_the_lines_about_what_nobody_awaits_are_bounded() -> None:
     planner = Planner(PROBLEM, PLANNING)
     robot = Robot(planner, SimulatorSettings(), InProcessSource())
-    late = (LateObservation(7, np.array([0.0])),) * 1000
+    late = (Late(0, 7, bytes(8)),) * 1000
     begun = EnvironmentReady(None, 0, None, late)
-    effects = robot.begin_trial(0, TrialHistory(planner, 11, 0), begun, 0.0, tail_is_certain=True)
+    effects = robot.begin_trial(0, Trial(planner, 11, 0), begun, 0.0, tail_is_certain=True)
     told = [e.fields for e in effects if isinstance(e, LogEvent) and e.name == "late_unused"]
     assert len(told) == 10
     assert str(told[-1]["reason"]).endswith("further ones of this trial are counted only")
@@ -168,22 +161,22 @@ def test_the_lines_about_what_nobody_awaits_are_bounded() -> None:
 def test_what_cannot_be_folded_in_is_not_written_down() -> None:
     """So the robot can go on once its environment is mended, which says again what it has shown."""
     planner = Planner(PROBLEM, PLANNING)
-    history = TrialHistory(planner, 11, 0)
-    history.fold_observation(0, np.array([0.0]), 1.0)
+    history = Trial(planner, 11, 0)
+    sense(history, 0, np.array([0.0]), 1.0)
     history.pending, _ = planner.choose_task_action(history.state)
 
-    def begin(last: Acted) -> list[RobotEffect]:
+    def begin(last: Moved) -> list[RobotEffect]:
         robot = Robot(planner, SimulatorSettings(), InProcessSource())
         begun = EnvironmentReady(None, 1, last)
         return robot.begin_trial(0, history, begun, 0.0, tail_is_certain=True)
 
-    effects = begin(Acted(0, None, None, np.array([0.5])))
+    effects = begin(Moved(0, None, encode_floats([0.5])))
     assert isinstance(effects[-1], Halt)
     assert "has no move_by_measurement" in str(effects[-1].error)
     assert not any(isinstance(effect, WriteRecords) for effect in effects)
-    effects = begin(Acted(0, None, None))
+    effects = begin(Moved(0, None))
     written = [effect.records for effect in effects if isinstance(effect, WriteRecords)]
-    assert written == [(PerformedRecord(0, None),)]
+    assert written == [(Moved(0, None),)]
 
 
 @pytest.mark.parametrize("lost_by", ["move", "late"])
@@ -196,31 +189,31 @@ def test_what_comes_with_a_move_is_written_before_a_lost_robot_holds_still(lost_
     )
     planner = Planner(problem, settings)
     lost = LostSettings(false_alarm_rate=0.1, on_lost="hold")
-    history = TrialHistory(planner, 11, 0, lost.false_alarm_rate)
+    history = Trial(planner, 11, 0, lost.false_alarm_rate)
     for step in range(3):
-        history.fold_observation(0, np.array([1e3]) if step == 1 else None, 1.0)
+        sense(history, 0, np.array([1e3]) if step == 1 else None, 1.0)
         history.pending, _ = planner.choose_task_action(history.state)
-        history.fold_move(PerformedRecord(step, None))
-    history.fold_observation(0, np.array([0.0]), 1.0)
+        history.take(Moved(step, None))
+    sense(history, 0, np.array([0.0]), 1.0)
     history.pending, _ = planner.choose_task_action(history.state)
     robot = Robot(planner, SimulatorSettings(), InProcessSource(), lost=lost)
     robot.begin_trial(0, history, EnvironmentReady(None, 3), 0.0, tail_is_certain=True)
-    late = (LateObservation(2, np.array([1e3])), LateObservation(0, np.array([0.0])))
-    shown = np.array([0.0]) if lost_by == "move" else None
-    effects = robot.handle(Acted(3, None, None, None, shown, late), 0.0)
+    late = (Late(4, 2, encode_floats([1e3])), Late(4, 0, bytes(8)))
+    moved = Moved(3, None, b"", bytes(8) if lost_by == "move" else b"")
+    effects = robot.handle(Acted(moved, None, late), 0.0)
     assert isinstance(effects[-1], Halt)
     written = [r for effect in effects if isinstance(effect, WriteRecords) for r in effect.records]
-    assert [type(record) for record in written] == [PerformedRecord, LateRecord, LateRecord]
+    assert [type(record) for record in written] == [Moved, Late, Late]
     assert history.awaited == ()
     assert history.is_lost
-    history.fold_reinitialisation()
+    begin_anew(history)
     assert not history.is_lost
 
 
 def test_an_unknown_performance_stops_unless_the_environment_can_tell() -> None:
     stages, _ = recorded()
     pending = next(s for s in stages if s and isinstance(s[-1], ActingRecord) and len(s) > 6)
-    known = len([r for r in pending if isinstance(r, PerformedRecord)])
+    known = len([r for r in pending if isinstance(r, Moved)])
     stopped = begin_after(pending, None).stopped
     assert stopped is not None
     assert isinstance(stopped.error, UnknownPerformanceError)
@@ -235,8 +228,8 @@ def test_an_unknown_performance_stops_unless_the_environment_can_tell() -> None:
 
 def test_a_tail_that_may_be_lost_stops_unless_the_environment_can_tell() -> None:
     stages, _ = recorded()
-    settled = next(s for s in stages if s and isinstance(s[-1], ObservedRecord) and len(s) > 6)
-    known = len([r for r in settled if isinstance(r, PerformedRecord)])
+    settled = next(s for s in stages if s and isinstance(s[-1], Sensed) and len(s) > 6)
+    known = len([r for r in settled if isinstance(r, Moved)])
     assert begin_after(settled, None, tail_is_certain=True).stopped is None
     assert begin_after(settled, None, tail_is_certain=False).stopped is not None
     assert begin_after(settled, known, tail_is_certain=False).stopped is None
@@ -285,7 +278,7 @@ def test_what_fails_after_an_action_was_performed_leaves_it_in_the_journal(count
     def act_and_fail(effect: Act) -> None:
         act(effect)
         if effect.step == 5:
-            failure = EnvironmentFailed(5, "is_done", "returned None", False, Acted(5, -2.5, None))
+            failure = EnvironmentFailed(5, "is_done", "returned None", False, Acted(Moved(5, -2.5)))
             world.heap = []
             world.after(0.1, lambda: world.robot.handle(failure, world.now))
 
@@ -294,7 +287,7 @@ def test_what_fails_after_an_action_was_performed_leaves_it_in_the_journal(count
     assert world.stopped is not None
     assert type(world.stopped.error) is HeldError
     assert "step 5, whose task action was performed: returned None" in str(world.stopped.error)
-    assert world.journal[-1] == PerformedRecord(5, -2.5)
+    assert world.journal[-1] == Moved(5, -2.5)
     # The effects come in this order: what is to be written down is, before the robot stops.
     resumed = begin_after(tuple(world.journal), None)
     assert resumed.stopped is None
@@ -468,9 +461,9 @@ def test_an_answer_for_another_step_than_was_asked_of_the_environment_stops_the_
     world = World()
     later = world.later
 
-    def spoil(event: Sensed | Acted) -> Callable[[], list[RobotEffect]]:
+    def spoil(event: Sensed | NoReading | Acted) -> Callable[[], list[RobotEffect]]:
         if isinstance(event, Acted) and event.step == 6:
-            event = event._replace(step=5)
+            event = event._replace(moved=Moved(5, None))
         return later(event)
 
     world.later = spoil  # type: ignore[method-assign]
@@ -502,9 +495,9 @@ def test_an_observation_of_the_wrong_size_stops_the_robot_resumably() -> None:
     world = World(launch="never")
     later = world.later
 
-    def spoil(event: Sensed | Acted) -> Callable[[], list[RobotEffect]]:
+    def spoil(event: Sensed | NoReading | Acted) -> Callable[[], list[RobotEffect]]:
         if isinstance(event, Sensed) and event.step >= 4:
-            event = event._replace(observation=np.zeros(7))
+            event = msgspec.structs.replace(event, observation=bytes(56))
         return later(event)
 
     world.later = spoil  # type: ignore[method-assign]

@@ -27,6 +27,7 @@ from holdfast.errors import (
     ProblemError,
     UnknownProblemError,
 )
+from holdfast.planning.inputs import Sensed, decode_floats, encode_floats
 from holdfast.planning.planner import (
     Planner,
     PlanningState,
@@ -48,7 +49,6 @@ from holdfast.protocol.messages import (
     MAX_TASK_ACTIONS,
     Busy,
     NeedState,
-    Observed,
     Progress,
     Refused,
     Reply,
@@ -56,10 +56,8 @@ from holdfast.protocol.messages import (
     SensingAnswer,
     SessionConfiguration,
     TaskAnswer,
-    decode_floats,
     decode_reply,
     encode,
-    encode_floats,
 )
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect, StartJob
@@ -187,7 +185,7 @@ class Robot:
         self.environment = SimulatedEnvironment(
             self.problem, self.session_configuration.seed, trial
         )
-        self.observed: list[Observed] = []
+        self.observed: list[Sensed] = []
 
     @property
     def planning(self) -> PlanningSettings:
@@ -216,7 +214,7 @@ class Robot:
         planner = Planner(self.problem, self.planning)
         index, _ = planner.choose_sensing_action(self.state)
         observation = self.environment.perform_sensing(index)
-        self.observed.append(Observed(self.state.step, index, encode_floats(observation)))
+        self.observed.append(Sensed(self.state.step, index, encode_floats(observation)))
         self.state, _ = planner.observe(self.state, index, observation)
 
     def act(self) -> None:
@@ -615,18 +613,18 @@ class TestRefusals:
     def test_observation_of_the_wrong_size(self) -> None:
         bench, robot = Bench(), Robot()
         robot.sense()
-        wrong = Observed(0, 0, encode_floats(np.zeros(7)))
+        wrong = Sensed(0, 0, encode_floats(np.zeros(7)))
         assert refused(bench.ask(robot.request(inputs=(wrong,)))).code == "invalid"
 
     @pytest.mark.parametrize(
         ("observed", "code"),
         [
-            (Observed(0, 10**6, encode_floats(np.zeros(1))), "invalid"),
-            (Observed(0, 0, b"123"), "malformed"),
-            (Observed(0, 0, encode_floats([np.nan])), "malformed"),
+            (Sensed(0, 10**6, encode_floats(np.zeros(1))), "invalid"),
+            (Sensed(0, 0, b"123"), "malformed"),
+            (Sensed(0, 0, encode_floats([np.nan])), "malformed"),
         ],
     )
-    def test_observation_that_is_none(self, observed: Observed, code: str) -> None:
+    def test_observation_that_is_none(self, observed: Sensed, code: str) -> None:
         bench, robot = Bench(), Robot()
         robot.sense()
         assert refused(bench.ask(robot.request(inputs=(observed,)))).code == code

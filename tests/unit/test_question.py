@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from holdfast.errors import MessageError
+from holdfast.planning.inputs import encode_floats
 from holdfast.planning.planner import Planner, decode_checkpoint
 from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.dispatcher import Dispatcher
-from holdfast.protocol.messages import MAX_TASK_ACTIONS, SensingAnswer, TaskAnswer, encode_floats
+from holdfast.protocol.messages import MAX_TASK_ACTIONS, SensingAnswer, TaskAnswer
 from holdfast.protocol.question import DecisionSource, InProcessSource, Question, same_actions
 
 

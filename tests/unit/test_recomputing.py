@@ -16,14 +16,10 @@ from holdfast.config.loader import Configuration
 from holdfast.errors import OutputError
 from holdfast.journal.fingerprint import EarlierCode
 from holdfast.journal.run_directory import RunDirectory
+from holdfast.planning.inputs import ActingRecord, Record, Sensed
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import EnvironmentSettings
-from holdfast.protocol.records import (
-    ActingRecord,
-    ObservedRecord,
-    Record,
-)
 from holdfast.robot import recomputing
 from holdfast.robot.recomputing import resume_run
 from holdfast.robot.trial import run_trial
@@ -124,7 +120,7 @@ def test_another_decision_is_refused_and_named(tmp_path: Path) -> None:
     begun = records_of(configuration, 2, 7)
     first = result_of(configuration, 0)
     sensed, acting = begun[0], begun[5]
-    assert isinstance(sensed, ObservedRecord)
+    assert isinstance(sensed, Sensed)
     assert isinstance(acting, ActingRecord)
     action = (np.frombuffer(acting.action) + 1e-16).tobytes()
     cases: dict[str, tuple[TrialResult, list[Record]]] = {

@@ -8,25 +8,19 @@ import msgspec
 import numpy as np
 import pytest
 from tests.recordings import Journalling, configuration_of, record_trial
+from tests.trial_inputs import come_late, sense
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import RecordError
+from holdfast.planning.inputs import ActingRecord, Moved, Record, Sensed, encode_floats
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
-from holdfast.planning.tracking import LateObservation
+from holdfast.planning.tracking import Trial
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.protocol.messages import encode_floats
-from holdfast.protocol.records import (
-    ActingRecord,
-    ObservedRecord,
-    PerformedRecord,
-    Record,
-    TrialHistory,
-)
 from holdfast.reports.figure import trial_figure
 from holdfast.reports.recorder import Recorder
-from holdfast.robot.recorded_trial import run_recorded_trial
+from holdfast.robot.recomputing import run_recorded_trial
 from holdfast.robot.trial import NULL_OBSERVER, run_trial
 
 
@@ -93,7 +87,7 @@ class TestRunRecordedTrial:
         configuration = configuration_of(tmp_path)
         records, result = self.first(configuration)
         observed = records[0]
-        assert isinstance(observed, ObservedRecord)
+        assert isinstance(observed, Sensed)
         other = msgspec.structs.replace(observed, sensing_action=observed.sensing_action ^ 1)
         for spoilt in ([other, *records[1:]], records[:20], records[1:]):
             with pytest.raises(RecordError, match="trial 1: the decision of step"):
@@ -107,25 +101,23 @@ def test_what_came_when_a_killed_robot_went_on_comes_there_again(again: tuple[st
         particle_filter=ParticleFilterSettings(num_particles=30), sensing_interval=0
     )
     planner = Planner(PegInHole2D(), settings)
-    history, records = TrialHistory(planner, 3, 0), list[Record]()
+    history, records = Trial(planner, 3, 0), list[Record]()
 
     def late(taken: int) -> None:
-        found = history.fold_late_observation(LateObservation(taken, np.array([0.1 * taken])))
-        assert found is not None
-        records.append(found[1])
+        records.append(come_late(history, taken, np.array([0.1 * taken])))
 
     for step in range(4):
         sensing_action, _ = planner.choose_sensing_action(history.state)
-        records.append(history.fold_observation(sensing_action, None, 0.0)[1])
+        records.append(sense(history, sensing_action, None, 0.0))
         if step == 2 and "chosen" in again:
             late(0)
         history.pending, _ = planner.choose_task_action(history.state)
         records.append(ActingRecord(step, encode_floats(history.pending)))
         if step == 2 and "moving" in again:
             late(1)
-        performed = PerformedRecord(step, None)
+        performed = Moved(step, None)
         records.append(performed)
-        history.fold_move(performed)
+        history.take(performed)
         if step == 2:
             late(2)
     result = history.result(None)

@@ -17,8 +17,8 @@ from tests.command_line import run_here
 
 from holdfast.errors import HoldfastError, OutputError
 from holdfast.journal.journal import Journal
+from holdfast.planning.inputs import ActingRecord, Sensed
 from holdfast.planning.outcome import DecisionLog, TrialResult
-from holdfast.protocol.records import ActingRecord, ObservedRecord
 from holdfast.reports.compare import Comparison, compare_runs
 
 COMMAND = [sys.executable, "-m", "holdfast"]
@@ -91,7 +91,7 @@ def run_of(
         if unfinished is not None:
             journal.append(
                 unfinished,
-                [ObservedRecord(0, 1, b"\0" * 8, b"\0" * 32, 0.5), ActingRecord(0, action)],
+                [Sensed(0, 1, b"\0" * 8, b"\0" * 32, 0.5), ActingRecord(0, action)],
             )
     return directory
 

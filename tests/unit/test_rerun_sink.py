@@ -15,8 +15,8 @@ from tests.recordings import a_sensing_step, a_task_step, result_of
 
 from holdfast.config.loader import Configuration, load
 from holdfast.planning.belief import Belief
+from holdfast.planning.inputs import Late, encode_floats
 from holdfast.planning.outcome import TrialResult
-from holdfast.planning.tracking import LateObservation
 from holdfast.reports.facts import (
     Decider,
     EventFact,
@@ -181,7 +181,7 @@ def test_a_late_observation_and_the_choice_not_to_sense(tmp_path: Path) -> None:
         sink.sensed(SensingFact(a_sensing_step(belief, 3, step=3), MS, 2 * MS, None))
         for explained in (False, True):
             after = a_sensing_step(belief, 3, step=5, explained=explained)
-            late = LateObservation(2, np.array([0.1]))
+            late = Late(5, 2, encode_floats([0.1]))
             step = LateStep(late, after.after, after.observation_info)
             sink.observed_late(LateFact(step, 3 * MS))
 

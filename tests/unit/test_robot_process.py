@@ -18,6 +18,7 @@ from tests.recordings import robot_configuration
 from holdfast.config.loader import Configuration
 from holdfast.errors import HeldError, ProblemError, TrialError
 from holdfast.journal.run_directory import RunDirectory
+from holdfast.planning.inputs import Moved, PausedRecord
 from holdfast.planning.outcome import SensingDecision, TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.protocol.events import (
@@ -34,7 +35,6 @@ from holdfast.protocol.events import (
     TransportEvent,
 )
 from holdfast.protocol.question import InProcessSource
-from holdfast.protocol.records import PausedRecord
 from holdfast.protocol.status import Status
 from holdfast.robot import own_planner
 from holdfast.robot import process as robot_process
@@ -220,7 +220,7 @@ def test_what_comes_from_inside_an_effect_is_handled_after_the_effects_at_hand(
     def world_answers(name: str, **_: object) -> None:
         machine.trace.append(name)
         if name == "first":
-            robot._happens(Acted(0, None, None))
+            robot._happens(Acted(Moved(0, None)))
 
     robots.event = world_answers  # type: ignore[method-assign, assignment]
     robot, machine = scripted(robots, lambda: robot._happens(RecoveryExited(1, "begin")))
@@ -240,8 +240,8 @@ def test_the_loop_looks_at_the_wire_before_it_handles_more_than_some_events(
             # A simulated world of which each step takes long never lets the queue run empty.
             robot._on_loop().call_soon(machine.trace.append, "the wire")
             clock.jump(0.1)
-            robot._happens(Acted(0, None, None))
-            robot._happens(Acted(1, None, None))
+            robot._happens(Acted(Moved(0, None)))
+            robot._happens(Acted(Moved(1, None)))
 
     robots.event = event  # type: ignore[method-assign, assignment]
     robot, machine = scripted(robots, lambda: robot._happens(RecoveryExited(1, "begin")))

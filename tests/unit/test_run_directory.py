@@ -18,10 +18,8 @@ from holdfast.journal.run_directory import (
     claim_default_directory,
     latest_default_directory,
 )
+from holdfast.planning.inputs import PausedRecord
 from holdfast.planning.settings import EnvironmentSettings
-from holdfast.protocol.records import (
-    PausedRecord,
-)
 from holdfast.robot.recomputing import resume_run
 
 

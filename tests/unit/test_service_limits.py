@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from holdfast.protocol.messages import MAX_INPUTS
+from holdfast.planning.inputs import MAX_INPUTS
 from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
 from holdfast.service import shell
 

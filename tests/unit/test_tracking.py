@@ -7,16 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.trial_inputs import begin_anew, come_late, move, sense
 
 from holdfast import numerics
-from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.errors import InvalidValueError, MessageError, ProblemError, RecordError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.randomness import Stream
 from holdfast.planning import tracking as module
 from holdfast.planning.outcome import Ending
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
-from holdfast.planning.tracking import LateObservation, Trial
+from holdfast.planning.tracking import Trial
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import ProblemBase
 
@@ -67,12 +68,12 @@ class Cart(ProblemBase):
 
 
 def acted(trial: Trial, **shown: FloatArray) -> None:
-    trial.move(trial.planner.choose_task_action(trial.state)[0], None, **shown)
+    move(trial, trial.planner.choose_task_action(trial.state)[0], None, **shown)
 
 
 def observed(trial: Trial, observation: FloatArray | None) -> None:
     action, _ = trial.planner.choose_sensing_action(trial.state)
-    trial.observe(action, observation, 0.0)
+    sense(trial, action, observation, 0.0)
 
 
 def bits(trial: Trial) -> bytes:
@@ -85,7 +86,7 @@ def test_an_observation_of_the_wrong_size_changes_nothing() -> None:
     acted(trial)
     before = bits(trial)
     with pytest.raises(InvalidValueError, match="observation of 2 coordinates"):
-        trial.observe_late(LateObservation(0, np.zeros(2)))
+        come_late(trial, 0, np.zeros(2))
     assert bits(trial) == before
     assert trial.awaited == (0,)
 
@@ -99,15 +100,18 @@ def test_what_is_awaited_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
             observed(trial, None)
         acted(trial)
     assert trial.awaited == (6,)
-    assert trial.observe_late(LateObservation(0, np.array([0.2]))) is None
-    assert trial.observe_late(LateObservation(6, np.array([0.2]))) is not None
+    with pytest.raises(RecordError, match="of step 0, where none is awaited"):
+        come_late(trial, 0, np.array([0.2]))
+    come_late(trial, 6, np.array([0.2]))
 
 
 def test_not_to_sense_awaits_nothing() -> None:
     planner = Planner(Cart(), SETTINGS)
     trial = Trial(planner, 1, 0)
     before = trial.state.belief
-    info, _ = trial.observe(planner.no_sensing, None, 0.5)
+    sense(trial, planner.no_sensing, None, 0.5)
+    info = trial.found
+    assert info is not None
     assert info.explained
     assert not info.resampled
     assert trial.state.sensed
@@ -115,7 +119,7 @@ def test_not_to_sense_awaits_nothing() -> None:
     assert trial.awaited == ()
     assert (trial.num_inputs, trial.num_sensed) == (1, 0)
     with pytest.raises(InvalidValueError, match="sensing action 1: cart has 0 to 0"):
-        trial.observe(planner.no_sensing, np.zeros(1), 0.0)
+        sense(Trial(planner, 1, 0), planner.no_sensing, np.zeros(1))
 
 
 @pytest.mark.parametrize(
@@ -123,18 +127,18 @@ def test_not_to_sense_awaits_nothing() -> None:
     [
         (np.zeros(3), None, "a move has the measured motion .* but peg_in_hole_2d has no "),
         (None, np.zeros(3), "a move has shown .* has no move_log_likelihood"),
-        (np.array([np.nan]), None, r"motion \[nan\]: every coordinate must be finite"),
+        (np.array([np.nan]), None, r"\[nan\] are not all finite"),
     ],
 )
 def test_a_problem_that_cannot_fold_it_in_is_named(
     motion: FloatArray | None, observation: FloatArray | None, message: str
 ) -> None:
     trial = Trial(Planner(PegInHole2D(), SETTINGS), 1, 0)
-    trial.observe(0, np.zeros(1), 0.0)
+    sense(trial, 0, np.zeros(1), 0.0)
     before = bits(trial)
     action, _ = trial.planner.choose_task_action(trial.state)
-    with pytest.raises((InvalidValueError, ProblemError), match=message):
-        trial.move(action, None, motion, observation)
+    with pytest.raises((InvalidValueError, MessageError, ProblemError), match=message):
+        move(trial, action, None, motion, observation)
     assert bits(trial) == before
 
 
@@ -148,7 +152,7 @@ def test_a_new_belief_is_the_initial_one_or_the_problems_own() -> None:
         observed(trial, np.array([0.2]))
         acted(trial)
         before = trial.state
-        assert trial.reinitialise() == bits(trial)
+        assert begin_anew(trial).digest == bits(trial)
         assert trial.state._replace(belief=before.belief) == before
         assert (trial.state.belief.weights == 1 / 50).all()
         # Of 50 normal deviates: outside 0.6 and 1.4 with a probability below 1e-4.
@@ -158,18 +162,17 @@ def test_a_new_belief_is_the_initial_one_or_the_problems_own() -> None:
 
 def test_what_was_taken_before_a_new_belief_is_no_evidence_against_it() -> None:
     """Else a robot whose belief has begun anew would be lost again by its old looks."""
-    late = [LateObservation(step, np.array([1e3])) for step in range(8)]
     alarms = []
     for begins_anew in (False, True):
         trial = Trial(Planner(Cart(), PlanningSettings(sensing_interval=0)), 1, 0)
-        for _ in late:
+        for _ in range(8):
             observed(trial, None)
             acted(trial)
         if begins_anew:
-            trial.reinitialise()
-        for each in late:
-            assert trial.observe_late(each) is not None
-        assert trial.num_unexplained == len(late)
+            begin_anew(trial)
+        for step in range(8):
+            come_late(trial, step, np.array([1e3]))
+        assert trial.num_unexplained == 8
         alarms.append(trial.lost_test.num_lost)
     assert alarms == [1, 0]
 
@@ -201,8 +204,7 @@ def test_one_observation_at_a_time_may_come_late_for_ever(monkeypatch: pytest.Mo
         observed(trial, None)
         acted(trial)
         acted(trial)
-        late = LateObservation(step, np.array([0.2]))
-        assert trial.observe_late(late) is not None
+        come_late(trial, step, np.array([0.2]))
         acted(trial)
         assert trial._inputs == []
 
@@ -237,21 +239,21 @@ def test_the_account_of_a_trial() -> None:
     def note() -> None:
         counts.append((trial.num_sensed, trial.num_inputs, trial.num_unexplained))
 
-    trial.observe(0, far, 2.0)
+    sense(trial, 0, far, 2.0)
     note()
-    trial.move(np.zeros(1), reward=-1.0)
+    move(trial, np.zeros(1), reward=-1.0)
     note()
-    trial.observe(0, None, 4.0)
+    sense(trial, 0, None, 4.0)
     note()
-    trial.move(np.zeros(1), reward=-0.5, observation=np.array([1.0]))
+    move(trial, np.zeros(1), reward=-0.5, observation=np.array([1.0]))
     note()
-    trial.observe(trial.planner.no_sensing, None, 0.0)
+    sense(trial, trial.planner.no_sensing, None, 0.0)
     note()
-    trial.move(np.zeros(1), motion=np.zeros(1))
+    move(trial, np.zeros(1), motion=np.zeros(1))
     note()
-    assert trial.observe_late(LateObservation(1, far)) is not None
+    come_late(trial, 1, far)
     note()
-    trial.reinitialise()
+    begin_anew(trial)
     note()
     assert counts == [
         *((0, 0, 0), (1, 1, 1), (1, 1, 1), (2, 2, 1), (2, 3, 1), (2, 4, 1), (2, 5, 1)),
@@ -262,7 +264,7 @@ def test_the_account_of_a_trial() -> None:
     assert (result.sensing_ms, result.mean_sensing_ms) == ((2.0, 4.0, 0.0), 2.0)
     assert result.recoveries == 0
     digests = {result.digest}
-    for shorter in (trial.reinitialise, lambda: trial.result(None)):
+    for shorter in (lambda: begin_anew(trial), lambda: trial.result(None)):
         shorter()
         digests.add(trial.result(None).digest)
     assert len(digests) == 3  # the log has the new belief, and each ending
@@ -276,9 +278,9 @@ def test_an_alarm_is_that_of_the_last_input(kind: str) -> None:
     observed(trial, None)
     acted(trial)
     if kind == "late":
-        assert trial.observe_late(LateObservation(0, far)) is not None
+        come_late(trial, 0, far)
     else:
-        trial.observe(0, far, 0.0)
+        sense(trial, 0, far, 0.0)
     assert alarm_of(trial) == "lost"
     if kind == "observed":
         acted(trial)
@@ -286,7 +288,7 @@ def test_an_alarm_is_that_of_the_last_input(kind: str) -> None:
     elif kind == "moved":
         acted(trial)
     else:
-        trial.reinitialise()
+        begin_anew(trial)
     assert alarm_of(trial) is None
 
 
@@ -298,13 +300,13 @@ def test_a_new_belief_has_no_evidence_against_it() -> None:
     trial = Trial(Planner(Cart(), PlanningSettings(sensing_interval=0)), 1, 0, 0.1)
     far = np.array([1e3])
     for alarmed in (False, True):
-        trial.observe(0, far, 0.0)
+        sense(trial, 0, far, 0.0)
         assert (trial.alarm is not None) == alarmed
         acted(trial)
-    trial.observe(0, far, 0.0)
-    trial.reinitialise()
+    sense(trial, 0, far, 0.0)
+    begin_anew(trial)
     acted(trial)
-    trial.observe(0, far, 0.0)
+    sense(trial, 0, far, 0.0)
     assert trial.alarm is None
 
 

@@ -11,6 +11,7 @@ from tests.robot_world import LOCAL, PLANNING, PROBLEM, World
 
 from holdfast.errors import HoldfastError, ProblemError, ServiceRefusedError
 from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.inputs import decode_floats, encode_floats
 from holdfast.planning.planner import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.events import (
@@ -23,13 +24,7 @@ from holdfast.protocol.events import (
     RobotEffect,
     VerificationNoted,
 )
-from holdfast.protocol.messages import (
-    Reply,
-    SensingAnswer,
-    TaskAnswer,
-    decode_floats,
-    encode_floats,
-)
+from holdfast.protocol.messages import Reply, SensingAnswer, TaskAnswer
 from holdfast.protocol.question import Provenance, Question, same_actions
 from holdfast.protocol.verification import MAX_OPEN_CHECKS, Verification
 

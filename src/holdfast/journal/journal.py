@@ -35,8 +35,8 @@ from holdfast.journal.journal_file import (
     steps_payload,
 )
 from holdfast.journal.journal_reader import SESSION_SIZE, JournalReader
+from holdfast.planning.inputs import Record
 from holdfast.planning.outcome import TrialResult
-from holdfast.protocol.records import Record
 from holdfast.runtime.files import synchronize
 
 __all__ = ["Journal"]

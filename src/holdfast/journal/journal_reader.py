@@ -31,8 +31,8 @@ from holdfast.journal.journal_file import (
     decode_entry,
     find_journal,
 )
+from holdfast.planning.inputs import Record
 from holdfast.planning.outcome import Decisions, TrialResult
-from holdfast.protocol.records import Record
 
 SESSION_SIZE = 16
 """Bytes that identify a run."""

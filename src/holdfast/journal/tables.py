@@ -146,13 +146,10 @@ def _mean(total: float | None, count: int) -> float | None:
     return None if total is None or not count else total / count
 
 
-_COUNTS = (
-    "sensing_decisions",
-    "missing_observations",
-    "unexplained_observations",
-    "lost",
-    "suspect_sensors",
-    "recoveries",
+_COUNTS = tuple(
+    name
+    for name in RunSummary.__struct_fields__
+    if name in TRIAL_COLUMNS and name not in ("seed", "digest", "fewest_distinct_particles")
 )
 """What the summary has of a trial's counts, under the same names: their sums."""
 

@@ -268,8 +268,7 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     """The result of a trial. Its scalar fields are the columns of ``trials.csv``.
 
     A field that is added here, with a default for older journals, is a column
-    (:data:`TRIAL_COLUMNS`); :func:`holdfast.robot.trial.run_trial` fills it in, and for a robot
-    :meth:`holdfast.protocol.records.TrialHistory.result`.
+    (:data:`TRIAL_COLUMNS`); :meth:`holdfast.planning.tracking.Trial.result` fills it in.
 
     Attributes
     ----------

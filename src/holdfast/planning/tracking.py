@@ -8,15 +8,38 @@ a trial in which each observation was there at its step and the same actions wer
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from collections.abc import Sequence
+from typing import TypeVar
 
+import msgspec
+import numpy as np
+
+from holdfast.errors import InvalidValueError, MessageError, RecordError
 from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.inputs import (
+    MAX_INPUTS,
+    ActingRecord,
+    CatchUpInput,
+    Input,
+    Late,
+    LocalTookOverRecord,
+    Moved,
+    PausedRecord,
+    Record,
+    Reinitialised,
+    Sensed,
+    decode_floats,
+    fold,
+    has_shown,
+)
 from holdfast.planning.lost import MOVE, LostTest, Verdict
-from holdfast.planning.outcome import DecisionLog, Ending, RewardAccount, TrialResult
+from holdfast.planning.outcome import DecisionLog, Ending, RewardAccount, TaskDecision, TrialResult
 from holdfast.planning.planner import ObservationInfo, Planner, PlanningState
 from holdfast.planning.settings import LostSettings
 
-__all__ = ["MAX_AWAITED", "MAX_INPUTS_SINCE", "LateObservation", "Trial"]
+__all__ = ["MAX_AWAITED", "MAX_INPUTS_SINCE", "Trial", "replay"]
+
+_GivenT = TypeVar("_GivenT", bound=Record)
 
 MAX_AWAITED = 16
 """Bound on the observations that are awaited at once; of more, the oldest is given up."""
@@ -24,38 +47,6 @@ MAX_AWAITED = 16
 MAX_INPUTS_SINCE = 2000
 """Bound on what happened since the oldest awaited observation, which is then given up: all of that
 is kept in memory, and folded again when it comes."""
-
-
-class LateObservation(NamedTuple):
-    """An observation that comes after its step.
-
-    Attributes
-    ----------
-    step : int
-        Task actions that were performed when it was taken.
-    observation : array of shape (observation_size,)
-    """
-
-    step: int
-    observation: FloatArray
-
-
-class _Sensed(NamedTuple):
-    sensing_action: int
-    observation: FloatArray | None
-
-
-class _Moved(NamedTuple):
-    action: FloatArray
-    motion: FloatArray | None
-    observation: FloatArray | None
-
-
-class _Reinitialised(NamedTuple):
-    pass
-
-
-_Input: TypeAlias = _Sensed | _Moved | _Reinitialised
 
 
 class Trial:
@@ -82,6 +73,15 @@ class Trial:
     lost_test : LostTest
     alarm : Verdict or None
         That of the last input or move.
+    found : ObservationInfo or None
+        What its observation was found to be.
+    is_lost : bool
+        Whether the robot was found lost by the last observation or move, or by what came late since
+        then.
+    pending : array or None
+        A task action in the journal that is not known to be performed.
+    paused : bool
+        Whether the last record says that the robot's process ended in order.
     sensing_ms : list of float
         How long each choice of a sensing action took.
     recoveries : int
@@ -106,11 +106,17 @@ class Trial:
         self.fewest_distinct: int | None = None
         self.lost_test = LostTest(false_alarm_rate)
         self.alarm: Verdict | None = None
+        self.found: ObservationInfo | None = None
         self.sensing_ms: list[float] = []
         self.recoveries = 0
-        # From the oldest awaited observation on: each input and, of an awaited one, the state
-        # before it.
-        self._inputs: list[_Input] = []
+        # The latest inputs from which a service can fold the state, as many as fit into a request.
+        self.inputs: tuple[CatchUpInput, ...] = ()
+        self.pending: FloatArray | None = None
+        self.paused = False
+        self.is_lost = False
+        # From the oldest awaited observation on: each input, the action of a move and, of an
+        # awaited one, the state before it.
+        self._inputs: list[tuple[Input, FloatArray | None]] = []
         self._before: dict[int, PlanningState] = {}
 
     @property
@@ -118,96 +124,129 @@ class Trial:
         """Steps whose observation is still to come, oldest first."""
         return tuple(state.step for state in self._before.values())
 
-    def observe(
-        self, sensing_action: int, observation: FloatArray | None, sensing_ms: float
-    ) -> tuple[ObservationInfo, bytes]:
-        """Fold in a sensing action; return what was found, and the digest of the state after it.
+    @property
+    def begun(self) -> bool:
+        """Whether anything has happened."""
+        return self.num_inputs > 0 or self.state.step > 0 or self.pending is not None
 
-        Without an observation it comes late, or never: there was no reading.
-        """
-        planner, before = self.planner, self.state
-        after, info = planner.observe(before, sensing_action, observation)
-        performed = sensing_action != planner.no_sensing
-        awaited = performed and observation is None
-        if awaited and len(self._before) == MAX_AWAITED:
-            self._give_up_oldest()
-        self._keep(_Sensed(sensing_action, observation), before if awaited else None)
-        self.state = after
-        self.num_sensed += performed
-        self.num_missing += awaited
-        self.num_inputs += 1
-        self._judge(sensing_action, None if observation is None else info)
-        self.sensing_ms.append(sensing_ms)
-        reached = planner.digest(after)
-        self.log.sensed(before.step, sensing_action, reached)
-        self.rewards.sensed(sensing_action)
-        return info, reached
+    @property
+    def actions(self) -> list[FloatArray]:
+        """The task actions that were performed, in order."""
+        decided = self.log.decisions()
+        return [np.array(each.action) for each in decided if isinstance(each, TaskDecision)]
 
-    def move(
-        self,
-        action: FloatArray,
-        reward: float | None = None,
-        motion: FloatArray | None = None,
-        observation: FloatArray | None = None,
-    ) -> ObservationInfo | None:
-        """Fold in a performed task action; return what its observation has shown, if there is one.
+    def take(self, given: _GivenT) -> _GivenT:
+        """Fold in a record; return it with the digest of the state that it leads to.
 
         Raises
         ------
+        RecordError
+            If it does not follow from those before it.
         HoldfastError
-            If the problem cannot fold in what the move has shown; nothing is changed then.
+            If the problem cannot fold it in. Nothing is changed by a record that raises.
         """
-        step = self.state.step
-        moved = _Moved(action, motion, observation)
-        state, info = self._moved(self.state, moved)
-        self._keep(moved)
-        self.log.acted(step, action)
-        self.state = state
-        if motion is not None or observation is not None:
-            self.num_inputs += 1
-            self.log.moved(step, self.planner.digest(state))
-        self._judge(MOVE, info)
-        self.rewards.acted(reward)
-        return info
+        digest = self._take(given)
+        self.paused = isinstance(given, PausedRecord)
+        return given if digest is None else msgspec.structs.replace(given, digest=digest)
 
-    def observe_late(self, late: LateObservation) -> tuple[ObservationInfo, bytes] | None:
-        """Fold in an observation at its step, and what followed again; None if none is awaited.
-
-        Otherwise return what was found, and the digest of the state that it led to.
-        """
-        position = next((at for at, state in self._before.items() if state.step == late.step), None)
-        if position is None:
+    def _take(self, given: Record) -> bytes | None:
+        if isinstance(given, PausedRecord):
             return None
-        sensed = self._inputs[position]
-        assert isinstance(sensed, _Sensed)
-        state = self._before[position]
-        state, info = self.planner.observe(state, sensed.sensing_action, late.observation)
+        if isinstance(given, LocalTookOverRecord):
+            self.recoveries += given.times
+            return None
+        state, pending = self.state, self.pending
+        if isinstance(given, Sensed | ActingRecord) and pending is not None:
+            raise RecordError("comes before the action of that step is known to be performed")
+        if given.step != state.step:
+            raise RecordError(f"is of step {given.step}, where step {state.step} is due")
+        if isinstance(given, Sensed):
+            if not self.planner.needs_sensing(state):
+                raise RecordError("is an observation where a task action is due")
+            return self._sense(given)
+        if isinstance(given, Late):
+            return self._take_late(given)
+        if isinstance(given, Reinitialised):
+            return self._reinitialise(given)
+        if isinstance(given, ActingRecord):
+            if self.planner.needs_sensing(state):
+                raise RecordError("is a task action where an observation is due")
+            self.pending = decode_floats(given.action, self.planner.problem.action_size)
+        elif pending is None:
+            raise RecordError("is of a performance of which no action was written down")
+        else:
+            self._move(given, pending)
+        return None
+
+    def _sense(self, given: Sensed) -> bytes:
+        before = self.state
+        after, info = fold(self.planner, before, given, None)
+        performed = given.sensing_action != self.planner.no_sensing
+        awaited = performed and not given.observation
+        if awaited and len(self._before) == MAX_AWAITED:
+            self._give_up_oldest()
+        self._keep(given, None, before if awaited else None)
+        self.state = after
+        self.num_sensed += performed
+        self.num_missing += awaited
+        self._note_input(given)
+        self._judge(given.sensing_action, info if given.observation else None)
+        self.found = info
+        self.is_lost = self._is_alarmed()
+        self.sensing_ms.append(given.sensing_ms)
+        reached = self.planner.digest(after)
+        self.log.sensed(before.step, given.sensing_action, reached)
+        self.rewards.sensed(given.sensing_action)
+        return reached
+
+    def _move(self, given: Moved, action: FloatArray) -> None:
+        state, info = fold(self.planner, self.state, given, action)
+        self._keep(given, action)
+        self.log.acted(given.step, action)
+        self.state, self.pending = state, None
+        if has_shown(given):
+            self._note_input(given)
+            self.log.moved(given.step, self.planner.digest(state))
+        self._judge(MOVE, info)
+        self.is_lost = self._is_alarmed()
+        self.rewards.acted(given.reward)
+
+    def _take_late(self, late: Late) -> bytes:
+        """Fold in an observation at its step, and what followed again."""
+        position = next((at for at, each in self._before.items() if each.step == late.taken), None)
+        if position is None:
+            raise RecordError(f"is an observation of step {late.taken}, where none is awaited")
+        sensed = self._inputs[position][0]
+        assert isinstance(sensed, Sensed)
+        sensed = msgspec.structs.replace(sensed, observation=late.observation)
+        state, info = fold(self.planner, self._before[position], sensed, None)
         again = {}
         for at in range(position + 1, len(self._inputs)):
             if at in self._before:
                 again[at] = state
-            state = self._folded(state, self._inputs[at])
+            state = fold(self.planner, state, *self._inputs[at])[0]
         # Then it says nothing of the belief that is.
-        of_old_belief = any(isinstance(each, _Reinitialised) for each in self._inputs[position:])
-        self._inputs[position] = _Sensed(sensed.sensing_action, late.observation)
+        of_old_belief = any(isinstance(each, Reinitialised) for each, _ in self._inputs[position:])
+        self._inputs[position] = sensed, None
         del self._before[position]
         self._before |= again
         self._drop_settled()
         self.state = state
         self.num_missing -= 1
-        self.num_inputs += 1
+        self._note_input(late)
         self._judge(sensed.sensing_action, info, of_old_belief=of_old_belief)
+        self.is_lost = self.is_lost or self._is_alarmed()
         reached = self.planner.digest(state)
-        self.log.observed_late(late.step, state.step, reached)
-        return info, reached
+        self.log.observed_late(late.taken, state.step, reached)
+        return reached
 
-    def reinitialise(self) -> bytes:
-        """Begin the belief anew; return the digest of the state that this leads to."""
-        self.state = self.planner.reinitialise(self.state)
-        self._keep(_Reinitialised())
-        self.num_inputs += 1
+    def _reinitialise(self, given: Reinitialised) -> bytes:
+        self.state = fold(self.planner, self.state, given, None)[0]
+        self._keep(given, None)
+        self._note_input(given)
         self.lost_test.restart()
-        self.alarm = None
+        self.alarm = self.found = None
+        self.is_lost = False
         reached = self.planner.digest(self.state)
         self.log.reinitialised(self.state.step, reached)
         return reached
@@ -244,7 +283,7 @@ class Trial:
         self, sensing_action: int, info: ObservationInfo | None, *, of_old_belief: bool = False
     ) -> None:
         """Count an observation; None is none."""
-        self.alarm = None
+        self.alarm, self.found = None, info
         if info is None:
             return
         self.num_unexplained += not info.explained
@@ -253,28 +292,23 @@ class Trial:
         if not of_old_belief:
             self.alarm = self.lost_test.observed(sensing_action, info.within_gate)
 
-    def _folded(self, state: PlanningState, given: _Input) -> PlanningState:
-        if isinstance(given, _Sensed):
-            return self.planner.observe(state, given.sensing_action, given.observation)[0]
-        if isinstance(given, _Moved):
-            return self._moved(state, given)[0]
-        return self.planner.reinitialise(state)
+    def _is_alarmed(self) -> bool:
+        return self.alarm is not None and self.alarm.kind == "lost"
 
-    def _moved(
-        self, state: PlanningState, moved: _Moved
-    ) -> tuple[PlanningState, ObservationInfo | None]:
-        after = self.planner.advance(state, moved.action, moved.motion)
-        if moved.observation is None:
-            return after, None
-        return self.planner.observe_move(after, moved.action, moved.observation)
+    def _note_input(self, given: Input) -> None:
+        self.num_inputs += 1
+        told = (*self.inputs, given)[-MAX_INPUTS:] if isinstance(given, Sensed | Moved) else ()
+        self.inputs = told
 
-    def _keep(self, given: _Input, before: PlanningState | None = None) -> None:
+    def _keep(
+        self, given: Input, action: FloatArray | None, before: PlanningState | None = None
+    ) -> None:
         """Keep an input while an observation is awaited that belongs before it."""
         if before is not None:
             self._before[len(self._inputs)] = before
         elif not self._before:
             return
-        self._inputs.append(given)
+        self._inputs.append((given, action))
         if len(self._inputs) > MAX_INPUTS_SINCE:
             self._give_up_oldest()
 
@@ -287,3 +321,32 @@ class Trial:
         first = min(self._before, default=len(self._inputs))
         del self._inputs[:first]
         self._before = {at - first: state for at, state in sorted(self._before.items())}
+
+
+def replay(
+    planner: Planner,
+    seed: int,
+    trial: int,
+    records: Sequence[Record],
+    false_alarm_rate: float = LostSettings().false_alarm_rate,
+) -> Trial:
+    """Fold the records of a trial, in the order in which they were written.
+
+    Raises RecordError if a record does not follow from those before it, or leads to another state
+    than before.
+    """
+    track = Trial(planner, seed, trial, false_alarm_rate)
+    for position, record in enumerate(records):
+        try:
+            _require_same(track.take(record), record)
+        except (RecordError, MessageError, InvalidValueError) as error:
+            raise RecordError(f"trial {trial}: record {position} of its journal {error}") from error
+    return track
+
+
+def _require_same(taken: Record, recorded: Record) -> None:
+    if taken != recorded:
+        raise RecordError(
+            "leads to another state than it did when it was written: the problem is not "
+            "deterministic, its code has changed, or the journal is damaged"
+        )

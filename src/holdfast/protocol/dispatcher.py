@@ -68,16 +68,16 @@ class Dispatcher(DecisionSource):
     ) -> None:
         super().__init__()
         self.takes_tasks = offload.what == "sensing"
-        timeout_s = 1e-3 * offload.detection_timeout_ms
+        detection_timeout_s = 1e-3 * offload.detection_timeout_ms
         wanted = recovery_settings.launch != "never"
-        self._timeout_s = timeout_s
-        self._patience_s = max(_LONGEST_SILENT_WAIT_S, timeout_s)
+        self._detection_timeout_s = detection_timeout_s
+        self._patience_s = max(_LONGEST_SILENT_WAIT_S, detection_timeout_s)
         self._limit_s = 1e-3 * offload.decision_timeout_ms
         self._launch_at_start = recovery_settings.launch == "at_start"
         self._services = ReplicaSet(
             services,
             local_service_name if wanted else None,
-            timeout_s,
+            detection_timeout_s,
             1e-3 * offload.startup_timeout_ms,
             distrusted,
         )
@@ -89,7 +89,7 @@ class Dispatcher(DecisionSource):
             session,
             epoch,
             session_configuration,
-            timeout_s,
+            detection_timeout_s,
             planner,
             self._verification,
             self.effects,
@@ -185,7 +185,7 @@ class Dispatcher(DecisionSource):
                     due.append(services.startup_until)
             elif question.needed_at is not None:
                 due += [self._calls.probe_at(replica, question) for replica in services.cloud]
-                due.append(question.needed_at + self._timeout_s)
+                due.append(question.needed_at + self._detection_timeout_s)
             if question.needed_at is not None and question is not self._reported_wait:
                 due.append(question.needed_at + self._patience_s)
             due.append(self._hedge_at(question))
@@ -376,7 +376,8 @@ class Dispatcher(DecisionSource):
             busy_until = services.busy_until(now)
             if busy_until is not None:
                 since = now if question.needed_at is None else question.needed_at
-                if busy_until - since <= self._timeout_s and not self._services.local_usable(now):
+                is_long = busy_until - since > self._detection_timeout_s
+                if not is_long and not self._services.local_usable(now):
                     return
         if services.local is None:
             self._hold_and_retry(question, now)
@@ -419,7 +420,7 @@ class Dispatcher(DecisionSource):
         An answer of a suspected one brings it back.
         """
         needed_at = question.needed_at
-        is_late = needed_at is not None and now >= needed_at + self._timeout_s
+        is_late = needed_at is not None and now >= needed_at + self._detection_timeout_s
         for replica in self._services.cloud:
             if replica.usable(now) and not self.tracker.is_recovering:
                 if is_late and not self._calls.is_asked(replica, question):

@@ -15,10 +15,9 @@ from typing import Generic, Literal, NamedTuple, TypeAlias, TypeVar
 
 from holdfast.errors import HoldfastError
 from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.inputs import Late, Moved, Record, Sensed
 from holdfast.planning.outcome import Ending, TrialResult
 from holdfast.planning.planner import PlanningState
-from holdfast.planning.tracking import LateObservation
-from holdfast.protocol.records import Record
 
 
 class ServiceAppeared(NamedTuple):
@@ -51,29 +50,25 @@ class CallEnded(NamedTuple):
 TransportEvent: TypeAlias = ServiceAppeared | ServiceVanished | ReplyReceived | CallEnded
 
 
-class Sensed(NamedTuple):
-    """A sensing action was performed; the observation is finite and read-only.
-
-    None if it comes later (with a task action), or never: ``no_reading``.
-    """
+class NoReading(NamedTuple):
+    """A sensing action was performed, and no observation will come of it."""
 
     step: int
-    observation: FloatArray | None
-    no_reading: bool = False
 
 
 class Acted(NamedTuple):
     """A task action was performed; all numbers are finite."""
 
-    step: int
-    reward: float | None  # None if the environment gives none
-    ending: Ending | None
-    # motion, observation: what the move has shown.
-    motion: FloatArray | None = None
-    observation: FloatArray | None = None
-    late: tuple[LateObservation, ...] = ()  # observations of earlier steps that have come meanwhile
+    moved: Moved
+    ending: Ending | None = None
+    late: tuple[Late, ...] = ()  # observations of earlier steps that have come meanwhile
     # Earlier steps of which it is known now that no observation will come.
     no_reading: tuple[int, ...] = ()
+
+    @property
+    def step(self) -> int:
+        """Its step."""
+        return self.moved.step
 
 
 class EnvironmentReady(NamedTuple):
@@ -83,9 +78,9 @@ class EnvironmentReady(NamedTuple):
     # Task actions performed in this trial, counted by the environment; None if it does not count.
     steps_performed: int | None
     # What the last of these has shown; of a resumed trial, if the environment can still tell.
-    last: Acted | None = None
+    last: Moved | None = None
     # Of a resumed trial: observations that have come meanwhile.
-    late: tuple[LateObservation, ...] = ()
+    late: tuple[Late, ...] = ()
 
 
 class EnvironmentFailed(NamedTuple):
@@ -101,7 +96,7 @@ class EnvironmentFailed(NamedTuple):
     counts_steps: bool = True
 
 
-EnvironmentEvent: TypeAlias = EnvironmentReady | Sensed | Acted | EnvironmentFailed
+EnvironmentEvent: TypeAlias = EnvironmentReady | Sensed | NoReading | Acted | EnvironmentFailed
 
 
 class OwnAnswer(NamedTuple):

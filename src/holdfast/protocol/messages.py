@@ -19,15 +19,12 @@ from __future__ import annotations
 
 import hashlib
 import zlib
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import msgspec
-import numpy as np
-import numpy.typing as npt
 
 from holdfast.errors import MessageError
-from holdfast.numerics import reproducible as numerics
-from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.inputs import MAX_INPUTS, CatchUpInput, Moved, Sensed
 from holdfast.planning.settings import PlanningSettings
 from holdfast.printable import one_line
 from holdfast.protocol.plain_data import check_plain_data
@@ -50,9 +47,6 @@ MAX_WORD = 2**32 - 1
 MAX_TEXT = 4000
 """Bound on the characters of a refusal's text."""
 
-MAX_INPUTS = 64
-"""Bound on the inputs of one request; a service further behind is sent the state."""
-
 MAX_CONFIGURATION_BYTES = 256 * 1024
 """Bound on a session configuration, encoded."""
 
@@ -69,33 +63,6 @@ Numbers = Annotated[bytes, msgspec.Meta(max_length=8 * MAX_ACTION_SIZE * MAX_TAS
 
 
 Observation = Annotated[bytes, msgspec.Meta(max_length=8 * MAX_ACTION_SIZE)]
-
-
-class Observed(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True, tag=1):
-    """An observation (little-endian float64) of the state of a step, before its task action.
-
-    It is empty if it comes later, or if the choice was not to sense.
-    """
-
-    step: Word
-    sensing_action: Word
-    observation: Observation
-
-
-class Moved(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True, tag=2):
-    """What the task action of a step has shown (little-endian float64); empty for nothing."""
-
-    step: Word
-    motion: Observation
-    observation: Observation
-
-
-Input: TypeAlias = Observed | Moved
-"""What a robot's belief rests on, besides the task actions, which follow from it.
-
-A late observation changes what is past, and a reinitialisation forgets it: after these a robot
-sends its state.
-"""
 
 
 class SessionConfiguration(msgspec.Struct, array_like=True, frozen=True):
@@ -145,13 +112,32 @@ class Request(msgspec.Struct, array_like=True, frozen=True):
     sensed: bool
     digest: Digest
     # Of this trial, in order, since the state that this service acknowledged last; all of them if
-    # it acknowledged none.
-    inputs: Annotated[tuple[Input, ...], msgspec.Meta(max_length=MAX_INPUTS)] = ()
+    # it acknowledged none. What a service can fold in: what was sensed, and what moves have shown.
+    inputs: tuple[CatchUpInput, ...] = ()
     # For a service that may not know the session.
     session_configuration: SessionConfiguration | None = None
     # The state (:func:`holdfast.planning.planner.encode_checkpoint`); then ``inputs`` is empty. A
     # decoded one is a view of the message.
     checkpoint: bytes | memoryview | None = None
+
+
+class _SentSensed(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True, tag=1):
+    """What of a :class:`~holdfast.planning.inputs.Sensed` is on the wire."""
+
+    step: Word
+    sensing_action: Word
+    observation: Observation
+
+
+class _SentMoved(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True, tag=2):
+    """What of a :class:`~holdfast.planning.inputs.Moved` is on the wire."""
+
+    step: Word
+    motion: Observation
+    observation: Observation
+
+
+_SentInputs = Annotated[tuple[_SentSensed | _SentMoved, ...], msgspec.Meta(max_length=MAX_INPUTS)]
 
 
 class _SentRequest(Request, array_like=True, frozen=True, forbid_unknown_fields=True):
@@ -162,6 +148,7 @@ class _SentRequest(Request, array_like=True, frozen=True, forbid_unknown_fields=
     whatever their size.
     """
 
+    inputs: _SentInputs = ()  # type: ignore[assignment]
     session_configuration: PackedConfiguration | None = None  # type: ignore[assignment]
     # Not copied: that would hold up all other threads, 40 ms for 60 MB.
     checkpoint: memoryview | None = None
@@ -249,6 +236,9 @@ _WORDS = {0xCC: 1, 0xCD: 2, 0xCE: 4}
 
 def encode(message: Request | Reply) -> bytes:
     """Encode a message."""
+    if isinstance(message, Request) and message.inputs:
+        sent: Any = tuple(map(_sent, message.inputs))
+        message = msgspec.structs.replace(message, inputs=sent)
     if isinstance(message, Request) and message.session_configuration is not None:
         # Without a session configuration the shorter form is read as the same request.
         packed = pack_configuration(message.session_configuration)
@@ -334,7 +324,19 @@ def decode_request(payload: bytes) -> Request:
         raise MessageError("malformed", "a request has a checkpoint and inputs as well")
     fields = msgspec.structs.asdict(sent) | {"session_configuration": session_configuration}
     del fields["settings"]
-    return Request(**fields)
+    return Request(**fields | {"inputs": tuple(map(_received, sent.inputs))})
+
+
+def _sent(given: CatchUpInput) -> _SentSensed | _SentMoved:
+    if isinstance(given, Sensed):
+        return _SentSensed(given.step, given.sensing_action, given.observation)
+    return _SentMoved(given.step, given.motion, given.observation)
+
+
+def _received(sent: Any) -> CatchUpInput:
+    if isinstance(sent, _SentSensed):
+        return Sensed(sent.step, sent.sensing_action, sent.observation)
+    return Moved(sent.step, None, sent.motion, sent.observation)
 
 
 def decode_reply(payload: bytes) -> Reply:
@@ -348,26 +350,6 @@ def decode_reply(payload: bytes) -> Reply:
         # A peer's words go into logs and messages, where a line of theirs would look like ours.
         return Refused(reply.number, one_line(reply.code), one_line(reply.text))
     return reply
-
-
-def numbers_of(data: bytes) -> FloatArray | None:
-    """Decode as many numbers as there are; None for none. Raise as :func:`decode_floats`."""
-    return decode_floats(data, len(data) // 8) if data else None
-
-
-def encode_floats(array: npt.ArrayLike) -> bytes:
-    """Encode numbers as little-endian float64."""
-    return np.ascontiguousarray(array, dtype="<f8").tobytes()
-
-
-def decode_floats(data: bytes, size: int) -> FloatArray:
-    """Decode ``size`` numbers; raise MessageError if their number differs, or one is not finite."""
-    if len(data) != 8 * size:
-        raise MessageError("malformed", f"{len(data)} bytes are not {size} numbers")
-    numbers = np.frombuffer(data, dtype="<f8").astype(np.float64)
-    if not numerics.all_finite(numbers):
-        raise MessageError("malformed", f"{numbers} are not all finite")
-    return numbers
 
 
 def _other_version(version: int) -> MessageError:

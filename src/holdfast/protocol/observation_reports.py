@@ -11,7 +11,6 @@ from collections import Counter
 from holdfast.errors import HeldError
 from holdfast.planning.belief import VALIDATION_GATE_SQUARED
 from holdfast.planning.lost import MOVE, Verdict
-from holdfast.planning.planner import ObservationInfo
 from holdfast.planning.settings import LostSettings, OnLost
 from holdfast.planning.tracking import Trial
 from holdfast.problems.attributes import sensing_labels
@@ -42,13 +41,14 @@ class ObservationReports:
         self._trial: int | None = None
         self._reported: Counter[str] = Counter()  # in that trial
 
-    def observed(
-        self, trial: Trial, step: int, info: ObservationInfo, **of_what: object
-    ) -> OnLost | None:
-        """Report what an observation of a step has shown; return what to do if the robot is lost.
+    def observed(self, trial: Trial, step: int, **of_what: object) -> OnLost | None:
+        """Report what the last input, of a step, has shown; return what to do if the robot is lost.
 
         ``of_what`` says in the report which observation it was.
         """
+        info = trial.found
+        if info is None:
+            return None
         self.counts["unexplained"] += not info.explained
         if not info.explained and trial.num_unexplained <= _MAX_REPORTS:
             distance = info.mahalanobis_distance

@@ -15,6 +15,7 @@ from typing import Literal, NamedTuple
 
 from holdfast.errors import HoldfastError, MessageError
 from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.inputs import CatchUpInput, decode_floats
 from holdfast.planning.planner import Planner, PlanningState, encode_checkpoint
 from holdfast.protocol.events import (
     ComputeOwnAnswer,
@@ -28,10 +29,8 @@ from holdfast.protocol.events import (
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_TASK_ACTIONS,
-    Input,
     SensingAnswer,
     TaskAnswer,
-    decode_floats,
 )
 from holdfast.protocol.status import StatusTracker
 
@@ -69,9 +68,9 @@ class WrongAnswer(NamedTuple):
 class Question:
     """A state in which to decide, and the answer as far as it has arrived.
 
-    The question itself never changes. Its answer is written by
-    :class:`~holdfast.protocol.verification.Verification` where services answer, else by
-    :class:`InProcessSource`; the robot writes ``needed_at``, ``num_ordered`` and its own actions.
+    The question itself never changes. Its answer is written by its own methods, and what is checked
+    of it by :class:`~holdfast.protocol.verification.Verification`; the robot writes ``needed_at``,
+    ``num_ordered`` and its own actions.
     """
 
     def __init__(
@@ -79,7 +78,7 @@ class Question:
         planner: Planner,
         state: PlanningState,
         digest: bytes,
-        inputs: tuple[Input, ...],
+        inputs: tuple[CatchUpInput, ...],
         num_inputs: int,
         # Whether the robot takes the task actions itself, and asks for the sensing action alone.
         takes_tasks: bool = False,
@@ -141,21 +140,29 @@ class Question:
         parts = ("task", self.task_provenance), ("sensing", self.sensing_provenance)
         return [(kind, given.service) for kind, given in parts if given is not None]
 
+    def follow_tasks(self, actions: Sequence[FloatArray], provenance: Provenance) -> None:
+        """Have the robot perform these task actions."""
+        self.task_actions, self.task_provenance = list(actions), provenance
+
+    def follow_sensing(self, answer: SensingAnswer, provenance: Provenance) -> None:
+        """Have the robot perform this sensing action."""
+        self.sensing, self.sensing_provenance = answer, provenance
+
+    def follow_own(self, own: OwnAnswer, round_trip_s: float) -> None:
+        """Have the robot do what its own planner has answered, one part or both."""
+        provenance = Provenance(OWN_PLANNER, round_trip_s, own.computed_s)
+        if own.actions:
+            self.follow_tasks(own.actions, provenance)
+        if self.sensing_step is not None and own.sensing_action is not None:
+            digest = own.ahead_digest[:DIGEST_SIZE]
+            answer = SensingAnswer(0, self.sensing_step, own.sensing_action, digest, 0)
+            self.follow_sensing(answer, provenance)
+
     def checkpoint(self) -> bytes:
         """Return the encoded state (computed once)."""
         if self._checkpoint is None:
             self._checkpoint = encode_checkpoint(self.state)
         return self._checkpoint
-
-    def take_own(self, own: OwnAnswer, round_trip_s: float) -> None:
-        """Make the robot follow what its own planner has answered."""
-        provenance = Provenance(OWN_PLANNER, round_trip_s, own.computed_s)
-        if own.actions:
-            self.task_actions, self.task_provenance = list(own.actions), provenance
-        if self.sensing_step is not None and own.sensing_action is not None:
-            digest = own.ahead_digest[:DIGEST_SIZE]
-            self.sensing = SensingAnswer(0, self.sensing_step, own.sensing_action, digest, 0)
-            self.sensing_provenance = provenance
 
     def read_tasks(self, reply: TaskAnswer, action_size: int) -> list[FloatArray]:
         """Return the task actions of a reply.
@@ -273,7 +280,7 @@ class InProcessSource(DecisionSource):
         if event.failure is not None:
             self.stop(event.failure)
             return
-        question.take_own(event, now - self._asked_at)
+        question.follow_own(event, now - self._asked_at)
         if event.sensing_action is None and question.sensing_step is not None:
             assert event.ahead is not None
             self._compute("sensing", event.ahead)

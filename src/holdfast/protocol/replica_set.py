@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Sequence
 
-from holdfast.protocol.messages import Input
+from holdfast.planning.inputs import CatchUpInput
 from holdfast.protocol.question import Question
 
 _LATE_IN_A_ROW = 3
@@ -287,7 +287,7 @@ class Replica:
 
     def catch_up(
         self, question: Question, *, whole_state: bool
-    ) -> tuple[tuple[Input, ...], bytes | None]:
+    ) -> tuple[tuple[CatchUpInput, ...], bytes | None]:
         """Return what a request must carry for the service to reach the question's state.
 
         The inputs since the state that it holds; or, where that is better, the whole state.
@@ -322,9 +322,12 @@ class ReplicaSet:
         startup_timeout_s: float = 0.0,
         distrusted: Collection[str] = (),  # services that answered wrongly earlier in this run
     ) -> None:
-        timeout_s = detection_timeout_s
-        self.cloud = [Replica(name, timeout_s, late_after_s=timeout_s) for name in cloud]
-        self.local = None if local is None else Replica(local, _LOCAL_PATIENCE * timeout_s)
+        self.cloud = [
+            Replica(name, detection_timeout_s, late_after_s=detection_timeout_s) for name in cloud
+        ]
+        self.local = (
+            None if local is None else Replica(local, _LOCAL_PATIENCE * detection_timeout_s)
+        )
         self._by_name = {replica.name: replica for replica in self.cloud}
         if self.local is not None:
             self._by_name[self.local.name] = self.local

@@ -107,12 +107,13 @@ class OpenRequests:
         session: bytes,
         epoch: int,
         session_configuration: SessionConfiguration,
-        timeout_s: float,  # from one request to the next of a service that may not hear the robot
+        # From one request to the next of a service that may not hear the robot, too.
+        detection_timeout_s: float,
         planner: Planner,
         verification: Verification,
         effects: Effects[RobotEffect],
     ) -> None:
-        self._timeout_s = timeout_s
+        self._detection_timeout_s = detection_timeout_s
         self._action_size = planner.problem.action_size
         self._num_choices = planner.num_choices
         self._verification = verification
@@ -152,7 +153,7 @@ class OpenRequests:
     def retry_at(self, replica: Replica, question: Question) -> float:
         """Return when a service that may not hear the robot is sent the question again."""
         sent_at = [call.sent_at for call in self.about(question) if call.replica is replica]
-        return max([replica.retry_at, *(at + self._timeout_s for at in sent_at)])
+        return max([replica.retry_at, *(at + self._detection_timeout_s for at in sent_at)])
 
     def probe_at(self, replica: Replica, question: Question) -> float | None:
         """Return when a suspected service may be sent the question; None if it need not be."""
@@ -162,7 +163,7 @@ class OpenRequests:
             return None  # it is at work, and says so
         # One probe at a time, so that a service further away than a turn is long can answer.
         probes = [call.sent_at for call in self.to(replica) if not call.answered]
-        return max(replica.retry_at, max(probes, default=-1e9) + self._timeout_s)
+        return max(replica.retry_at, max(probes, default=-1e9) + self._detection_timeout_s)
 
     def first_sent_at(self) -> float:
         """Return when the oldest open request was sent."""

@@ -18,10 +18,22 @@ from __future__ import annotations
 
 from holdfast.errors import HeldError, HoldfastError, UnknownPerformanceError
 from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.inputs import (
+    ActingRecord,
+    Late,
+    LocalTookOverRecord,
+    Moved,
+    PausedRecord,
+    Record,
+    Reinitialised,
+    Sensed,
+    encode_floats,
+    has_shown,
+)
 from holdfast.planning.outcome import Ending
-from holdfast.planning.planner import ObservationInfo, Planner, PlanningState
+from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.settings import LostSettings, SimulatorSettings
-from holdfast.planning.tracking import LateObservation
+from holdfast.planning.tracking import Trial
 from holdfast.protocol.events import (
     Act,
     Acted,
@@ -30,28 +42,19 @@ from holdfast.protocol.events import (
     EnvironmentFailed,
     EnvironmentReady,
     Halt,
+    NoReading,
     OwnAnswer,
     Paused,
     RecoveryExited,
     RobotEffect,
     Sense,
-    Sensed,
     Timing,
     TransportEvent,
     WriteRecords,
 )
-from holdfast.protocol.messages import DIGEST_SIZE, encode_floats
+from holdfast.protocol.messages import DIGEST_SIZE
 from holdfast.protocol.observation_reports import ObservationReports, held_error
 from holdfast.protocol.question import DecisionSource, Provenance, Question
-from holdfast.protocol.records import (
-    ActingRecord,
-    LocalTookOverRecord,
-    PausedRecord,
-    PerformedRecord,
-    Record,
-    TrialHistory,
-    has_shown,
-)
 from holdfast.protocol.status import Status
 
 _TICKS_INTERVAL_S = 1.0
@@ -80,7 +83,7 @@ class Robot:
         self._period_s = None if rate_hz is None else 1.0 / rate_hz
         # One list for both, because the order of all effects counts.
         self._effects = source.effects
-        self._history: TrialHistory | None = None
+        self._history: Trial | None = None
         self._trial = 0
         self._ending: Ending | None = None
         self._lost_at: int | None = None
@@ -134,7 +137,7 @@ class Robot:
         return 0 if self._history is None else self._history.num_unexplained
 
     @property
-    def _current_history(self) -> TrialHistory:
+    def _current_history(self) -> Trial:
         assert self._history is not None, "between trials"
         return self._history
 
@@ -146,8 +149,8 @@ class Robot:
     def begin_trial(
         self,
         trial: int,
-        # From :func:`~holdfast.protocol.records.replay`; of no records for a new trial.
-        history: TrialHistory,
+        # From :func:`~holdfast.planning.tracking.replay`; of no records for a new trial.
+        history: Trial,
         begun: EnvironmentReady,
         now: float,
         *,
@@ -208,7 +211,7 @@ class Robot:
             )
         if history.pending is not None and performed == known + 1:
             self._effects.report("performed_unseen", trial=self._trial, step=known)
-            self._fold_move(begun.last or Acted(known, None, None))
+            self._fold_move(begun.last or Moved(known, None))
             return None
         if performed != known:
             raise UnknownPerformanceError(
@@ -227,7 +230,7 @@ class Robot:
         now: float,
     ) -> list[RobotEffect]:
         """Handle an event."""
-        if isinstance(event, Sensed | Acted | EnvironmentFailed):
+        if isinstance(event, Sensed | NoReading | Acted | EnvironmentFailed):
             # Between trials, or after a stop, whatever comes late is of no use.
             if self._history is not None and self._awaits_environment and not self._stopped:
                 self._awaits_environment = False
@@ -238,7 +241,7 @@ class Robot:
                             f"{self._history.state.step} was asked of it; the robot holds still"
                         )
                     )
-                elif isinstance(event, Sensed):
+                elif isinstance(event, Sensed | NoReading):
                     self._sensed(event, now)
                 elif isinstance(event, Acted):
                     self._performed(event)
@@ -281,30 +284,30 @@ class Robot:
 
     # -- the environment -------------------------------------------------------------------------
 
-    def _sensed(self, event: Sensed, now: float) -> None:
+    def _sensed(self, event: Sensed | NoReading, now: float) -> None:
         history = self._current_history
         step, sensing_action = history.state.step, self._sensing_action
+        shown = b"" if isinstance(event, NoReading) else event.observation
+        given = Sensed(step, sensing_action, shown, sensing_ms=self._computed_ms)
         try:
-            info, record = history.fold_observation(
-                sensing_action, event.observation, self._computed_ms
-            )
+            record = history.take(given)
         except HoldfastError as error:
             self._stop(error)
             return
         self._write(record)
-        if event.no_reading:
+        if isinstance(event, NoReading):
             self.reports.no_reading(history, sensing_action=sensing_action)
         state = history.state
-        self._judge(step, info, sensing_action=sensing_action)
+        self._judge(step, sensing_action=sensing_action)
         self._hold_if_lost()
         if not self._pausing and not self._stopped:
             is_new = history.state is not state  # its belief has begun anew
             self._ask(self._planner.digest(history.state) if is_new else record.digest, now)
 
-    def _judge(self, step: int, info: ObservationInfo, **of_what: object) -> None:
-        """Report what an observation has shown, and act if the robot is lost."""
+    def _judge(self, step: int, **of_what: object) -> None:
+        """Report what the last input has shown, and act if the robot is lost."""
         history = self._current_history
-        on_lost = self.reports.observed(history, step, info, **of_what)
+        on_lost = self.reports.observed(history, step, **of_what)
         if on_lost == "hold":
             self._lost_at = step
         elif on_lost == "reinitialise":
@@ -318,13 +321,13 @@ class Robot:
     def _reinitialise(self) -> None:
         """Begin the belief anew, before anything else is decided."""
         history = self._current_history
-        self._write(history.fold_reinitialisation())
+        self._write(history.take(Reinitialised(history.state.step)))
         self.reports.reinitialised(history)
 
     def _performed(self, event: Acted) -> None:
         self._ending = event.ending
         try:
-            self._fold_move(event)
+            self._fold_move(event.moved)
             for late in event.late:
                 self._take_late_observation(late)
             for step in event.no_reading:
@@ -333,30 +336,23 @@ class Robot:
         except HoldfastError as error:
             self._stop(error)
 
-    def _fold_move(self, event: Acted) -> None:
+    def _fold_move(self, moved: Moved) -> None:
         """Fold in what a performed task action has shown."""
-        motion, shown = (
-            b"" if each is None else encode_floats(each)
-            for each in (event.motion, event.observation)
-        )
-        record = PerformedRecord(event.step, event.reward, motion, shown)
         self.num_performed += 1
         # Before it is written: what cannot be folded in now can never be.
-        info = self._current_history.fold_move(record)
-        self._unwritten.append(record)
-        if info is not None:
-            self._judge(event.step, info, of="move")
+        self._unwritten.append(self._current_history.take(moved))
+        self._judge(moved.step, of="move")
 
-    def _take_late_observation(self, late: LateObservation) -> None:
+    def _take_late_observation(self, late: Late) -> None:
         """Fold in an observation of an earlier step."""
         history = self._current_history
-        found = history.fold_late_observation(late)
-        if found is None:
-            self.reports.late_unused(history, late.step)
+        if late.taken not in history.awaited:
+            self.reports.late_unused(history, late.taken)
             return
-        info, record = found
-        self._unwritten.append(record)
-        self._judge(late.step, info, of="late")
+        # The environment need not know at which step the robot is.
+        given = Late(history.state.step, late.taken, late.observation)
+        self._unwritten.append(history.take(given))
+        self._judge(late.taken, of="late")
 
     def _failed(self, event: EnvironmentFailed) -> None:
         where = f"the robot holds still in trial {self._trial}, step {event.step}"
@@ -435,7 +431,7 @@ class Robot:
         self._timed("sensing", question, provenance, now)
         self._sensing_action = answer.sensing_action
         if answer.sensing_action == self._planner.no_sensing:
-            self._sensed(Sensed(state.step, None), now)
+            self._sensed(Sensed(state.step, answer.sensing_action, b""), now)
             self._go_on(now)
             return
         self._awaits_environment = True

@@ -26,6 +26,7 @@ from holdfast.errors import (
     OtherCodeError,
     UnknownProblemError,
 )
+from holdfast.planning.inputs import CatchUpInput, Moved, Sensed, encode_floats, fold
 from holdfast.planning.interruption import Interruption, check, interruptible
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.settings import PlanningSettings
@@ -44,13 +45,8 @@ from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_ACTION_SIZE,
     MAX_TASK_ACTIONS,
-    Input,
-    Moved,
-    Observed,
     Request,
     SessionConfiguration,
-    encode_floats,
-    numbers_of,
     unpack_configuration,
 )
 from holdfast.protocol.service_limits import ServiceLimits
@@ -347,18 +343,12 @@ class Job:
         return state
 
 
-def _with_input(planner: Planner, state: PlanningState, given: Input) -> PlanningState:
+def _with_input(planner: Planner, state: PlanningState, given: CatchUpInput) -> PlanningState:
     """Return the state after an input of its step."""
-    if planner.needs_sensing(state) != isinstance(given, Observed):
+    if planner.needs_sensing(state) != isinstance(given, Sensed):
         raise _LacksStateError
-    observation = numbers_of(given.observation)
-    if isinstance(given, Observed):
-        return planner.observe(state, given.sensing_action, observation)[0]
-    action, _ = planner.choose_task_action(state)
-    state = planner.advance(state, action, numbers_of(given.motion))
-    if observation is None:
-        return state
-    return planner.observe_move(state, action, observation)[0]
+    action = None if isinstance(given, Sensed) else planner.choose_task_action(state)[0]
+    return fold(planner, state, given, action)[0]
 
 
 def _account(error: BaseException, describe: Callable[[BaseException], str]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from holdfast.protocol.messages import MAX_INPUTS
+from holdfast.planning.inputs import MAX_INPUTS
 
 
 class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):

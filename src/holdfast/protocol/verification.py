@@ -51,10 +51,7 @@ _Difference: TypeAlias = tuple[int, str, str]
 
 
 class Verification:
-    """Takes answers, has some recomputed and finds the service that was wrong.
-
-    It alone writes into the answer of a question that services answer.
-    """
+    """Takes answers, has some recomputed and finds the service that was wrong."""
 
     def __init__(
         self,
@@ -98,7 +95,7 @@ class Verification:
         actions, provenance = self._within_limits(question, actions, provenance)
         followed = question.task_actions
         if followed is None:
-            question.task_actions, question.task_provenance = list(actions), provenance
+            question.follow_tasks(actions, provenance)
             self._sample(question, "task", provenance.service)
         elif not same_actions(followed, actions):
             self._two_answers(question, "task", provenance.service)
@@ -109,7 +106,7 @@ class Verification:
         """Take a sensing action of a service; the robot follows the first that comes."""
         followed = question.sensing
         if followed is None:
-            question.sensing, question.sensing_provenance = answer, provenance
+            question.follow_sensing(answer, provenance)
             self._sample(question, "sensing", provenance.service)
         elif (followed.sensing_action, followed.digest) != (answer.sensing_action, answer.digest):
             self._two_answers(question, "sensing", provenance.service)
@@ -182,7 +179,7 @@ class Verification:
         """Have a share of the questions answered by the own planner, too."""
         if question.own is not None:
             if not self._compare(question, kind, question.own):
-                question.take_own(question.own, question.own.computed_s)
+                question.follow_own(question.own, question.own.computed_s)
         elif service != self._exempt and self._is_drawn(question):
             self.check(question)
 
@@ -223,7 +220,7 @@ class Verification:
         performed = question.num_ordered
         if not same_actions((question.task_actions or [])[:performed], event.actions[:performed]):
             return False
-        question.take_own(event, event.computed_s)
+        question.follow_own(event, event.computed_s)
         return True
 
     def _decided_again(self, question: Question, first: OwnAnswer, second: OwnAnswer) -> None:

@@ -21,9 +21,9 @@ import msgspec
 from holdfast.journal.fingerprint import read_earlier
 from holdfast.journal.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.journal.run_directory import configuration_difference, recorded_configuration
+from holdfast.planning.inputs import ActingRecord, decisions_of
 from holdfast.planning.outcome import Decisions, SensingDecision, TaskDecision
 from holdfast.printable import one_line
-from holdfast.protocol.records import ActingRecord, ObservedRecord, decisions_of
 
 __all__ = ["Comparison", "Difference", "compare_runs"]
 
@@ -216,7 +216,7 @@ def _state_of(number: int, finished: set[int], begun: UnfinishedTrial | None) ->
     if number in finished:
         return "finished"
     if begun is not None and begun.trial == number:
-        looked = sum(isinstance(record, ObservedRecord) for record in begun.records)
+        looked = sum(isinstance(each, SensingDecision) for each in decisions_of(begun.records))
         acted = sum(isinstance(record, ActingRecord) for record in begun.records)
         return (
             f"unfinished, {_counted(looked, 'sensing action')} and "

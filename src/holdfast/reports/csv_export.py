@@ -111,8 +111,8 @@ class CsvSink:
     def observed_late(self, fact: LateFact) -> None:
         """Write a late observation among the events: the row of its step is written."""
         late, after, _ = fact.step
-        shown = {"trial": after.trial, "step": after.step, "taken": late.step}
-        shown["observation"] = late.observation.tolist()
+        shown = {"trial": after.trial, "step": after.step, "taken": late.taken}
+        shown["observation"] = late.numbers().tolist()
         self.happened(EventFact(fact.time_ns, "late_observation", shown))
 
     def trial_ends(self, fact: TrialEndFact) -> None:

@@ -10,8 +10,9 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 from holdfast.journal.run_clock import Stamp
-from holdfast.numerics.arrays import FloatArray, floats_or_none
+from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.belief import Belief
+from holdfast.planning.inputs import numbers_of
 from holdfast.planning.outcome import TrialResult
 from holdfast.robot.trial import LateStep, SensingStep, TaskStep
 
@@ -87,7 +88,8 @@ class TaskFact(NamedTuple):
     @property
     def shown(self) -> tuple[FloatArray | None, FloatArray | None]:
         """What the move has shown: its motion, and its observation."""
-        return floats_or_none(self.step.shown.motion), floats_or_none(self.step.shown.observation)
+        moved = self.step.moved
+        return numbers_of(moved.motion), numbers_of(moved.observation)
 
 
 class LateFact(NamedTuple):

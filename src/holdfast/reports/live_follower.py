@@ -23,18 +23,16 @@ from holdfast.journal.journal_reader import JournalReader, decode_records, decod
 from holdfast.journal.run_directory import EVENTS_NAME, TIMINGS_NAME
 from holdfast.journal.timings import TimingRow, timings_of
 from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.inputs import (
+    ActingRecord,
+    Late,
+    Moved,
+    Record,
+    Sensed,
+)
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.tracking import Trial
-from holdfast.protocol.messages import decode_floats, numbers_of
-from holdfast.protocol.records import (
-    ActingRecord,
-    LateRecord,
-    ObservedRecord,
-    PerformedRecord,
-    Record,
-    ReinitialisedRecord,
-)
 from holdfast.reports.facts import (
     Decider,
     FactSink,
@@ -93,7 +91,6 @@ class Follower:
         self._clock = clock
         self._trial: Trial | None = None
         self._simulated: SimulatedEnvironment | None = None
-        self._pending: FloatArray | None = None
         self._deciders: dict[tuple[int, int, str], tuple[int, Decider]] = {}
         self._answered: Decider | None = None
         self.steps = self.left_out = 0
@@ -109,12 +106,12 @@ class Follower:
             self.end(time_ns)
             trial = self._begin(number, time_ns)
         for record in records:
-            self._fold(trial, record, time_ns)
+            self._take(trial, record, time_ns)
 
     def _begin(self, number: int, time_ns: int) -> Trial:
         seed = self._configuration.simulator.seed
         self._trial = trial = Trial(self._planner, seed, number)
-        self._pending = self._answered = None
+        self._answered = None
         if self._configuration.environment.object is None:
             self._simulated = SimulatedEnvironment(self._planner.problem, seed, number)
         self._sink.trial_begins(TrialBeginFact(number, time_ns))
@@ -124,8 +121,8 @@ class Follower:
         """Take the result of a trial, and with it that its last action was performed."""
         self.records(result.trial, [], time_ns)
         assert self._trial is not None
-        if self._pending is not None:
-            self._fold(self._trial, PerformedRecord(self._trial.state.step, None), time_ns)
+        if self._trial.pending is not None:
+            self._take(self._trial, Moved(self._trial.state.step, None), time_ns)
         self.end(time_ns, result)
 
     def end(self, time_ns: int, result: TrialResult | None = None) -> None:
@@ -153,42 +150,34 @@ class Follower:
     def _true_state(self) -> FloatArray | None:
         return None if self._simulated is None else self._simulated.state
 
-    def _fold(self, trial: Trial, record: Record, time_ns: int) -> None:
+    def _take(self, trial: Trial, record: Record, time_ns: int) -> None:
         is_late = self._clock() - time_ns > _LATE_NS
-        if isinstance(record, ObservedRecord):
-            self._sensed(trial, record, time_ns, is_late=is_late)
+        before, action, why = trial.state, trial.pending, None
+        if isinstance(record, Sensed) and not is_late:
+            why = self._planner.choose_sensing_action(before)[1]
+        record = trial.take(record)
+        if isinstance(record, Sensed):
+            decided_ns, decider = self._deciders.pop(
+                (before.trial, before.step, "sensing"), (time_ns, None)
+            )
+            if why is not None:
+                assert trial.found is not None
+                step = SensingStep(before, record, why, trial.state, trial.found)
+                self._sink.sensed(SensingFact(step, decided_ns, time_ns, decider))
         elif isinstance(record, ActingRecord):
-            self._pending = decode_floats(record.action, self._planner.problem.action_size)
             self.steps += 1
             self.left_out += is_late
             if not is_late:
-                self._acting(trial.state, self._pending, time_ns)
-        elif isinstance(record, PerformedRecord):
-            assert self._pending is not None
-            motion, observation = numbers_of(record.motion), numbers_of(record.observation)
-            trial.move(self._pending, record.reward, motion, observation)
+                assert trial.pending is not None
+                self._acting(before, trial.pending, time_ns)
+        elif isinstance(record, Moved):
             if self._simulated is not None:
-                self._simulated.perform(self._pending)
-            self._pending = None
-        elif isinstance(record, LateRecord):
-            late = record.late()
-            found = trial.observe_late(late)
-            if found is not None and not is_late:
-                self._sink.observed_late(LateFact(LateStep(late, trial.state, found[0]), time_ns))
-        elif isinstance(record, ReinitialisedRecord):
-            trial.reinitialise()  # an event tells of it
-
-    def _sensed(self, trial: Trial, record: ObservedRecord, time_ns: int, *, is_late: bool) -> None:
-        before = trial.state
-        why = None if is_late else self._planner.choose_sensing_action(before)[1]
-        observation = numbers_of(record.observation)
-        info, _ = trial.observe(record.sensing_action, observation, record.sensing_ms)
-        decided_ns, decider = self._deciders.pop(
-            (before.trial, before.step, "sensing"), (time_ns, None)
-        )
-        if why is not None:
-            step = SensingStep(before, record.sensing_action, why, observation, trial.state, info)
-            self._sink.sensed(SensingFact(step, decided_ns, time_ns, decider))
+                assert action is not None
+                self._simulated.perform(action)
+        elif isinstance(record, Late) and not is_late:
+            assert trial.found is not None
+            late = LateStep(record, trial.state, trial.found)
+            self._sink.observed_late(LateFact(late, time_ns))
 
     def _acting(self, state: PlanningState, action: FloatArray, time_ns: int) -> None:
         """Show an action when it is ordered: how it went shows at the next one."""
@@ -197,7 +186,9 @@ class Follower:
             # An answer has the task actions up to the next sensing step.
             self._answered = asked[1]
         info = self._planner.choose_task_action(state)[1]
-        step = TaskStep(cast("Environment", self._simulated), state, info, action, None)
+        step = TaskStep(
+            cast("Environment", self._simulated), state, info, action, Moved(state.step, None)
+        )
         self._sink.acted(TaskFact(step, time_ns, self._answered, self._true_state))
 
 

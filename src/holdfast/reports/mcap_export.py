@@ -138,7 +138,8 @@ class McapSink:
 
     def sensed(self, fact: SensingFact) -> None:
         """Write the belief and the choice, then the observation and the belief that it led to."""
-        (before, action, _, observation, after, info), now, later, decider = fact
+        (before, sensed, _, after, info), now, later, decider = fact
+        action, observation = sensed.sensing_action, sensed.numbers()
         self._place(now, before, before.stage)
         self._belief(now, before.belief)
         label = self._choices[action]
@@ -185,8 +186,8 @@ class McapSink:
     def observed_late(self, fact: LateFact) -> None:
         """Write a late observation and the belief that it led to."""
         (late, after, _), now = fact
-        label = f"taken at step {late.step}"
-        self._array(now, "/holdfast/late_observation", late.observation, label)
+        label = f"taken at step {late.taken}"
+        self._array(now, "/holdfast/late_observation", late.numbers(), label)
         self._belief(now, after.belief)
 
     def trial_ends(self, fact: TrialEndFact) -> None:

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from holdfast.config.loader import Configuration
 from holdfast.errors import OutputError
 from holdfast.journal.journal_reader import JournalReader
+from holdfast.journal.tables import trial_row
 from holdfast.numerics.arrays import FloatArray, IntArray, whole
 from holdfast.planning.belief import Belief
 from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
@@ -159,11 +160,8 @@ def open_run(path: str | Path, *, problem_directory: str | Path | None = None) -
     with RecordedRun(run, "open", problem_directory=directory) as recorded:
         configuration, trials = recorded.configuration, recorded.trials
     with JournalReader.read_run(run, "open") as journal:
-        rows = [
-            [getattr(result, column) for column in TRIAL_COLUMNS]
-            for result in journal.results()
-            if result.trial in trials  # the run may have gone on
-        ]
+        # Those that are known to the first: the run may have gone on.
+        rows = [trial_row(each) for each in journal.results() if each.trial in trials]
     columns = zip(*rows, strict=True) if rows else ([] for _ in TRIAL_COLUMNS)
     results = {
         name: np.array([np.nan if value is None else value for value in column])
@@ -197,7 +195,7 @@ class _Collector:
 
     def observed_late(self, fact: LateFact) -> None:
         """Keep a late observation."""
-        self._late[fact.step.late.step] = fact.step.late.observation
+        self._late[fact.step.late.taken] = fact.step.late.numbers()
 
     def trial_ends(self, fact: TrialEndFact) -> None:
         """Keep the end."""

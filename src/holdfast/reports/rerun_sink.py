@@ -146,9 +146,10 @@ class RerunSink:
 
     def sensed(self, fact: SensingFact) -> None:
         """Log the choice and the alternatives, then the belief that the observation led to."""
-        (before, action, why, _, after, info), decided_ns, observed_ns, decider = fact
+        (before, sensed, why, after, info), decided_ns, observed_ns, decider = fact
         self._at(decided_ns, before.trial, before.step)
         self._belief(before.belief)
+        action = sensed.sensing_action
         label = self._choices[action]
         self._state("sensing_action", label)
         self._decider(decider)
@@ -186,7 +187,7 @@ class RerunSink:
         late, after, info = fact.step
         self._at(fact.time_ns, after.trial, after.step)
         self._belief(after.belief)
-        text = f"trial {after.trial}, step {after.step}: the observation of step {late.step} came"
+        text = f"trial {after.trial}, step {after.step}: the observation of step {late.taken} came"
         if info.explained:
             self._text("INFO", text)
         else:

@@ -25,13 +25,13 @@ from holdfast.numerics.arrays import (
 )
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.numerics.randomness import Purpose, Stream, seed_and_trial, stream
+from holdfast.planning.inputs import Late, Moved, Sensed, encode_floats
 from holdfast.planning.outcome import Done, Ending, MoveResult, ending_of
 from holdfast.planning.settings import EnvironmentSettings
-from holdfast.planning.tracking import LateObservation
 from holdfast.problems import checked
 from holdfast.problems.attributes import check_sizes, has_general_observations, sensing_action_of
 from holdfast.problems.problem import Problem, ProblemBase
-from holdfast.protocol.events import Acted, EnvironmentReady, Sensed
+from holdfast.protocol.events import Acted, EnvironmentReady, NoReading
 from holdfast.protocol.messages import MAX_ACTION_SIZE
 
 __all__ = [
@@ -271,17 +271,17 @@ class CheckedEnvironment:
         if resumed and callable(ask):
             self.method = "steps_performed"
             count = self._count(ask())
-        last: Acted | None = None
-        late: tuple[LateObservation, ...] = ()
+        last: Moved | None = None
+        late: tuple[Late, ...] = ()
         if resumed:
             ask = getattr(environment, "last_move", None)
             if count and callable(ask):
                 self.method = "last_move"
                 last = self._moved(count - 1, ask())
-            late, _ = self._late()
+            late, _ = self._late(count or 0)
         return EnvironmentReady(self._is_done(), count, last, late)
 
-    def sense(self, step: int, sensing_action: int) -> Sensed:
+    def sense(self, step: int, sensing_action: int) -> Sensed | NoReading:
         """Perform a sensing action."""
         # Before sensing: the problem may write into the array that the environment returns.
         size = self._sizes[sensing_action]
@@ -293,11 +293,12 @@ class CheckedEnvironment:
                     f"{self.called} returned LATER, but there is no late_observations() that "
                     "could return the observation when it is there"
                 )
-            return Sensed(step, None)
+            return Sensed(step, sensing_action, b"")
         if self._is_missing(shown):
-            return Sensed(step, None, no_reading=True)
+            return NoReading(step)
         need = f"an array of shape ({size or 'n'},), of {_NUMBERS}, or None"
-        return Sensed(step, self._array(shown, shown, need, size))
+        observation = self._array(shown, shown, need, size)
+        return Sensed(step, sensing_action, encode_floats(observation))
 
     def perform(self, step: int, task_action: FloatArray) -> Acted:
         """Perform a task action, take what comes late, and ask whether the task is done."""
@@ -305,21 +306,21 @@ class CheckedEnvironment:
         self.method = "perform"
         # A copy: the robot's own record of the action must stay what it is.
         action = np.array(task_action, dtype=np.float64)
-        acted = self.performed = self._moved(step, self._environment.perform(action))
-        late, no_reading = self._late()
+        acted = self.performed = Acted(self._moved(step, self._environment.perform(action)))
+        late, no_reading = self._late(step + 1)
         acted = self.performed = acted._replace(late=late, no_reading=no_reading)
         return acted._replace(ending=self._is_done())
 
-    def _moved(self, step: int, shown: object) -> Acted:
+    def _moved(self, step: int, shown: object) -> Moved:
         """Return what a task action has shown."""
         if not isinstance(shown, MoveResult):
-            return Acted(step, self._reward(shown), None)
+            return Moved(step, self._reward(shown))
         need = f"a MoveResult whose {{}} is an array of 1 to {MAX_ACTION_SIZE} {_NUMBERS}"
         motion, observation = (
-            None if value is None else self._array(value, value, need.format(what))
+            b"" if value is None else encode_floats(self._array(value, value, need.format(what)))
             for value, what in ((shown.motion, "motion"), (shown.observation, "observation"))
         )
-        return Acted(step, self._reward(shown.reward), None, motion, observation)
+        return Moved(step, self._reward(shown.reward), motion, observation)
 
     @property
     def called(self) -> str:
@@ -360,7 +361,7 @@ class CheckedEnvironment:
         finite.setflags(write=False)
         return finite
 
-    def _late(self) -> tuple[tuple[LateObservation, ...], tuple[int, ...]]:
+    def _late(self, now: int) -> tuple[tuple[Late, ...], tuple[int, ...]]:
         """Ask for observations of earlier steps, and of which steps there is no reading."""
         ask = getattr(self._environment, "late_observations", None)
         if not callable(ask):
@@ -379,7 +380,8 @@ class CheckedEnvironment:
                 no_reading.append(step)
                 continue
             of_shape = f"{need} with observations of shape (n,), of {_NUMBERS}"
-            late.append(LateObservation(step, self._array(entry[1], value, of_shape)))
+            observation = self._array(entry[1], value, of_shape)
+            late.append(Late(now, step, encode_floats(observation)))
         return tuple(late), tuple(no_reading)
 
     def _is_missing(self, shown: object) -> bool:

@@ -26,10 +26,11 @@ from gymnasium import spaces
 from holdfast.config.registry import make_problem
 from holdfast.errors import InvalidValueError
 from holdfast.numerics import reproducible as numerics
-from holdfast.numerics.arrays import FloatArray, floats_or_none, integer, whole
+from holdfast.numerics.arrays import FloatArray, integer, whole
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.numerics.randomness import Purpose, seed_and_trial, stream
 from holdfast.planning.belief import Belief, standard_deviation
+from holdfast.planning.inputs import Moved, Sensed, encode_floats
 from holdfast.planning.outcome import Ending, MoveResult, ending_of
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.settings import Method, PlanningSettings, SimulatorSettings
@@ -256,7 +257,7 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
 
     def _sense(self, track: Trial, world: SimulatedEnvironment, choice: int) -> float:
         shown = None if choice == self.planner.no_sensing else world.perform_sensing(choice)
-        track.observe(choice, shown, 0.0)
+        track.take(Sensed(track.state.step, choice, encode_floats(shown)))
         self._sensing_steps += 1
         self._last_chosen[choice] = self._sensing_steps
         return -float(self._costs[choice])
@@ -266,7 +267,9 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
         shown = world.perform(executed)
         result = shown if isinstance(shown, MoveResult) else MoveResult(shown)
         reward, motion, observation = result
-        track.move(executed, reward, *map(floats_or_none, (motion, observation)))
+        track.pending = executed
+        shows = map(encode_floats, (motion, observation))
+        track.take(Moved(track.state.step, reward, *shows))
         self._ending = ending_of(world.is_done())
         if reward is not None and not self._minus_steps:
             return float(reward)

@@ -23,8 +23,10 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 from holdfast.config.loader import Configuration
 from holdfast.config.user_code import account_of_user_error, describe_problem_error
 from holdfast.errors import DEFECT, HeldError, HoldfastError, TrialError, defect_fields
+from holdfast.planning.inputs import Record
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import PlanningState
+from holdfast.planning.tracking import Trial, replay
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.events import (
     Abandon,
@@ -49,7 +51,6 @@ from holdfast.protocol.events import (
     WriteRecords,
 )
 from holdfast.protocol.question import DecisionSource, InProcessSource
-from holdfast.protocol.records import Record, TrialHistory, replay
 from holdfast.protocol.robot import Robot
 from holdfast.robot.ending_signals import ending_signals
 from holdfast.robot.environment_maker import EnvironmentMaker
@@ -161,7 +162,7 @@ class RobotProcess:
         self._launcher = links.launcher
         self._runner: EnvironmentRunner | None = None
         self._replayed: int | None = None
-        self._starting: tuple[int, TrialHistory, bool] | None = None
+        self._starting: tuple[int, Trial, bool] | None = None
         self._finished: set[int] = set()
         self._numbers = iter(range(configuration.simulator.num_trials))
         self._verifying = False

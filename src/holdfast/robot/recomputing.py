@@ -14,6 +14,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from time import perf_counter
+from typing import cast
 
 import msgspec
 import numpy as np
@@ -24,17 +25,30 @@ from holdfast.journal.fingerprint import EarlierCode, ranges_of
 from holdfast.journal.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.journal.run_directory import RunDirectory
 from holdfast.numerics.floating_mode import in_own_mode
-from holdfast.planning.outcome import SensingDecision, TaskDecision, TrialResult
-from holdfast.planning.planner import Planner, PlanningState, digest
-from holdfast.protocol.records import decisions_of
+from holdfast.planning.inputs import (
+    ActingRecord,
+    Late,
+    Moved,
+    Record,
+    Reinitialised,
+    Sensed,
+    decisions_of,
+    encode_floats,
+)
+from holdfast.planning.outcome import Ending, SensingDecision, TaskDecision, TrialResult
+from holdfast.planning.planner import Planner, PlanningState, TaskInfo, digest
+from holdfast.planning.tracking import Trial
 from holdfast.robot.environment import Environment, SimulatedEnvironment
-from holdfast.robot.recorded_trial import run_recorded_trial
 from holdfast.robot.trial import (
     NULL_OBSERVER,
     SensingStep,
     TaskStep,
     TrialObserver,
     run_trial,
+    take_late,
+    take_move,
+    take_reinitialisation,
+    take_sensing,
 )
 
 __all__ = ["ComparedTrial", "RecordedTrials", "compute_again", "resume_run", "resume_run_if_begun"]
@@ -94,6 +108,68 @@ class RecordedTrials:
                 return False
             run_recorded_trial(planner, seed, trial, records or [], observer, recorded)
         return True
+
+
+def run_recorded_trial(
+    planner: Planner,
+    seed: int,
+    trial: int,
+    # In the order in which they were written; the one of the last performance may be missing.
+    records: Sequence[Record],
+    observer: TrialObserver,
+    # None if the trial is not finished: then it does not end, and None is returned.
+    result: TrialResult | None = None,
+    # Performs the same task actions, so that the true state is known.
+    simulated: SimulatedEnvironment | None = None,
+) -> TrialResult | None:
+    """Run a trial again, as far as its records go.
+
+    Raises DecidedOtherwiseError if a decision is another one than the recorded.
+    """
+    track = Trial(planner, seed, trial)
+    # For the observer, which asks it for the true state alone.
+    environment = cast("Environment", simulated)
+    task_info: TaskInfo | None = None
+
+    def take(record: Record) -> None:
+        nonlocal task_info
+        state = track.state
+        if isinstance(record, Sensed):
+            otherwise = DecidedOtherwiseError(trial, state.step, "sensing")
+            if not planner.needs_sensing(state):
+                raise otherwise
+            chosen, sensing_info = planner.choose_sensing_action(state)
+            if chosen != record.sensing_action:
+                raise otherwise
+            take_sensing(track, record, sensing_info, observer)
+        elif isinstance(record, ActingRecord):
+            executed, task_info = planner.choose_task_action(state)
+            if planner.needs_sensing(state) or encode_floats(executed) != record.action:
+                raise DecidedOtherwiseError(trial, state.step, "task")
+            track.take(record)
+        elif isinstance(record, Moved):
+            assert track.pending is not None
+            assert task_info is not None
+            if simulated is not None:
+                simulated.perform(track.pending)
+            take_move(track, record, task_info, observer, environment)
+        elif isinstance(record, Late):
+            take_late(track, record, observer)
+        elif isinstance(record, Reinitialised):
+            take_reinitialisation(track, observer)
+
+    observer.trial_began(environment, track.state)
+    for record in records:
+        take(record)
+    if track.pending is not None:
+        take(Moved(track.state.step, None))
+    if result is None:
+        return None
+    if track.state.step != result.steps:
+        raise DecidedOtherwiseError(trial, track.state.step, None)
+    ended = track.result(Ending(result.outcome, result.reason))
+    observer.trial_ended(track.state, ended)
+    return ended
 
 
 class ComparedTrial(TrialObserver):

@@ -9,17 +9,16 @@ from typing import NamedTuple
 from holdfast.config.loader import Configuration
 from holdfast.config.user_code import describe_problem_error
 from holdfast.errors import HoldfastError
+from holdfast.planning.inputs import Sensed, encode_floats
 from holdfast.planning.planner import Decision, Planner, PlanningState, digest
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_TASK_ACTIONS,
     PROTOCOL_VERSION,
-    Observed,
     Reply,
     Request,
     SensingAnswer,
     TaskAnswer,
-    encode_floats,
 )
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.session_configuration import session_configuration_of
@@ -51,7 +50,7 @@ def reference_decisions(configuration: Configuration) -> list[ReferenceDecision]
     """
     decisions: list[ReferenceDecision] = []
 
-    def decide(state: PlanningState, *observations: Observed) -> Decision:
+    def decide(state: PlanningState, *observations: Sensed) -> Decision:
         began = time.perf_counter()
         decision = planner.decide(state, MAX_TASK_ACTIONS)
         took_s = time.perf_counter() - began
@@ -76,7 +75,7 @@ def reference_decisions(configuration: Configuration) -> list[ReferenceDecision]
                 world.perform(action)
             shown = world.perform_sensing(sensing_action)
             state, _ = planner.observe(ahead, sensing_action, shown)
-            decide(state, Observed(ahead.step, sensing_action, encode_floats(shown)))
+            decide(state, Sensed(ahead.step, sensing_action, encode_floats(shown)))
     except Exception as error:  # user code may raise anything
         raise HoldfastError(describe_problem_error(configuration.problem_name, error)) from error
     return decisions

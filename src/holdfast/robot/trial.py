@@ -16,7 +16,8 @@ from typing import NamedTuple
 
 from holdfast.errors import HeldError, InvalidValueError
 from holdfast.numerics.arrays import FloatArray, whole
-from holdfast.planning.outcome import MoveResult, TrialResult
+from holdfast.planning.inputs import Late, Moved, Reinitialised, Sensed
+from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import ObservationInfo, Planner, PlanningState, SensingInfo, TaskInfo
 from holdfast.planning.settings import (
     EnvironmentSettings,
@@ -25,7 +26,7 @@ from holdfast.planning.settings import (
     SimulatorSettings,
     check_settings,
 )
-from holdfast.planning.tracking import LateObservation, Trial
+from holdfast.planning.tracking import Trial
 from holdfast.robot.environment import (
     CheckedEnvironment,
     Environment,
@@ -35,39 +36,48 @@ from holdfast.robot.environment import (
 
 
 class SensingStep(NamedTuple):
-    """A sensing action, its observation, and the states before and after it.
-
-    There is no observation if it comes later, if there was no reading, or if the choice was not to
-    sense (``planner.no_sensing``).
-    """
+    """A sensing action, its observation, and the states before and after it."""
 
     before: PlanningState
-    sensing_action: int
+    sensed: Sensed
     sensing_info: SensingInfo
-    observation: FloatArray | None
     after: PlanningState
     observation_info: ObservationInfo
+
+    @property
+    def sensing_action(self) -> int:
+        """What was chosen; the choice may be not to sense (``planner.no_sensing``)."""
+        return self.sensed.sensing_action
+
+    @property
+    def observation(self) -> FloatArray | None:
+        """What was observed; None if it comes later, never, or if nothing was sensed."""
+        return self.sensed.numbers()
 
 
 class TaskStep(NamedTuple):
     """A task action that was performed, and the state in which it was chosen.
 
-    ``shown`` is what the environment returned, ``observation_info`` what its observation led to.
+    ``moved`` is what the environment returned, ``observation_info`` what its observation led to.
     """
 
     environment: Environment
     state: PlanningState
     task_info: TaskInfo
     executed: FloatArray
-    reward: float | None
-    shown: MoveResult = MoveResult()
+    moved: Moved
     observation_info: ObservationInfo | None = None
+
+    @property
+    def reward(self) -> float | None:
+        """None if the environment gave none."""
+        return self.moved.reward
 
 
 class LateStep(NamedTuple):
     """A late observation, and the state after it was folded in at its step."""
 
-    late: LateObservation
+    late: Late
     after: PlanningState
     observation_info: ObservationInfo
 
@@ -164,25 +174,56 @@ def run_trial(
         if planner.needs_sensing(track.state):
             _sense(track, world, observer)
             _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
-        before = track.state
-        executed, task_info = planner.choose_task_action(before)
-        acted = world.perform(before.step, executed)
-        shown = MoveResult(acted.reward, acted.motion, acted.observation)
-        info = track.move(executed, acted.reward, acted.motion, acted.observation)
-        observer.acted(
-            TaskStep(environment, before, task_info, executed, acted.reward, shown, info)
-        )
-        if info is not None:
+        executed, task_info = planner.choose_task_action(track.state)
+        acted = world.perform(track.state.step, executed)
+        track.pending = executed
+        take_move(track, acted.moved, task_info, observer, environment)
+        if track.found is not None:
             _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
         for late in acted.late:
-            found = track.observe_late(late)
-            if found is not None:
-                observer.observed_late(LateStep(late, track.state, found[0]))
+            if late.taken in track.awaited:
+                take_late(track, late, observer)
                 _act_if_lost(track, lost.on_lost, reinitialised_after, observer)
         ending = acted.ending
     ended = track.result(ending)
     observer.trial_ended(track.state, ended)
     return ended
+
+
+def take_sensing(
+    track: Trial, sensed: Sensed, sensing_info: SensingInfo, observer: TrialObserver
+) -> None:
+    """Fold in a sensing action, and tell the observer."""
+    before, sensed = track.state, track.take(sensed)
+    assert track.found is not None
+    observer.sensed(SensingStep(before, sensed, sensing_info, track.state, track.found))
+
+
+def take_move(
+    track: Trial,
+    moved: Moved,
+    task_info: TaskInfo,
+    observer: TrialObserver,
+    environment: Environment,
+) -> None:
+    """Fold in the pending task action, and tell the observer."""
+    before, action = track.state, track.pending
+    assert action is not None
+    moved = track.take(moved)
+    observer.acted(TaskStep(environment, before, task_info, action, moved, track.found))
+
+
+def take_late(track: Trial, late: Late, observer: TrialObserver) -> None:
+    """Fold in a late observation that is awaited, and tell the observer."""
+    late = track.take(late)
+    assert track.found is not None
+    observer.observed_late(LateStep(late, track.state, track.found))
+
+
+def take_reinitialisation(track: Trial, observer: TrialObserver) -> None:
+    """Begin the belief anew, and tell the observer."""
+    track.take(Reinitialised(track.state.step))
+    observer.reinitialised(track.state)
 
 
 def _require_new(environment: Environment) -> None:
@@ -203,13 +244,12 @@ def _sense(track: Trial, world: CheckedEnvironment, observer: TrialObserver) -> 
     started = perf_counter()
     sensing_action, sensing_info = planner.choose_sensing_action(before)
     sensing_ms = (perf_counter() - started) * 1e3
-    observation = None
+    shown = b""
     if sensing_action != planner.no_sensing:
-        observation = world.sense(before.step, sensing_action).observation
-    info, _ = track.observe(sensing_action, observation, sensing_ms)
-    observer.sensed(
-        SensingStep(before, sensing_action, sensing_info, observation, track.state, info)
-    )
+        came = world.sense(before.step, sensing_action)
+        shown = came.observation if isinstance(came, Sensed) else b""
+    sensed = Sensed(before.step, sensing_action, shown, sensing_ms=sensing_ms)
+    take_sensing(track, sensed, sensing_info, observer)
 
 
 def _act_if_lost(
@@ -231,5 +271,4 @@ def _act_if_lost(
     else:
         again = is_lost and on_lost == "reinitialise"
     if again:
-        track.reinitialise()
-        observer.reinitialised(track.state)
+        take_reinitialisation(track, observer)

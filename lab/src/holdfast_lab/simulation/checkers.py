@@ -84,7 +84,7 @@ class _Places(dict[type, tuple[str, ...]]):
 
     def __missing__(self, kind: type) -> tuple[str, ...]:
         places: list[str] = []
-        if kind.__module__.startswith("holdfast.protocol"):
+        if kind.__module__.startswith(("holdfast.protocol", "holdfast.planning.tracking")):
             places = [slot for each in kind.__mro__ for slot in getattr(each, "__slots__", ())]
             places.append("__dict__")
         self[kind] = tuple(places)

@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from holdfast.planning.inputs import Record, decode_record, encode_record
 from holdfast.planning.outcome import TrialResult
-from holdfast.protocol.records import Record, decode_record, encode_record
 
 __all__ = ["Disk", "Unfinished"]
 

@@ -18,15 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.inputs import ActingRecord, Late, Moved, Record, Sensed, encode_floats
 from holdfast.planning.outcome import Done, TrialResult
-from holdfast.planning.tracking import LateObservation
-from holdfast.protocol.records import (
-    ActingRecord,
-    LateRecord,
-    ObservedRecord,
-    PerformedRecord,
-    Record,
-)
 from holdfast_lab.errors import Violation
 from holdfast_lab.simulation.reference_runs import (
     BEFORE_CHOOSING,
@@ -55,12 +48,12 @@ class Resumed(NamedTuple):
     ----------
     last : ReferenceStep or None
         Its last task action, if it can still tell what that has shown.
-    late : tuple of LateObservation
+    late : tuple of Late
         What has come meanwhile.
     """
 
     last: ReferenceStep | None
-    late: tuple[LateObservation, ...]
+    late: tuple[Late, ...]
 
 
 class EnvironmentModel:
@@ -175,9 +168,9 @@ class EnvironmentModel:
         may_lack : bool
             Whether a power cut has taken some away.
         """
-        observed = [each for each in records if isinstance(each, ObservedRecord)]
-        written = [each.taken for each in records if isinstance(each, LateRecord)]
-        known = sum(isinstance(each, PerformedRecord) for each in records)
+        observed = [each for each in records if isinstance(each, Sensed)]
+        written = [each.taken for each in records if isinstance(each, Late)]
+        known = sum(isinstance(each, Moved) for each in records)
         acting = sum(isinstance(each, ActingRecord) for each in records)
         if self._shows_the_same:
             self.performed = known
@@ -276,7 +269,7 @@ class EnvironmentModel:
         self.performed += 1
         return due
 
-    def come(self, moment: int = BEFORE_SENSING) -> tuple[LateObservation, ...]:
+    def come(self, moment: int = BEFORE_SENSING) -> tuple[Late, ...]:
         """Return the observations of earlier steps that have come."""
         if not self._coming:
             return ()
@@ -294,7 +287,7 @@ class EnvironmentModel:
                 # Once more, or of a process that has forgotten that it sensed: it must not count.
                 shown = np.array([99.0])
                 self._useless.append(taken)
-            late.append(LateObservation(taken, shown))
+            late.append(Late(self.performed, taken, encode_floats(shown)))
         self._refer()
         return tuple(late)
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.errors import HoldfastError, UnknownPerformanceError
 from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.inputs import Late, Moved, Record, Sensed, encode_floats
 from holdfast.planning.outcome import ending_of
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import (
@@ -21,7 +22,7 @@ from holdfast.planning.settings import (
     RecoverySettings,
     SimulatorSettings,
 )
-from holdfast.planning.tracking import LateObservation
+from holdfast.planning.tracking import Trial, replay
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.events import (
     Abandon,
@@ -34,6 +35,7 @@ from holdfast.protocol.events import (
     Halt,
     Launch,
     LogEvent,
+    NoReading,
     OwnAnswer,
     Paused,
     RecoveryExited,
@@ -41,14 +43,12 @@ from holdfast.protocol.events import (
     RobotEffect,
     Send,
     Sense,
-    Sensed,
     Timing,
     TransportEvent,
     VerificationNoted,
     WriteRecords,
 )
 from holdfast.protocol.messages import MAX_TASK_ACTIONS
-from holdfast.protocol.records import Record, TrialHistory, replay
 from holdfast.protocol.robot import Robot
 from holdfast_lab.errors import Violation
 from holdfast_lab.simulation.checkers import StatusChecker
@@ -434,9 +434,7 @@ class RobotNode:
         begin = (self.incarnation, self._begin, trial, history, records, is_complete)
         self._queue.after(_BEGINS_AFTER_S, self._happens, *begin)
 
-    def _begin(
-        self, trial: int, history: TrialHistory, records: list[Record], is_complete: bool
-    ) -> None:
+    def _begin(self, trial: int, history: Trial, records: list[Record], is_complete: bool) -> None:
         robot = self.machine
         assert robot is not None
         simulated = self._run.environment == "simulated"
@@ -470,7 +468,7 @@ class RobotNode:
         ending = ending_of(environment.done)
         last = None
         if performed and resumed.last is not None:
-            last = _acted(performed - 1, resumed.last)
+            last = _moved(performed - 1, resumed.last)
         begun = EnvironmentReady(ending, performed, last, resumed.late)
         self._world.note("robot", "begins trial %s at step %s", trial, known)
         self._note_late(resumed.late)
@@ -478,9 +476,9 @@ class RobotNode:
             robot.begin_trial(trial, history, begun, self._now(), tail_is_certain=is_complete)
         )
 
-    def _note_late(self, late: tuple[LateObservation, ...]) -> None:
+    def _note_late(self, late: tuple[Late, ...]) -> None:
         for each in late:
-            self._world.note("robot", "is shown what was sensed in step %s", each.step)
+            self._world.note("robot", "is shown what was sensed in step %s", each.taken)
 
     # -- its body --------------------------------------------------------------------------------
 
@@ -491,8 +489,10 @@ class RobotNode:
         shown = self._environment.sense(step, sensing_action)
         if shown is None:
             self._world.sensed_late(step)
-        no_reading = shown is None and not self._environment.will_come(step)
-        self._happens(process, self._heard, Sensed(step, shown, no_reading))
+        sensed: Sensed | NoReading = Sensed(step, sensing_action, encode_floats(shown))
+        if shown is None and not self._environment.will_come(step):
+            sensed = NoReading(step)
+        self._happens(process, self._heard, sensed)
 
     def _performs(self, process: int, step: int, action: FloatArray) -> None:
         if self._is_gone(process):
@@ -507,9 +507,9 @@ class RobotNode:
         shown = self._environment.act(step, action)
         late = self._environment.come()
         self._note_late(late)
-        event = _acted(step, shown)._replace(late=late)
+        event = Acted(_moved(step, shown), ending_of(shown.done), late)
         self._queue.after(self._run.act_s, self._happens, process, self._heard, event)
 
 
-def _acted(step: int, done: ReferenceStep) -> Acted:
-    return Acted(step, done.reward, ending_of(done.done), done.motion, done.shown)
+def _moved(step: int, done: ReferenceStep) -> Moved:
+    return Moved(step, done.reward, encode_floats(done.motion), encode_floats(done.shown))

@@ -5,28 +5,27 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
+from tests.trial_inputs import begin_anew, come_late, sense
 
 from holdfast.errors import RecordError
-from holdfast.planning.planner import Planner
-from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
-from holdfast.planning.tracking import LateObservation
-from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.protocol.messages import encode_floats
-from holdfast.protocol.records import (
+from holdfast.planning.inputs import (
     ActingRecord,
-    LateRecord,
+    Late,
     LocalTookOverRecord,
-    ObservedRecord,
+    Moved,
     PausedRecord,
-    PerformedRecord,
     Record,
-    ReinitialisedRecord,
-    TrialHistory,
+    Reinitialised,
+    Sensed,
     decode_record,
+    encode_floats,
     encode_record,
     has_shown,
-    replay,
 )
+from holdfast.planning.planner import Planner
+from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
+from holdfast.planning.tracking import Trial, replay
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
 
 PROBLEM = PegInHole2D()
 PLANNING = PlanningSettings(
@@ -34,14 +33,14 @@ PLANNING = PlanningSettings(
 )
 PLANNING_EACH_STEP = msgspec.structs.replace(PLANNING, sensing_interval=0)
 RECORDS: list[Record] = [
-    ObservedRecord(8, 1, encode_floats([0.5]), bytes(32), 1.5),
+    Sensed(8, 1, encode_floats([0.5]), bytes(32), 1.5),
     ActingRecord(8, encode_floats([0.25, -0.5, 0.0])),
-    PerformedRecord(8, None),
+    Moved(8, None),
     PausedRecord(),
     LocalTookOverRecord(2),
-    PerformedRecord(8, -1.0, encode_floats([0.5]), encode_floats([1.0, 2.0])),
-    LateRecord(9, 8, encode_floats([0.5]), bytes(32)),
-    ReinitialisedRecord(9, bytes(32)),
+    Moved(8, -1.0, encode_floats([0.5]), encode_floats([1.0, 2.0])),
+    Late(9, 8, encode_floats([0.5]), bytes(32)),
+    Reinitialised(9, bytes(32)),
 ]
 
 
@@ -57,10 +56,10 @@ def test_deep_nesting_is_no_record() -> None:
             decode_record(data)
 
 
-def first_record(**changes: object) -> ObservedRecord:
+def first_record(**changes: object) -> Sensed:
     """Return an observation that could be the first of a trial, but for its digest."""
     shown = encode_floats(np.zeros(1))
-    return msgspec.structs.replace(ObservedRecord(0, 0, shown, bytes(32), 1.0), **changes)
+    return msgspec.structs.replace(Sensed(0, 0, shown, bytes(32), 1.0), **changes)
 
 
 @pytest.mark.parametrize(
@@ -83,15 +82,14 @@ def test_a_record_that_does_not_follow_is_named(record: Record, why: str) -> Non
 def test_what_came_late_may_stand_between_an_action_and_its_performance() -> None:
     """A resumed robot is told of it before it performs the action that its journal ends with."""
     planner = Planner(PROBLEM, PLANNING)
-    history = TrialHistory(planner, 11, 4)
-    sensed = history.fold_observation(0, None, 1.0)[1]
+    history = Trial(planner, 11, 4)
+    sensed = sense(history, 0, None, 1.0)
     action, _ = planner.choose_task_action(history.state)
     history.pending = action
-    found = history.fold_late_observation(LateObservation(0, np.array([3.5])))
-    assert found is not None
-    performed = PerformedRecord(0, -1.0)
-    history.fold_move(performed)
-    records: list[Record] = [sensed, ActingRecord(0, encode_floats(action)), found[1], performed]
+    found = come_late(history, 0, np.array([3.5]))
+    performed = Moved(0, -1.0)
+    history.take(performed)
+    records: list[Record] = [sensed, ActingRecord(0, encode_floats(action)), found, performed]
     again = replay(planner, 11, 4, records)
     assert planner.digest(again.state) == planner.digest(history.state)
     assert again.awaited == ()
@@ -102,66 +100,66 @@ def test_what_came_late_may_stand_between_an_action_and_its_performance() -> Non
 
 def test_a_lost_robot_stays_lost_when_an_explained_observation_comes_late() -> None:
     """It held still, or was killed, before the new belief was written down."""
-    history = TrialHistory(Planner(PROBLEM, PLANNING_EACH_STEP), 5, 0, 1.0)
+    history = Trial(Planner(PROBLEM, PLANNING_EACH_STEP), 5, 0, 1.0)
     explained = history.planner.problem.observation_mean(history.state.belief.states[:1], 0)[0]
-    history.fold_observation(0, None, 0.0)
+    sense(history, 0, None, 0.0)
     history.pending = np.zeros(3)
-    history.fold_move(PerformedRecord(0, None))
-    history.fold_observation(0, np.full(1, 1e6), 0.0)
+    history.take(Moved(0, None))
+    sense(history, 0, np.full(1, 1e6), 0.0)
     assert history.is_lost
-    found = history.fold_late_observation(LateObservation(0, explained))
-    assert found is not None
-    assert found[0].within_gate
+    come_late(history, 0, explained)
+    assert history.found is not None
+    assert history.found.within_gate
     assert history.is_lost
-    history.fold_reinitialisation()
+    begin_anew(history)
     assert not history.is_lost
 
 
 def test_an_unexplained_observation_that_comes_late_can_find_it_lost() -> None:
-    history = TrialHistory(Planner(PROBLEM, PLANNING_EACH_STEP), 5, 0, 1.0)
-    history.fold_observation(0, None, 0.0)
+    history = Trial(Planner(PROBLEM, PLANNING_EACH_STEP), 5, 0, 1.0)
+    sense(history, 0, None, 0.0)
     assert not history.is_lost
-    assert history.fold_late_observation(LateObservation(0, np.full(1, 1e6))) is not None
+    come_late(history, 0, np.full(1, 1e6))
     assert history.is_lost
 
 
 def test_a_suspect_sensor_is_no_lost_robot() -> None:
     """Twice outside, and between them another sensor inside."""
-    history = TrialHistory(Planner(PROBLEM, PLANNING_EACH_STEP), 5, 0, 2 / 80)
+    history = Trial(Planner(PROBLEM, PLANNING_EACH_STEP), 5, 0, 2 / 80)
     kinds = []
     for action in (0, 1, 0):
         inside = history.planner.problem.observation_mean(history.state.belief.states, action)
-        history.fold_observation(action, np.full(1, 1e6) if action == 0 else inside[0], 0.0)
+        sense(history, action, np.full(1, 1e6) if action == 0 else inside[0], 0.0)
         kinds.append(None if history.alarm is None else history.alarm.kind)
         assert not history.is_lost
         history.pending = np.zeros(3)
-        history.fold_move(PerformedRecord(history.state.step, None))
+        history.take(Moved(history.state.step, None))
     assert kinds == [None, None, "sensor_suspect"]
 
 
 def test_what_has_begun() -> None:
     """Any of an input, a step or an action that is in the journal alone."""
 
-    def begun(history: TrialHistory) -> bool:
+    def begun(history: Trial) -> bool:
         return history.begun
 
     planner = Planner(PROBLEM, PLANNING)
-    assert not begun(TrialHistory(planner, 1, 0))
-    history = TrialHistory(planner, 1, 0)
-    history.fold_observation(0, None, 0.0)
+    assert not begun(Trial(planner, 1, 0))
+    history = Trial(planner, 1, 0)
+    sense(history, 0, None, 0.0)
     assert begun(history)
-    history = TrialHistory(planner, 1, 0)
+    history = Trial(planner, 1, 0)
     history.pending = np.zeros(3)
     assert begun(history)
-    history = TrialHistory(planner, 1, 0)
+    history = Trial(planner, 1, 0)
     history.state = history.state._replace(step=1)
     assert begun(history)
 
 
 def test_what_a_record_has_shown() -> None:
     shown = encode_floats(np.zeros(1))
-    assert not has_shown(PerformedRecord(0, None))
-    assert has_shown(PerformedRecord(0, None, shown))
-    assert has_shown(PerformedRecord(0, None, b"", shown))
-    assert has_shown(LateRecord(2, 0, shown, bytes(32)))
+    assert not has_shown(Moved(0, None))
+    assert has_shown(Moved(0, None, shown))
+    assert has_shown(Moved(0, None, b"", shown))
+    assert has_shown(Late(2, 0, shown, bytes(32)))
     assert not has_shown(first_record())
