@@ -93,7 +93,7 @@ def break_even_lines(lines: pd.DataFrame) -> Figure:
     for place, end in enumerate(ends.values()):
         panel.plot([end, end], [place - 0.4, place + 0.4], color="#8A9099", linewidth=1.2)
     panel.set_xticks(ticks := [300, 1_000, 3_000, 10_000, 30_000], [f"{each:,}" for each in ticks])
-    bounds = "particles at break-even, with bounds; grey: measured up to here"
-    panel.set_xlabel(f"{bounds}\n({never} kinds of decisions with a horizon H: none is known)")
+    text = "particles at break-even, with bounds; grey: measured up to here"
+    panel.set_xlabel(f"{text}\n({never} kinds of decisions with a horizon H: none is known)")
     plots.legend_below(figure, panel, 4, frameon=False)
     return figure
