@@ -93,7 +93,8 @@ session_configurations = st.builds(
     seed=st.integers(0, 2**63 - 1),
 )
 observed = st.builds(Sensed, step=words, sensing_action=words, observation=numbers)
-moved = st.builds(Moved, step=words, motion=numbers, observation=numbers)
+# A service is not told of rewards.
+moved = st.builds(Moved, step=words, reward=st.none(), motion=numbers, observation=numbers)
 _asked = {
     "version": st.just(PROTOCOL_VERSION),
     "session": st.binary(min_size=16, max_size=16),
