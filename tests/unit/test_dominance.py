@@ -40,7 +40,7 @@ class Sensors(ProblemBase):
         return -states[..., :-1]
 
 
-def choices_of(problem: Sensors, estimator: Estimator) -> list[int]:
+def choices_of(problem: Any, estimator: Estimator) -> list[int]:
     selector = SelectorSettings(method="action_entropy", estimator=estimator)
     chosen = []
     for trial in range(50):
