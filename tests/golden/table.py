@@ -130,6 +130,8 @@ def _selectors() -> Iterator[Run]:
     ahead = {"active_sensing.horizon": 2, "active_sensing.discount": 0.5}
     for method in _choices("method"):
         for estimator in _choices("estimator") if method.endswith("_entropy") else (None,):
+            if estimator == "prior_neighbors_undominated":
+                continue  # Nothing is dominated here, so it decides as prior_neighbors.
             acts = method.startswith(("action_", "path_"))
             for actions in _choices("actions") if acts else (None,):
                 chosen = {"method": method, "estimator": estimator, "actions": actions}
