@@ -102,7 +102,7 @@ class TrialChart:
 
     def observed_late(self, fact: LateFact) -> None:
         """Note a late observation; it is folded in before the next step."""
-        self._notes.append(f"the observation of step {fact.step.late.step} came late")
+        self._notes.append(f"the observation of step {fact.step.late.taken} came late")
 
     @in_own_mode
     def trial_ends(self, fact: TrialEndFact) -> None:
