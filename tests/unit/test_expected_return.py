@@ -458,11 +458,10 @@ class TestSensingCosts:
 
     def test_a_robot_pays_for_each_look(self) -> None:
         planner = Planner(Priced(), settings_of(method="random", particles=30))
-        history = Trial(planner, 0, 0)
-        observation = np.array([0.5])
-        for sensing_action, total in ((0, -0.5), (1, -0.75), (2, -0.75)):
-            sense(history, sensing_action, observation, 0.0)
-            assert history.rewards.total == total
+        for trial, price in enumerate((0.5, 0.25, 0.0)):
+            history = Trial(planner, 0, trial)
+            sense(history, trial, np.array([0.5]), 0.0)
+            assert history.rewards.total == -price
 
     def test_a_price_alone_is_a_reward(self) -> None:
         problem = Free()
