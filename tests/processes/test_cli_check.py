@@ -94,7 +94,7 @@ def test_json_and_the_lines_of_the_user(tmp_path: Path, capsys: pytest.CaptureFi
     ("kind", "move", "code", "seen"),
     [
         ("Loops", LOOPS, 1, "move raised TimeoutError: it has not returned in 2 s"),
-        ("Ends", ENDS, 1, "move raised _EndedError: os._exit(0) would end the process"),
+        ("Ends", ENDS, 1, "move raised ProcessEndError: os._exit(0) would end the process"),
         ("Crashes", CRASHES, 1, "ended the process of the check: it was killed by SIGSEGV in the"),
         ("Slow", SLOW, 0, "0 errors, 0 warnings; too little time for "),
         ("Thread", THREAD, 0, "0 errors, 0 warnings"),
