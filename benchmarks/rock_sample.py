@@ -224,7 +224,7 @@ def play(method: str, rule: Rule, seed: int, trial: int) -> World:
     """Play a trial with one of holdfast's selectors."""
     selector = SelectorSettings(
         method=method,  # type: ignore[arg-type]
-        rollout_looks=8,
+        rollout_sensing_steps=8,
         sensing_is_optional=rule.moves is None,
         nats_per_cost=rule.nats,
     )

@@ -50,7 +50,7 @@ WAYS: Mapping[str, SelectorSettings] = {
     "state entropy": SelectorSettings(method="state_entropy", estimator="nearest_neighbor"),
     "action covariance": SelectorSettings(method="action_covariance"),
     "expected return, 8 looks": SelectorSettings(
-        method="expected_return", rollout_reward="steps", rollout_looks=8
+        method="expected_return", rollout_reward="steps", rollout_sensing_steps=8
     ),
 }
 

@@ -194,7 +194,9 @@ def _depends_on_resolution(selector: SelectorSettings) -> bool:
 
 def _selector_of(cell: _Cell) -> tuple[SelectorSettings, int]:
     """Return how a cell chooses what to sense, and its interval."""
-    returns = SelectorSettings(method="expected_return", rollout_reward="steps", rollout_looks=8)
+    returns = SelectorSettings(
+        method="expected_return", rollout_reward="steps", rollout_sensing_steps=8
+    )
     if cell.way == FIXED:
         return SelectorSettings(), int(cell.number)
     if cell.way == "return, intervals":

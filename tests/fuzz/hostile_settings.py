@@ -154,7 +154,7 @@ def random_settings(chance: random.Random, most: float = 1.0) -> PlanningSetting
         "active_sensing.num_nearest_neighbors": drawn(1, 300) if chance.random() < 0.4 else 5,
         "active_sensing.horizon": drawn(1, 30),
         "selector.rollout_steps": drawn(1, 2000),
-        "selector.rollout_looks": drawn(1, 100),
+        "selector.rollout_sensing_steps": drawn(1, 100),
         "selector.max_observation_samples": drawn(1, 400),
         "selector.path_offsets": tuple(range(drawn(1, 16))),
         "sensing_interval": drawn(1, 60),

@@ -104,7 +104,7 @@ def test_same_bits_as_robot_by_robot(problem: Any, threads: int) -> None:
     settings = PlanningSettings(
         active_sensing=ActiveSensingSettings(discount=DISCOUNT, num_cores=threads),
         selector=SelectorSettings(
-            method="expected_return", rollout_looks=LOOKS, rollout_steps=STEPS
+            method="expected_return", rollout_sensing_steps=LOOKS, rollout_steps=STEPS
         ),
         sensing_interval=INTERVAL - 1,
     )

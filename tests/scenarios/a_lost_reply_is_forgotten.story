@@ -21,7 +21,7 @@ cut service=cloud-1 at=0.029476 for_s=0.1
    0.2920  robot    performs sensing action 0 of step 0
    0.2920  robot    hears of call 2: its end
    0.2930  robot    asks cloud-2, call 3
-   0.2930  robot    restore service=cloud-1 step=0 bytes=1567
+   0.2930  robot    restore service=cloud-1 step=0 bytes=1575
    0.2930  robot    asks cloud-1, call 4
    0.2960  robot    hears of call 3: TaskAnswer
    0.2960  robot    performs task action 0

@@ -49,7 +49,7 @@ message service=local direction=from number=22 what=drop
    0.4356  robot    performs task actions 1 to 8
    0.5172  robot    performs sensing action 0 of step 9
    0.5182  robot    asks local, call 5
-   0.5182  robot    restore service=cloud-1 step=9 bytes=1567
+   0.5182  robot    restore service=cloud-1 step=9 bytes=1575
    0.5182  robot    asks cloud-1, call 6
    0.5194  robot    hears of call 5: TaskAnswer
    0.5194  robot    performs task action 9
@@ -67,24 +67,24 @@ message service=local direction=from number=22 what=drop
    0.8020  robot    resumed_trial trial=0 step=16
    0.8020  robot    performed_unseen trial=0 step=16
    0.8110  robot    service_appeared service=cloud-1
-   0.8110  robot    restore service=cloud-1 step=17 bytes=1567
+   0.8110  robot    restore service=cloud-1 step=17 bytes=1575
    0.8110  robot    asks cloud-1, call 1
    1.0610  robot    service_suspected service=cloud-1 reason=no sign of progress for 250 ms
    1.0610  robot    status from=standard to=local_recovery silent_ms=250 reason=cloud-1 no sign of progress for 250 ms
    1.0610  robot    launch service=local
    1.0610  local    is launched
-   1.0610  robot    restore service=cloud-1 step=17 bytes=1567
+   1.0610  robot    restore service=cloud-1 step=17 bytes=1575
    1.0610  robot    retry service=cloud-1 step=17 attempt=2 waited_ms=259
    1.0610  robot    asks cloud-1, call 2
    1.0610  robot    holding step=17 reason=cloud-1: no sign of progress for 250 ms; local: is being launched
    1.2110  local    starts, process 2
    1.2210  robot    launched launch_ms=160
-   1.2210  robot    restore service=local step=17 bytes=1567
+   1.2210  robot    restore service=local step=17 bytes=1575
    1.2210  robot    retry service=local step=17 attempt=3 waited_ms=419
    1.2210  robot    asks local, call 3
    1.2252  robot    hears of call 3: its end
    1.2252  robot    service_suspected service=local reason=a call ended without the answer
-   1.2452  robot    restore service=local step=17 bytes=1567
+   1.2452  robot    restore service=local step=17 bytes=1575
    1.2452  robot    retry service=local step=17 attempt=4 waited_ms=443.2
    1.2452  robot    asks local, call 4
    1.2454  robot    hears of call 4: TaskAnswer
@@ -101,7 +101,7 @@ message service=local direction=from number=22 what=drop
    1.2680  robot    performs task actions 19 to 26
    1.3496  robot    performs sensing action 0 of step 27
    1.3506  robot    asks local, call 6
-   1.3506  robot    restore service=cloud-1 step=27 bytes=1567
+   1.3506  robot    restore service=cloud-1 step=27 bytes=1575
    1.3506  robot    asks cloud-1, call 7
    1.3518  robot    hears of call 6: TaskAnswer
    1.3518  robot    performs task action 27
@@ -110,13 +110,13 @@ message service=local direction=from number=22 what=drop
    1.4436  robot    performs sensing action 2 of step 36
    1.4446  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    1.4446  robot    asks local, call 8
-   1.6006  robot    restore service=cloud-1 step=36 bytes=1567
+   1.6006  robot    restore service=cloud-1 step=36 bytes=1575
    1.6006  robot    asks cloud-1, call 9
-   1.8506  robot    restore service=cloud-1 step=36 bytes=1567
+   1.8506  robot    restore service=cloud-1 step=36 bytes=1575
    1.8506  robot    asks cloud-1, call 10
-   2.1006  robot    restore service=cloud-1 step=36 bytes=1567
+   2.1006  robot    restore service=cloud-1 step=36 bytes=1575
    2.1006  robot    asks cloud-1, call 11
-   2.3506  robot    restore service=cloud-1 step=36 bytes=1567
+   2.3506  robot    restore service=cloud-1 step=36 bytes=1575
    2.3506  robot    asks cloud-1, call 12
    2.4446  robot    service_suspected service=local reason=no sign of progress for 1000 ms
    2.4446  robot    launch service=local
@@ -125,7 +125,7 @@ message service=local direction=from number=22 what=drop
    2.4456  robot    hears of call 4: its end
    2.4456  robot    hears of call 6: its end
    2.5946  local    starts, process 3
-   2.6006  robot    restore service=cloud-1 step=36 bytes=1567
+   2.6006  robot    restore service=cloud-1 step=36 bytes=1575
    2.6006  robot    retry service=cloud-1 step=36 attempt=6 waited_ms=1156
    2.6006  robot    asks cloud-1, call 13
    2.6036  robot    hears of call 13: TaskAnswer

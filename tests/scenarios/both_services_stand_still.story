@@ -33,7 +33,7 @@ stop node=local at=0.6 for_s=30
    0.5000  robot    hears of call 4: its end
    0.5118  local    starts, process 1
    0.5218  robot    launched launch_ms=160
-   0.5218  robot    restore service=local step=9 bytes=1567
+   0.5218  robot    restore service=local step=9 bytes=1575
    0.5218  robot    retry service=local step=9 attempt=3 waited_ms=410
    0.5218  robot    asks local, call 5
    0.5230  robot    hears of call 5: TaskAnswer

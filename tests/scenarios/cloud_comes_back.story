@@ -26,7 +26,7 @@ crash service=cloud-1 at=0.1 down_s=0.3
    0.1118  robot    holding step=9 reason=cloud-1: is not there; local: is being launched
    0.2520  local    starts, process 1
    0.2620  robot    launched launch_ms=160
-   0.2620  robot    restore service=local step=9 bytes=1567
+   0.2620  robot    restore service=local step=9 bytes=1575
    0.2620  robot    asks local, call 3
    0.2632  robot    hears of call 3: TaskAnswer
    0.2632  robot    restored service=local step=9 restore_ms=1.2
@@ -45,7 +45,7 @@ crash service=cloud-1 at=0.1 down_s=0.3
    0.4000  cloud-1  starts, process 2
    0.4082  robot    performs task action 23
    0.4100  robot    service_appeared service=cloud-1
-   0.4100  robot    restore service=cloud-1 step=18 bytes=1567
+   0.4100  robot    restore service=cloud-1 step=18 bytes=1575
    0.4100  robot    asks cloud-1, call 5
    0.4130  robot    hears of call 5: TaskAnswer
    0.4130  robot    restored service=cloud-1 step=18 restore_ms=3

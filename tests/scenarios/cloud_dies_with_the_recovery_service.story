@@ -26,7 +26,7 @@ crash service=local at=0.3
    0.1118  robot    holding step=9 reason=cloud-1: is not there; local: is being launched
    0.2020  local    starts, process 1
    0.2120  robot    launched launch_ms=160
-   0.2120  robot    restore service=local step=9 bytes=1567
+   0.2120  robot    restore service=local step=9 bytes=1575
    0.2120  robot    asks local, call 3
    0.2132  robot    hears of call 3: TaskAnswer
    0.2132  robot    restored service=local step=9 restore_ms=1.2
@@ -44,7 +44,7 @@ crash service=local at=0.3
    0.3060  robot    holding step=18 reason=cloud-1: is not there; local: is being launched
    0.4510  local    starts, process 2
    0.4610  robot    launched launch_ms=160
-   0.4610  robot    restore service=local step=18 bytes=1567
+   0.4610  robot    restore service=local step=18 bytes=1575
    0.4610  robot    asks local, call 4
    0.4622  robot    hears of call 4: TaskAnswer
    0.4622  robot    restored service=local step=18 restore_ms=1.2

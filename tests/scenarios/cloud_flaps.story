@@ -27,7 +27,7 @@ crash service=cloud-1 at=0.4 down_s=0.08
    0.1118  robot    holding step=9 reason=cloud-1: is not there; local: is being launched
    0.1800  cloud-1  starts, process 2
    0.1900  robot    service_appeared service=cloud-1
-   0.1900  robot    restore service=cloud-1 step=9 bytes=1567
+   0.1900  robot    restore service=cloud-1 step=9 bytes=1575
    0.1900  robot    asks cloud-1, call 3
    0.1930  robot    hears of call 3: TaskAnswer
    0.1930  robot    restored service=cloud-1 step=9 restore_ms=3
@@ -45,7 +45,7 @@ crash service=cloud-1 at=0.4 down_s=0.08
    0.2620  robot    launched launch_ms=160
    0.2644  robot    performs task actions 16 to 17
    0.2848  robot    performs sensing action 0 of step 18
-   0.2858  robot    restore service=local step=18 bytes=1567
+   0.2858  robot    restore service=local step=18 bytes=1575
    0.2858  robot    asks local, call 4
    0.2870  robot    hears of call 4: TaskAnswer
    0.2870  robot    restored service=local step=18 restore_ms=1.2
@@ -56,7 +56,7 @@ crash service=cloud-1 at=0.4 down_s=0.08
    0.3300  cloud-1  starts, process 3
    0.3380  robot    performs task action 23
    0.3400  robot    service_appeared service=cloud-1
-   0.3400  robot    restore service=cloud-1 step=18 bytes=1567
+   0.3400  robot    restore service=cloud-1 step=18 bytes=1575
    0.3400  robot    asks cloud-1, call 5
    0.3430  robot    hears of call 5: TaskAnswer
    0.3430  robot    restored service=cloud-1 step=18 restore_ms=3
@@ -85,7 +85,7 @@ crash service=cloud-1 at=0.4 down_s=0.08
    0.4800  cloud-1  starts, process 4
    0.4870  robot    performs task action 37
    0.4900  robot    service_appeared service=cloud-1
-   0.4900  robot    restore service=cloud-1 step=36 bytes=1567
+   0.4900  robot    restore service=cloud-1 step=36 bytes=1575
    0.4900  robot    asks cloud-1, call 8
    0.4930  robot    hears of call 8: TaskAnswer
    0.4930  robot    restored service=cloud-1 step=36 restore_ms=3

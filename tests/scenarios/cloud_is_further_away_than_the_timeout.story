@@ -32,7 +32,7 @@ run trial=3 latency_s=0.2 lease_s=3.0
    0.9078  robot    asks cloud-1, call 4
    1.1578  robot    service_suspected service=cloud-1 reason=no sign of progress for 250 ms
    1.1578  robot    status from=keep_alive to=local_recovery silent_ms=250 reason=cloud-1 no sign of progress for 250 ms
-   1.1578  robot    restore service=local step=9 bytes=1567
+   1.1578  robot    restore service=local step=9 bytes=1575
    1.1578  robot    retry service=local step=9 attempt=2 waited_ms=250
    1.1578  robot    asks local, call 5
    1.1590  robot    hears of call 5: TaskAnswer

@@ -23,7 +23,7 @@ out_of_memory service=cloud-1 part=sensing at=0.03 for_s=0.5
    0.1962  robot    hears of call 3: Refused
    0.1962  robot    refused service=cloud-1 code=out_of_memory reason=out of memory for a sensing part final=False
    0.1990  robot    performs task actions 9 to 13
-   0.2962  robot    restore service=cloud-1 step=9 bytes=1567
+   0.2962  robot    restore service=cloud-1 step=9 bytes=1575
    0.2962  robot    retry service=cloud-1 step=9 attempt=2 waited_ms=0
    0.2962  robot    asks cloud-1, call 4
    0.2982  robot    hears of call 4: TaskAnswer
@@ -32,7 +32,7 @@ out_of_memory service=cloud-1 part=sensing at=0.03 for_s=0.5
    0.3012  robot    hears of call 4: Refused
    0.3012  robot    refused service=cloud-1 code=out_of_memory reason=out of memory for a sensing part final=False
    0.3190  robot    performs task actions 15 to 17
-   0.5012  robot    restore service=cloud-1 step=9 bytes=1567
+   0.5012  robot    restore service=cloud-1 step=9 bytes=1575
    0.5012  robot    retry service=cloud-1 step=9 attempt=3 waited_ms=132
    0.5012  robot    asks cloud-1, call 5
    0.5032  robot    hears of call 5: TaskAnswer
@@ -46,7 +46,7 @@ out_of_memory service=cloud-1 part=sensing at=0.03 for_s=0.5
    0.5300  cloud-1  has memory for sensing parts again
    0.6562  local    starts, process 1
    0.6662  robot    launched launch_ms=160
-   0.6662  robot    restore service=local step=9 bytes=1567
+   0.6662  robot    restore service=local step=9 bytes=1575
    0.6662  robot    retry service=local step=9 attempt=4 waited_ms=297
    0.6662  robot    asks local, call 6
    0.6674  robot    hears of call 6: TaskAnswer
@@ -71,7 +71,7 @@ out_of_memory service=cloud-1 part=sensing at=0.03 for_s=0.5
    1.0092  robot    performs sensing action 2 of step 36
    1.0102  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    1.0102  robot    asks local, call 9
-   1.0102  robot    restore service=cloud-1 step=36 bytes=1567
+   1.0102  robot    restore service=cloud-1 step=36 bytes=1575
    1.0102  robot    asks cloud-1, call 10
    1.0114  robot    hears of call 9: TaskAnswer
    1.0132  robot    hears of call 10: TaskAnswer

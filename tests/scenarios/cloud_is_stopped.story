@@ -28,7 +28,7 @@ stop node=cloud-1 at=0.1 for_s=0.6
    0.3618  robot    holding step=9 reason=cloud-1: no sign of progress for 250 ms; local: is being launched
    0.5118  local    starts, process 1
    0.5218  robot    launched launch_ms=160
-   0.5218  robot    restore service=local step=9 bytes=1567
+   0.5218  robot    restore service=local step=9 bytes=1575
    0.5218  robot    retry service=local step=9 attempt=3 waited_ms=410
    0.5218  robot    asks local, call 5
    0.5230  robot    hears of call 5: TaskAnswer

@@ -76,7 +76,7 @@ message service=local direction=to number=0 what=drop
    0.8674  robot    asks cloud-1, call 10
    0.8674  robot    holding step=27 reason=cloud-1: no sign of progress for 250 ms; local: is being launched
    0.8700  robot    launched launch_ms=610
-   0.8700  robot    restore service=local step=27 bytes=1567
+   0.8700  robot    restore service=local step=27 bytes=1575
    0.8700  robot    retry service=local step=27 attempt=3 waited_ms=252.6
    0.8700  robot    asks local, call 11
    0.8734  robot    hears of call 10: SensingAnswer
@@ -96,7 +96,7 @@ message service=local direction=to number=0 what=drop
    0.9882  robot    asks cloud-1, call 13
    1.2382  robot    service_suspected service=cloud-1 reason=no sign of progress for 250 ms
    1.2382  robot    status from=keep_alive to=local_recovery silent_ms=250 reason=cloud-1 no sign of progress for 250 ms
-   1.2382  robot    restore service=local step=36 bytes=1567
+   1.2382  robot    restore service=local step=36 bytes=1575
    1.2382  robot    retry service=local step=36 attempt=2 waited_ms=250
    1.2382  robot    asks local, call 14
    1.2394  robot    hears of call 14: TaskAnswer

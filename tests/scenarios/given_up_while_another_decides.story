@@ -23,7 +23,7 @@ stop node=cloud-1 at=0.1 for_s=0.3
    0.1108  robot    performs sensing action 0 of step 9
    0.1118  robot    asks cloud-1, call 3
    0.3618  robot    service_suspected service=cloud-1 reason=no sign of progress for 250 ms
-   0.3618  robot    restore service=cloud-2 step=9 bytes=1567
+   0.3618  robot    restore service=cloud-2 step=9 bytes=1575
    0.3618  robot    retry service=cloud-2 step=9 attempt=2 waited_ms=250
    0.3618  robot    asks cloud-2, call 4
    0.3648  robot    hears of call 4: TaskAnswer

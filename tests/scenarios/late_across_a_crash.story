@@ -26,7 +26,7 @@ kill_robot at=0.3 down_s=0.05
    0.1006  robot    resumed_trial trial=0 step=3
    0.1006  robot    performs task action 3
    0.1096  robot    service_appeared service=cloud-1
-   0.1108  robot    restore service=cloud-1 step=4 bytes=1567
+   0.1108  robot    restore service=cloud-1 step=4 bytes=1575
    0.1108  robot    asks cloud-1, call 1
    0.1138  robot    hears of call 1: TaskAnswer
    0.1138  robot    restored service=cloud-1 step=4 restore_ms=3
@@ -54,7 +54,7 @@ kill_robot at=0.3 down_s=0.05
    0.3510  robot    resumed_trial trial=0 step=21
    0.3510  robot    performed_unseen trial=0 step=21
    0.3600  robot    service_appeared service=cloud-1
-   0.3600  robot    restore service=cloud-1 step=22 bytes=1567
+   0.3600  robot    restore service=cloud-1 step=22 bytes=1575
    0.3600  robot    asks cloud-1, call 1
    0.3630  robot    hears of call 1: TaskAnswer
    0.3630  robot    restored service=cloud-1 step=22 restore_ms=3

@@ -24,7 +24,7 @@ slow service=cloud-1 at=0.05 for_s=0.25 factor=20
    0.1178  robot    performs sensing action 0 of step 9
    0.1188  robot    asks cloud-1, call 3
    0.1238  robot    hedge step=9 waited_ms=5
-   0.1238  robot    restore service=local step=9 bytes=1567
+   0.1238  robot    restore service=local step=9 bytes=1575
    0.1238  robot    asks local, call 4
    0.1250  robot    hears of call 4: TaskAnswer
    0.1250  robot    restored service=local step=9 restore_ms=1.2

@@ -24,7 +24,7 @@ kill_robot at=0.055 down_s=0.05
    0.1060  robot    resumed_trial trial=0 step=3
    0.1060  robot    performed_unseen trial=0 step=3
    0.1150  robot    service_appeared service=cloud-1
-   0.1150  robot    restore service=cloud-1 step=4 bytes=1567
+   0.1150  robot    restore service=cloud-1 step=4 bytes=1575
    0.1150  robot    asks cloud-1, call 1
    0.1180  robot    hears of call 1: TaskAnswer
    0.1180  robot    restored service=cloud-1 step=4 restore_ms=3

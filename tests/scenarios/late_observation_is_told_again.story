@@ -25,7 +25,7 @@ kill_robot at=0.3 down_s=0.05
    0.1060  robot    resumed_trial trial=0 step=3
    0.1060  robot    performed_unseen trial=0 step=3
    0.1150  robot    service_appeared service=cloud-1
-   0.1150  robot    restore service=cloud-1 step=4 bytes=1567
+   0.1150  robot    restore service=cloud-1 step=4 bytes=1575
    0.1150  robot    asks cloud-1, call 1
    0.1180  robot    hears of call 1: TaskAnswer
    0.1180  robot    restored service=cloud-1 step=4 restore_ms=3
@@ -55,7 +55,7 @@ kill_robot at=0.3 down_s=0.05
    0.3510  robot    performed_unseen trial=0 step=21
    0.3510  robot    late_unused trial=0 step=22 taken=0 reason=no observation of that step is awaited: it has come before, was given up, or nothing was sensed there
    0.3600  robot    service_appeared service=cloud-1
-   0.3600  robot    restore service=cloud-1 step=22 bytes=1567
+   0.3600  robot    restore service=cloud-1 step=22 bytes=1575
    0.3600  robot    asks cloud-1, call 1
    0.3630  robot    hears of call 1: TaskAnswer
    0.3630  robot    restored service=cloud-1 step=22 restore_ms=3

@@ -31,7 +31,7 @@ launch number=2 what=late seconds=0.3
    0.1118  robot    holding step=9 reason=cloud-1: is not there; local: is being launched
    0.5220  local    starts, process 1
    0.5320  robot    launched launch_ms=460
-   0.5320  robot    restore service=local step=9 bytes=1567
+   0.5320  robot    restore service=local step=9 bytes=1575
    0.5320  robot    asks local, call 3
    0.5332  robot    hears of call 3: TaskAnswer
    0.5332  robot    restored service=local step=9 restore_ms=1.2

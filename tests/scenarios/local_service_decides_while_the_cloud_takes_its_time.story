@@ -28,13 +28,13 @@ slow service=cloud-1 at=0.16 for_s=1 factor=2000
    0.1500  cloud-1  starts, process 2
    0.1600  cloud-1  computes 2000 times as long
    0.1600  robot    service_appeared service=cloud-1
-   0.1600  robot    restore service=cloud-1 step=9 bytes=1567
+   0.1600  robot    restore service=cloud-1 step=9 bytes=1575
    0.1600  robot    asks cloud-1, call 3
    0.2120  robot    hears of call 3: Progress
    0.2120  robot    resumed held_ms=100.2
    0.2520  local    starts, process 1
    0.2620  robot    launched launch_ms=160
-   0.2620  robot    restore service=local step=9 bytes=1567
+   0.2620  robot    restore service=local step=9 bytes=1575
    0.2620  robot    retry service=local step=9 attempt=2 waited_ms=150.2
    0.2620  robot    asks local, call 4
    0.2620  robot    hears of call 3: Progress
@@ -58,7 +58,7 @@ slow service=cloud-1 at=0.16 for_s=1 factor=2000
    0.4184  robot    performs task actions 24 to 26
    0.4490  robot    performs sensing action 0 of step 27
    0.4500  robot    asks local, call 6
-   0.4500  robot    restore service=cloud-1 step=27 bytes=1567
+   0.4500  robot    restore service=cloud-1 step=27 bytes=1575
    0.4500  robot    asks cloud-1, call 7
    0.4512  robot    hears of call 6: TaskAnswer
    0.4512  robot    performs task action 27

@@ -27,7 +27,7 @@ kill_robot boundary=25 before=journal down_s=0.05
    0.1628  robot    resumed_trial trial=2 step=9
    0.1628  robot    reinitialised trial=2 step=9
    0.1718  robot    service_appeared service=cloud-1
-   0.1718  robot    restore service=cloud-1 step=9 bytes=1567
+   0.1718  robot    restore service=cloud-1 step=9 bytes=1575
    0.1718  robot    asks cloud-1, call 1
    0.1748  robot    hears of call 1: TaskAnswer
    0.1748  robot    restored service=cloud-1 step=9 restore_ms=3

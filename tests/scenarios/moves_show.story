@@ -76,7 +76,7 @@ crash service=cloud-1 at=0.3 down_s=0.3
    0.2476  robot    resumed_trial trial=1 step=13
    0.2476  robot    performs task action 13
    0.2566  robot    service_appeared service=cloud-1
-   0.2578  robot    restore service=cloud-1 step=14 bytes=1570
+   0.2578  robot    restore service=cloud-1 step=14 bytes=1578
    0.2578  robot    asks cloud-1, call 1
    0.2608  robot    hears of call 1: TaskAnswer
    0.2608  robot    restored service=cloud-1 step=14 restore_ms=3
@@ -102,7 +102,7 @@ crash service=cloud-1 at=0.3 down_s=0.3
    0.3106  robot    holding step=18 reason=cloud-1: is not there; local: is being launched
    0.4520  local    starts, process 1
    0.4620  robot    launched launch_ms=160
-   0.4620  robot    restore service=local step=18 bytes=1570
+   0.4620  robot    restore service=local step=18 bytes=1578
    0.4620  robot    asks local, call 5
    0.4652  robot    hears of call 5: SensingAnswer
    0.4652  robot    restored service=local step=18 restore_ms=3.2
@@ -167,7 +167,7 @@ crash service=cloud-1 at=0.3 down_s=0.3
    0.6084  robot    performs task action 30
    0.6084  robot    hears of call 19: its end
    0.6100  robot    service_appeared service=cloud-1
-   0.6100  robot    restore service=cloud-1 step=30 bytes=1570
+   0.6100  robot    restore service=cloud-1 step=30 bytes=1578
    0.6100  robot    asks cloud-1, call 20
    0.6130  robot    hears of call 20: TaskAnswer
    0.6130  robot    restored service=cloud-1 step=30 restore_ms=3

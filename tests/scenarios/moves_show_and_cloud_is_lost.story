@@ -73,7 +73,7 @@ crash service=cloud-1 at=0.18 down_s=0.4
    0.1820  robot    hears of call 15: its end
    0.3320  local    starts, process 1
    0.3420  robot    launched launch_ms=160
-   0.3420  robot    restore service=local step=12 bytes=1570
+   0.3420  robot    restore service=local step=12 bytes=1578
    0.3420  robot    retry service=local step=12 attempt=2 waited_ms=161.6
    0.3420  robot    asks local, call 16
    0.3432  robot    hears of call 16: TaskAnswer
@@ -173,7 +173,7 @@ crash service=cloud-1 at=0.18 down_s=0.4
    0.5800  cloud-1  starts, process 2
    0.5898  robot    asks local, call 39
    0.5900  robot    service_appeared service=cloud-1
-   0.5900  robot    restore service=cloud-1 step=33 bytes=1570
+   0.5900  robot    restore service=cloud-1 step=33 bytes=1578
    0.5900  robot    asks cloud-1, call 40
    0.5910  robot    hears of call 39: TaskAnswer
    0.5910  robot    performs task action 33

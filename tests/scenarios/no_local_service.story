@@ -23,7 +23,7 @@ crash service=cloud-1 at=0.1 down_s=3
    0.1118  robot    holding step=9 reason=cloud-1: is not there
    3.1000  cloud-1  starts, process 2
    3.1100  robot    service_appeared service=cloud-1
-   3.1100  robot    restore service=cloud-1 step=9 bytes=1567
+   3.1100  robot    restore service=cloud-1 step=9 bytes=1575
    3.1100  robot    asks cloud-1, call 3
    3.1130  robot    hears of call 3: TaskAnswer
    3.1130  robot    restored service=cloud-1 step=9 restore_ms=3

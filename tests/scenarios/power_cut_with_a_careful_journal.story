@@ -28,7 +28,7 @@ kill_robot boundary=30 power_cut=true lost_appends=2
    0.3362  robot    resumed_trial trial=0 step=10
    0.3362  robot    performed_unseen trial=0 step=10
    0.3452  robot    service_appeared service=cloud-1
-   0.3452  robot    restore service=cloud-1 step=11 bytes=1567
+   0.3452  robot    restore service=cloud-1 step=11 bytes=1575
    0.3452  robot    asks cloud-1, call 1
    0.3482  robot    hears of call 1: TaskAnswer
    0.3482  robot    restored service=cloud-1 step=11 restore_ms=3

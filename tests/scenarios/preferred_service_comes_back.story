@@ -25,7 +25,7 @@ slow service=cloud-2 at=0 for_s=5 factor=1500
    0.0920  robot    service_vanished service=cloud-1
    0.1006  robot    performs task action 8
    0.1108  robot    performs sensing action 0 of step 9
-   0.1118  robot    restore service=cloud-2 step=9 bytes=1567
+   0.1118  robot    restore service=cloud-2 step=9 bytes=1575
    0.1118  robot    asks cloud-2, call 3
    0.1200  cloud-1  starts, process 2
    0.1300  robot    service_appeared service=cloud-1
@@ -33,7 +33,7 @@ slow service=cloud-2 at=0 for_s=5 factor=1500
    0.2138  robot    hears of call 3: Progress
    0.2638  robot    hears of call 3: Progress
    0.3138  robot    hears of call 3: Progress
-   0.3618  robot    restore service=cloud-1 step=9 bytes=1567
+   0.3618  robot    restore service=cloud-1 step=9 bytes=1575
    0.3618  robot    asks cloud-1, call 4
    0.3638  robot    hears of call 3: Progress
    0.3648  robot    hears of call 4: TaskAnswer

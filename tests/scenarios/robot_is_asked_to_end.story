@@ -21,7 +21,7 @@ pause_robot at=0.1
    0.3016  robot    begins trial 0 at step 8
    0.3016  robot    resumed_trial trial=0 step=8
    0.3106  robot    service_appeared service=cloud-1
-   0.3106  robot    restore service=cloud-1 step=8 bytes=1567
+   0.3106  robot    restore service=cloud-1 step=8 bytes=1575
    0.3106  robot    asks cloud-1, call 1
    0.3136  robot    hears of call 1: TaskAnswer
    0.3136  robot    restored service=cloud-1 step=8 restore_ms=3

@@ -27,7 +27,7 @@ crash service=cloud-1 at=0.05 down_s=3600
    0.2006  robot    holding step=9 reason=cloud-1: is not there; local: is being launched
    0.3520  local    starts, process 1
    0.3620  robot    launched launch_ms=310
-   0.3620  robot    restore service=local step=9 bytes=1567
+   0.3620  robot    restore service=local step=9 bytes=1575
    0.3620  robot    asks local, call 3
    0.3632  robot    hears of call 3: TaskAnswer
    0.3632  robot    restored service=local step=9 restore_ms=1.2

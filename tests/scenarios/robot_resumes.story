@@ -22,7 +22,7 @@ kill_robot boundary=19
    0.2914  robot    resumed_trial trial=0 step=7
    0.2914  robot    performs task action 7
    0.3004  robot    service_appeared service=cloud-1
-   0.3016  robot    restore service=cloud-1 step=8 bytes=1567
+   0.3016  robot    restore service=cloud-1 step=8 bytes=1575
    0.3016  robot    asks cloud-1, call 1
    0.3046  robot    hears of call 1: TaskAnswer
    0.3046  robot    restored service=cloud-1 step=8 restore_ms=3

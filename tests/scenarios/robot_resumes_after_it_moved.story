@@ -22,7 +22,7 @@ kill_robot boundary=18
    0.2914  robot    resumed_trial trial=0 step=6
    0.2914  robot    performed_unseen trial=0 step=6
    0.3004  robot    service_appeared service=cloud-1
-   0.3004  robot    restore service=cloud-1 step=7 bytes=1567
+   0.3004  robot    restore service=cloud-1 step=7 bytes=1575
    0.3004  robot    asks cloud-1, call 1
    0.3034  robot    hears of call 1: TaskAnswer
    0.3034  robot    restored service=cloud-1 step=7 restore_ms=3

@@ -31,7 +31,7 @@ kill_robot at=0.204675 down_s=0.05 body_goes_on=true
    0.8951  robot    resumed_trial trial=0 step=1
    0.8951  robot    performed_unseen trial=0 step=1
    0.9041  robot    service_appeared service=cloud-1
-   0.9041  robot    restore service=cloud-1 step=2 bytes=1567
+   0.9041  robot    restore service=cloud-1 step=2 bytes=1575
    0.9041  robot    asks cloud-1, call 1
    0.9071  robot    hears of call 1: TaskAnswer
    0.9071  robot    restored service=cloud-1 step=2 restore_ms=3
@@ -42,7 +42,7 @@ kill_robot at=0.204675 down_s=0.05 body_goes_on=true
    0.9785  robot    performs sensing action 0 of step 9
    0.9795  robot    asks cloud-1, call 2
    0.9815  robot    hears of call 2: NeedState
-   0.9815  robot    restore service=cloud-1 step=9 bytes=1567
+   0.9815  robot    restore service=cloud-1 step=9 bytes=1575
    0.9815  robot    asks cloud-1, call 3
    0.9845  robot    hears of call 3: TaskAnswer
    0.9845  robot    restored service=cloud-1 step=9 restore_ms=3
@@ -53,7 +53,7 @@ kill_robot at=0.204675 down_s=0.05 body_goes_on=true
    1.0763  robot    performs sensing action 0 of step 18
    1.0773  robot    asks cloud-1, call 4
    1.0793  robot    hears of call 4: NeedState
-   1.0793  robot    restore service=cloud-1 step=18 bytes=1567
+   1.0793  robot    restore service=cloud-1 step=18 bytes=1575
    1.0793  robot    asks cloud-1, call 5
    1.0823  robot    hears of call 5: TaskAnswer
    1.0823  robot    restored service=cloud-1 step=18 restore_ms=3
@@ -64,7 +64,7 @@ kill_robot at=0.204675 down_s=0.05 body_goes_on=true
    1.1741  robot    performs sensing action 0 of step 27
    1.1751  robot    asks cloud-1, call 6
    1.1771  robot    hears of call 6: NeedState
-   1.1771  robot    restore service=cloud-1 step=27 bytes=1567
+   1.1771  robot    restore service=cloud-1 step=27 bytes=1575
    1.1771  robot    asks cloud-1, call 7
    1.1801  robot    hears of call 7: TaskAnswer
    1.1801  robot    restored service=cloud-1 step=27 restore_ms=3
@@ -76,7 +76,7 @@ kill_robot at=0.204675 down_s=0.05 body_goes_on=true
    1.2729  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    1.2729  robot    asks cloud-1, call 8
    1.2749  robot    hears of call 8: NeedState
-   1.2749  robot    restore service=cloud-1 step=36 bytes=1567
+   1.2749  robot    restore service=cloud-1 step=36 bytes=1575
    1.2749  robot    asks cloud-1, call 9
    1.2779  robot    hears of call 9: TaskAnswer
    1.2779  robot    restored service=cloud-1 step=36 restore_ms=3

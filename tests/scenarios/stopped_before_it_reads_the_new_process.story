@@ -15,7 +15,7 @@ stop node=cloud-1 at=0.611716 for_s=0.8
    0.1210  robot    asks cloud-1, call 2
    0.1294  cloud-1  is asked by 20 other robots
    0.2010  robot    hears of call 2: NeedState
-   0.2010  robot    restore service=cloud-1 step=0 bytes=1567
+   0.2010  robot    restore service=cloud-1 step=0 bytes=1575
    0.2010  robot    asks cloud-1, call 3
    0.3204  robot    hears of call 3: TaskAnswer
    0.3204  robot    restored service=cloud-1 step=0 restore_ms=119.405
@@ -29,21 +29,21 @@ stop node=cloud-1 at=0.611716 for_s=0.8
    0.5052  robot    begins trial 0 at step 9
    0.5052  robot    resumed_trial trial=0 step=9
    0.5142  robot    service_appeared service=cloud-1
-   0.5142  robot    restore service=cloud-1 step=9 bytes=1567
+   0.5142  robot    restore service=cloud-1 step=9 bytes=1575
    0.5142  robot    asks cloud-1, call 1
    0.5440  robot    is killed
    0.5940  robot    is started again
    0.5950  robot    begins trial 0 at step 9
    0.5950  robot    resumed_trial trial=0 step=9
    0.6040  robot    service_appeared service=cloud-1
-   0.6040  robot    restore service=cloud-1 step=9 bytes=1567
+   0.6040  robot    restore service=cloud-1 step=9 bytes=1575
    0.6040  robot    asks cloud-1, call 1
    0.6117  cloud-1  is stopped
    0.8540  robot    service_suspected service=cloud-1 reason=no sign of progress for 250 ms
    0.8540  robot    status from=standard to=local_recovery silent_ms=250 reason=cloud-1 no sign of progress for 250 ms
    0.8540  robot    launch service=local
    0.8540  local    is launched
-   0.8540  robot    restore service=cloud-1 step=9 bytes=1567
+   0.8540  robot    restore service=cloud-1 step=9 bytes=1575
    0.8540  robot    retry service=cloud-1 step=9 attempt=2 waited_ms=259
    0.8540  robot    asks cloud-1, call 2
    0.8540  robot    holding step=9 reason=cloud-1: no sign of progress for 250 ms; local: is being launched
@@ -52,7 +52,7 @@ stop node=cloud-1 at=0.611716 for_s=0.8
    1.0117  robot    hears of call 1: its end
    1.0117  robot    hears of call 2: its end
    1.0140  robot    launched launch_ms=160
-   1.0140  robot    restore service=local step=9 bytes=1567
+   1.0140  robot    restore service=local step=9 bytes=1575
    1.0140  robot    retry service=local step=9 attempt=3 waited_ms=419
    1.0140  robot    asks local, call 3
    1.0152  robot    hears of call 3: TaskAnswer
@@ -65,7 +65,7 @@ stop node=cloud-1 at=0.611716 for_s=0.8
    1.1970  robot    performs sensing action 0 of step 18
    1.1980  robot    asks local, call 4
    1.1982  robot    hears of call 4: NeedState
-   1.1982  robot    restore service=local step=18 bytes=1567
+   1.1982  robot    restore service=local step=18 bytes=1575
    1.1982  robot    asks local, call 5
    1.1994  robot    hears of call 5: TaskAnswer
    1.1994  robot    restored service=local step=18 restore_ms=1.2
@@ -76,7 +76,7 @@ stop node=cloud-1 at=0.611716 for_s=0.8
    1.3812  robot    performs sensing action 0 of step 27
    1.3822  robot    asks local, call 6
    1.3824  robot    hears of call 6: NeedState
-   1.3824  robot    restore service=local step=27 bytes=1567
+   1.3824  robot    restore service=local step=27 bytes=1575
    1.3824  robot    asks local, call 7
    1.3836  robot    hears of call 7: TaskAnswer
    1.3836  robot    restored service=local step=27 restore_ms=1.2
@@ -85,7 +85,7 @@ stop node=cloud-1 at=0.611716 for_s=0.8
    1.4136  robot    hears of call 7: SensingAnswer
    1.4136  robot    hears of call 7: its end
    1.4217  robot    service_appeared service=cloud-1
-   1.4217  robot    restore service=cloud-1 step=27 bytes=1567
+   1.4217  robot    restore service=cloud-1 step=27 bytes=1575
    1.4217  robot    asks cloud-1, call 8
    1.4240  robot    performs task actions 29 to 34
    1.5427  robot    hears of call 8: TaskAnswer
@@ -96,7 +96,7 @@ stop node=cloud-1 at=0.611716 for_s=0.8
    1.5664  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    1.5664  robot    asks cloud-1, call 9
    1.6464  robot    hears of call 9: NeedState
-   1.6464  robot    restore service=cloud-1 step=36 bytes=1567
+   1.6464  robot    restore service=cloud-1 step=36 bytes=1575
    1.6464  robot    asks cloud-1, call 10
    1.7274  robot    hears of call 10: TaskAnswer
    1.7274  robot    restored service=cloud-1 step=36 restore_ms=81

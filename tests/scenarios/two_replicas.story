@@ -22,7 +22,7 @@ crash service=cloud-1 at=0.1 down_s=0.1
    0.1006  robot    performs task action 8
    0.1020  robot    service_vanished service=cloud-1
    0.1108  robot    performs sensing action 0 of step 9
-   0.1118  robot    restore service=cloud-2 step=9 bytes=1567
+   0.1118  robot    restore service=cloud-2 step=9 bytes=1575
    0.1118  robot    asks cloud-2, call 3
    0.1148  robot    hears of call 3: TaskAnswer
    0.1148  robot    restored service=cloud-2 step=9 restore_ms=3
@@ -40,7 +40,7 @@ crash service=cloud-1 at=0.1 down_s=0.1
    0.2136  robot    hears of call 4: its end
    0.2208  robot    performs task actions 19 to 26
    0.3024  robot    performs sensing action 0 of step 27
-   0.3034  robot    restore service=cloud-1 step=27 bytes=1567
+   0.3034  robot    restore service=cloud-1 step=27 bytes=1575
    0.3034  robot    asks cloud-1, call 5
    0.3064  robot    hears of call 5: TaskAnswer
    0.3064  robot    restored service=cloud-1 step=27 restore_ms=3

@@ -20,9 +20,9 @@ from tests.simulation.late_defects import LATE_DEFECTS
 
 from holdfast.protocol import requests, service
 from holdfast.protocol.dispatcher import Dispatcher
+from holdfast.protocol.failure_detector import FailureDetector
 from holdfast.protocol.local_service import RestartPolicy
 from holdfast.protocol.question import Question
-from holdfast.protocol.replica_set import FailureDetector
 from holdfast.protocol.robot import Robot
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import Job

@@ -48,11 +48,11 @@ def test_each_differs_in_what_it_says(tmp_path: Path) -> None:
     assert found["always θ"].configuration.planning.selector.sensing_action == 2
     of_returns = found["expected_return, 8 looks"].configuration.planning.selector
     # The problem has rewards, but steps are to be few.
-    assert (of_returns.rollout_looks, of_returns.rollout_reward) == (8, "steps")
+    assert (of_returns.rollout_sensing_steps, of_returns.rollout_reward) == (8, "steps")
     of_reward, _ = first_candidates(base, ["looks", "methods"], "reward")
     assert by_name(of_reward)["expected_return, 8 looks"].changes == {
         "selector.method": "expected_return",
-        "selector.rollout_looks": 8,
+        "selector.rollout_sensing_steps": 8,
     }
     only, _ = first_candidates(base, ["estimators"], "steps")
     assert {each.name for each in only[2:]} == {
@@ -76,7 +76,7 @@ def test_what_does_not_fit(tmp_path: Path) -> None:
 
 
 def test_a_configuration_that_is_random_is_not_tried_twice(tmp_path: Path) -> None:
-    base = written(tmp_path, "selector: {method: random, rollout_looks: 7}\n")
+    base = written(tmp_path, "selector: {method: random, rollout_sensing_steps: 7}\n")
     candidates, _ = first_candidates(base, ["methods"], "steps")
     assert RANDOM not in by_name(candidates)
     assert by_name(candidates)["path_entropy"].changes == {"selector.method": "path_entropy"}

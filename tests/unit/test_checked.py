@@ -243,7 +243,9 @@ class TestStreams:
 
     def test_noise_is_the_same_after_every_sensing_action(self) -> None:
         problem = Rough()
-        selector = SelectorSettings(method="expected_return", rollout_steps=2, rollout_looks=1)
+        selector = SelectorSettings(
+            method="expected_return", rollout_steps=2, rollout_sensing_steps=1
+        )
         planner = Planner(problem, msgspec.structs.replace(SETTINGS, selector=selector))
         planner.choose_sensing_action(planner.init(4))
         moves = problem.drawn["move"]

@@ -11,7 +11,7 @@ from holdfast.config.problem_builder import find_problem
 from holdfast.config.source import Source, module_directory
 from holdfast.config.yaml_document import read
 from holdfast.errors import ConfigurationError
-from holdfast.planning.settings import SimulatorSettings
+from holdfast.planning.settings import SelectorSettings, SimulatorSettings
 
 PATH = Path("run.yaml")
 
@@ -61,6 +61,15 @@ def test_names_that_earlier_releases_had_are_those_of_today() -> None:
     assert source("problem: holdfast.laboratory:R").problem == "holdfast.laboratory:R"
     with pytest.raises(ConfigurationError, match="problem is 3"):
         find_problem(source("problem: 3"), None)
+    for named in (
+        source("selector: {rollout_looks: 7}"),
+        source("selector: {}", {"selector.rollout_looks": 7}),
+    ):
+        assert named.section("selector", SelectorSettings).rollout_sensing_steps == 7
+    with pytest.raises(ConfigurationError, match="rollout_looks is not a known key"):
+        source("selector: {rollout_looks: 7, rollout_sensing_steps: 6}").section(
+            "selector", SelectorSettings
+        )
 
 
 def test_the_directory_of_a_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

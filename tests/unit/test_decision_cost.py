@@ -47,7 +47,7 @@ def test_each_numeric_setting_is_a_factor_or_listed_as_none() -> None:
 @pytest.mark.parametrize("key", [*COSTLY])
 def test_a_costly_setting_never_lowers_the_cost_and_raises_it_somewhere(key: str) -> None:
     plain = PlanningSettings()
-    if key == "selector.rollout_looks":
+    if key == "selector.rollout_sensing_steps":
         plain = with_key(plain, "sensing_interval", 1)
     rises = False
     for method in METHODS:
@@ -153,7 +153,7 @@ def test_the_defaults_are_brief() -> None:
 def test_the_words_name_the_keys_of_the_method() -> None:
     settings = with_key(PlanningSettings(), "selector.method", "expected_return")
     words = describe_cost(PEG, settings)
-    for key in ("rollout_steps 200", "rollout_looks 4", "max_observation_samples 40"):
+    for key in ("rollout_steps 200", "rollout_sensing_steps 4", "max_observation_samples 40"):
         assert f"selector.{key}" in words
     assert "3 sensing actions" in words
     assert "path_offsets" not in words

@@ -126,7 +126,12 @@ def settings_of(
     particles: int = 60,
     **selector: Any,
 ) -> PlanningSettings:
-    selector = {"method": "expected_return", "rollout_steps": 60, "rollout_looks": 4, **selector}
+    selector = {
+        "method": "expected_return",
+        "rollout_steps": 60,
+        "rollout_sensing_steps": 4,
+        **selector,
+    }
     return PlanningSettings(
         particle_filter=ParticleFilterSettings(num_particles=particles),
         active_sensing=ActiveSensingSettings(
@@ -270,15 +275,17 @@ class TestRollouts:
         rollout_returns(
             Noted(), settings, self.STATES, estimates, estimates[:, :, np.newaxis], 0, HYPOTHESES
         )
-        assert len(asked) <= settings.selector.rollout_looks * (settings.sensing_interval + 1)
+        assert len(asked) <= settings.selector.rollout_sensing_steps * (
+            settings.sensing_interval + 1
+        )
 
     def alone(
         self, problem: Any, settings: PlanningSettings, state: FloatArray, estimate: FloatArray
     ) -> float:
         """Return the mean over the sensing step at which the state gets known."""
         total, left = 0.0, 1.0
-        for later in range(1, settings.selector.rollout_looks + 1):
-            last = later == settings.selector.rollout_looks
+        for later in range(1, settings.selector.rollout_sensing_steps + 1):
+            last = later == settings.selector.rollout_sensing_steps
             share = left if last else left / 4.0
             known_from = later * (settings.sensing_interval + 1)
             total += share * self.one(problem, settings, state, estimate, known_from)

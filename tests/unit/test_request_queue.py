@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from tests.unit.test_protocol_service import Robot, make_problem
 
-from holdfast.protocol.expected_time import ExpectedTime
+from holdfast.protocol.computing_time import ExpectedTime
 from holdfast.protocol.messages import Request, pack_configuration
 from holdfast.protocol.request_queue import RequestQueue
 from holdfast.protocol.service_jobs import Job

@@ -11,7 +11,7 @@ from tests.questions import received
 from tests.unit.test_protocol_service import Bench, Robot, content, refused
 
 from holdfast.problems.problem import Problem
-from holdfast.protocol.expected_time import ExpectedTime
+from holdfast.protocol.computing_time import ExpectedTime
 from holdfast.protocol.messages import Request, SessionConfiguration, encode
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect, StartJob

@@ -73,6 +73,9 @@ SECTIONS = (
 _MOVED = {"holdfast.lab.studies.": "studies.", "holdfast.lab.": "holdfast_lab."}
 """Packages whose classes runs of earlier releases name, and where they are now."""
 
+_RENAMED = {("selector", "rollout_looks"): "rollout_sensing_steps"}
+"""Keys of earlier releases, and what they are called now."""
+
 _ON_TOP = ("problem", "problem_directory")
 
 _StructT = TypeVar("_StructT", bound=msgspec.Struct)
@@ -127,6 +130,7 @@ class Source:
             self.sections[name] = dict(section or {})
         for given, value in overrides.items():
             name, _, key = given.partition(".")
+            key = _RENAMED.get((name, key), key)
             if name not in SECTIONS:
                 raise self.unknown((name,), SECTIONS)
             self.sections[name][key] = (
@@ -197,8 +201,12 @@ class Source:
 
 
 def with_names_of_today(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a configuration's data with the names that classes of earlier releases have now."""
+    """Return a configuration's data with what earlier names of classes and keys are now."""
     named = {**data}
+    for (section, key), now in _RENAMED.items():
+        values = data.get(section)
+        if isinstance(values, Mapping) and key in values and now not in values:
+            named[section] = {now if each == key else each: values[each] for each in values}
     if "problem" in data:
         named["problem"] = name_of_today(data["problem"])
     environment = data.get("environment")

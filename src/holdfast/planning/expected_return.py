@@ -12,11 +12,11 @@ them lead to the same actions, and a return is the sum of a hundred noisy steps.
   numbers). A difference then comes from the observations alone.
 - Within a rollout the belief is its estimate, which moves as a few of its particles do.
 - The robot will sense again and learn then what it does not sense now. At each of the next
-  ``rollout_looks`` sensing steps the rollout forks: with a probability of one over their number the
-  state is known from then on, and the known-state policy acts; at the last one it is known for
-  sure. Both branches are followed: no draw decides. With one such step this is QMDP (Littman,
-  Cassandra and Kaelbling, "Learning policies for partially observable environments", ICML 1995)
-  over an interval.
+  ``rollout_sensing_steps`` sensing steps the rollout forks: with a probability of one over their
+  number the state is known from then on, and the known-state policy acts; at the last one it is
+  known for sure. Both branches are followed: no draw decides. With one such step this is QMDP
+  (Littman, Cassandra and Kaelbling, "Learning policies for partially observable environments",
+  ICML 1995) over an interval.
 - Where sensing has prices, the mean price is paid at each later sensing step up to the goal, as by
   a robot that senses at random from then on: a robot that is sooner at the goal pays less often. If
   knowledge were free later, sensing would be put off for ever. Not to sense, where it is a choice,
@@ -211,7 +211,7 @@ def _rollouts_of(
     counts_steps = settings.selector.rollout_reward == "steps" or not own_rewards
     own = RolloutSettings(
         settings.sensing_interval + 1,
-        settings.selector.rollout_looks,
+        settings.selector.rollout_sensing_steps,
         settings.selector.rollout_steps,
         settings.active_sensing.discount,
         price,

@@ -215,7 +215,7 @@ class SelectorSettings(_Section, frozen=True, forbid_unknown_fields=True, kw_onl
         any problem without rewards.
     rollout_steps : int
         Steps after which a rollout that has not reached the goal ends.
-    rollout_looks : int
+    rollout_sensing_steps : int
         In a rollout the state gets known at each of so many of the next sensing steps with equal
         chances, 1 over this number, and at the last one for sure.
     max_observation_samples : int
@@ -239,7 +239,7 @@ class SelectorSettings(_Section, frozen=True, forbid_unknown_fields=True, kw_onl
     path_discount: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.5
     rollout_reward: Literal["problem", "steps"] = "problem"
     rollout_steps: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 200
-    rollout_looks: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 4
+    rollout_sensing_steps: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 4
     max_observation_samples: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 40
 
 

@@ -37,7 +37,7 @@ COSTLY: Mapping[str, str] = {
     "active_sensing.num_nearest_neighbors": "neighbours",
     "selector.path_offsets": "path_entropy",
     "selector.rollout_steps": "expected_return",
-    "selector.rollout_looks": "expected_return",
+    "selector.rollout_sensing_steps": "expected_return",
     "selector.max_observation_samples": "expected_return",
     "sensing_interval": "every method",
 }
@@ -339,15 +339,15 @@ def _expected_return(sizes: _Sizes) -> Cost:
         num_bytes += 24.0 * sizes.senses * own.observation_size * particles
     if has_own_rollouts(sizes.problem):
         # The true state and two particles; and once at each look the way from there.
-        unknown_steps = min(steps, interval * selector.rollout_looks)
-        known_steps = min(steps / interval, float(selector.rollout_looks)) * steps
+        unknown_steps = min(steps, interval * selector.rollout_sensing_steps)
+        known_steps = min(steps / interval, float(selector.rollout_sensing_steps)) * steps
         seconds += posteriors * 6.0 * unknown_steps * sizes.move_s(1.0, 0.0)
         seconds += posteriors * 20.0 * known_steps * unit_s
         return Cost(seconds, num_bytes)
     # Columns of a rollout: it forks at each of the next looks, and carries a cloud up to the last.
-    looks = min(float(selector.rollout_looks), math.floor((steps - 1.0) / interval))
+    looks = min(float(selector.rollout_sensing_steps), math.floor((steps - 1.0) / interval))
     forks = 0.0 if own.known_return is not None else looks
-    unknown_steps = min(steps, interval * selector.rollout_looks)
+    unknown_steps = min(steps, interval * selector.rollout_sensing_steps)
     column_steps = unknown_steps * (1.0 + forks / 2.0)
     if own.known_return is None:
         column_steps += (steps - unknown_steps) * forks
@@ -414,7 +414,7 @@ def describe_cost(problem: Problem | None, planning: PlanningSettings) -> str:
         parts += [
             f"selector.max_observation_samples {selector.max_observation_samples}",
             f"selector.rollout_steps {selector.rollout_steps}",
-            f"selector.rollout_looks {selector.rollout_looks}",
+            f"selector.rollout_sensing_steps {selector.rollout_sensing_steps}",
         ]
     elif selector.method not in UNINFORMED_METHODS:
         parts.append(f"active_sensing.num_nearest_neighbors {sensing.num_nearest_neighbors}")

@@ -29,7 +29,7 @@ from holdfast.planning.settings import PlanningSettings
 from holdfast.printable import one_line
 from holdfast.protocol.plain_data import check_plain_data
 
-PROTOCOL_VERSION = 5
+PROTOCOL_VERSION = 6
 """Raised when a message changes its form or meaning. All versions have the same checksum."""
 
 CHECKSUM_SIZE = 4

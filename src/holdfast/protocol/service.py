@@ -18,7 +18,7 @@ is handed (at most ``max_running`` at a time) anywhere, and returns its :class:`
 
 This module decides what requests and results mean. Memory is in
 :mod:`~holdfast.protocol.service_sessions`, the order of work in
-:mod:`~holdfast.protocol.request_queue`, replies in :mod:`~holdfast.protocol.service_calls` and
+:mod:`~holdfast.protocol.request_queue`, replies in :mod:`~holdfast.protocol.service_replies` and
 computation in :mod:`~holdfast.protocol.service_jobs`.
 """
 
@@ -32,17 +32,15 @@ import msgspec
 from holdfast.errors import InvalidValueError, MessageError
 from holdfast.planning.planner import needs_sensing
 from holdfast.problems.problem import Problem
+from holdfast.protocol.computing_time import ExpectedTime
 from holdfast.protocol.decision_cost import ANY_MACHINE, Cost, Pricing
 from holdfast.protocol.events import Effects
-from holdfast.protocol.expected_time import ExpectedTime
-from holdfast.protocol.lanes import Lanes
 from holdfast.protocol.messages import (
     MAX_WORD,
     Request,
     SessionConfiguration,
     pack_configuration,
 )
-from holdfast.protocol.service_calls import WaitingCalls
 from holdfast.protocol.service_jobs import (
     Computed,
     EndCall,
@@ -52,7 +50,9 @@ from holdfast.protocol.service_jobs import (
     ServiceEffect,
     StartJob,
 )
+from holdfast.protocol.service_lanes import Lanes
 from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
+from holdfast.protocol.service_replies import WaitingCalls
 from holdfast.protocol.service_sessions import (
     BRIEF,
     LONG,

@@ -433,7 +433,7 @@ class StartJob(NamedTuple):
     # problem that is not built in, or an unusual request.
     expected_s: float
     # Whether its lane ends it after a moment. All others may take any time, so their threads have
-    # less weight (:class:`~holdfast.protocol.lanes.Lanes`).
+    # less weight (:class:`~holdfast.protocol.service_lanes.Lanes`).
     is_brief: bool
 
 

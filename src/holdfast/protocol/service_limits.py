@@ -37,7 +37,7 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
     # Estimated time of one decision on one core (:mod:`holdfast.protocol.decision_cost`).
     max_decision_s: float = 10.0
     # max_brief_s, max_medium_s: estimated time of a decision in the lanes of these names
-    # (:mod:`holdfast.protocol.lanes`).
+    # (:mod:`holdfast.protocol.service_lanes`).
     max_brief_s: float = 0.02
     max_medium_s: float = 0.1
     # Estimated memory of one decision, and of all long ones that run at a time.

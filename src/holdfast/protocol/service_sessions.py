@@ -24,8 +24,8 @@ import msgspec
 from holdfast.config.registry import BUILT_IN
 from holdfast.planning.planner import PlanningState
 from holdfast.planning.settings import PlanningSettings
+from holdfast.protocol.computing_time import ExpectedTime
 from holdfast.protocol.decision_cost import Cost, Price, ProblemCost
-from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.messages import Request, SessionConfiguration, pack_configuration
 from holdfast.protocol.service_limits import ServiceLimits
 
@@ -110,7 +110,7 @@ class PendingTask:
         self.slot = PREFETCHED if request is None else REQUESTED
         self.urgent = request is not None
         self.calls: dict[int, WaitingCall] = {}
-        # Where it waits and runs (:mod:`~holdfast.protocol.lanes`).
+        # Where it waits and runs (:mod:`~holdfast.protocol.service_lanes`).
         self.lane = session.lane_of(request)
         self.num_bytes = 0.0  # estimated memory, unless it is brief
         self.cost_s = self._expected_s()
@@ -174,7 +174,7 @@ class Session:
 
     :class:`SessionTable` writes ``served``, ``closed`` and ``num_bytes``, and drops states and
     answers; :class:`~holdfast.protocol.service.Service` and
-    :class:`~holdfast.protocol.lanes.Lanes` write all else.
+    :class:`~holdfast.protocol.service_lanes.Lanes` write all else.
     """
 
     def __init__(

@@ -18,8 +18,8 @@ from time import perf_counter
 
 from holdfast.errors import HoldfastError
 from holdfast.planning.planner import Planner
+from holdfast.protocol.computing_time import ExpectedTime
 from holdfast.protocol.events import ComputeOwnAnswer, OwnAnswer
-from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.messages import MAX_TASK_ACTIONS
 from holdfast.runtime.pool import ThreadPool
 

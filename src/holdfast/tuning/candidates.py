@@ -122,7 +122,7 @@ def _first(base: Configuration, variations: Sequence[Variation], objective: Obje
     if "looks" in variations and ("methods" in variations or selector.method == "expected_return"):
         of_returns = _of_method(base, "expected_return", objective)
         for looks in _LOOKS:
-            more = {"selector.rollout_looks": looks}
+            more = {"selector.rollout_sensing_steps": looks}
             yield f"expected_return, {looks} look{'s' * (looks > 1)}", of_returns | more
     for method in methods:
         if method in ENTROPY_METHODS:

@@ -67,7 +67,9 @@ def check_sensors(inspection: Inspection) -> None:
         if told > 0.1 * _NOTHING:
             seen = f"{inspection.label(action)} tells little each time: "
             advice = "Leave it out if another one shows the same. If it alone shows what decides, "
-            advice += "compare selector.method: expected_return and rollout_looks: 8 with random."
+            advice += (
+                "compare selector.method: expected_return and rollout_sensing_steps: 8 with random."
+            )
         seen += f"{told:.2g} nats in {len(beliefs)} beliefs of simulated trials"
         free = costs[action] < costs.max()
         inspection.add("information" if free else "warning", "sensors", seen, advice)
@@ -235,7 +237,7 @@ def _report_useless(
             seen += f"next task action, in {count} beliefs of simulated trials"
             advice = "If it counts later, or only together with another one, looking one step "
             advice += "ahead never chooses it: compare with selector.method: expected_return and "
-            advice += "rollout_looks: 8, and with random. Else leave it out."
+            advice += "rollout_sensing_steps: 8, and with random. Else leave it out."
             inspection.add("warning", "sensors", seen, advice)
 
 

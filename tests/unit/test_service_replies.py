@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 from tests.unit.test_protocol_service import Robot
 
+from holdfast.protocol.computing_time import ExpectedTime
 from holdfast.protocol.events import Effects
-from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.messages import Busy, Progress, Refused, Reply, decode_reply
-from holdfast.protocol.service_calls import WaitingCalls
 from holdfast.protocol.service_jobs import EndCall, SendReply, ServiceEffect
 from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
+from holdfast.protocol.service_replies import WaitingCalls
 from holdfast.protocol.service_sessions import PendingTask, Session
 
 

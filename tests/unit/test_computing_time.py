@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from holdfast.protocol.expected_time import _TYPICAL_INERTIA, ExpectedTime
+from holdfast.protocol.computing_time import _TYPICAL_INERTIA, ExpectedTime
 
 
 def test_one_that_others_made_longer_counts_little_and_a_shorter_one_at_once() -> None:
