@@ -106,9 +106,12 @@ def test_runs_a_sweep_and_a_study(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert other == one | {"name": "method=random"}
     studied, _ = results_page(Path(__file__).parents[2] / "docs" / "results" / "parameters")
     assert b"data:image/svg+xml" in studied
-    (tmp_path / "nothing").mkdir()
+    (tmp_path / "nothing" / "figure.svg").mkdir(parents=True)  # a directory is no figure
     with pytest.raises(OutputError, match="neither a run nor results"):
         results_page(tmp_path / "nothing")
+    (tmp_path / "nothing" / "table.csv").write_text("run,measure,effect,low,high\na,x,1,0,2\n")
+    (tmp_path / "nothing" / "sweep.json").write_text("{}")
+    assert len(charts_of(results_page(tmp_path / "nothing")[0])) == 1
 
 
 def test_the_worst_come_first() -> None:

@@ -106,3 +106,6 @@ def test_a_scene_of_coordinates_that_no_state_has(
     monkeypatch.setattr(problem, "scene", lambda: drawn, raising=False)
     with pytest.raises(ProblemError, match=r"scene of peg_in_hole_2d has axes .* from 0 to 2"):
         checked.scene(problem)
+    monkeypatch.setattr(problem, "scene", lambda: "a drawing", raising=False)
+    with pytest.raises(ProblemError, match=r"scene of .* gives 'a drawing': need a Scene"):
+        checked.scene(problem)

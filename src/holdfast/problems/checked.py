@@ -455,6 +455,8 @@ def scene(problem: Any) -> Any:
     drawn = _ask(problem, "scene")
     if drawn is None:
         return None
+    if not hasattr(drawn, "walls"):
+        raise ProblemError(f"scene of {name_of(problem)} gives {in_brief(drawn)}: need a Scene")
     moved = [axes for axes, _ in drawn.walls]
     known = range(problem.state_size)
     if (

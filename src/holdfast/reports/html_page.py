@@ -135,7 +135,7 @@ class HtmlPage:
         if len(content) > MAX_BYTES:
             raise OutputError(
                 f"the report is {len(content):,} bytes large; the limit is {MAX_BYTES:,}: show "
-                "fewer trials (--worst)"
+                "fewer trials of a run (--worst; with 0 none)"
             )
         return content
 

@@ -342,7 +342,7 @@ def results_page(directory: Path) -> tuple[bytes, list[str]]:
         If there is nothing of these in it.
     """
     page = HtmlPage(f"Results in {directory.absolute().name}")
-    found = {path.name: path for path in sorted(directory.glob("*"))}
+    found = {path.name: path for path in sorted(directory.glob("*")) if path.is_file()}
     for name in ("tune.md", "table.md"):
         if name in found:
             page.section("Finding")
@@ -375,7 +375,9 @@ def _add_effects(page: HtmlPage, columns: Sequence[str], rows: Iterable[Sequence
         low, high = _number(row.get("low")), _number(row.get("high"))
         if low is None or high is None:
             continue
-        what = f"{row['kind']} of {row['measure']}" if "measure" in row else "difference of cost"
+        what = (
+            f"{row.get('kind')} of {row['measure']}" if "measure" in row else "difference of cost"
+        )
         panels.setdefault(what, []).append(
             {
                 "name": one_line(str(row.get("run", row.get("candidate"))))[:60],

@@ -557,7 +557,7 @@ class Link(asyncio.BufferedProtocol):
         self._extend_lease_if_unread(now)
         if now >= self._lease_ends_at:
             # If this process has stalled, first read what came meanwhile.
-            self._loop.call_soon(self._loop.call_soon, self._end_if_silent)
+            self._loop.call_soon(self._loop.call_soon, self._end_if_silent, now)
             return
         valid_s = math.inf if self.peer is None else self.peer.expires_at - time.time()
         if valid_s <= 0.0:
@@ -586,11 +586,12 @@ class Link(asyncio.BufferedProtocol):
         return self._spoke_at < now - 0.9 * self._ping_interval_s
 
     @ends_link
-    def _end_if_silent(self) -> None:
+    def _end_if_silent(self, checked_at: float) -> None:
         if self._ended:
             return
         self._extend_lease_if_unread(self._loop.time())
-        if self._loop.time() < self._lease_ends_at:
+        # Not the time of now: this process may have stalled again since it has read.
+        if checked_at < self._lease_ends_at:
             self._tick()
         elif self.hello is None:
             self.end(f"has said no hello within {OPENING_TIMEOUT_S:g} s", abort=True)
