@@ -72,15 +72,6 @@ def test_in_process(reference: Path) -> None:
     assert summary_of(reference)["missing_observations"] == 10
 
 
-def test_through_a_service(site: Site, reference: Path) -> None:
-    path = configure(site.directory)
-    service = service_of(site)
-    robot = site.run(path, services=[service])
-    robot.finish()
-    assert robot.statuses() == []
-    assert_identical(robot.out, reference)
-
-
 def test_a_service_that_is_killed(site: Site, reference: Path) -> None:
     path = configure(site.directory, (7, 22))
     service = service_of(site)

@@ -271,14 +271,13 @@ class TestHealth:
 
 
 class TestServiceManager:
-    @pytest.mark.parametrize("abstract", [True])
-    def test_of_a_robot(self, abstract: bool, site: Site, references: References) -> None:
+    def test_of_a_robot(self, site: Site, references: References) -> None:
         document = document_of(PEG)
         steps = sensing_steps(document)
         cloud = site.service().start()
         story = Story(site, references, document)
         begun = []
-        with NotifySocket(abstract=abstract) as manager:
+        with NotifySocket(abstract=True) as manager:
 
             def starts() -> None:
                 manager.wait_for("WATCHDOG=1", 3)

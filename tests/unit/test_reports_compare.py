@@ -376,27 +376,3 @@ class TestCommand:
         done = self.compare(tmp_path, tmp_path / "missing")
         assert (done.returncode, done.stdout) == (2, "")
         assert done.stderr.startswith(f"holdfast: error: {tmp_path}: holds no journal.bin")
-
-    @pytest.mark.slow
-    def test_real_runs(self, tmp_path: Path) -> None:
-        configuration = tmp_path / "peg.yaml"
-        configuration.write_text(
-            "problem: peg_in_hole_2d\n"
-            "particle_filter: {num_particles: 30}\n"
-            "active_sensing: {num_observation_samples: 2, num_cores: 1}\n"
-            "simulator: {num_trials: 2, max_steps: 30, seed: 3}\n"
-        )
-        for name, seed in (("first", 3), ("second", 3), ("other", 4)):
-            subprocess.run(
-                [
-                    *(*COMMAND, "run", str(configuration), "--out", str(tmp_path / name)),
-                    *("--quiet", "--seed", str(seed), "--jobs", "1"),
-                ],
-                check=True,
-                timeout=60,
-            )
-        done = self.compare(tmp_path / "first", tmp_path / "second")
-        assert done.returncode == 0, done.stdout
-        done = self.compare(tmp_path / "first", tmp_path / "other")
-        assert done.returncode == 1
-        assert done.stdout.splitlines()[0] == "different: seed"

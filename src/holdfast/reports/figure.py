@@ -34,8 +34,9 @@ from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.planning.outcome import Outcome
 from holdfast.problems import checked
-from holdfast.problems.attributes import choice_labels, circular_states, state_labels
+from holdfast.problems.attributes import choice_labels, circular_states
 from holdfast.problems.problem import Problem, Scene
+from holdfast.reports.csv_export import state_labels
 from holdfast.reports.facts import SCORES
 from holdfast.reports.recorder import TrialRecord
 from holdfast.reports.scene_drawing import obstacles_within, outline, shown_part, walls_at
@@ -173,13 +174,6 @@ def _title(configuration: Configuration, record: TrialRecord) -> str:
     return text
 
 
-def _labels(problem: Problem) -> Sequence[str]:
-    labels = state_labels(problem)
-    if len(labels) == problem.state_size:
-        return labels
-    return [f"state[{index}]" for index in range(problem.state_size)]
-
-
 def _style_of(sensing_action: int) -> tuple[str, str]:
     return (
         _ACTION_COLORS[sensing_action % len(_ACTION_COLORS)],
@@ -204,7 +198,7 @@ def _marker_size(record: TrialRecord) -> float:
 def _draw_workspace(panel: Axes, problem: Problem, scene: Scene, record: TrialRecord) -> None:
     axes = list(scene.axes)
     panel.set_aspect("equal", anchor="N")
-    x_label, y_label = (_labels(problem)[axis] for axis in axes)
+    x_label, y_label = (state_labels(problem)[axis] for axis in axes)
     panel.set_xlabel(x_label)
     panel.set_ylabel(y_label)
     for spine in panel.spines.values():
@@ -378,7 +372,7 @@ def _draw_coordinates(
     for index in circular_states(problem):
         _follow_turns(estimates[:, index], truth[:, index])
     steps = np.arange(len(estimates))
-    for index, (panel, label) in enumerate(zip(panels, _labels(problem), strict=True)):
+    for index, (panel, label) in enumerate(zip(panels, state_labels(problem), strict=True)):
         mean, two = estimates[:, index], 2.0 * deviations[:, index]
         panel.fill_between(steps, mean - two, mean + two, color=_BELIEF, alpha=0.22, linewidth=0)
         panel.plot(steps, mean, **_ESTIMATED, linewidth=1.1)

@@ -20,6 +20,7 @@ from holdfast.problems import checked
 from holdfast.problems.attributes import sensing_labels, state_labels
 from holdfast.problems.problem import Problem, Scene
 from holdfast.reports.poses import POSE_COORDINATES, PoseLayout
+from holdfast.reports.scene_drawing import body_corners
 
 __all__ = ["GrowingPath", "Marker", "scene_markers", "sensing_markers"]
 
@@ -44,7 +45,6 @@ _PATH_GROWTH = 20
 times its length, not the square of it."""
 
 _ARC_POINTS = 25
-_DISC_POINTS = 49
 
 
 class Marker(NamedTuple):
@@ -143,7 +143,7 @@ def scene_markers(
                 Marker("CUBE", body_frame, "body", scale=box.size, color=faded,
                        moves_with_frame=True)
             )  # fmt: skip
-        elif scene.body is not None:
+        elif len(corners := body_corners(scene)):
             markers.append(
                 Marker(
                     "LINE_STRIP",
@@ -151,7 +151,7 @@ def scene_markers(
                     f"body_{body_frame}",
                     scale=(_LINE * size, 0.0, 0.0),
                     color=color,
-                    points=tuple(_in_space(corner, axes) for corner in _outline(scene)),
+                    points=tuple(_in_space(corner, axes) for corner in (*corners, corners[0])),
                     moves_with_frame=True,
                 )
             )
@@ -236,14 +236,6 @@ def _in_space(place: Any, axes: tuple[int, int], depth: float = 0.0) -> tuple[fl
     point = [depth, depth, depth]
     point[axes[0]], point[axes[1]] = float(place[0]), float(place[1])
     return tuple(point)
-
-
-def _outline(scene: Scene) -> FloatArray:
-    body = np.asarray(scene.body, dtype=np.float64)
-    if body.ndim == 0:
-        turn = np.linspace(0.0, 2.0 * np.pi, _DISC_POINTS)
-        return np.asarray(body * np.stack([np.cos(turn), np.sin(turn)], axis=1))
-    return np.vstack([body, body[:1]])
 
 
 def _cuboids(corners: Iterable[tuple[Any, Any]], frame: str) -> list[Marker]:
