@@ -7,10 +7,8 @@ somebody's silence would be seen as a run that never ends.
 
 from __future__ import annotations
 
-import itertools
 import os
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,45 +18,10 @@ import pytest
 from benchmarks.rolling import Replicas, Way, decisions_of, start_robots, wait_until
 from tests.deploy.docker import missing
 from tests.ports import free_port
-from tests.processes.faults import PATIENCE_S, References, Site, Story, assert_identical, events_of
-from tests.processes.test_faults import GATED, SERVES_GATED
+from tests.processes.faults import PATIENCE_S, assert_identical, events_of
 
 ROBOTS, SEEDS, TRIALS = 8, 2, 2
 FAILURES = {"launch", "service_suspected", "service_vanished", "status", "hedge", "wrong_answer"}
-
-
-def test_what_is_computed_when_the_signal_comes_is_delivered(
-    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    references = References(tmp_path_factory.mktemp("references"))
-    with Site(tmp_path) as site:
-        gate = site.gate(4)
-        first, second = (site.service(*SERVES_GATED, "--drain-s", "3600") for _ in range(2))
-        first.variables["HOLDFAST_TEST_GATE"] = str(gate.port)
-        first.start()
-        second.start()
-        story = Story(site, references, GATED, recovery={"launch": "on_failure"})
-        # However fast it is, it does not come to its end before it has heard the goodbye.
-        story.at("perform", 30, lambda: story.running.wait_for("service_vanished"))
-        robot = site.run(story.file, services=[first, second])
-        gate.wait()
-        answered = len(decisions_of(robot.out))
-        first.process.signal(signal.SIGTERM)
-        first.process.wait_for("stopping")
-        gate.open()
-        story.finish(robot)
-        assert first.process.wait() == 0
-    deciders = [row["service"] for row in decisions_of(robot.out)]
-    # What it owed it has given, and the other one decided all that was asked after that.
-    assert deciders[answered] == first.endpoint
-    # (Before that either may have: the one that connects first is asked first.)
-    owed = deciders[answered:]
-    assert sum(after != before for before, after in itertools.pairwise(owed)) == 1
-    assert deciders[-1] == second.endpoint
-    said = {event["event"] for event in events_of(robot.out)}
-    assert said & FAILURES == {"service_vanished"}
-    (left,) = first.process.matching("robot_disconnected")
-    assert left["reason"] == "said goodbye"
 
 
 @pytest.fixture

@@ -183,9 +183,7 @@ class RunOptions(Options):
         return self.command_to_resume(
             "run",
             directory,
-            *("resume_if_begun", "after_reboot", "restart", "watchdog_s"),
-            *("quiet", "view_file"),
-            "watchdog_s",
+            *("resume_if_begun", "after_reboot", "restart", "watchdog_s", "quiet", "view_file"),
         )
 
     def overrides(self) -> list[Override]:
