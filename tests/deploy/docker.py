@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 import pytest
+from tests.programs import completed
 
 __all__ = [
     "PATIENCE_S",
@@ -65,13 +66,8 @@ def missing(reason: str) -> NoReturn:
 
 def holdfast(*words: object, cwd: Path) -> None:
     """Run the command on this machine, which must succeed."""
-    done = subprocess.run(
-        [sys.executable, "-m", "holdfast", *map(str, words)],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=PATIENCE_S,
+    done = completed(
+        [sys.executable, "-m", "holdfast", *map(str, words)], cwd=cwd, timeout=PATIENCE_S
     )
     assert done.returncode == 0, f"{words}: {done.returncode}\n{done.stdout}\n{done.stderr}"
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from tests.deploy.docker import PATIENCE_S, ROOT
+from tests.programs import completed
 
 from holdfast.transport.key_ring import make_credentials
 
@@ -32,13 +33,10 @@ class Place:
         ssh.chmod(0o755)
         keys = self.directory / "keys" / "service"
         words = ("admin@host", "cloud", "--keys", keys, "--wheel", self.directory / "holdfast.whl")
-        return subprocess.run(
+        return completed(
             [str(word) for word in (ROOT / "deploy/cloud-init/set-up", *words)],
             env={**os.environ, "SSH": str(ssh)},
-            capture_output=True,
-            text=True,
             timeout=PATIENCE_S,
-            check=False,
         )
 
     def called(self) -> list[str]:

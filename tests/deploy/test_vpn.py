@@ -36,6 +36,7 @@ from tests.processes.faults import (
     sensing_steps,
     wait_until,
 )
+from tests.programs import completed
 
 from holdfast_lab.testbed.namespace import NetworkNamespace
 
@@ -262,13 +263,7 @@ def make_profiles(*words: str | Path, **variables: str) -> str:
 
 
 def called(*words: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [MAKE_PROFILES, *words],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        env={**os.environ, **variables},
-    )
+    return completed([MAKE_PROFILES, *words], timeout=PATIENCE_S, env={**os.environ, **variables})
 
 
 # -- fixtures ------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from tests.deploy.docker import BASE, ROOT, Engine, missing
 from tests.golden.table import pinned
+from tests.programs import completed
 
 import holdfast
 
@@ -49,14 +50,7 @@ echo "served: $(grep -o '"digest": "[0-9a-f]*"' /tmp/run/summary.json)"
 
 
 def _make(goal: str, dist: Path) -> None:
-    done = subprocess.run(
-        ["make", goal, f"DIST={dist}"],
-        cwd=ROOT,
-        text=True,
-        capture_output=True,
-        timeout=_BUILD_S,
-        check=False,
-    )
+    done = completed(["make", goal, f"DIST={dist}"], cwd=ROOT, timeout=_BUILD_S)
     assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
 
 

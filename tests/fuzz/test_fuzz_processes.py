@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import itertools
 import random
-import subprocess
 import sys
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from tests.fuzz.attacker import TRANSPORTS, attacked
 from tests.fuzz.hostile_settings import keys_of
 from tests.fuzz.soak import run_soak
 from tests.fuzz.targets import TARGETS
+from tests.programs import completed
 from tests.unit.test_protocol_service import Bench
 
 from holdfast.config import registry
@@ -38,17 +38,14 @@ ATTACK_S = 4.0
 def test_decoders_guided_by_coverage(target: str, tmp_path: Path) -> None:
     # PyYAML parses in Python: a configuration takes a hundred times as long as a message.
     runs = RUNS // 10 if target == "configuration" else RUNS
-    done = subprocess.run(
+    done = completed(
         [
             sys.executable,
             *("-m", "tests.fuzz.decoders", target),
             *("--runs", str(runs), "--seed", "1", "--crashes", str(tmp_path)),
         ],
         cwd=ROOT,
-        capture_output=True,
-        text=True,
         timeout=600,
-        check=False,
     )
     assert done.returncode == 0, done.stderr[-3000:]
     assert f"Done {runs} runs" in done.stderr

@@ -26,6 +26,7 @@ from tests.process_states import stop
 from tests.processes.world import PATIENCE_S as PATIENCE_S
 from tests.processes.world import Gate, World
 from tests.processes.world import Hook as Hook
+from tests.programs import completed
 
 from holdfast.config.loader import load
 from holdfast.config.registry import BUILT_IN
@@ -228,14 +229,7 @@ def holdfast(
     directory: Path, *arguments: str, command: Sequence[str] = COMMAND
 ) -> subprocess.CompletedProcess[str]:
     """Run a command in a directory to its end."""
-    return subprocess.run(
-        [*command, *arguments],
-        cwd=directory,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
+    return completed([*command, *arguments], cwd=directory, timeout=PATIENCE_S)
 
 
 def page(address: str, path: str) -> tuple[int, str]:

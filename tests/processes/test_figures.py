@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.programs import completed
 
 CONFIGURATION = """
 problem: capsule_robot
@@ -19,14 +20,11 @@ simulator: {num_trials: 1, max_steps: 20, seed: 3}
 
 def run(directory: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     (directory / "capsule.yaml").write_text(CONFIGURATION)
-    return subprocess.run(
+    return completed(
         [sys.executable, "-m", "holdfast", "run", "capsule.yaml", "--out", "out"],
         cwd=directory,
         env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
         timeout=120,
-        check=False,
     )
 
 

@@ -7,12 +7,12 @@ there afterwards, what is there must be known to be all, and the journal must be
 from __future__ import annotations
 
 import shutil
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 import pytest
+from tests.programs import completed
 from tests.unit.test_journal import all_records, records_of
 
 from holdfast.journal.journal import Journal
@@ -24,13 +24,7 @@ def why_no_strace() -> str | None:
     """Return why no process can be traced here; None if one can."""
     if shutil.which("strace") is None:
         return "strace is not installed (Debian's package: strace)"
-    done = subprocess.run(
-        ["strace", "-o", "/dev/null", "true"],
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
+    done = completed(["strace", "-o", "/dev/null", "true"], timeout=30)
     return None if done.returncode == 0 else f"nothing can be traced: {done.stderr.strip()}"
 
 
@@ -43,13 +37,7 @@ def said_when_struck(path: Path, fault: str, number: int) -> list[str] | None:
     command = ["strace", "-f", "-qq", "-o", str(trace)]
     command += ["-e", f"trace={_CALLS}", "-e", f"inject={_CALLS}:{fault}:when={number}"]
     writer = Path(__file__).with_name("journal_writer.py")
-    done = subprocess.run(
-        [*command, sys.executable, str(writer), str(path)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    done = completed([*command, sys.executable, str(writer), str(path)], timeout=60)
     assert "Traceback" not in done.stderr, done.stderr
     struck = "INJECTED" in trace.read_text() or done.returncode != 0
     return done.stdout.splitlines() if struck else None

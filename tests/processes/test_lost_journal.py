@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from tests.processes.faults import (
     document_of,
     sensing_steps,
 )
+from tests.programs import completed
 
 PEG = "peg_in_hole_2d"
 SHORT = document_of(PEG, max_steps=40)
@@ -37,13 +37,7 @@ def why_no_mounts() -> str | None:
     """Return why no file system can be mounted in a namespace of its own; None if it can be."""
     if shutil.which("unshare") is None:
         return "unshare is not installed (Debian's package: util-linux)"
-    done = subprocess.run(
-        [*_IN_NAMESPACE, "mount", "-t", "tmpfs", "tmpfs", "/mnt"],
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
+    done = completed([*_IN_NAMESPACE, "mount", "-t", "tmpfs", "tmpfs", "/mnt"], timeout=30)
     return None if done.returncode == 0 else f"no mount in a namespace: {done.stderr.strip()}"
 
 

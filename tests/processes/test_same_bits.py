@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from tests.programs import completed
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -120,13 +121,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
         environment = {key: value for key, value in os.environ.items() if key not in SETTINGS}
         # The kernel takes it for the number of processors: threads even where there is only one.
         environment["OMP_NUM_THREADS"] = str(cores or 4)
-        return subprocess.run(
+        return completed(
             [sys.executable, str(directory / "script.py"), str(jobs), *paths],
             env=environment | settings,
-            capture_output=True,
-            text=True,
             timeout=300,
-            check=False,
         )
 
     return run_them

@@ -22,6 +22,7 @@ from typing import Any
 import msgspec
 import pytest
 from tests.processes.faults import PATIENT
+from tests.programs import completed
 from tests.unit.test_protocol_service import Robot, content
 
 from holdfast.protocol.events import (
@@ -437,12 +438,7 @@ class TestRefusing:
 
     def test_no_standard_input_to_wait_for(self) -> None:
         command = [*COMMAND, *ANYWHERE, "--until-stdin-closes"]
-        done = subprocess.run(
-            ["/bin/sh", "-c", 'exec "$@" <&-', "sh", *command],
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE_S,
-        )
+        done = completed(["/bin/sh", "-c", 'exec "$@" <&-', "sh", *command], timeout=PATIENCE_S)
         # It is as one that has ended: the service ends as well, and says why.
         assert done.returncode == 0
         assert "standard input has ended" in done.stderr
@@ -531,13 +527,7 @@ def tell(*arguments):
 service_process._say_ready = tell
 sys.exit(service_process.main(["--listen", "tcp/127.0.0.1:0", "--until-stdin-closes"]))
 """
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-    )
+    done = completed([sys.executable, "-c", program], stdin=subprocess.DEVNULL, timeout=PATIENCE_S)
     assert done.returncode == 0, done.stderr
     modules = set(json.loads(done.stdout.splitlines()[1]))
     assert "numpy" in modules

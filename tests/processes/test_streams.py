@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from tests.processes.faults import COMMAND
+from tests.programs import completed
 
 CONFIGURATION = """
 problem: capsule_robot
@@ -91,14 +92,11 @@ def test_a_path_that_the_encoding_of_the_streams_lacks(tmp_path: Path) -> None:
         (("run", "größe.yaml", "--jobs", "1", "--out", "größe"), 0),
         (("run", "größe.yaml", "--jobs", "1", "--out", "größe"), 2),
     ):
-        done = subprocess.run(
+        done = completed(
             [*COMMAND, *arguments],
             cwd=tmp_path,
             env={**os.environ, "PYTHONIOENCODING": "ascii:strict"},
-            capture_output=True,
-            text=True,
             timeout=120,
-            check=False,
         )
         assert (done.returncode, "Traceback" in done.stderr) == (code, False), done.stderr
         assert "gr\\xf6\\xdfe" in done.stderr

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.ports import free_port
+from tests.programs import completed
 from tests.ros.conftest import PATIENCE_S, ROOT, left_out
 
 SYSTEM_PYTHON = "/usr/bin/python3"
@@ -57,15 +58,7 @@ class AtMaster:
 
     def run(self, *words: str) -> str:
         """Run a command to its end, and return what it prints."""
-        done = subprocess.run(
-            words,
-            env=self.environment,
-            cwd=self.directory,
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE_S,
-            check=False,
-        )
+        done = completed(words, env=self.environment, cwd=self.directory, timeout=PATIENCE_S)
         assert done.returncode == 0, f"{words}: {done.returncode}\n{done.stdout}\n{done.stderr}"
         return done.stdout
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import base64
 import json
-import subprocess
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from tests.command_line import run_here
+from tests.programs import completed
 
 if TYPE_CHECKING:
     import pytest
@@ -63,16 +63,13 @@ def test_every_message(ros2: Ros2, tmp_path: Path, capsys: pytest.CaptureFixture
             (connection.msgtype, raw, reader.deserialize(raw, connection.msgtype))
             for connection, _, raw in reader.messages()
         ]
-    done = subprocess.run(
+    done = completed(
         [ros2.python, "-c", READER],
         input="\n".join(
             json.dumps([kind, base64.b64encode(raw).decode()]) for kind, raw, _ in messages
         ),
-        capture_output=True,
-        text=True,
         env=ros2.environment,
         timeout=120,
-        check=False,
     )
     assert done.returncode == 0, done.stderr
     store = get_typestore(Stores.ROS2_KILTED)

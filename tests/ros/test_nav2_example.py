@@ -6,9 +6,9 @@
 from __future__ import annotations
 
 import json
-import subprocess
 
 import numpy as np
+from tests.programs import completed
 from tests.ros.conftest import ROOT, Ros2
 from tests.ros.domains import own_domain
 
@@ -16,7 +16,7 @@ from tests.ros.domains import own_domain
 def test_it_looks_until_the_particles_agree_and_goes_through_the_door(ros2: Ros2) -> None:
     stand_in = ROOT / "examples" / "nav2" / "stand_in"
     with own_domain() as domain:
-        done = subprocess.run(
+        done = completed(
             [str(ros2.python), "examples/nav2/navigate.py"],
             cwd=ROOT,
             env={
@@ -24,10 +24,7 @@ def test_it_looks_until_the_particles_agree_and_goes_through_the_door(ros2: Ros2
                 "ROS_DOMAIN_ID": str(domain),
                 "PYTHONPATH": f"{stand_in}:{ros2.environment['PYTHONPATH']}",
             },
-            capture_output=True,
-            text=True,
             timeout=300,
-            check=False,
         )
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()

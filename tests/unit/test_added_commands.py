@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.programs import completed
 
 from holdfast.cli import added_commands
 from holdfast.cli.application import find_command
@@ -45,13 +46,10 @@ def packages(tmp_path: Path) -> Path:
 
 
 def holdfast(packages: Path | None, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
+    return completed(
         [sys.executable, "-c", "import holdfast.cli; holdfast.cli.main()", *arguments],
         env={**os.environ, "PYTHONPATH": "" if packages is None else str(packages)},
-        capture_output=True,
-        text=True,
         timeout=60,
-        check=False,
     )
 
 

@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import os
 import platform
-import subprocess
 import sys
 
 import pytest
+from tests.programs import completed
 
 pytestmark = pytest.mark.skipif(
     platform.libc_ver()[0] != "glibc", reason="another C library has no arenas, or other ones"
@@ -47,13 +47,8 @@ def arenas(how: str, **variables: str) -> int:
         for name, value in os.environ.items()
         if name not in ("MALLOC_ARENA_MAX", "GLIBC_TUNABLES")
     }
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, how],
-        env={**environment, **variables},
-        capture_output=True,
-        text=True,
-        timeout=30.0,
-        check=False,
+    done = completed(
+        [sys.executable, "-c", PROGRAM, how], env={**environment, **variables}, timeout=30.0
     )
     assert done.returncode == 0, done.stderr
     return done.stdout.count("<heap nr=")

@@ -7,18 +7,13 @@ import subprocess
 import sys
 
 import pytest
+from tests.programs import completed
 
 from holdfast.cli.exit_codes import EndedBySignal, ended_by_signals, signal_of
 
 
 def python(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", program, *arguments],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    return completed([sys.executable, "-c", program, *arguments], timeout=60)
 
 
 def test_a_service_does_not_wait_for_the_command_line() -> None:

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from tests.programs import completed
 
 from holdfast import _kernel
 from holdfast.numerics.arrays import FloatArray, IntArray
@@ -162,13 +163,10 @@ def run_workload(
     environment.pop("HOLDFAST_SIMD", None)
     if simd is not None:
         environment["HOLDFAST_SIMD"] = simd
-    return subprocess.run(
+    return completed(
         [sys.executable, "-W", "ignore", "-c", before + WORKLOAD + after],
         env=environment,
-        capture_output=True,
-        text=True,
         timeout=120,
-        check=False,
     )
 
 

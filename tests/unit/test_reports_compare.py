@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 from tests.command_line import run_here
+from tests.programs import completed
 
 from holdfast.errors import HoldfastError, OutputError
 from holdfast.journal.journal import Journal
@@ -336,13 +337,7 @@ class TestRuns:
 class TestCommand:
     @staticmethod
     def compare(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [*COMMAND, "compare", *map(str, arguments)],
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-        )
+        return completed([*COMMAND, "compare", *map(str, arguments)], timeout=60)
 
     def test_identical(self, tmp_path: Path) -> None:
         first = run_of(tmp_path / "first", [result_of(0)])
