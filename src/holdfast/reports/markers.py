@@ -143,7 +143,7 @@ def scene_markers(
                 Marker("CUBE", body_frame, "body", scale=box.size, color=faded,
                        moves_with_frame=True)
             )  # fmt: skip
-        elif len(corners := body_corners(scene)):
+        elif len(body := body_corners(scene)):
             markers.append(
                 Marker(
                     "LINE_STRIP",
@@ -151,7 +151,7 @@ def scene_markers(
                     f"body_{body_frame}",
                     scale=(_LINE * size, 0.0, 0.0),
                     color=color,
-                    points=tuple(_in_space(corner, axes) for corner in (*corners, corners[0])),
+                    points=tuple(_in_space(corner, axes) for corner in (*body, body[0])),
                     moves_with_frame=True,
                 )
             )
