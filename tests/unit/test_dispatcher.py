@@ -10,6 +10,7 @@ from holdfast.protocol.events import (
     Launch,
     LogEvent,
     RecoveryExited,
+    Send,
     ServiceAppeared,
     ServiceVanished,
 )
@@ -77,6 +78,21 @@ def test_busy_is_waited_for_if_short_and_evaded_if_long() -> None:
     cloud.rule = lambda r: [Busy(r.number, 5000)] if nth(r) == 3 else None
     world.complete()
     assert world.statuses()[0] == "local_recovery"
+
+
+@pytest.mark.parametrize("stalled_s", [0.0, 0.35])
+def test_replies_are_late_by_the_time_in_which_the_robot_could_receive(stalled_s: float) -> None:
+    world = World()
+    world.services["cloud"].latency_s = 0.2  # so each reply needs 0.4 s; the timeout is shorter
+    send = world.send
+
+    def stall(effect: Send) -> None:
+        send(effect)
+        world.robot.event_loop_stalled(stalled_s)
+
+    world.send = stall  # type: ignore[method-assign]
+    world.complete()
+    assert bool(world.reports("late_replies")) == (stalled_s == 0.0)
 
 
 @pytest.mark.parametrize("comes", [True, False])

@@ -315,6 +315,23 @@ def test_nobody_is_blamed_for_the_time_in_which_the_loop_did_not_listen(
     assert machine.deaf_s[0] >= blocked_s
 
 
+def test_nobody_is_blamed_for_what_a_wakeup_itself_takes(
+    robots: Robots, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock(monkeypatch)
+    robots.event = lambda *_, **__: clock.jump(50.0)  # type: ignore[method-assign, assignment]
+
+    def begin() -> None:
+        machine.wakeups = [time.monotonic()]
+        robot._on_loop().call_later(0.02, robot._happens, RecoveryExited(1, "end"))
+
+    robot, machine = scripted(robots, begin)
+    machine.answers = [[LogEvent("a policy that takes long", {})], [Paused()]]
+    robot.run(())
+    assert machine.trace == ["wake", "handle RecoveryExited"]
+    assert machine.deaf_s[0] >= 50.0
+
+
 def test_nobody_is_blamed_if_the_process_was_stopped_when_it_should_have_woken_up(
     robots: Robots, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -200,6 +200,8 @@ class Dispatcher(DecisionSource):
         """Excuse the services: for so long the robot's process could not receive."""
         for replica in self._services:
             replica.detector.excuse(seconds)
+        for call in self._calls:
+            call.excused_s += seconds
 
     # -- presence --------------------------------------------------------------------------------
 

@@ -65,6 +65,7 @@ class OpenRequest:
         self.replica = replica
         self.question = question
         self.sent_at = sent_at
+        self.excused_s = 0.0  # of the wait for its first reply: the robot could not receive
         # heard, has_task_part, has_sensing_part: whether any reply has come, and that part of the
         # answer.
         self.heard = False
@@ -292,7 +293,7 @@ class OpenRequests:
             return
         call.heard = True
         replica = call.replica
-        soonest_s = replica.note_first_reply(call.sent_at, now)
+        soonest_s = replica.note_first_reply(call.sent_at + call.excused_s, now)
         if soonest_s is not None:
             self._effects.report(
                 "late_replies",

@@ -335,6 +335,8 @@ class RobotProcess:
             if wake and not self._ended:
                 self._now = max(self._now, now)
                 self._carry_out(self.robot.wake(self._now))
+                before, now = now, monotonic()
+                self._event_loop_stalled(now - before)
             while not self._ended and (self._happened or self._own.compute_brief()):
                 if now - began > self._turn_s:
                     self._go_on_soon()
