@@ -75,5 +75,6 @@ def test_refusals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_values_are_rounded_away_from_zero_and_intervals_outward() -> None:
     assert [rounded(each, 0) for each in (42.5, 57.5, -42.5)] == [43.0, 58.0, -43.0]
     assert rounded(0.15, 1) == 0.2
+    assert str(rounded(-0.3, 0)) == "0.0"
     assert outward((30.6, 54.4), 0) == (30.0, 55.0)
     assert outward((-0.3, 0.3), 1) == (-0.3, 0.3)  # bounds that have so many digits stay

@@ -161,7 +161,8 @@ def decimals(bounds: Sequence[float]) -> int:
 def rounded(value: float, digits: int) -> float:
     """Return a value with so many decimals; a tie goes away from zero, as people expect."""
     scale = 10.0**digits
-    return math.copysign(math.floor(abs(value) * scale * (1.0 + 1e-12) + 0.5) / scale, value)
+    size = math.floor(abs(value) * scale * (1.0 + 1e-12) + 0.5) / scale
+    return math.copysign(size, value) + 0.0  # no -0
 
 
 def outward(bounds: Sequence[float], digits: int) -> tuple[float, float]:
