@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import itertools
 import json
@@ -84,14 +83,6 @@ class Browser:
         """Click at a place of the window, as a person."""
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-
-    def picture(self, path: Path) -> None:
-        """Write the whole page as PNG."""
-        size = self.call("Page.getLayoutMetrics")["cssContentSize"]
-        shown = self.call("Page.captureScreenshot", captureBeyondViewport=True,
-                          clip={"x": 0, "y": 0, "scale": 1, "width": size["width"],
-                                "height": size["height"]})  # fmt: skip
-        path.write_bytes(base64.b64decode(shown["data"]))
 
 
 @contextlib.contextmanager

@@ -6,6 +6,9 @@ from collections.abc import Iterator
 
 import pytest
 from tests.deploy.docker import Engine, Images, build, running_engine
+from tests.processes.conftest import references, site
+
+__all__ = ["engine", "images", "references", "site"]
 
 
 @pytest.fixture(scope="session")

@@ -64,7 +64,7 @@ def missing(reason: str) -> NoReturn:
     pytest.skip(reason)
 
 
-def holdfast(*words: object, cwd: Path) -> None:
+def holdfast(*words: object, cwd: Path | None = None) -> None:
     """Run the command on this machine, which must succeed."""
     done = completed(
         [sys.executable, "-m", "holdfast", *map(str, words)], cwd=cwd, timeout=PATIENCE_S

@@ -20,6 +20,7 @@ import pytest
 from tests.deploy.docker import ROOT, missing
 from tests.golden.table import pinned
 from tests.ports import free_port
+from tests.programs import completed
 
 pytestmark = pytest.mark.slow
 
@@ -32,14 +33,7 @@ _BOUND_S = 1200.0
 
 
 def _run(*words: object, **options: Any) -> str:
-    done: subprocess.CompletedProcess[str] = subprocess.run(
-        [str(word) for word in words],
-        text=True,
-        capture_output=True,
-        timeout=_BOUND_S,
-        check=False,
-        **options,
-    )
+    done = completed([str(word) for word in words], _BOUND_S, **options)
     assert done.returncode == 0, f"{words}: {done.returncode}\n{done.stdout}\n{done.stderr}"
     return done.stdout
 
@@ -96,16 +90,9 @@ def test_a_robot_of_one_kind_is_served_by_one_of_the_other(machine: Path, tmp_pa
     name = "examples/peg_in_hole_2d.yaml"
     words = pinned()[name][0].split()[1:]
     with _service(machine, free_port()) as endpoint:
-        options = (
-            "--service",
-            endpoint,
-            "--recovery",
-            "never",
-            "--quiet",
-            "--out",
-            tmp_path / "run",
-        )
-        _run(sys.executable, "-m", "holdfast", *words, *options, cwd=ROOT)
+        options = ("--service", endpoint, "--recovery", "never", "--quiet")
+        command = (sys.executable, "-m", "holdfast", *words, *options)
+        _run(*command, "--out", tmp_path / "run", cwd=ROOT)
     summary = json.loads((tmp_path / "run/summary.json").read_text())
     assert summary["digest"] == pinned()[name][1]
     assert set(summary["sensing_decisions_by_service"]) == {endpoint}

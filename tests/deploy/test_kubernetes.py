@@ -24,6 +24,7 @@ import kubernetes_validate
 import pytest
 import yaml
 from tests.deploy.docker import ROOT
+from tests.deploy.test_prometheus import adapter_rule
 from tests.ports import free_port
 from tests.processes.faults import COMMAND, PATIENCE_S, Site, document_of, services_in_order
 
@@ -275,13 +276,6 @@ def test_a_robot_is_started_by_a_person_alone() -> None:
     assert pod["securityContext"] == pod_of(base())["securityContext"]
 
 
-def adapter_rule() -> Manifest:
-    path = KUBERNETES / "overlays" / "autoscaled-on-decisions" / "prometheus-adapter.yaml"
-    (rule,) = yaml.safe_load(path.read_text())["rules"]
-    assert isinstance(rule, dict)
-    return rule
-
-
 def test_the_pod_is_given_as_long_as_it_takes_to_end() -> None:
     done = subprocess.run([*COMMAND, "serve", "--help"], text=True, capture_output=True, check=True)
     found = re.search(r"--drain-s.*?default:?\s*([\d.]+)", done.stdout, re.DOTALL)
@@ -378,13 +372,8 @@ def test_a_robot_decides_through_what_the_manifests_start(site: Site) -> None:
     # The robot calls it as in the cluster; the names are its own, and nobody else sees them.
     hosts = site.directory / "hosts"
     hosts.write_text(f"127.0.0.1 localhost {host}\n")
-    own_hosts = (
-        "unshare",
-        "--mount",
-        "sh",
-        "-c",
-        f'mount --bind "{hosts}" /etc/hosts && exec "$@"',
-    )
+    script = f'mount --bind "{hosts}" /etc/hosts && exec "$@"'
+    own_hosts = ("unshare", "--mount", "sh", "-c", script)
     file = site.configure(document_of("peg_in_hole_2d", max_steps=20))
     options = ("--tls", home / "robot", "--rate", "10000", "--recovery", "never")
     endpoint = f"tls/{host}:{ports[0]}"

@@ -6,18 +6,16 @@ import json
 import os
 import socket
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from tests.deploy.docker import PATIENCE_S, ROOT, Engine, Images
+from tests.deploy.docker import ROOT, Engine, Images, holdfast
 from tests.deploy.machine import USER, Machine, booted
 
 CLOUD_INIT = ROOT / "deploy/cloud-init"
 EXAMPLE = ROOT / "examples/peg_in_hole_2d.yaml"
-HOLDFAST = Path(sys.executable).with_name("holdfast")
 CLOUD, ROBOT = "holdfast-cloud", "holdfast-robot"
 
 RUN = "/var/lib/private/holdfast/run"
@@ -227,19 +225,6 @@ def test_units_are_without_fault_and_hardened(lab: Lab) -> None:
         assert lab.machine.do(f"systemd-analyze verify --man=no {unit}.service 2>&1") == ""
         security = f"systemd-analyze security --no-pager --threshold={MOST_EXPOSED} {unit}.service"
         print(lab.machine.do(security).splitlines()[-1])
-
-
-def holdfast(*words: object) -> None:
-    """Run a command here, which must succeed."""
-    done = subprocess.run(
-        [str(word) for word in (HOLDFAST, *words)],
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        timeout=PATIENCE_S,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout
 
 
 def summary(run: Path) -> dict[str, Any]:

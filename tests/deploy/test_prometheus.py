@@ -6,7 +6,6 @@ import re
 import shutil
 import subprocess
 import urllib.request
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -122,12 +121,6 @@ def test_the_adapter_counts_decisions_in_progress(tmp_path: Path) -> None:
     )
     done = promtool("test", "rules", tmp_path / "played.yaml")
     assert done.returncode == 0, done.stdout + done.stderr
-
-
-@pytest.fixture
-def site(tmp_path: Path) -> Iterator[Site]:
-    with Site(tmp_path) as site:
-        yield site
 
 
 @pytest.mark.parametrize("processes", [1, 2])

@@ -282,11 +282,6 @@ def _tools() -> None:
 
 
 @pytest.fixture(scope="module")
-def references(tmp_path_factory: pytest.TempPathFactory) -> References:
-    return References(tmp_path_factory.mktemp("references"))
-
-
-@pytest.fixture(scope="module")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("keys")
     with Site(directory) as site:
@@ -310,12 +305,6 @@ def laid(kind: str, tmp_path: Path, stack: contextlib.ExitStack) -> Tunnel:
 @pytest.fixture
 def tunnel(laid: Tunnel) -> Tunnel:
     return laid.up()
-
-
-@pytest.fixture
-def site(tmp_path: Path) -> Iterator[Site]:
-    with Site(tmp_path) as site:
-        yield site
 
 
 # -- holdfast over them --------------------------------------------------------------------------
