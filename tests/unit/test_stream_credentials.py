@@ -117,46 +117,42 @@ class Cloud:
         call.end()
 
 
-def test_a_revoked_robots_link_ends_and_no_other(tmp_path: Path) -> None:
+async def test_a_revoked_robots_link_ends_and_no_other(tmp_path: Path) -> None:
     make_credentials(tmp_path, robots=["anna", "berta"], services=["cloud"])
-
-    async def run() -> None:
-        cloud = Cloud(tmp_path / "cloud")
-        endpoint = await cloud.start()
-        anna, berta = (Robot(tmp_path / name, endpoint) for name in ("anna", "berta"))
-        for robot, name in ((anna, b"anna"), (berta, b"berta")):
-            await robot.connected()
-            assert await robot.ask(1) == [name]
-        cloud.holds = True
-        for robot in (anna, berta):
-            robot.transport.call("cloud", 2, b"?")
-        await until(lambda: len(cloud.held) == 2)
-        assert cloud.transport.reload_credentials() == 0, "nobody is revoked yet"
-        revoke_credentials(tmp_path, names=["anna"])
-        assert cloud.transport.reload_credentials() == 1
-        await until(lambda: bool(anna.vanished), anna.events)
-        assert 2 in anna.ended
-        await until(lambda: f"refuses this end, which {REVOKED}" in anna.refusals, anna.refusals)
-        # It is not let in again, and the log says who that was.
-        await until(lambda: cloud.told[-1][0] == "link_refused", cloud.told)
-        again = cloud.told[-1][1]
-        assert (again["robot"], again["reason"]) == ("anna", REVOKED)
-        assert len([name for name, _ in cloud.told if name == "robot_connected"]) == 2
-        # The other one has its answer over the link over which it asked.
-        for call in cloud.held:
-            cloud.answer(call)
-        await until(lambda: 2 in berta.ended)
-        assert berta.boots == ["b1"]
-        assert berta.refusals == []
-        assert [each.payload for each in berta.events if isinstance(each, ReplyReceived)] == [
-            b"berta"
-        ] * 2
-        told = [fields for name, fields in cloud.told if name == "robot_disconnected"]
-        assert [(each["robot"], each["reason"]) for each in told] == [("anna", REVOKED)]
-        for end in (anna.transport, berta.transport, cloud.transport):
-            await end.close()
-
-    asyncio.run(run())
+    cloud = Cloud(tmp_path / "cloud")
+    endpoint = await cloud.start()
+    anna, berta = (Robot(tmp_path / name, endpoint) for name in ("anna", "berta"))
+    for robot, name in ((anna, b"anna"), (berta, b"berta")):
+        await robot.connected()
+        assert await robot.ask(1) == [name]
+    cloud.holds = True
+    for robot in (anna, berta):
+        robot.transport.call("cloud", 2, b"?")
+    await until(lambda: len(cloud.held) == 2)
+    assert cloud.transport.reload_credentials() == 0, "nobody is revoked yet"
+    revoke_credentials(tmp_path, names=["anna"])
+    assert cloud.transport.reload_credentials() == 1
+    await until(lambda: bool(anna.vanished), anna.events)
+    assert 2 in anna.ended
+    await until(lambda: f"refuses this end, which {REVOKED}" in anna.refusals, anna.refusals)
+    # It is not let in again, and the log says who that was.
+    await until(lambda: cloud.told[-1][0] == "link_refused", cloud.told)
+    again = cloud.told[-1][1]
+    assert (again["robot"], again["reason"]) == ("anna", REVOKED)
+    assert len([name for name, _ in cloud.told if name == "robot_connected"]) == 2
+    # The other one has its answer over the link over which it asked.
+    for call in cloud.held:
+        cloud.answer(call)
+    await until(lambda: 2 in berta.ended)
+    assert berta.boots == ["b1"]
+    assert berta.refusals == []
+    assert [each.payload for each in berta.events if isinstance(each, ReplyReceived)] == [
+        b"berta"
+    ] * 2
+    told = [fields for name, fields in cloud.told if name == "robot_disconnected"]
+    assert [(each["robot"], each["reason"]) for each in told] == [("anna", REVOKED)]
+    for end in (anna.transport, berta.transport, cloud.transport):
+        await end.close()
 
 
 @contextlib.asynccontextmanager
@@ -177,77 +173,65 @@ async def shaken_hands(
 
 
 @pytest.mark.parametrize("protocol", ["tls", "udp"])
-def test_nothing_of_a_revoked_robot_is_handled(tmp_path: Path, protocol: str) -> None:
+async def test_nothing_of_a_revoked_robot_is_handled(tmp_path: Path, protocol: str) -> None:
     """By a service that had the list when it began: no hello is answered, no keys are sent."""
     make_credentials(tmp_path, robots=["anna"], services=["cloud"])
     revoke_credentials(tmp_path, names=["anna"])
-
-    async def run() -> None:
-        cloud = Cloud(tmp_path / "cloud", protocol)
-        cloud.holds = True
-        endpoint = await cloud.start()
-        loop = asyncio.get_running_loop()
-        (tmp_path / "anna" / "revoked.pem").unlink()
-        async with shaken_hands(endpoint, tmp_path / "anna") as (connection, tls):
-            tls.send(encode_hello("robot", "anna", "0", LEASE_MS) + encode_frame(CALL, 1, b"?"))
-            await loop.sock_sendall(connection, tls.take())
-            told = b""
-            while data := await loop.sock_recv(connection, 65536):
-                told += tls.receive(data)
-        (only,) = FrameDecoder(1000).feed(told)
-        assert only.kind == GOODBYE
-        assert read_goodbye(only.payload) == REVOKED
-        ((name, fields),) = cloud.told
-        assert (name, fields["robot"], fields["reason"]) == ("link_refused", "anna", REVOKED)
-        assert cloud.held == []
-        await cloud.transport.close()
-
-    asyncio.run(run())
+    cloud = Cloud(tmp_path / "cloud", protocol)
+    cloud.holds = True
+    endpoint = await cloud.start()
+    loop = asyncio.get_running_loop()
+    (tmp_path / "anna" / "revoked.pem").unlink()
+    async with shaken_hands(endpoint, tmp_path / "anna") as (connection, tls):
+        tls.send(encode_hello("robot", "anna", "0", LEASE_MS) + encode_frame(CALL, 1, b"?"))
+        await loop.sock_sendall(connection, tls.take())
+        told = b""
+        while data := await loop.sock_recv(connection, 65536):
+            told += tls.receive(data)
+    (only,) = FrameDecoder(1000).feed(told)
+    assert only.kind == GOODBYE
+    assert read_goodbye(only.payload) == REVOKED
+    ((name, fields),) = cloud.told
+    assert (name, fields["robot"], fields["reason"]) == ("link_refused", "anna", REVOKED)
+    assert cloud.held == []
+    await cloud.transport.close()
 
 
-def test_a_rotated_robot_is_let_in_by_itself(tmp_path: Path) -> None:
+async def test_a_rotated_robot_is_let_in_by_itself(tmp_path: Path) -> None:
     """Its new credentials are read when it tries again."""
     make_credentials(tmp_path, robots=["anna"], services=["cloud"])
-
-    async def run() -> None:
-        cloud = Cloud(tmp_path / "cloud")
-        anna = Robot(tmp_path / "anna", await cloud.start())
-        await anna.connected()
-        revoke_credentials(tmp_path, names=["anna"])
-        cloud.transport.reload_credentials()
-        await until(lambda: bool(anna.vanished), anna.events)
-        make_credentials(tmp_path, robots=["anna"], rotate=True)
-        await until(lambda: len(anna.boots) == 2, (anna.events, anna.refusals))
-        assert await anna.ask(1) == [b"anna"]
-        for end in (anna.transport, cloud.transport):
-            await end.close()
-
-    asyncio.run(run())
+    cloud = Cloud(tmp_path / "cloud")
+    anna = Robot(tmp_path / "anna", await cloud.start())
+    await anna.connected()
+    revoke_credentials(tmp_path, names=["anna"])
+    cloud.transport.reload_credentials()
+    await until(lambda: bool(anna.vanished), anna.events)
+    make_credentials(tmp_path, robots=["anna"], rotate=True)
+    await until(lambda: len(anna.boots) == 2, (anna.events, anna.refusals))
+    assert await anna.ask(1) == [b"anna"]
+    for end in (anna.transport, cloud.transport):
+        await end.close()
 
 
-def test_a_robot_believes_no_service_that_is_revoked(tmp_path: Path) -> None:
+async def test_a_robot_believes_no_service_that_is_revoked(tmp_path: Path) -> None:
     make_credentials(tmp_path, robots=["anna"], services=["cloud"])
-
-    async def run() -> None:
-        cloud = Cloud(tmp_path / "cloud")
-        endpoint = await cloud.start()
-        first = Robot(tmp_path / "anna", endpoint)
-        await first.connected()
-        revoke_credentials(tmp_path, names=["cloud"])
-        # The robot has the list now; the thief who has the service's key has none.
-        (tmp_path / "cloud" / "revoked.pem").unlink()
-        second = Robot(tmp_path / "anna", endpoint)
-        wanted = f"{REVOKED}; 'holdfast keys DIR --rotate --service NAME' makes a new key"
-        await until(lambda: wanted in second.refusals, second.refusals)
-        assert second.boots == []
-        # One that runs already finds the list when it connects again.
-        cloud.transport.end_links(lambda _: "is to come again")
-        await until(lambda: wanted in first.refusals, first.refusals)
-        assert first.boots == ["b1"]
-        for end in (first.transport, second.transport, cloud.transport):
-            await end.close()
-
-    asyncio.run(run())
+    cloud = Cloud(tmp_path / "cloud")
+    endpoint = await cloud.start()
+    first = Robot(tmp_path / "anna", endpoint)
+    await first.connected()
+    revoke_credentials(tmp_path, names=["cloud"])
+    # The robot has the list now; the thief who has the service's key has none.
+    (tmp_path / "cloud" / "revoked.pem").unlink()
+    second = Robot(tmp_path / "anna", endpoint)
+    wanted = f"{REVOKED}; 'holdfast keys DIR --rotate --service NAME' makes a new key"
+    await until(lambda: wanted in second.refusals, second.refusals)
+    assert second.boots == []
+    # One that runs already finds the list when it connects again.
+    cloud.transport.end_links(lambda _: "is to come again")
+    await until(lambda: wanted in first.refusals, first.refusals)
+    assert first.boots == ["b1"]
+    for end in (first.transport, second.transport, cloud.transport):
+        await end.close()
 
 
 def put(directory: Path, other: Path, *, believing: list[Path]) -> None:
@@ -258,137 +242,117 @@ def put(directory: Path, other: Path, *, believing: list[Path]) -> None:
     (directory / "authority.pem").write_bytes(b"".join(authorities))
 
 
-def test_links_end_whose_authority_is_replaced_and_no_others(tmp_path: Path) -> None:
+async def test_links_end_whose_authority_is_replaced_and_no_others(tmp_path: Path) -> None:
     old, new, cloud_directory = (tmp_path / name for name in ("old", "new", "cloud"))
     make_credentials(old, robots=["anna"], services=["cloud"])
     make_credentials(new, robots=["berta"], services=["cloud"])
     cloud_directory.mkdir()
     put(cloud_directory, old / "cloud", believing=[old / "cloud"])
-
-    async def run() -> None:
-        cloud = Cloud(cloud_directory)
-        endpoint = await cloud.start()
-        anna = Robot(old / "anna", endpoint)
-        await anna.connected()
-        # Both are believed while robots move from one to the other.
-        put(cloud_directory, new / "cloud", believing=[old / "cloud", new / "cloud"])
-        assert cloud.transport.reload_credentials() == 0
-        berta = Robot(new / "berta", endpoint)
-        await berta.connected()
-        put(cloud_directory, new / "cloud", believing=[new / "cloud"])
-        assert cloud.transport.reload_credentials() == 1
-        await until(lambda: f"refuses this end, which {FOREIGN}" in anna.refusals, anna.refusals)
-        assert anna.vanished == anna.boots == ["b1"]
-        assert await berta.ask(1) == [b"berta"]
-        assert berta.boots == ["b1"]
-        told = [fields for name, fields in cloud.told if name == "robot_disconnected"]
-        assert [(each["robot"], each["reason"]) for each in told] == [("anna", FOREIGN)]
-        for end in (anna.transport, berta.transport, cloud.transport):
-            await end.close()
-
-    asyncio.run(run())
+    cloud = Cloud(cloud_directory)
+    endpoint = await cloud.start()
+    anna = Robot(old / "anna", endpoint)
+    await anna.connected()
+    # Both are believed while robots move from one to the other.
+    put(cloud_directory, new / "cloud", believing=[old / "cloud", new / "cloud"])
+    assert cloud.transport.reload_credentials() == 0
+    berta = Robot(new / "berta", endpoint)
+    await berta.connected()
+    put(cloud_directory, new / "cloud", believing=[new / "cloud"])
+    assert cloud.transport.reload_credentials() == 1
+    await until(lambda: f"refuses this end, which {FOREIGN}" in anna.refusals, anna.refusals)
+    assert anna.vanished == anna.boots == ["b1"]
+    assert await berta.ask(1) == [b"berta"]
+    assert berta.boots == ["b1"]
+    told = [fields for name, fields in cloud.told if name == "robot_disconnected"]
+    assert [(each["robot"], each["reason"]) for each in told] == [("anna", FOREIGN)]
+    for end in (anna.transport, berta.transport, cloud.transport):
+        await end.close()
 
 
-def test_who_has_shown_a_certificate_and_said_no_hello_is_ended_with_the_others(
+async def test_who_has_shown_a_certificate_and_said_no_hello_is_ended_with_the_others(
     tmp_path: Path,
 ) -> None:
     make_credentials(tmp_path, robots=["anna", "berta"], services=["cloud"])
-
-    async def run() -> None:
-        cloud = Cloud(tmp_path / "cloud")
-        endpoint = await cloud.start()
-        loop = asyncio.get_running_loop()
-        async with (
-            shaken_hands(endpoint, tmp_path / "anna") as (connection, tls),
-            shaken_hands(endpoint, tmp_path / "berta") as (other, other_tls),
-        ):
-            for each, its_tls in ((connection, tls), (other, other_tls)):
-                await loop.sock_sendall(each, its_tls.take())
-            waiting = cloud.transport._without_hello
-            await until(lambda: [link.peer is not None for link in waiting] == [True, True])
-            revoke_credentials(tmp_path, names=["anna"])
-            assert cloud.transport.reload_credentials() == 1
-            told = b""
-            while data := await loop.sock_recv(connection, 65536):
-                told += tls.receive(data)
-            (last,) = FrameDecoder(1000).feed(told)
-            assert read_goodbye(last.payload) == REVOKED
-            assert [link.peer.name for link in waiting if link.peer] == ["berta"]
-        await cloud.transport.close()
-
-    asyncio.run(run())
+    cloud = Cloud(tmp_path / "cloud")
+    endpoint = await cloud.start()
+    loop = asyncio.get_running_loop()
+    async with (
+        shaken_hands(endpoint, tmp_path / "anna") as (connection, tls),
+        shaken_hands(endpoint, tmp_path / "berta") as (other, other_tls),
+    ):
+        for each, its_tls in ((connection, tls), (other, other_tls)):
+            await loop.sock_sendall(each, its_tls.take())
+        waiting = cloud.transport._without_hello
+        await until(lambda: [link.peer is not None for link in waiting] == [True, True])
+        revoke_credentials(tmp_path, names=["anna"])
+        assert cloud.transport.reload_credentials() == 1
+        told = b""
+        while data := await loop.sock_recv(connection, 65536):
+            told += tls.receive(data)
+        (last,) = FrameDecoder(1000).feed(told)
+        assert read_goodbye(last.payload) == REVOKED
+        assert [link.peer.name for link in waiting if link.peer] == ["berta"]
+    await cloud.transport.close()
 
 
 @pytest.mark.parametrize("reason", [REVOKED, FOREIGN])
-def test_who_shook_hands_before_the_files_came_is_not_let_in_after_them(
+async def test_who_shook_hands_before_the_files_came_is_not_let_in_after_them(
     tmp_path: Path, reason: str
 ) -> None:
     make_credentials(tmp_path, robots=["anna"], services=["cloud"])
     make_credentials(tmp_path / "other", services=["cloud"])
-
-    async def run() -> None:
-        cloud = Cloud(tmp_path / "cloud")
-        endpoint = await cloud.start()
-        loop = asyncio.get_running_loop()
-        async with shaken_hands(endpoint, tmp_path / "anna") as (connection, tls):
-            if reason == REVOKED:
-                revoke_credentials(tmp_path, names=["anna"])
-            else:
-                other = tmp_path / "other" / "cloud"
-                put(tmp_path / "cloud", other, believing=[other])
-            assert cloud.transport.reload_credentials() == 0, "it has not shown a certificate yet"
-            tls.send(encode_hello("robot", "anna", "0", LEASE_MS))
-            await loop.sock_sendall(connection, tls.take())
-            told = b""
-            while data := await loop.sock_recv(connection, 65536):
-                told += tls.receive(data)
-        last = list(FrameDecoder(1000).feed(told))[-1]
-        assert last.kind == GOODBYE
-        assert read_goodbye(last.payload) == reason
-        assert [name for name, _ in cloud.told] == ["link_refused"]
-        await cloud.transport.close()
-
-    asyncio.run(run())
+    cloud = Cloud(tmp_path / "cloud")
+    endpoint = await cloud.start()
+    loop = asyncio.get_running_loop()
+    async with shaken_hands(endpoint, tmp_path / "anna") as (connection, tls):
+        if reason == REVOKED:
+            revoke_credentials(tmp_path, names=["anna"])
+        else:
+            other = tmp_path / "other" / "cloud"
+            put(tmp_path / "cloud", other, believing=[other])
+        assert cloud.transport.reload_credentials() == 0, "it has not shown a certificate yet"
+        tls.send(encode_hello("robot", "anna", "0", LEASE_MS))
+        await loop.sock_sendall(connection, tls.take())
+        told = b""
+        while data := await loop.sock_recv(connection, 65536):
+            told += tls.receive(data)
+    last = list(FrameDecoder(1000).feed(told))[-1]
+    assert last.kind == GOODBYE
+    assert read_goodbye(last.payload) == reason
+    assert [name for name, _ in cloud.told] == ["link_refused"]
+    await cloud.transport.close()
 
 
-def test_credentials_that_cannot_be_read_leave_those_of_before(tmp_path: Path) -> None:
+async def test_credentials_that_cannot_be_read_leave_those_of_before(tmp_path: Path) -> None:
     make_credentials(tmp_path, robots=["anna"], services=["cloud"])
-
-    async def run() -> None:
-        cloud = Cloud(tmp_path / "cloud")
-        endpoint = await cloud.start()
-        for name in ("revoked.pem", "key.pem"):
-            (tmp_path / "cloud" / name).write_bytes(b"half a fi")
-            with pytest.raises(TransportError, match=r"is no private key|revoked"):
-                cloud.transport.reload_credentials()
-            (tmp_path / "cloud" / name).unlink()
-        anna = Robot(tmp_path / "anna", endpoint)
-        await anna.connected()
-        for end in (anna.transport, cloud.transport):
-            await end.close()
-
-    asyncio.run(run())
+    cloud = Cloud(tmp_path / "cloud")
+    endpoint = await cloud.start()
+    for name in ("revoked.pem", "key.pem"):
+        (tmp_path / "cloud" / name).write_bytes(b"half a fi")
+        with pytest.raises(TransportError, match=r"is no private key|revoked"):
+            cloud.transport.reload_credentials()
+        (tmp_path / "cloud" / name).unlink()
+    anna = Robot(tmp_path / "anna", endpoint)
+    await anna.connected()
+    for end in (anna.transport, cloud.transport):
+        await end.close()
 
 
-def test_files_of_a_robot_that_do_not_belong_together_leave_those_of_before(
+async def test_files_of_a_robot_that_do_not_belong_together_leave_those_of_before(
     tmp_path: Path,
 ) -> None:
     make_credentials(tmp_path, robots=["anna", "berta"], services=["cloud"])
-
-    async def run() -> None:
-        cloud = Cloud(tmp_path / "cloud")
-        anna = Robot(tmp_path / "anna", await cloud.start())
-        await anna.connected()
-        (tmp_path / "anna" / "key.pem").write_bytes((tmp_path / "berta" / "key.pem").read_bytes())
-        cloud.transport.end_links(lambda _: "is to come again")
-        await until(lambda: len(anna.boots) == 2, (anna.events, anna.refusals))
-        (told,) = [each for each in anna.refusals if "key.pem: is not the key of " in each]
-        assert told.endswith("certificate.pem; the previous ones stay in use")
-        assert await anna.ask(1) == [b"anna"]
-        for end in (anna.transport, cloud.transport):
-            await end.close()
-
-    asyncio.run(run())
+    cloud = Cloud(tmp_path / "cloud")
+    anna = Robot(tmp_path / "anna", await cloud.start())
+    await anna.connected()
+    (tmp_path / "anna" / "key.pem").write_bytes((tmp_path / "berta" / "key.pem").read_bytes())
+    cloud.transport.end_links(lambda _: "is to come again")
+    await until(lambda: len(anna.boots) == 2, (anna.events, anna.refusals))
+    (told,) = [each for each in anna.refusals if "key.pem: is not the key of " in each]
+    assert told.endswith("certificate.pem; the previous ones stay in use")
+    assert await anna.ask(1) == [b"anna"]
+    for end in (anna.transport, cloud.transport):
+        await end.close()
 
 
 def short_lived(directory: Path, seconds: float, **names: list[str]) -> None:
@@ -397,40 +361,32 @@ def short_lived(directory: Path, seconds: float, **names: list[str]) -> None:
     make_credentials(directory, days=1, now=end - timedelta(days=1), **names)  # type: ignore[arg-type]
 
 
-def test_a_robots_link_ends_when_its_certificate_expires(tmp_path: Path) -> None:
+async def test_a_robots_link_ends_when_its_certificate_expires(tmp_path: Path) -> None:
     make_credentials(tmp_path, robots=["berta"], services=["cloud"])
     short_lived(tmp_path, 3.0, robots=["anna"])
     load_credentials(tmp_path / "anna", "robot", warn=lambda _: None)
-
-    async def run() -> None:
-        cloud = Cloud(tmp_path / "cloud")
-        endpoint = await cloud.start()
-        anna, berta = (Robot(tmp_path / name, endpoint) for name in ("anna", "berta"))
-        for robot in (anna, berta):
-            await robot.connected()
-        await until(lambda: bool(anna.vanished), anna.events)
-        why = "refuses this end, which has a certificate that has expired"
-        await until(lambda: why in anna.refusals, anna.refusals)
-        assert anna.boots == ["b1"]
-        assert berta.boots == ["b1"]
-        assert not berta.vanished
-        for end in (anna.transport, berta.transport, cloud.transport):
-            await end.close()
-
-    asyncio.run(run())
+    cloud = Cloud(tmp_path / "cloud")
+    endpoint = await cloud.start()
+    anna, berta = (Robot(tmp_path / name, endpoint) for name in ("anna", "berta"))
+    for robot in (anna, berta):
+        await robot.connected()
+    await until(lambda: bool(anna.vanished), anna.events)
+    why = "refuses this end, which has a certificate that has expired"
+    await until(lambda: why in anna.refusals, anna.refusals)
+    assert anna.boots == ["b1"]
+    assert berta.boots == ["b1"]
+    assert not berta.vanished
+    for end in (anna.transport, berta.transport, cloud.transport):
+        await end.close()
 
 
-def test_a_robot_leaves_a_service_whose_certificate_expires(tmp_path: Path) -> None:
+async def test_a_robot_leaves_a_service_whose_certificate_expires(tmp_path: Path) -> None:
     make_credentials(tmp_path, robots=["anna"])
     short_lived(tmp_path, 3.0, services=["cloud"])
-
-    async def run() -> None:
-        cloud = Cloud(tmp_path / "cloud")
-        anna = Robot(tmp_path / "anna", await cloud.start())
-        await anna.connected()
-        await until(lambda: bool(anna.vanished), anna.events)
-        assert "has a certificate that has expired" in anna.refusals
-        for end in (anna.transport, cloud.transport):
-            await end.close()
-
-    asyncio.run(run())
+    cloud = Cloud(tmp_path / "cloud")
+    anna = Robot(tmp_path / "anna", await cloud.start())
+    await anna.connected()
+    await until(lambda: bool(anna.vanished), anna.events)
+    assert "has a certificate that has expired" in anna.refusals
+    for end in (anna.transport, cloud.transport):
+        await end.close()
