@@ -138,22 +138,19 @@ class TestBounds:
 
         run(test)
 
-    def test_close_ends_connections_and_frees_the_port(self) -> None:
-        async def main() -> None:
-            async with serving() as address:
-                reader, writer = await asyncio.open_connection(*address)
-                await asyncio.sleep(0)  # it is accepted in some later turn
-                assert (await exchange(address, b"GET /livez HTTP/1.1\r\n\r\n")).endswith(b"ok\n")
-            async with asyncio.timeout(PATIENCE_S):
-                with contextlib.suppress(ConnectionResetError):
-                    assert await reader.read() == b""
-            writer.close()
-            with pytest.raises(ConnectionRefusedError):
-                await asyncio.open_connection(*address)
-            async with serving(*address) as again:
-                assert again == address
-
-        asyncio.run(main())
+    async def test_close_ends_connections_and_frees_the_port(self) -> None:
+        async with serving() as address:
+            reader, writer = await asyncio.open_connection(*address)
+            await asyncio.sleep(0)  # it is accepted in some later turn
+            assert (await exchange(address, b"GET /livez HTTP/1.1\r\n\r\n")).endswith(b"ok\n")
+        async with asyncio.timeout(PATIENCE_S):
+            with contextlib.suppress(ConnectionResetError):
+                assert await reader.read() == b""
+        writer.close()
+        with pytest.raises(ConnectionRefusedError):
+            await asyncio.open_connection(*address)
+        async with serving(*address) as again:
+            assert again == address
 
 
 class TestAddresses:
@@ -181,25 +178,19 @@ class TestAddresses:
         with pytest.raises(argparse.ArgumentTypeError, match=re.escape(f"is {text!r}: ")):
             http_address(text)
 
-    def test_an_address_of_another_machine_is_named_once(self) -> None:
-        async def main() -> None:
-            text = r"health or metrics at 192\.0\.2\.1:8080: Cannot assign requested address: "
-            text += r"this machine has no such address \(0\.0\.0\.0 is all that it has\)"
-            with pytest.raises(HealthError, match=f"^{text}$"):
-                async with serving("192.0.2.1", 8080):
+    async def test_an_address_of_another_machine_is_named_once(self) -> None:
+        text = r"health or metrics at 192\.0\.2\.1:8080: Cannot assign requested address: "
+        text += r"this machine has no such address \(0\.0\.0\.0 is all that it has\)"
+        with pytest.raises(HealthError, match=f"^{text}$"):
+            async with serving("192.0.2.1", 8080):
+                pass
+
+    async def test_a_port_that_is_taken_is_named(self) -> None:
+        with socket.socket() as other:
+            other.bind(("127.0.0.1", 0))
+            other.listen()
+            port = other.getsockname()[1]
+            text = rf"127\.0\.0\.1:{port}: another program listens there"
+            with pytest.raises(HealthError, match=text):
+                async with serving("127.0.0.1", port):
                     pass
-
-        asyncio.run(main())
-
-    def test_a_port_that_is_taken_is_named(self) -> None:
-        async def main() -> None:
-            with socket.socket() as other:
-                other.bind(("127.0.0.1", 0))
-                other.listen()
-                port = other.getsockname()[1]
-                text = rf"127\.0\.0\.1:{port}: another program listens there"
-                with pytest.raises(HealthError, match=text):
-                    async with serving("127.0.0.1", port):
-                        pass
-
-        asyncio.run(main())

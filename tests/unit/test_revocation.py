@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import NameOID
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.unit.test_key_ring import run_keys
+from tests.unit.test_key_ring import contents_of, run_keys
 
 from holdfast.errors import CredentialsError, TransportError
 from holdfast.transport.credentials import load_credentials
@@ -34,14 +34,6 @@ def serial_of(directory: Path) -> int:
 
 def list_in(directory: Path) -> x509.CertificateRevocationList:
     return x509.load_pem_x509_crl((directory / REVOKED_FILE).read_bytes())
-
-
-def contents_of(directory: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(directory)): path.read_bytes()
-        for path in sorted(directory.rglob("*"))
-        if path.is_file()
-    }
 
 
 @pytest.fixture

@@ -56,10 +56,3 @@ def test_it_says_what_it_lacks(
     said = run_here(capsys, tmp_path, "ros1-serve", "--configuration", str(EXAMPLE))
     assert (said.code, said.stdout) == (2, "")
     assert "ROS messages need rosbags: pip install rosbags" in said.stderr
-
-
-def test_it_has_the_options_of_serve(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    said = run_here(capsys, tmp_path, "ros1-serve", "--help")
-    assert said.code == 0
-    assert "--listen ENDPOINT" in said.stdout
-    assert "--ros1-name NAME" in said.stdout

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
 import gc
 import math
 import socket
 import threading
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
 from typing import Any, cast
 
 import pytest
@@ -49,16 +48,6 @@ from holdfast_lab.testbed.in_process import InProcessNetwork
 
 PATIENCE_S = 30.0
 LARGE = b"x" * (65 << 10)
-
-
-def on_a_loop(test: Callable[..., Awaitable[None]]) -> Callable[..., None]:
-    """Run a test on an event loop; only a hang takes so long."""
-
-    @functools.wraps(test)
-    def run(**arguments: Any) -> None:
-        asyncio.run(asyncio.wait_for(test(**arguments), PATIENCE_S))
-
-    return run
 
 
 class Patient:
@@ -188,7 +177,6 @@ def next_request(robot: Robot) -> bytes:
     return encode(robot.request(since=max(0, len(robot.observed) - 1)))
 
 
-@on_a_loop
 async def test_trials_of_many_robots_at_once() -> None:
     async with joined() as both:
         robots = [(Patient(both.network), Robot(key=key, seed=key)) for key in range(1, 9)]
@@ -201,7 +189,6 @@ async def test_trials_of_many_robots_at_once() -> None:
     assert all(computed >= 0.0 and waited >= 0.0 for _, computed, waited in both.timed)
 
 
-@on_a_loop
 async def test_first_jobs_and_other_peoples_code_run_on_threads() -> None:
     async with joined() as both:
         both.held.let_go.set()
@@ -215,7 +202,6 @@ async def test_first_jobs_and_other_peoples_code_run_on_threads() -> None:
     [b"damaged", with_checksum(b"no request"), with_checksum(b"\x9b\x7f"), LARGE],
     ids=["checksum", "form", "version", "large"],
 )
-@on_a_loop
 async def test_what_is_refused_leaves_nothing_for_the_collector(payload: bytes) -> None:
     """An error holds the frames that it went through, and would be held by one of them."""
     async with joined() as both:
@@ -234,7 +220,6 @@ async def test_what_is_refused_leaves_nothing_for_the_collector(payload: bytes) 
             gc.enable()
 
 
-@on_a_loop
 async def test_signs_of_progress_while_a_worker_computes() -> None:
     async with joined() as both:
         patient, call, _ = await both.robot_in_work(1)
@@ -249,7 +234,6 @@ async def test_signs_of_progress_while_a_worker_computes() -> None:
         assert any(isinstance(reply, SensingAnswer) for reply in replies)
 
 
-@on_a_loop
 async def test_calls_are_heard_while_all_workers_compute() -> None:
     async with joined(workers=1, max_waiting=1) as both:
         patient, first, _ = await both.robot_in_work(1)
@@ -268,7 +252,7 @@ async def test_calls_are_heard_while_all_workers_compute() -> None:
     ("bound", "value"),
     [("_MAX_UNDECODED", 2), ("_MAX_UNDECODED_BYTES", int(2.5 * len(LARGE)))],
 )
-def test_large_requests_beyond_the_bound_are_turned_away_unread(
+async def test_large_requests_beyond_the_bound_are_turned_away_unread(
     bound: str, value: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shell, bound, value)
@@ -280,31 +264,27 @@ def test_large_requests_beyond_the_bound_are_turned_away_unread(
         return decode_request(payload)
 
     monkeypatch.setattr(shell, "decode_request", decode)
-
-    async def test() -> None:
-        async with joined() as both:
-            patient = Patient(both.network)
-            kept = {patient.send(LARGE), patient.send(LARGE)}
-            unread = {patient.send(LARGE) for _ in range(28)}
-            # What is small is decoded meanwhile.
-            assert isinstance((await Patient(both.network).ask(b"rubbish"))[0], Refused)
-            delays = set()
-            for replies in (await patient.collect(unread)).values():
-                (busy,) = replies
-                assert isinstance(busy, Busy)
-                assert busy.number == 0
-                delays.add(busy.retry_after_ms)
-            assert min(delays) == 100
-            assert len(delays) > 20  # they do not come back all at once
-            assert both.shell.statistics().busy == 28
-            let_go.set()
-            for replies in (await patient.collect(kept)).values():
-                assert isinstance(replies[0], Refused)
-            # There is room again.
-            assert isinstance((await patient.ask(LARGE))[0], Refused)
-            assert both.log.events[0][0] == "busy"
-
-    on_a_loop(test)()
+    async with joined() as both:
+        patient = Patient(both.network)
+        kept = {patient.send(LARGE), patient.send(LARGE)}
+        unread = {patient.send(LARGE) for _ in range(28)}
+        # What is small is decoded meanwhile.
+        assert isinstance((await Patient(both.network).ask(b"rubbish"))[0], Refused)
+        delays = set()
+        for replies in (await patient.collect(unread)).values():
+            (busy,) = replies
+            assert isinstance(busy, Busy)
+            assert busy.number == 0
+            delays.add(busy.retry_after_ms)
+        assert min(delays) == 100
+        assert len(delays) > 20  # they do not come back all at once
+        assert both.shell.statistics().busy == 28
+        let_go.set()
+        for replies in (await patient.collect(kept)).values():
+            assert isinstance(replies[0], Refused)
+        # There is room again.
+        assert isinstance((await patient.ask(LARGE))[0], Refused)
+        assert both.log.events[0][0] == "busy"
 
 
 class LargeCall:
@@ -330,7 +310,7 @@ class LargeCall:
         return decode_reply(self.replies[-1])
 
 
-def test_one_robot_takes_no_room_for_large_requests_from_another(
+async def test_one_robot_takes_no_room_for_large_requests_from_another(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(shell, "_MAX_UNDECODED_BYTES", 2 * len(LARGE))
@@ -341,36 +321,27 @@ def test_one_robot_takes_no_room_for_large_requests_from_another(
         return decode_request(payload)
 
     monkeypatch.setattr(shell, "decode_request", decode)
-
-    async def test() -> None:
-        async with joined() as both:
-            names = ["mallory"] * 3 + ["anna", "berta", "anna", "carla"]
-            calls = [LargeCall(name) for name in names]
-            for call in calls:
-                both.shell.deliver(call)
-            for index in (2, 5, 6):  # hers beyond the room, and all beyond twice the room
-                assert isinstance(await calls[index].answer(), Busy)
-            let_go.set()
-            for index in (0, 1, 3, 4):
-                assert isinstance(await calls[index].answer(), Refused)
-
-    on_a_loop(test)()
+    async with joined() as both:
+        names = ["mallory"] * 3 + ["anna", "berta", "anna", "carla"]
+        calls = [LargeCall(name) for name in names]
+        for call in calls:
+            both.shell.deliver(call)
+        for index in (2, 5, 6):  # hers beyond the room, and all beyond twice the room
+            assert isinstance(await calls[index].answer(), Busy)
+        let_go.set()
+        for index in (0, 1, 3, 4):
+            assert isinstance(await calls[index].answer(), Refused)
 
 
-def test_one_call_is_let_in_however_large_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_one_call_is_let_in_however_large_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shell, "_MAX_UNDECODED_BYTES", 10)
-
-    async def test() -> None:
-        async with joined() as both:
-            assert isinstance((await Patient(both.network).ask(LARGE))[0], Refused)
-
-    on_a_loop(test)()
+    async with joined() as both:
+        assert isinstance((await Patient(both.network).ask(LARGE))[0], Refused)
 
 
 @pytest.mark.parametrize(
     "error", [KeyboardInterrupt(), asyncio.CancelledError(), GeneratorExit(), SystemExit(1)]
 )
-@on_a_loop
 async def test_a_problem_that_raises_anything_costs_no_worker(error: BaseException) -> None:
     async with joined() as both:
         both.held.error = error
@@ -385,7 +356,6 @@ async def test_a_problem_that_raises_anything_costs_no_worker(error: BaseExcepti
 
 
 @pytest.mark.parametrize("event", ["refused", "session_taken_over"])
-@on_a_loop
 async def test_what_happens_often_is_logged_now_and_then_with_its_number(event: str) -> None:
     """Whoever raises the epoch of its own session with each message must not fill a disk."""
     async with joined() as both:
@@ -405,7 +375,6 @@ async def test_what_happens_often_is_logged_now_and_then_with_its_number(event: 
         assert len(told) < 50
 
 
-@on_a_loop
 async def test_close_does_not_wait_for_a_computation() -> None:
     async with joined(workers=1) as both:
         patient, call, _ = await both.robot_in_work(1)
@@ -419,7 +388,6 @@ async def test_close_does_not_wait_for_a_computation() -> None:
         assert ServiceVanished("service", "boot") in events
 
 
-@on_a_loop
 async def test_a_service_that_drains_answers_whoever_is_still_there() -> None:
     async with joined(workers=1) as both:
         patient, call, _ = await both.robot_in_work(1)
@@ -433,7 +401,6 @@ async def test_a_service_that_drains_answers_whoever_is_still_there() -> None:
         assert isinstance(replies[-1], SensingAnswer)
 
 
-@on_a_loop
 async def test_draining_ends_at_its_bound() -> None:
     async with joined(workers=1) as both:
         await both.robot_in_work(1)
@@ -506,7 +473,6 @@ def scripted(*jobs: tuple[str, float, Callable[[], object]]) -> tuple[Script, Se
     return machine, ServiceShell(machine, InProcessNetwork().service("service", "boot"), Log())
 
 
-@on_a_loop
 async def test_a_call_whose_link_has_ended_is_reported_once_and_not_within_a_reply() -> None:
     machine, both = scripted()
     await both.start()
@@ -523,7 +489,6 @@ async def test_a_call_whose_link_has_ended_is_reported_once_and_not_within_a_rep
     await both.close()
 
 
-@on_a_loop
 async def test_what_has_arrived_is_heard_before_the_next_brief_job() -> None:
     here, there = socket.socketpair()
     threads = []
@@ -554,7 +519,6 @@ async def test_what_has_arrived_is_heard_before_the_next_brief_job() -> None:
     assert set(threads) == {threading.current_thread()}
 
 
-@on_a_loop
 async def test_long_jobs_run_beside_each_other_and_beside_the_loop() -> None:
     meeting = threading.Barrier(3, timeout=PATIENCE_S)
     machine, both = scripted(("one", 0.002, meeting.wait), ("two", math.inf, meeting.wait))
@@ -569,7 +533,6 @@ async def test_long_jobs_run_beside_each_other_and_beside_the_loop() -> None:
     await both.close()
 
 
-@on_a_loop
 async def test_the_way_to_a_thread_and_back_is_no_part_of_a_jobs_time() -> None:
     """Else a brief job that was once sent to a thread would be sent there for ever."""
     loop, here = asyncio.get_running_loop(), threading.current_thread()
@@ -606,7 +569,6 @@ def broken(*_: object) -> None:
 
 
 @pytest.mark.parametrize("expected_s", [1e-4, math.inf], ids=["loop", "thread"])
-@on_a_loop
 async def test_a_job_with_a_defect_is_refused_alone(expected_s: float) -> None:
     machine, both = scripted(("one", expected_s, broken))
     await both.start()
@@ -623,7 +585,6 @@ async def test_a_job_with_a_defect_is_refused_alone(expected_s: float) -> None:
 
 
 @pytest.mark.parametrize("method", ["receive", "finished", "tick", "started"])
-@on_a_loop
 async def test_a_machine_with_a_defect_forgets_everything_and_goes_on(
     method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

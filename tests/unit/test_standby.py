@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import signal
 import socket
 import sys
@@ -13,7 +12,6 @@ from tests.master_state import known
 
 from ros1_master_guard import process as master_process
 from ros1_master_guard.errors import GuardError
-from ros1_master_guard.process import MasterState
 from ros1_master_guard.settings import GuardSettings, MasterAddress
 from ros1_master_guard.standby import MasterProcess
 
@@ -26,7 +24,7 @@ def settings(directory: Path, program: str) -> GuardSettings:
     return GuardSettings(MasterAddress("localhost", 11311, "127.0.0.1"), str(python))
 
 
-def test_what_a_master_told_is_known_when_it_has_ended(tmp_path: Path) -> None:
+async def test_what_a_master_told_is_known_when_it_has_ended(tmp_path: Path) -> None:
     program = f"""
 import os, socket, sys
 sys.path.insert(0, {str(Path(master_process.__file__).parent)!r})
@@ -39,60 +37,44 @@ guard.sendall(encoded(state))
 for number in range(2000): guard.sendall(encoded(('parameters', '/a', [number] * 100)))
 os.kill(os.getpid(), 9)
 """
-
-    async def run() -> tuple[int, MasterState]:
-        with socket.socket() as listening:
-            process = MasterProcess(settings(tmp_path, program), listening)
-            await process.serve(known())
-            code = await process.ended
-            assert process.link.following is not None
-            await process.link.following
-            await process.end()
-            return code, process.link.state
-
     expected = known()
     expected.parameters["a"] = [1999] * 100
-    assert asyncio.run(run()) == (-signal.SIGKILL, expected)
+    with socket.socket() as listening:
+        process = MasterProcess(settings(tmp_path, program), listening)
+        await process.serve(known())
+        assert await process.ended == -signal.SIGKILL
+        assert process.link.following is not None
+        await process.link.following
+        await process.end()
+    assert process.link.state == expected
 
 
-def test_a_process_that_ignores_the_signal_is_killed(tmp_path: Path) -> None:
+async def test_a_process_that_ignores_the_signal_is_killed(tmp_path: Path) -> None:
     program = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); signal.pause()"
-
-    async def run() -> int:
-        with socket.socket() as listening:
-            process = MasterProcess(settings(tmp_path, program), listening)
-            await process.end(signal.SIGSTOP)
-            return await process.ended
-
-    assert asyncio.run(run()) == -signal.SIGKILL
+    with socket.socket() as listening:
+        process = MasterProcess(settings(tmp_path, program), listening)
+        await process.end(signal.SIGSTOP)
+        assert await process.ended == -signal.SIGKILL
 
 
-def test_a_python_without_ros_is_named(tmp_path: Path) -> None:
+async def test_a_python_without_ros_is_named(tmp_path: Path) -> None:
     # Isolated and without site-packages, no Python has rosmaster.
     python = tmp_path / "python"
     python.write_text(f'#!/bin/sh\nexec {sys.executable} -I -S "$@"\n')
     python.chmod(0o755)
     settings = GuardSettings(MasterAddress("localhost", 11311, "127.0.0.1"), str(python))
-
-    async def run() -> None:
-        with socket.socket() as listening:
-            process = MasterProcess(settings, listening)
-            try:
-                await process.warm()
-            finally:
-                await process.end()
-
-    with pytest.raises(GuardError, match=r"cannot run a ROS 1 master .*rosmaster"):
-        asyncio.run(run())
+    with socket.socket() as listening:
+        process = MasterProcess(settings, listening)
+        with pytest.raises(GuardError, match=r"cannot run a ROS 1 master .*rosmaster"):
+            await process.warm()
+        await process.end()
 
 
-def test_a_python_that_is_not_there_is_named(tmp_path: Path) -> None:
+async def test_a_python_that_is_not_there_is_named(tmp_path: Path) -> None:
     address = MasterAddress("localhost", 11311, "127.0.0.1")
     settings = GuardSettings(address, str(tmp_path / "python"))
-
-    async def run() -> None:
-        with socket.socket() as listening:
-            MasterProcess(settings, listening)
-
-    with pytest.raises(GuardError, match="cannot be run: No such file"):
-        asyncio.run(run())
+    with (
+        socket.socket() as listening,
+        pytest.raises(GuardError, match="cannot be run: No such file"),
+    ):
+        MasterProcess(settings, listening)
