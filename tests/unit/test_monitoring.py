@@ -7,7 +7,7 @@ import asyncio
 import contextlib
 import re
 import socket
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 
 import pytest
 
@@ -48,14 +48,6 @@ async def exchange(address: HttpAddress, request: bytes) -> bytes:
         writer.close()
 
 
-def run(test: Callable[[HttpAddress], Awaitable[None]], host: str = "127.0.0.1") -> None:
-    async def main() -> None:
-        async with serving(host) as address:
-            await test(address)
-
-    asyncio.run(main())
-
-
 class TestAnswers:
     @pytest.mark.parametrize(
         ("request_line", "status", "body"),
@@ -72,17 +64,15 @@ class TestAnswers:
             (b"\x16\x03\x01 hello TLS", b"400 Bad Request", b"this is no request of HTTP/1\n"),
         ],
     )
-    def test_to_a_request(self, request_line: bytes, status: bytes, body: bytes) -> None:
-        async def test(address: HttpAddress) -> None:
+    async def test_to_a_request(self, request_line: bytes, status: bytes, body: bytes) -> None:
+        async with serving() as address:
             answer = await exchange(address, request_line + b"\r\nHost: here\r\n\r\n")
             head, _, got = answer.partition(b"\r\n\r\n")
             assert head.startswith(b"HTTP/1.1 " + status + b"\r\n")
             assert got == body
 
-        run(test)
-
-    def test_a_head_in_pieces(self) -> None:
-        async def test(address: HttpAddress) -> None:
+    async def test_a_head_in_pieces(self) -> None:
+        async with serving() as address:
             reader, writer = await asyncio.open_connection(*address)
             for piece in (b"GET /li", b"vez HTTP/1.1\r\nHo", b"st: here\r\n", b"\r", b"\n"):
                 writer.write(piece)
@@ -92,37 +82,27 @@ class TestAnswers:
                 assert (await reader.read()).endswith(b"\r\n\r\nok\n")
             writer.close()
 
-        run(test)
-
-    def test_a_head_without_an_end(self) -> None:
-        async def test(address: HttpAddress) -> None:
+    async def test_a_head_without_an_end(self) -> None:
+        async with serving() as address:
             answer = await exchange(address, b"GET /livez HTTP/1.1\r\n" + b"X: y\r\n" * 1365)
             assert answer.startswith(b"HTTP/1.1 431 ")
 
-        run(test)
-
-    def test_over_version_6(self) -> None:
+    async def test_over_version_6(self) -> None:
         if not socket.has_dualstack_ipv6():
             pytest.skip("no IPv6 here")
-
-        async def test(address: HttpAddress) -> None:
+        async with serving("::1") as address:
             assert (await exchange(address, b"GET /livez HTTP/1.1\r\n\r\n")).endswith(b"ok\n")
-
-        run(test, "::1")
 
 
 class TestBounds:
-    def test_silent_connections_are_sent_away(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def test_silent_connections_are_sent_away(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(health, "_TIMEOUT_S", 0.05)
-
-        async def test(address: HttpAddress) -> None:
+        async with serving() as address:
             with contextlib.suppress(ConnectionResetError):
                 assert await exchange(address, b"GET /livez HTTP/1.1\r\n") == b""
 
-        run(test)
-
-    def test_the_oldest_connection_makes_room(self) -> None:
-        async def test(address: HttpAddress) -> None:
+    async def test_the_oldest_connection_makes_room(self) -> None:
+        async with serving() as address:
             silent = [await asyncio.open_connection(*address) for _ in range(65)]
             assert (await exchange(address, b"GET /livez HTTP/1.1\r\n\r\n")).endswith(b"ok\n")
             for reader, _ in silent[:2]:
@@ -135,8 +115,6 @@ class TestBounds:
                 assert (await reader.read()).endswith(b"ok\n")
             for _, writer in silent:
                 writer.close()
-
-        run(test)
 
     async def test_close_ends_connections_and_frees_the_port(self) -> None:
         async with serving() as address:
