@@ -139,9 +139,8 @@ def _clock(budget_s: float, patience_s: float) -> Iterator[None]:
     began = since = perf_counter()
     running: FrameType | None = None
 
-    def look(number: int, frame: FrameType | None) -> None:
+    def look(_: int, frame: FrameType | None) -> None:
         nonlocal running, since
-        del number
         call = None
         while frame is not None and not frame.f_code.co_filename.startswith(_OURS):
             if is_users_file(frame.f_code.co_filename):

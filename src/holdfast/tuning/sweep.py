@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -83,10 +84,7 @@ def arms_of(
             # 1 and true are equal but not the same.
             if repr(value) in map(repr, values[:index]):
                 raise InvalidValueError(f"{key} has the value {_text(value)} twice")
-    count = 1
-    for values in axes.values():
-        count *= len(values)
-    if count > MAX_ARMS:
+    if (count := math.prod(map(len, axes.values()))) > MAX_ARMS:
         raise InvalidValueError(f"{count:,} combinations; a sweep has at most {MAX_ARMS}")
     varied = [key for key, values in axes.items() if len(values) > 1]
     arms: list[SweptArm] = []

@@ -89,7 +89,6 @@ class Tuning(Table, msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
-_WIDEST_STATE = 60
 _COLUMNS = CandidateRow.__struct_fields__
 
 
@@ -99,12 +98,10 @@ def _in_its_unit(objective: Objective, *costs: float) -> list[float]:
 
 
 def _raced(each: CandidateRow, objective: Objective) -> tuple[str, ...]:
-    state = textwrap.shorten(each.state, _WIDEST_STATE, placeholder=" ...")
+    state = textwrap.shorten(each.state, 60, placeholder=" ...")
     if each.cost is None or each.difference is None or each.interval is None:
         return (each.candidate, str(each.trials), *6 * ("",), state)
-    (value,), (difference,) = (
-        _in_its_unit(objective, cost) for cost in (each.cost, each.difference)
-    )
+    value, difference = (_in_its_unit(objective, cost)[0] for cost in (each.cost, each.difference))
     low, high = _in_its_unit(objective, *each.interval)
     return (
         each.candidate,
