@@ -76,13 +76,15 @@ class HtmlPage:
         """Add a paragraph."""
         self._parts.append(f"<p{' class=muted' * muted}>{_escaped(text)}</p>")
 
-    def table(self, head: Sequence[object], rows: Iterable[Sequence[object]]) -> None:
-        """Add a table; of a long one the first rows, with a note."""
+    def table(
+        self, head: Sequence[object], rows: Iterable[Sequence[object]], most: int = _MAX_ROWS
+    ) -> None:
+        """Add a table; of a long one the first rows, at ``most``, with a note."""
         lines = list(rows)
-        shown = [_row("th", head)] * bool(head) + [_row("td", row) for row in lines[:_MAX_ROWS]]
+        shown = [_row("th", head)] * bool(head) + [_row("td", row) for row in lines[:most]]
         self._parts.append(f"<div class=scroll><table>{''.join(shown)}</table></div>")
-        if len(lines) > _MAX_ROWS:
-            self.paragraph(f"The first {_MAX_ROWS} of {len(lines):,} rows.", muted=True)
+        if len(lines) > most:
+            self.paragraph(f"The first {most} of {len(lines):,} rows.", muted=True)
 
     def code(self, text: str, *, summary: str = "") -> None:
         """Add text as it is; one with a ``summary`` is folded."""

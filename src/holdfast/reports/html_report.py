@@ -24,7 +24,7 @@ from holdfast.printable import one_line
 from holdfast.reports.facts import EventFact
 from holdfast.reports.html_page import HtmlPage, chart_part
 from holdfast.reports.outcome_comparison import (
-    compare_outcomes,
+    compare_results,
     estimates_of,
     read_outcomes,
     shown_estimate,
@@ -121,8 +121,7 @@ def run_page(
         begun = "" if unfinished is None else f"; trial {unfinished.trial} was begun"
         page.paragraph(f"The run is not finished{begun}.")
     page.section("Outcome")
-    estimates = map(shown_estimate, estimates_of(results, step_limit=outcomes.step_limit))
-    page.table(["", "value", "95 % interval"], estimates)
+    _add_estimates(page, results, outcomes.step_limit)
     sums = {name: sum(getattr(each, name) for each in results) for name in _COUNTS}
     page.table([], [(words, f"{sums[name]:,}") for name, words in _COUNTS.items() if sums[name]])
     _add_trials(page, results)
@@ -137,6 +136,11 @@ def run_page(
     page.code(meta.get("configuration", ""), summary="All settings, with defaults")
     _add_origin(page, meta)
     return page.html(), notes
+
+
+def _add_estimates(page: HtmlPage, results: Sequence[TrialResult], step_limit: int) -> None:
+    estimates = map(shown_estimate, estimates_of(results, step_limit=step_limit))
+    page.table(["", "value", "95 % interval"], estimates)
 
 
 def _add_trials(page: HtmlPage, results: Sequence[TrialResult]) -> None:
@@ -314,19 +318,18 @@ def _add_origin(page: HtmlPage, meta: Mapping[str, str]) -> None:
 
 def comparison_page(runs: Sequence[Path]) -> tuple[bytes, list[str]]:
     """Return the report of several runs, compared with the first; notes as of :func:`run_page`."""
-    found = compare_outcomes(runs)
+    outcomes = [read_outcomes(run, str(run)) for run in runs]
+    found = compare_results(outcomes, strict=True)
     page = HtmlPage(f"{len(runs)} runs, compared with {found.baseline}")
     page.section("Comparison")
     page.table(found.shown()[0], found.shown()[1:])
     for line in found.legend().splitlines():
         page.paragraph(line, muted=True)
     _add_effects(page, found.columns(), found.rows())
-    for run in runs:
-        page.section(str(run))
-        outcomes = read_outcomes(run, str(run))
-        results = list(outcomes.results.values())
-        estimates = map(shown_estimate, estimates_of(results, step_limit=outcomes.step_limit))
-        page.table(["", "value", "95 % interval"], estimates)
+    for run in outcomes:
+        page.section(run.name)
+        results = list(run.results.values())
+        _add_estimates(page, results, run.step_limit)
         _add_trials(page, results)
     return page.html(), []
 
@@ -357,9 +360,7 @@ def results_page(directory: Path) -> tuple[bytes, list[str]]:
     for name in [each for each in found if each.endswith(".csv") and each not in _SHOWN]:
         page.section(name)
         columns, *rows = _rows_of(found[name])
-        page.table(columns, [list(map(_readable, row)) for row in rows[:_ROWS]])
-        if len(rows) > _ROWS:
-            page.paragraph(f"The first {_ROWS} of {len(rows):,} rows.", muted=True)
+        page.table(columns, [list(map(_readable, row)) for row in rows], _ROWS)
     for name in [each for each in ("tuned.yaml", *_RESULTS) if each in found]:
         page.section("Machine and versions" if name == "origin.json" else name)
         page.code(_text_of(found[name]), summary="All settings" if name == "tune.json" else "")

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from holdfast.errors import HoldfastError, InvalidValueError
+from holdfast.errors import HoldfastError, InvalidValueError, how_to_install
 from holdfast.printable import csv_rows
 from holdfast.runtime.files import write_atomically
 from holdfast.validation import as_path
@@ -64,7 +64,7 @@ class Table:
         try:
             import pandas as pd
         except ImportError as error:
-            raise HoldfastError("to_pandas: pip install 'holdfast-sensing[tune]'") from error
+            raise HoldfastError(f"to_pandas: {how_to_install('pandas', 'tune')}") from error
         return pd.DataFrame(list(self.rows()), columns=list(self.columns()))
 
     def to_csv(self, path: str | Path | None = None) -> str:

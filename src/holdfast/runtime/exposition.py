@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from holdfast.errors import MetricsError
+from holdfast.errors import MetricsError, how_to_install
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
@@ -55,9 +55,8 @@ def require_prometheus() -> None:
     try:
         import prometheus_client  # noqa: F401
     except ImportError as error:
-        raise MetricsError(
-            "metrics need the package prometheus-client: pip install prometheus-client"
-        ) from error
+        advice = how_to_install("prometheus-client")
+        raise MetricsError(f"metrics need the package prometheus-client: {advice}") from error
 
 
 def exposition(families: Iterable[Metric], processes: Sequence[int]) -> bytes:

@@ -16,7 +16,7 @@ import threading
 from multiprocessing.connection import Connection
 from typing import Self
 
-from holdfast.errors import HoldfastError, InvalidValueError
+from holdfast.errors import HoldfastError, InvalidValueError, how_to_install
 from holdfast.printable import one_line
 
 __all__ = ["RayCluster", "RayProcess"]
@@ -49,9 +49,8 @@ class RayCluster:
         try:
             self.ray = importlib.import_module("ray")
         except ImportError as error:
-            raise InvalidValueError(
-                f"Ray cannot be imported ({error}): pip install 'holdfast-sensing[ray]'"
-            ) from error
+            advice = how_to_install("ray[client]", "ray")
+            raise InvalidValueError(f"Ray cannot be imported ({error}): {advice}") from error
 
     def __enter__(self) -> Self:
         handler = signal.getsignal(signal.SIGTERM)

@@ -13,7 +13,7 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import NamedTuple, Self
 
-from holdfast.errors import CredentialsError, TransportError
+from holdfast.errors import CredentialsError, TransportError, how_to_install
 from holdfast.transport.credentials import date_text, warn_if_open
 from holdfast.transport.endpoints import AUTHORITY_FILE, REVOKED_FILE, Role, parse_host
 
@@ -31,9 +31,8 @@ try:
     )
     from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 except ImportError as error:
-    raise CredentialsError(
-        "making keys needs the package cryptography: pip install cryptography"
-    ) from error
+    advice = how_to_install("cryptography")
+    raise CredentialsError(f"making keys needs the package cryptography: {advice}") from error
 
 AUTHORITY_DAYS = 3650
 """Days for which a new authority is valid; no certificate outlives its authority."""

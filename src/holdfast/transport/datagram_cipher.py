@@ -15,7 +15,7 @@ import os
 import struct
 from typing import TYPE_CHECKING, NamedTuple
 
-from holdfast.errors import KeysExhaustedError, TransportError
+from holdfast.errors import KeysExhaustedError, TransportError, how_to_install
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.ciphers.aead import AESGCM
@@ -68,7 +68,7 @@ def require_cryptography() -> type[AESGCM]:
     except ImportError as error:
         raise TransportError(
             "udp/... needs the package cryptography, which is not installed: "
-            "pip install cryptography; or use tls/..."
+            f"{how_to_install('cryptography')}; or use tls/..."
         ) from error
     return AESGCM
 
