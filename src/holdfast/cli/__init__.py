@@ -18,8 +18,6 @@ import sys
 from collections.abc import Callable, Sequence
 from types import TracebackType
 
-__all__ = ["main"]
-
 
 def main(application: Callable[[Sequence[str]], int] | None = None) -> None:
     """Run the command line and exit.

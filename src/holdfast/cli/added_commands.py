@@ -29,8 +29,6 @@ from typing import cast
 from holdfast.errors import HoldfastError
 from holdfast.printable import printable
 
-__all__ = ["GROUP", "added_commands", "load_command", "summary_of"]
-
 GROUP = "holdfast.commands"
 
 

@@ -16,8 +16,6 @@ from typing import NamedTuple
 from holdfast.cli.exit_codes import EXIT_ERROR
 from holdfast.errors import HoldfastError, OptionError
 
-__all__ = ["COMMANDS", "Command", "FoundCommand", "find_command"]
-
 
 class Command(NamedTuple):
     """A command, and the name of its module, which is imported when the command is run."""

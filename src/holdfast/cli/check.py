@@ -29,7 +29,6 @@ from holdfast.runtime.command_line import (
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
 
-__all__ = ["main"]
 
 _WIDEST = 110
 

@@ -13,8 +13,6 @@ from holdfast.printable import one_line, printable
 from holdfast.runtime.command_line import Options, argument, flag, location
 from holdfast.runtime.files import shown_path
 
-__all__ = ["main"]
-
 
 class CompareOptions(Options):
     """Compare two runs, and show where they first differ.

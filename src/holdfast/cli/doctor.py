@@ -16,7 +16,6 @@ from holdfast.runtime.command_line import Options, argument, flag, location, opt
 if TYPE_CHECKING:
     from holdfast.robot.doctor import LayerFinding
 
-__all__ = ["main"]
 
 _COLORS = {"ok": 32, "warns": 33, "fails": 31}
 """Colours of a terminal: green, yellow, red; else its own."""

@@ -11,21 +11,6 @@ from holdfast.errors import HoldfastError, RunError
 from holdfast.printable import printable
 from holdfast.runtime.command_line import wants_json
 
-__all__ = [
-    "EXIT_CAN_GO_ON",
-    "EXIT_DIFFERENT",
-    "EXIT_ERROR",
-    "EXIT_REBOOTED",
-    "EXIT_SIGNAL",
-    "EXIT_WRONG_ANSWER",
-    "EndedBySignal",
-    "ended_by_signals",
-    "interrupted_by",
-    "print_error",
-    "say_interrupted",
-    "signal_of",
-]
-
 EXIT_DIFFERENT = 1
 """The decisions of two compared runs differ."""
 

@@ -29,16 +29,6 @@ if TYPE_CHECKING:
     from holdfast.reports.facts import FactSink
     from holdfast.reports.replay import RecordedRun
 
-__all__ = [
-    "chosen_trials",
-    "main",
-    "notes_about",
-    "print_written",
-    "problem_directory_option",
-    "replay_trials",
-    "trials_option",
-    "user_errors_told",
-]
 
 _NOTE = "decided as recorded"
 """The note of the progress bar."""

@@ -21,7 +21,6 @@ from holdfast.runtime.command_line import (
 if TYPE_CHECKING:
     from holdfast.transport.key_ring import Issued, KeyRing
 
-__all__ = ["main"]
 
 # Those of holdfast.transport.key_ring, which need not be imported for a --help.
 _DEFAULT_DAYS = 365

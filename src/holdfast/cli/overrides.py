@@ -11,8 +11,6 @@ from typing import Any, NamedTuple
 
 from holdfast.errors import InvalidValueError
 
-__all__ = ["Override", "combined", "parse_assignment", "parse_values"]
-
 
 class Override(NamedTuple):
     """Plain data for a ``section.key`` instead of the file's, and its words on the command line."""

@@ -11,8 +11,6 @@ from holdfast.cli.terminal import counted, progress_line
 from holdfast.runtime.command_line import Options, argument, flag, location, option, whole_number
 from holdfast.runtime.files import require_free, shown_path, write_atomically
 
-__all__ = ["main"]
-
 _MOST_TRIALS = 12
 
 

@@ -23,8 +23,6 @@ from holdfast.runtime.logs import EventLog
 from holdfast.runtime.parent_death import parent_death_prefix
 from holdfast.runtime.process_ends import how_it_ended, restart_delay_s
 
-__all__ = ["ends_for_good", "run_until_it_ends"]
-
 _ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 _STEADY_S = 10.0

@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from holdfast.runtime.events import EventSink
     from holdfast.runtime.service_manager import ServiceManager
 
-__all__ = ["RobotFindings", "is_robot_run", "main"]
 
 _RUNS = Path("runs")
 _NEED_A_SERVICE = ("recovery.launch", "offload.tls")

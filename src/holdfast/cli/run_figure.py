@@ -27,13 +27,6 @@ if TYPE_CHECKING:
     from holdfast.planning.outcome import TrialResult
     from holdfast.reports.recorder import Recorder
 
-__all__ = [
-    "Remark",
-    "draw_figure",
-    "own_backend",
-    "repeat",
-    "service_that_decided",
-]
 
 _LONGEST_REPETITION_S = 30.0
 """A trial that took longer is not run again for its figure."""

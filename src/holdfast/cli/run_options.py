@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
     from holdfast.runtime.monitoring import HttpAddress
 
-__all__ = ["RunOptions", "viewer"]
 
 _MIN_RATE_HZ = 0.001
 _MAX_RATE_HZ = 10_000.0

@@ -18,13 +18,6 @@ from holdfast.errors import UnwritableOutputError
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
-__all__ = [
-    "EXIT_UNREAD",
-    "end_with_reader",
-    "escape_unencodable",
-    "ignore_unwritable_stderr",
-    "replace_closed_streams",
-]
 
 EXIT_UNREAD = 128 + signal.SIGPIPE
 """The standard output has no reader any more: 141, as after SIGPIPE."""

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from holdfast.planning.outcome import TrialResult
     from holdfast.tuning.sweep import SweptArm
 
-__all__ = ["main"]
 
 _RUNS = Path("runs")
 

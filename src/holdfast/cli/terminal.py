@@ -23,16 +23,6 @@ if TYPE_CHECKING:
     from holdfast.journal.tables import RunSummary
     from holdfast.planning.outcome import TrialResult
 
-__all__ = [
-    "ProgressLine",
-    "RecomputingDisplay",
-    "RunDisplay",
-    "counted",
-    "duration",
-    "print_files",
-    "print_summary",
-    "progress_line",
-]
 
 _PLAIN_INTERVAL_S = 5.0
 """Without a terminal, at most one line of progress in this time: logs stay short."""

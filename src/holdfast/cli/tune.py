@@ -36,8 +36,6 @@ from holdfast.runtime.command_line import (
 from holdfast.runtime.files import shown_path
 from holdfast.runtime.output_directory import claim_directory
 
-__all__ = ["TuneOptions", "main"]
-
 _MOST_TRIALS = 100_000
 _LONGEST_S = 30 * 86_400.0
 _UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0}

@@ -26,8 +26,6 @@ from holdfast.runtime.command_line import (
 )
 from holdfast.runtime.files import directory_beside, move_into_place, require_free
 
-__all__ = ["main"]
-
 
 class ViewOptions(Options):
     """Show a recorded run in Rerun's viewer (extra view); the run is not changed.

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import ast
 
-__all__ = ["follow_imports"]
-
 
 def follow_imports(
     modules: Iterable[str],

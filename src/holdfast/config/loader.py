@@ -45,8 +45,6 @@ from holdfast.problems.attributes import resolution_of, sensing_labels
 from holdfast.problems.problem import Problem
 from holdfast.validation import shown
 
-__all__ = ["Configuration", "load"]
-
 
 @dataclass(frozen=True)
 class Configuration:

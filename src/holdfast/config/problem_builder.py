@@ -31,8 +31,6 @@ from holdfast.problems.attributes import (
 from holdfast.problems.problem import Problem, ProblemBase
 from holdfast.validation import shown
 
-__all__ = ["BuiltProblem", "build_from", "build_problem", "find_problem", "schemas_of"]
-
 
 def schemas_of(problem_class: type) -> dict[str, type[msgspec.Struct]]:
     """Return the types of a problem's own sections, as far as it declares them."""

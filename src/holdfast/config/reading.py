@@ -7,8 +7,6 @@ import os
 import stat
 from pathlib import Path
 
-__all__ = ["absolute_endpoint", "read_bounded"]
-
 
 def read_bounded(path: Path, most: int) -> bytes:
     """Read at most so many bytes of a file or pipe that the user names.

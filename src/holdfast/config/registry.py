@@ -19,8 +19,6 @@ from holdfast.numerics.arrays import plain
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.problems.problem import Problem
 
-__all__ = ["BUILT_IN", "BuiltIn", "make_problem", "names", "problem_class", "problem_module"]
-
 GROUP = "holdfast.problems"
 
 

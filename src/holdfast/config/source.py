@@ -35,15 +35,6 @@ from holdfast.validation import (
     shown,
 )
 
-__all__ = [
-    "SECTIONS",
-    "SETTINGS",
-    "Source",
-    "module_directory",
-    "name_of_today",
-    "with_names_of_today",
-]
-
 SETTINGS: Mapping[str, type[msgspec.Struct]] = {
     "particle_filter": ParticleFilterSettings,
     "active_sensing": ActiveSensingSettings,

@@ -26,8 +26,6 @@ from pathlib import Path
 from holdfast import __version__, _kernel
 from holdfast.config.imports import follow_imports
 
-__all__ = ["core_version", "machines", "problem_digest", "problem_sources"]
-
 _PACKAGE = Path(__file__).resolve().parents[1]
 _DIGEST_SIZE = 8
 _SOURCE_DIGEST_SIZE = 32

@@ -24,15 +24,6 @@ from holdfast.config.user_modules import find_in
 from holdfast.errors import ConfigurationError
 from holdfast.printable import did_you_mean
 
-__all__ = [
-    "account_of_user_error",
-    "describe_problem_error",
-    "find_class",
-    "in_words",
-    "is_users_file",
-    "registered_names",
-]
-
 _HOLDFAST = Path(__file__).resolve().parents[1]
 _LIBRARIES = tuple(
     Path(path).resolve()

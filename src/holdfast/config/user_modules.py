@@ -20,8 +20,6 @@ from types import ModuleType
 from holdfast.config.imports import follow_imports
 from holdfast.errors import ConfigurationError
 
-__all__ = ["find_in"]
-
 _STANDARD = [path for name in ("stdlib", "platstdlib") if (path := sysconfig.get_path(name))]
 _STANDARD += [str(Path(path) / "lib-dynload") for path in _STANDARD]
 

@@ -24,8 +24,6 @@ import yaml
 from holdfast.errors import ConfigurationError
 from holdfast.validation import KeyPath, dotted
 
-__all__ = ["MAX_BYTES", "MAX_DEPTH", "MAX_VALUES", "Document", "read", "write"]
-
 MAX_BYTES = 1024 * 1024
 """Largest document, in bytes."""
 

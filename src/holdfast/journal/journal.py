@@ -39,8 +39,6 @@ from holdfast.planning.inputs import Record
 from holdfast.planning.outcome import TrialResult
 from holdfast.runtime.files import synchronize
 
-__all__ = ["Journal"]
-
 _MAX_EPOCH = 2**32 - 1
 
 

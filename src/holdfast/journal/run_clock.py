@@ -18,8 +18,6 @@ from typing import NamedTuple
 
 from holdfast.journal.journal_file import boot_id
 
-__all__ = ["RunClock", "Stamp", "read_clocks"]
-
 _NS_PER_S = 1_000_000_000
 
 _STEP_NS = _NS_PER_S // 2

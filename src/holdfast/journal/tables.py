@@ -20,8 +20,6 @@ from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
 from holdfast.printable import csv_rows
 
-__all__ = ["RunSummary", "SummaryBuilder", "csv_lines", "trial_row", "wilson_interval"]
-
 _NORMAL_QUANTILE_975 = 1.959963984540054
 
 

@@ -24,30 +24,6 @@ from holdfast.earlier_names import EARLIER_NAMES, warn_of_earlier_name
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.numerics.arrays import FloatArray, in_brief, integer, real_numbers
 
-__all__ = [
-    "check_problem",
-    "check_sizes",
-    "choice_labels",
-    "circular_actions",
-    "circular_observation",
-    "circular_states",
-    "has_batched_likelihoods",
-    "has_circular_observations",
-    "has_general_observations",
-    "has_own",
-    "know_earlier_names",
-    "moves_give_observations",
-    "name_of",
-    "resolution_of",
-    "sensing_action_of",
-    "sensing_costs",
-    "sensing_labels",
-    "sequence_of",
-    "state_labels",
-    "static_parameters",
-]
-
-
 MAX_SENSING_COST = 1e150
 """So that no sum of prices, and no square of one, is too large for a float."""
 

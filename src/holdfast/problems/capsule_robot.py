@@ -30,8 +30,6 @@ from holdfast.problems.rigid_body import (
     validated,
 )
 
-__all__ = ["CapsuleRobot", "CapsuleRobotModel", "CapsuleRobotPlanner", "Target", "Wall"]
-
 MAX_PARTS = 10_000
 """Bound on the numbers of walls, via points and sensing actions."""
 

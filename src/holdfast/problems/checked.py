@@ -32,38 +32,6 @@ from holdfast.numerics.randomness import Stream
 from holdfast.printable import one_line
 from holdfast.problems.attributes import has_own, name_of
 
-__all__ = [
-    "ends",
-    "executed_action",
-    "expected_move",
-    "expected_path",
-    "initial_states",
-    "is_failure",
-    "is_goal",
-    "known_state_return",
-    "log_likelihood",
-    "log_likelihoods",
-    "measured_motion",
-    "move",
-    "move_each",
-    "move_log_likelihood",
-    "move_observation",
-    "moved_by_measurement",
-    "next_stage",
-    "next_stages",
-    "policy",
-    "prediction",
-    "predictions",
-    "reinitial_states",
-    "require_usable",
-    "reward",
-    "rewards",
-    "rollout_returns",
-    "sample_observation",
-    "scene",
-    "truths",
-]
-
 MAX_OBSERVATION_SIZE = 1024
 
 

@@ -34,8 +34,6 @@ from holdfast.problems.rigid_body import (
     validated,
 )
 
-__all__ = ["Hole", "MultitierPegInHole2D", "MultitierPegInHole2DModel"]
-
 
 class Hole(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A hole and the plate that it is in, of which half lies above the hole's centre."""

@@ -30,8 +30,6 @@ from holdfast.problems.rigid_body import (
     validated,
 )
 
-__all__ = ["PegInHole2D", "PegInHole2DModel"]
-
 
 class PegInHole2DModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The section ``model``; docs/problems.md has the meaning and the unit of each key."""

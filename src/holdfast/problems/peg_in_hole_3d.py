@@ -30,8 +30,6 @@ from holdfast.problems.rigid_body import (
     validated,
 )
 
-__all__ = ["PegInHole3D", "PegInHole3DModel"]
-
 Pose = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
 PoseVariance = tuple[Variance, Variance, Variance, Variance, Variance, Variance]
 

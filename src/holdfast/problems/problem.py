@@ -42,20 +42,6 @@ from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray, real_numbe
 from holdfast.numerics.randomness import Stream
 from holdfast.problems.attributes import know_earlier_names
 
-__all__ = [
-    "BatchedMotionProblem",
-    "BatchedObservationProblem",
-    "ExpectedMotionProblem",
-    "FailingProblem",
-    "GeneralObservationProblem",
-    "KnownStateReturnProblem",
-    "Problem",
-    "ProblemBase",
-    "ReinitialisedProblem",
-    "Scene",
-    "ShownMovesProblem",
-]
-
 
 class Scene:
     """The drawing of a problem: the plane of two coordinates, its obstacles and the body.

@@ -32,23 +32,6 @@ from holdfast.numerics.geometry import (
 from holdfast.numerics.randomness import NOISE_FREE, Stream
 from holdfast.problems.problem import ProblemBase
 
-__all__ = [
-    "Coordinate",
-    "CoordinatePair",
-    "Length",
-    "PegPlanner",
-    "PegProblem",
-    "PositiveVariance",
-    "RigidBodyProblem",
-    "Seed",
-    "Tolerance",
-    "Variance",
-    "constant",
-    "rectangle",
-    "upright_limit",
-    "validated",
-]
-
 Coordinate = Annotated[float, msgspec.Meta(ge=-1e5, le=1e5)]
 CoordinatePair = tuple[Coordinate, Coordinate]
 Length = Annotated[float, msgspec.Meta(gt=0.0, le=1e5)]

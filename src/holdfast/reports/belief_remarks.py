@@ -20,8 +20,6 @@ from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.attributes import circular_states, name_of, state_labels
 from holdfast.reports.recorder import TrialRecord
 
-__all__ = ["belief_remarks"]
-
 _SHARE = 0.2
 """Share of the beliefs after an observation from which on a remark is made."""
 

@@ -25,8 +25,6 @@ from holdfast.planning.inputs import ActingRecord, decisions_of
 from holdfast.planning.outcome import Decisions, SensingDecision, TaskDecision
 from holdfast.printable import one_line
 
-__all__ = ["Comparison", "Difference", "compare_runs"]
-
 _ENDING = struct.Struct("<cQ32s")
 
 

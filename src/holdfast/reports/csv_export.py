@@ -33,8 +33,6 @@ from holdfast.reports.facts import (
     TrialEndFact,
 )
 
-__all__ = ["TABLES", "CsvSink"]
-
 TABLES = ("trials.csv", "steps.csv", "beliefs.csv", "events.csv")
 """One row a trial; a step; a particle of a belief; an event of the services."""
 

@@ -43,8 +43,6 @@ from holdfast.reports.scene_drawing import obstacles_within, outline, shown_part
 from holdfast.robot.trial import SensingStep
 from holdfast.runtime.files import write_atomically
 
-__all__ = ["STYLE", "trial_figure"]
-
 _TRUE = "#111111"
 _BELIEF = "#2F6DB3"
 _OBSTACLE = "#C9CDD2"

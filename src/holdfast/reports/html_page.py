@@ -25,8 +25,6 @@ import msgspec
 from holdfast.errors import HoldfastError, OutputError, how_to_install
 from holdfast.printable import printable
 
-__all__ = ["MAX_BYTES", "Chart", "HtmlPage", "chart_part", "require_vega"]
-
 MAX_BYTES = 3_000_000
 """Largest size of a page; the library takes 0.9 MB of it."""
 

@@ -36,8 +36,6 @@ from holdfast.runtime.events import severity
 from holdfast.runtime.files import bounded_lines
 from holdfast.runtime.log_lines import fields_as_text
 
-__all__ = ["comparison_page", "is_run", "results_page", "run_page", "worst_trials"]
-
 _STEPS = 300
 """Steps of all shown trials together, evenly spread; and as many of sensing actions."""
 

@@ -47,8 +47,6 @@ from holdfast.reports.view_target import ViewTarget
 from holdfast.robot.environment import Environment, SimulatedEnvironment
 from holdfast.robot.trial import LateStep, SensingStep, TaskStep
 
-__all__ = ["Follower", "FollowerReport", "RunFiles", "follow"]
-
 _LATE_NS = 3_000_000_000
 """A step that was read longer ago is not drawn."""
 

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
     from holdfast.reports.view_target import ViewTarget
 
-__all__ = ["LiveView"]
 
 _START_S = 60.0
 """Longest wait for the viewer, before the run begins."""

@@ -22,8 +22,6 @@ from holdfast.problems.problem import Problem, Scene
 from holdfast.reports.poses import POSE_COORDINATES, PoseLayout
 from holdfast.reports.scene_drawing import body_corners
 
-__all__ = ["GrowingPath", "Marker", "scene_markers", "sensing_markers"]
-
 _AT_ORIGIN = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _OBSTACLE = (0.79, 0.80, 0.82, 0.6)
 _GOAL = (0.12, 0.54, 0.30, 0.9)

@@ -41,7 +41,6 @@ from holdfast.runtime.events import severity
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
-__all__ = ["MAP_FRAME", "TASK_FRAME", "McapSink", "require_rosbags"]
 
 MAP_FRAME = "map"
 TASK_FRAME = "task"

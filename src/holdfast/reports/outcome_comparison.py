@@ -24,20 +24,6 @@ from holdfast.planning.outcome import TrialResult
 from holdfast.reports.table_formats import TIMES, Table, aligned, decimals, outward, rounded
 from holdfast.robot.environment_maker import BUILT_IN
 
-__all__ = [
-    "ComparedRun",
-    "OutcomeComparison",
-    "OutcomeEffect",
-    "OutcomeEstimate",
-    "bootstrap_interval",
-    "compare_outcomes",
-    "compare_results",
-    "effects_of",
-    "estimates_of",
-    "read_outcomes",
-    "shown_estimate",
-]
-
 LEVEL = 0.95
 RESAMPLES = 9_999
 _SEED = 0

@@ -28,9 +28,6 @@ from holdfast.numerics.circular import differences
 from holdfast.planning.belief import Belief, estimate
 from holdfast.problems.attributes import circular_states, sequence_of
 
-__all__ = ["POSE_COORDINATES", "PoseLayout", "pose_layout"]
-
-
 POSE_COORDINATES = ("x", "y", "z", "roll", "pitch", "yaw")
 """In the order of the covariance of ``geometry_msgs/PoseWithCovariance``: rotations are about the
 fixed axes X, Y and Z."""

@@ -34,8 +34,6 @@ from holdfast.reports.facts import (
 from holdfast.reports.replay import RecordedRun
 from holdfast.robot.trial import SensingStep
 
-__all__ = ["RunArrays", "TrialArrays", "open_run"]
-
 
 @dataclass(frozen=True)
 class TrialArrays:

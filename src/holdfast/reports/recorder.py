@@ -15,8 +15,6 @@ from holdfast.problems.attributes import circular_states
 from holdfast.robot.environment import Environment
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver
 
-__all__ = ["Recorder", "TrialRecord", "true_state"]
-
 MAX_PARTICLES_KEPT = 500
 """Particles kept of a belief; more would not show in a figure."""
 

@@ -55,8 +55,6 @@ from holdfast.robot.environment import Environment
 from holdfast.robot.recomputing import ComparedTrial, RecordedTrials
 from holdfast.robot.trial import LateStep, SensingStep, TaskStep
 
-__all__ = ["RecordedRun"]
-
 
 class RecordedRun:
     """A recorded run, open to be read; to be used in a ``with`` statement.

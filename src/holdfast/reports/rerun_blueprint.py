@@ -19,8 +19,6 @@ from holdfast.reports.csv_export import state_labels
 from holdfast.reports.facts import SCORES
 from holdfast.reports.poses import PoseLayout, pose_layout
 
-__all__ = ["blueprint", "drawn_layout", "is_flat"]
-
 _FRAMES_PER_S = 10.0
 """Steps a second, when a recorded run is played."""
 

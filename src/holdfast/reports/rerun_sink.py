@@ -45,8 +45,6 @@ from holdfast.reports.view_target import ViewTarget
 from holdfast.runtime.events import severity
 from holdfast.runtime.log_lines import fields_as_text
 
-__all__ = ["MAX_PARTICLES", "RerunSink"]
-
 MAX_PARTICLES = 1000
 """Particles that are drawn of a belief: evenly spread ones, if it has more."""
 

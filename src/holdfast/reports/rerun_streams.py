@@ -25,8 +25,6 @@ import rerun.blueprint as rrb
 from holdfast.errors import ViewError
 from holdfast.reports.view_target import LOCAL_URL, ViewTarget
 
-__all__ = ["RerunStreams"]
-
 _APPLICATION = "holdfast"
 _START_S = 20.0
 """Longest wait for a viewer that was started."""

@@ -13,17 +13,6 @@ import numpy as np
 from holdfast.numerics.arrays import FloatArray
 from holdfast.problems.problem import Scene
 
-__all__ = [
-    "NARROWEST",
-    "WIDEST",
-    "body_corners",
-    "limits_of",
-    "obstacles_within",
-    "outline",
-    "shown_part",
-    "walls_at",
-]
-
 NARROWEST, WIDEST = 1.0, 1.35
 """Least and largest width of what is shown, by its height."""
 

@@ -19,8 +19,6 @@ from holdfast.printable import csv_rows
 from holdfast.runtime.files import write_atomically
 from holdfast.validation import as_path
 
-__all__ = ["TIMES", "Table", "aligned", "decimals", "outward", "rounded"]
-
 TIMES = "\N{MULTIPLICATION SIGN}"
 
 _LATEX = {

@@ -40,8 +40,6 @@ from holdfast.reports.scene_drawing import (
     walls_at,
 )
 
-__all__ = ["MAX_PARTICLES", "TrialChart"]
-
 MAX_PARTICLES = 80
 """Particles that are kept of a belief: evenly spread ones, if it has more."""
 

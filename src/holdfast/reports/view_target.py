@@ -9,8 +9,6 @@ from typing import NamedTuple
 
 from holdfast.errors import InvalidValueError, ViewError, how_to_install
 
-__all__ = ["LOCAL_URL", "ViewTarget", "require_rerun", "viewer_url"]
-
 _PORT = 9876
 LOCAL_URL = f"rerun+http://127.0.0.1:{_PORT}/proxy"
 """Address of a viewer on this machine."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import os
 
-__all__ = ["host_and_port", "system_words", "why_not_bound"]
-
 
 def host_and_port(host: str, port: int) -> str:
     """Return HOST:PORT, with an IPv6 address in brackets."""

@@ -18,25 +18,6 @@ from typing import Any, ClassVar, NamedTuple, NoReturn, Self
 
 from holdfast.errors import OptionError
 
-__all__ = [
-    "MAX_JOBS",
-    "MAX_SEED",
-    "MAX_TRIALS",
-    "Option",
-    "Options",
-    "argument",
-    "bad_value",
-    "flag",
-    "jobs_option",
-    "location",
-    "number",
-    "one_of",
-    "option",
-    "seed_option",
-    "wants_json",
-    "whole_number",
-]
-
 MAX_JOBS = 1024
 """Largest number of worker processes that a command can be asked for (``--jobs``)."""
 

@@ -10,8 +10,6 @@ import contextlib
 
 from holdfast.errors import DescriptorError
 
-__all__ = ["NEEDED", "allow_descriptors"]
-
 NEEDED = 64
 """For any command. A robot was seen to have 21 open at a time, a service 9 without its robots."""
 

@@ -30,14 +30,6 @@ from typing import Literal, Protocol, TypeAlias
 
 from holdfast.errors import DEFECT
 
-__all__ = [
-    "BoundedEventLog",
-    "Event",
-    "EventRates",
-    "EventSink",
-    "severity",
-]
-
 _REPEAT_INTERVAL_S = 1.0
 _BURST = 20
 """Events of one kind that pass at once: more than correct peers cause."""

@@ -17,7 +17,6 @@ from holdfast.errors import MetricsError, how_to_install
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
 
-__all__ = ["BUCKETS_S", "CONTENT_TYPE", "Durations", "exposition", "require_prometheus"]
 
 BUCKETS_S = (
     *(50e-6, 100e-6, 250e-6, 500e-6),

@@ -22,21 +22,6 @@ from typing import BinaryIO, NamedTuple
 
 from holdfast.errors import OutputError
 
-__all__ = [
-    "NewFile",
-    "bounded_lines",
-    "create_directory_atomically",
-    "directory_beside",
-    "move_into_place",
-    "remember_directory",
-    "remove_unfinished_of",
-    "replace_file",
-    "require_free",
-    "shown_path",
-    "started_in",
-    "write_atomically",
-]
-
 _started_in: Path | None = None
 """Where the command was started; the code of a problem or robot may change the directory later."""
 

@@ -15,8 +15,6 @@ import msgspec
 
 from holdfast.printable import one_line
 
-__all__ = ["LINES", "MAX_LINE_BYTES", "LogFormat", "fields_as_text", "json_line", "text_line"]
-
 LogFormat: TypeAlias = Literal["text", "json"]
 
 MAX_LINE_BYTES = 4096

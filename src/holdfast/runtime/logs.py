@@ -25,8 +25,6 @@ from holdfast.errors import OutputError
 from holdfast.runtime.command_line import one_of, option
 from holdfast.runtime.log_lines import LINES, LogFormat
 
-__all__ = ["EventLog", "LogFormat", "log_option", "write_event"]
-
 _MAX_QUEUED_LINES = 10_000
 _FLUSH_TIMEOUT_S = 0.5
 

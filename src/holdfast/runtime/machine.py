@@ -11,8 +11,6 @@ import numpy as np
 
 from holdfast import _kernel
 
-__all__ = ["available_cores", "machine_of_here"]
-
 
 def machine_of_here() -> dict[str, str]:
     """Return the machine and what the kernel runs on, by name."""

@@ -19,13 +19,6 @@ from typing import Any, NamedTuple, TypeAlias
 from holdfast.errors import HealthError
 from holdfast.runtime.addresses import host_and_port, why_not_bound
 
-__all__ = [
-    "HttpAddress",
-    "MonitoringServers",
-    "Page",
-    "Pages",
-]
-
 _MAX_HEAD_BYTES = 8192
 _MAX_CONNECTIONS = 64
 _TIMEOUT_S = 5.0

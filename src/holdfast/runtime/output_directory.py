@@ -9,8 +9,6 @@ from pathlib import Path
 from holdfast.errors import OutputError
 from holdfast.runtime.files import shown_path
 
-__all__ = ["claim_directory"]
-
 
 def claim_directory(out: Path | None, parent: Path, name: str) -> Path:
     """Create an empty output directory: ``out``, which may exist, or ``name`` in ``parent``.

@@ -13,8 +13,6 @@ import os
 import signal
 import sys
 
-__all__ = ["end_with_parent", "parent_death_prefix"]
-
 _PR_SET_PDEATHSIG = 1
 
 

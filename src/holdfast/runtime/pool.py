@@ -15,8 +15,6 @@ from collections.abc import Callable
 from queue import SimpleQueue
 from typing import Any, TypeAlias, TypeVar
 
-__all__ = ["ThreadPool"]
-
 _Result = TypeVar("_Result")
 _Task: TypeAlias = tuple[Callable[[], Any], Callable[[Any], None]]
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import signal
 
-__all__ = ["how_it_ended", "restart_delay_s", "signal_name"]
-
 _MOST_DOUBLINGS = 30
 
 

@@ -19,8 +19,6 @@ from typing import Self
 from holdfast.errors import HoldfastError, InvalidValueError, how_to_install
 from holdfast.printable import one_line
 
-__all__ = ["RayCluster", "RayProcess"]
-
 _ERROR = 40  # the level of Python's logging
 _CONNECT_S = 10.0
 _END_S = 5.0

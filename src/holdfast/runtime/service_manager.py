@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from holdfast.runtime.events import EventSink
 
-__all__ = ["ServiceManager"]
 
 _CHECK_INTERVAL_S = 1.0
 """The status is checked for changes at least this often."""

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from holdfast.runtime.events import EventSink
 
-__all__ = ["DEFAULT_WATCHDOG_S", "EXIT_STUCK", "LoopWatchdog", "watchdog_option"]
 
 DEFAULT_WATCHDOG_S = 20.0
 """As ``WatchdogSec=`` of the units in ``deploy/systemd``."""

@@ -26,8 +26,6 @@ from holdfast.runtime.parent_death import end_with_parent
 from holdfast.runtime.process_ends import signal_name
 from holdfast.runtime.ray_workers import RayProcess
 
-__all__ = ["WorkerProcess", "end_workers"]
-
 _ENDING_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
 
 _END_S = 10.0

@@ -32,8 +32,6 @@ from holdfast.problems.attributes import (
 from holdfast.tuning.contract_check import acted, draw_observation
 from holdfast.tuning.findings import CheckEndedError, Inspection, spread_out
 
-__all__ = ["check_likelihoods", "remedy_of", "uniform_p"]
-
 _REPLICATES = 300  # simulated observations of a sensing action from each kind of belief
 _PARTICLES = 200
 _CLOUDS = 10  # beliefs that come of one state each

@@ -29,21 +29,6 @@ from holdfast.printable import one_line
 from holdfast.problems.attributes import resolution_of, sensing_labels
 from holdfast.problems.problem import ProblemBase
 
-__all__ = [
-    "AS_CONFIGURED",
-    "BY_DEFAULT",
-    "DEFAULT",
-    "RANDOM",
-    "VARIATIONS",
-    "Candidate",
-    "Objective",
-    "Variation",
-    "changed",
-    "first_candidates",
-    "has_rewards",
-    "later_candidates",
-]
-
 Objective: TypeAlias = Literal["reward", "steps", "success"]
 """What is the best: the most reward less prices, the fewest steps (a trial that does not succeed
 counts as the limit), or the most successes."""

@@ -33,7 +33,6 @@ from holdfast.tuning.problem_check import check_problem
 if TYPE_CHECKING:
     from types import FrameType
 
-__all__ = ["PATIENCE_S", "check_apart", "require_right"]
 
 PATIENCE_S = 30.0  # a single call of the problem's code that takes longer is an error
 _OURS = str(Path(__file__).parent)

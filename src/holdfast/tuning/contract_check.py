@@ -21,8 +21,6 @@ from holdfast.problems import checked
 from holdfast.problems.attributes import has_general_observations, sensing_labels
 from holdfast.tuning.findings import CheckEndedError, Inspection
 
-__all__ = ["acted", "check_contract", "check_streams", "draw_observation"]
-
 _SHAPES = ((1,), (3, 4))  # leading shapes beside () and (n,)
 _SAME = 1e-9  # relative difference up to which a batch and its rows differ by rounding alone
 _DRAWS = 200  # of each of two samples that are compared

@@ -27,19 +27,6 @@ from holdfast.planning.settings import PlanningSettings
 from holdfast.printable import one_line
 from holdfast.problems.attributes import sensing_labels, state_labels
 
-__all__ = [
-    "CONTRACT",
-    "FALSE_ALARM_RATE",
-    "OVER",
-    "WHERE",
-    "CheckEndedError",
-    "Finding",
-    "Inspection",
-    "OutOfTimeError",
-    "Walk",
-    "spread_out",
-]
-
 FALSE_ALARM_RATE = 0.001  # probability that all tests of a right problem together find an error
 OVER = "not looked at, or not at all of it: the time was over"  # of what the budget has cut short
 

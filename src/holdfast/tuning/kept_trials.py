@@ -17,8 +17,6 @@ from holdfast.journal.run_directory import first_difference
 from holdfast.printable import csv_rows
 from holdfast.runtime.files import shown_path, write_atomically
 
-__all__ = ["FRESH", "KeptTrials", "TrialRow"]
-
 FRESH = 1_000_000  # number of the first trial that judges; those of the race are below it
 TRIALS_NAME = "trials.csv"
 SETTINGS_NAME = "tune.json"

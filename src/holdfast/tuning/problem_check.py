@@ -28,8 +28,6 @@ from holdfast.tuning.sensor_check import check_sensors
 from holdfast.tuning.trial_check import check_decision_time, check_goals, check_method, check_trials
 from holdfast.validation import as_function
 
-__all__ = ["CHECKS", "check_problem"]
-
 _STATES = 48
 _NEEDED = ("limit_action", "next_stage", "reward", "scene", "resolution", "state_labels")
 

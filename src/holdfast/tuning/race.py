@@ -31,8 +31,6 @@ import numpy as np
 
 from holdfast.numerics.arrays import FloatArray
 
-__all__ = ["PILOT_TRIALS", "MeasuredTrial", "Standing", "beats", "race"]
-
 _BETS = np.array([1 / 64, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 9 / 10])
 """Shares of the capital: small ones find small differences, large ones soon find large ones."""
 

@@ -30,8 +30,6 @@ from holdfast.problems.attributes import (
 from holdfast.tuning.contract_check import draw_observation
 from holdfast.tuning.findings import Inspection, Walk
 
-__all__ = ["check_sensors"]
-
 _SAMPLES = 8  # hypothetical observations of a sensing action from each belief
 _HYPOTHESES = 32  # trial number of the first of the streams here
 _MOST_ACTIONS = 32

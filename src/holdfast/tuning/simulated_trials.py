@@ -34,8 +34,6 @@ from holdfast.robot.trial_pool import Arm, TrialPool, available_cores
 from holdfast.runtime.command_line import MAX_SEED, MAX_TRIALS
 from holdfast.validation import as_function, as_path
 
-__all__ = ["SimulatedTrial", "Trials", "arm_of", "compare", "run_trials", "table_of"]
-
 _SHOWN = ("trial", "outcome", "steps", "reward", "sensing_decisions", "mean_sensing_ms")
 
 

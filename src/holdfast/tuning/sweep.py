@@ -31,8 +31,6 @@ from holdfast.robot.trial_pool import Arm, TrialPool
 from holdfast.runtime.files import shown_path, write_atomically
 from holdfast.tuning.simulated_trials import arm_of, table_of
 
-__all__ = ["MAX_ARMS", "Sweep", "SweptArm", "arms_of"]
-
 MAX_ARMS = 200  # largest number of combinations; each has an open journal
 _MAX_NAME = 100
 _UNSAFE = re.compile(r"[^\w.=,+-]+")

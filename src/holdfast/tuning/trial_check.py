@@ -38,8 +38,6 @@ from holdfast.tuning.contract_check import acted, check_contract
 from holdfast.tuning.findings import CheckEndedError, Inspection, Severity, Walk, spread_out
 from holdfast.tuning.verdict import mean_difference
 
-__all__ = ["check_decision_time", "check_goals", "check_method", "check_trials"]
-
 _WALKS = 64
 _KEPT, _CHOSEN = 24, 48  # steps whose states are kept, and states whose contract is checked
 _LONGER = 4  # times max_steps, to tell a limit that is too low from a trial that is lost

@@ -52,8 +52,6 @@ from holdfast.tuning.tuning_report import CandidateRow, Tuning, write_report
 from holdfast.tuning.verdict import MUCH_SLOWER, cost_of, judge, mean_difference
 from holdfast.validation import as_function, as_path
 
-__all__ = ["Progress", "tune"]
-
 _SHARE_OF_THE_RACE = 0.6
 _LEAST_FRESH = 20
 _AT_MOST_OF_THE_RACE = 0.75  # where trials take longer than those before

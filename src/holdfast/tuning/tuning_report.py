@@ -22,8 +22,6 @@ from holdfast.runtime.files import write_atomically
 from holdfast.tuning.candidates import Objective
 from holdfast.tuning.verdict import FAMILY_LEVEL, Comparison
 
-__all__ = ["CandidateRow", "Tuning", "tuned_yaml", "tuning_figure", "tuning_tables", "write_report"]
-
 CONFIGURATION_NAME = "tuned.yaml"
 
 _PATHS = (("offload", "services"), ("offload", "tls"), ("environment", "directory"))

@@ -22,8 +22,6 @@ from holdfast.reports.outcome_comparison import bootstrap_interval
 from holdfast.tuning.candidates import AS_CONFIGURED, RANDOM, Objective
 from holdfast.tuning.kept_trials import TrialRow
 
-__all__ = ["FAMILY_LEVEL", "MUCH_SLOWER", "Comparison", "cost_of", "judge", "mean_difference"]
-
 FAMILY_LEVEL = 0.95  # confidence of all intervals of the objective together
 _WIDE = 0.1  # an interval that reaches so far, as a share of the mean, says little
 MUCH_SLOWER = 2.0
