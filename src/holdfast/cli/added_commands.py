@@ -43,10 +43,7 @@ def added_commands() -> dict[str, EntryPoint]:
 def load_command(entry_point: EntryPoint) -> ModuleType:
     """Import the module of a command.
 
-    Raises
-    ------
-    HoldfastError
-        If it cannot be imported, or has no ``main``.
+    Raises HoldfastError if it cannot be imported, or has no ``main``.
     """
     try:
         module = cast(ModuleType, entry_point.load())

@@ -84,11 +84,8 @@ class FoundCommand(NamedTuple):
 def find_command(arguments: Sequence[str]) -> FoundCommand:
     """Find the command that the first word names, and import its module.
 
-    Raises
-    ------
-    HoldfastError
-        If there is none of that name, or its package is not here; or if another package of the
-        name ``holdfast`` lies over this one.
+    Raises HoldfastError if there is none of that name, or its package is not here; or if another
+    package of the name ``holdfast`` lies over this one.
     """
     if "_PLACES" not in vars(sys.modules["holdfast"]):
         raise HoldfastError(_OVERWRITTEN)

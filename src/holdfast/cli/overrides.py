@@ -28,12 +28,8 @@ class Override(NamedTuple):
 def parse_assignment(assignment: str) -> Override:
     """Read ``SECTION.KEY=VALUE``, as ``--set`` takes it; the value is YAML.
 
-    Raises
-    ------
-    InvalidValueError
-        If it is not of that form, names a key below a key, or has no value.
-    ConfigurationError
-        If the value is not YAML.
+    Raises InvalidValueError if it is not of that form, names a key below a key, or has no value;
+    ConfigurationError if the value is not YAML.
     """
     from holdfast.config.yaml_document import read
 

@@ -103,10 +103,7 @@ def build_problem(
 ) -> Problem:
     """Build a problem from plain data that did not come from a file.
 
-    Raises
-    ------
-    ConfigurationError
-        If the data does not fit the problem.
+    Raises ConfigurationError if the data does not fit the problem.
     """
     sections = {"model": model, "state_space_planner": state_space_planner}
     source = Source(Document(sections, {}), Path(name), {})
@@ -115,20 +112,13 @@ def build_problem(
 
 
 class BuiltProblem(NamedTuple):
-    """A problem and what it was built from.
-
-    Attributes
-    ----------
-    model, state_space_planner : dict
-        The problem's two sections with their defaults, as plain data.
-    unlisted : tuple of str
-        Arguments whose defaults plain data cannot hold.
-    """
+    """A problem and what it was built from."""
 
     problem: Problem
+    # The problem's two sections with their defaults, as plain data.
     model: dict[str, Any]
     state_space_planner: dict[str, Any]
-    unlisted: tuple[str, ...]
+    unlisted: tuple[str, ...]  # arguments whose defaults plain data cannot hold
 
 
 @in_own_mode

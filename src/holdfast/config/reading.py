@@ -11,12 +11,8 @@ from pathlib import Path
 def read_bounded(path: Path, most: int) -> bytes:
     """Read at most so many bytes of a file or pipe that the user names.
 
-    A pipe may be a shell's ``<(command)``; it is waited for, as other tools do.
-
-    Raises
-    ------
-    OSError
-        If it cannot be read, or is neither a file nor a pipe; ``strerror`` says what is wrong.
+    A pipe may be a shell's ``<(command)``; it is waited for, as other tools do. Raises OSError if
+    it cannot be read, or is neither a file nor a pipe; ``strerror`` says what is wrong.
     """
     mode = path.stat().st_mode
     if stat.S_ISDIR(mode):

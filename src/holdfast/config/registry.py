@@ -109,12 +109,8 @@ def problem_class(name: str, search_directory: Path | None = None) -> type[Any]:
     """Find the class of a problem by its registered name, or ``module:Class``.
 
     The search directory is that in which ``module`` is looked for first
-    (:mod:`holdfast.config.user_modules`).
-
-    Raises
-    ------
-    UnknownProblemError
-        If the name is not registered, or the module or its class cannot be imported.
+    (:mod:`holdfast.config.user_modules`). Raises UnknownProblemError if the name is not registered,
+    or the module or its class cannot be imported.
     """
     if name in BUILT_IN:
         module_name, _, class_name = BUILT_IN[name].place.partition(":")

@@ -140,6 +140,9 @@ def find_class(
 ) -> type[Any]:
     """Find a class by its name.
 
+    Raises ``error_type`` if the name is not registered, or the module or its class cannot be
+    imported, whatever its import raises.
+
     Parameters
     ----------
     name : str
@@ -150,12 +153,6 @@ def find_class(
         Directory in which ``module`` is looked for first (:mod:`holdfast.config.user_modules`).
     built_in : iterable of str
         Further names that messages suggest.
-
-    Raises
-    ------
-    error_type
-        If the name is not registered, or the module or its class cannot be imported, whatever its
-        import raises.
     """
     try:
         if ":" in name:

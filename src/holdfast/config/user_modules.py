@@ -44,10 +44,8 @@ class _Finder:
 def find_in(directory: Path, module: str) -> None:
     """Have a module imported from a directory, if it is there, with what it imports beside it.
 
-    Raises
-    ------
-    ConfigurationError
-        If this process, or the standard library, has another module of one of these names.
+    Raises ConfigurationError if this process, or the standard library, has another module of one of
+    these names.
     """
     directory = directory.resolve()
     _put_on_path(str(directory))

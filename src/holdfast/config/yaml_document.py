@@ -65,17 +65,10 @@ _PLAIN_SCALARS = (
 
 @dataclass(frozen=True)
 class Document:
-    """What a file says, and where.
+    """What a file says, and where."""
 
-    Attributes
-    ----------
-    data : object
-        None, bool, int, float, str, and lists and mappings (with text as keys) of these.
-    lines : mapping of KeyPath to int
-        Line (from 1) of each key of a mapping and of each item of a list.
-    """
-
-    data: Any
+    data: Any  # none, bool, int, float, str, and lists and mappings (with text as keys) of these
+    # Line (from 1) of each key of a mapping and of each item of a list.
     lines: Mapping[KeyPath, int]
 
     def line(self, path: KeyPath) -> int | None:
@@ -266,11 +259,8 @@ def _scalar(node: yaml.ScalarNode) -> Any:
 def read(content: bytes, name: str) -> Document:
     """Read one YAML document in UTF-8; messages call it by its ``name``, usually its path.
 
-    Raises
-    ------
-    ConfigurationError
-        If this is no YAML, or holds what this reader does not take; the message has the line and
-        the column.
+    Raises ConfigurationError if this is no YAML, or holds what this reader does not take; the
+    message has the line and the column.
     """
     if len(content) > MAX_BYTES:
         raise ConfigurationError(f"{name}: over {MAX_BYTES} bytes; a configuration has far fewer")

@@ -38,21 +38,12 @@ def fingerprint(configuration: Configuration) -> dict[str, str]:
 
 
 class Difference(NamedTuple):
-    """How the code of an earlier run differs from that of this one.
+    """How the code of an earlier run differs from that of this one."""
 
-    Attributes
-    ----------
-    words : str
-        For a person.
-    made_by : str
-        The version that made the earlier run, with the digest of its core if that is known.
-    is_the_problems : bool
-        Whether the problem's own source differs, else only holdfast's.
-    """
-
-    words: str
+    words: str  # for a person
+    # The version that made the earlier run, with the digest of its core if that is known.
     made_by: str
-    is_the_problems: bool
+    is_the_problems: bool  # whether the problem's own source differs, else only holdfast's
 
 
 def difference(there: Mapping[str, str], here: Mapping[str, str]) -> Difference | None:
@@ -75,23 +66,14 @@ def difference(there: Mapping[str, str], here: Mapping[str, str]) -> Difference 
 
 
 class EarlierCode(msgspec.Struct, frozen=True, kw_only=True):
-    """What another version of holdfast decided in a run, before this one went on with it.
+    """What another version of holdfast decided in a run, before this one went on with it."""
 
-    Attributes
-    ----------
-    holdfast : str
-        The version, with the digest of what decides in it.
-    finished : tuple of (int, int)
-        Ranges of finished trials: the first and the last of each.
-    unfinished : tuple of (int, int), or None
-        The trial that was begun, and how many of its decisions were there.
-    computed_again : tuple of int
-        Trials whose decisions the version that went on has computed, all with the same result.
-    """
-
-    holdfast: str
+    holdfast: str  # the version, with the digest of what decides in it
+    # Ranges of finished trials: the first and the last of each.
     finished: tuple[tuple[int, int], ...]
+    # The trial that was begun, and how many of its decisions were there.
     unfinished: tuple[int, int] | None = None
+    # Trials whose decisions the version that went on has computed, all with the same result.
     computed_again: tuple[int, ...]
 
     def decided(self) -> str:

@@ -68,10 +68,7 @@ class Journal(JournalReader):
     ) -> Self:
         """Create a journal with notes about the run, to which its session is added.
 
-        Raises
-        ------
-        OutputError
-            If there is a file already or it cannot be written.
+        Raises OutputError if there is a file already or it cannot be written.
         """
         return cls.create_from(path, [_first_notes(meta)], survives)
 
@@ -109,11 +106,7 @@ class Journal(JournalReader):
         """Make a journal of one of an earlier version, unless that was done before.
 
         The old one is renamed (``journal.sqlite.old``), so that no earlier version goes on with it.
-
-        Raises
-        ------
-        OutputError
-            If the old one is damaged or in use, or this cannot be written.
+        Raises OutputError if the old one is damaged or in use, or this cannot be written.
         """
         from holdfast.journal.old_journal import files_of, old_entries  # few runs need it
 
@@ -129,11 +122,8 @@ class Journal(JournalReader):
     def open(cls, path: Path, *, survives: Survives = "process_crash") -> Self:
         """Open an existing journal to go on with it.
 
-        Raises
-        ------
-        OutputError
-            If there is none, it is no journal, damaged, another version's, or in use by another
-            process.
+        Raises OutputError if there is none, it is no journal, damaged, another version's, or in use
+        by another process.
         """
         journal = cls._opened(path, os.O_RDWR)
         journal.survives = survives
@@ -239,12 +229,8 @@ class Journal(JournalReader):
     def add(self, result: TrialResult, *, keep_steps: bool = False) -> None:
         """Write a finished trial, with its decisions; when this returns, it is on the disk.
 
-        ``keep_steps`` keeps its steps for :meth:`kept_steps`.
-
-        Raises
-        ------
-        OutputError
-            If the trial is in the journal already, or the disk is full.
+        ``keep_steps`` keeps its steps for :meth:`kept_steps`. Raises OutputError if the trial is in
+        the journal already, or the disk is full.
         """
         trial, decisions = result.trial, result.decisions
         if decisions is None:

@@ -120,12 +120,8 @@ class JournalFile:
 
     One that is open to be written (``flags`` with ``os.O_RDWR``) is locked. The lock is that of
     this opening, so it ends with the process, and no other use of the file touches it. ``name`` is
-    the name under which it is created.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be opened, or another process is writing to it.
+    the name under which it is created. Raises OutputError if it cannot be opened, or another
+    process is writing to it.
     """
 
     def __init__(self, path: Path, flags: int, name: Path | None = None) -> None:
@@ -263,12 +259,8 @@ def damaged(path: Path, how: str) -> OutputError:
 def find_journal(run: Path, purpose: str) -> Path:
     """Return the journal of a run, by its directory or the journal itself.
 
-    ``purpose`` is a verb, for messages: what the run is needed for.
-
-    Raises
-    ------
-    OutputError
-        If there is none.
+    ``purpose`` is a verb, for messages: what the run is needed for. Raises OutputError if there is
+    none.
     """
     if run.is_dir():
         for name in (JOURNAL_NAME, OLD_JOURNAL_NAME):

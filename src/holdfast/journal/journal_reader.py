@@ -44,19 +44,12 @@ _decode_decisions = msgspec.msgpack.Decoder(Decisions).decode
 
 
 class UnfinishedTrial(NamedTuple):
-    """A trial with journalled steps and no end.
-
-    Attributes
-    ----------
-    records : list of Record
-        In the order in which they were appended.
-    is_complete : bool
-        Whether none can have been lost: the machine is known not to have been rebooted since, or
-        each was on the disk before it was acted on (``survives="power_cut"``).
-    """
+    """A trial with journalled steps and no end."""
 
     trial: int
-    records: list[Record]
+    records: list[Record]  # in the order in which they were appended
+    # Whether none can have been lost: the machine is known not to have been rebooted since, or each
+    # was on the disk before it was acted on (``survives="power_cut"``).
     is_complete: bool
 
 
@@ -80,10 +73,7 @@ class JournalReader:
     def read(cls, path: Path) -> Self:
         """Open a journal; neither it nor its directory change, and a run may be writing to it.
 
-        Raises
-        ------
-        OutputError
-            If there is none, it is no journal, damaged, or another version's.
+        Raises OutputError if there is none, it is no journal, damaged, or another version's.
         """
         return cls._opened(path, os.O_RDONLY)
 

@@ -44,10 +44,7 @@ def files_of(path: Path) -> list[Path]:
 def old_entries(path: Path) -> Iterator[Entry]:
     """Yield what is in a journal of an earlier version; it is not changed.
 
-    Raises
-    ------
-    OutputError
-        If it is damaged, of a still earlier version, or in use.
+    Raises OutputError if it is damaged, of a still earlier version, or in use.
     """
     with contextlib.ExitStack() as stack:
         try:

@@ -135,12 +135,8 @@ class RunDirectory:
         """Claim a directory for a new run; it is made if it is not there.
 
         A run of which no trial is finished or begun does not keep its directory. ``notes`` are
-        added to those about the run.
-
-        Raises
-        ------
-        OutputError
-            If it holds a run already, or cannot be written.
+        added to those about the run. Raises OutputError if it holds a run already, or cannot be
+        written.
         """
         path = path.absolute()
         try:
@@ -190,14 +186,10 @@ class RunDirectory:
         """Open the directory of a run that shall go on, perhaps to more trials than it had.
 
         If another version of holdfast began it, recorded decisions are computed again first, and
-        must come out the same. ``on_progress`` gets how many were, and of how many.
-
-        Raises
-        ------
-        OutputError
-            If it holds no run, one of code that decides otherwise or with another configuration,
-            one with a trial that the configuration does not ask for, one that is damaged, or one
-            that is in use; or if it cannot be written.
+        must come out the same. ``on_progress`` gets how many were, and of how many. Raises
+        OutputError if it holds no run, one of code that decides otherwise or with another
+        configuration, one with a trial that the configuration does not ask for, one that is
+        damaged, or one that is in use; or if it cannot be written.
         """
         path = path.absolute()
         if not path.is_dir():
@@ -247,12 +239,8 @@ class RunDirectory:
         """Open the directory of a run that has begun, else claim it for a new one.
 
         A process that was killed while it claimed the directory leaves a journal without a trial,
-        or none: that counts as not begun, and so does any other content.
-
-        Raises
-        ------
-        OutputError
-            As :meth:`resume` and :meth:`create` do.
+        or none: that counts as not begun, and so does any other content. Raises OutputError as
+        :meth:`resume` and :meth:`create` do.
         """
         is_there = False
         with contextlib.suppress(OSError):  # create() reports it
@@ -273,11 +261,7 @@ class RunDirectory:
         Whatever starts a command again by itself (systemd, Docker, cron) does so after a reboot,
         too, where the robot may have been moved, or somebody may stand beside it. So the run goes
         on only in the boot in which it was begun, or in which a person has said ``after_reboot``.
-
-        Raises
-        ------
-        RebootedError
-            If the robot may not move. A boot that is not known is another one.
+        Raises RebootedError if the robot may not move. A boot that is not known is another one.
         """
         meta = self.journal.meta()
         before = meta.get(_BOOT, meta.get("steps_boot"))  # a run of 0.1 has only the second
@@ -355,11 +339,7 @@ def claim_default_directory(configuration: Configuration, parent: Path) -> Path:
     """Return a directory in ``parent`` that is free for a new run; both are made if missing.
 
     It is ``<stem of the configuration>-seed<seed>``, with ``-2``, ``-3``, ... if that is taken.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be made.
+    Raises OutputError if it cannot be made.
     """
     for path in _default_directories(configuration, parent):
         free = _unused_journal(path)
@@ -383,10 +363,7 @@ def claim_default_directory(configuration: Configuration, parent: Path) -> Path:
 def latest_default_directory(configuration: Configuration, parent: Path) -> Path:
     """Return the last of the directories that :func:`claim_default_directory` has made.
 
-    Raises
-    ------
-    OutputError
-        If there is none.
+    Raises OutputError if there is none.
     """
     paths = _default_directories(configuration, parent)
     made = list(itertools.takewhile(Path.exists, paths))

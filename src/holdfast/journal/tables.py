@@ -24,83 +24,50 @@ _NORMAL_QUANTILE_975 = 1.959963984540054
 
 
 class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """The content of ``summary.json``.
-
-    Attributes
-    ----------
-    holdfast_version : str
-        Of the last part, if the run was resumed.
-    trials : int
-        Trials that the configuration asks for.
-    finished : int
-        Trials that are finished; all other numbers are about these.
-    successes, failures : int
-        Trials that reached the goal, and that the environment ended as failed; the rest ran out of
-        steps.
-    success_rate_interval_95 : tuple of float, or None
-        Wilson's interval.
-    mean_reward : float or None
-        None if a finished trial has no reward.
-    mean_reward_of_successes : float or None
-        Earlier work reports this one.
-    mean_steps : float or None
-        Arithmetic mean; ``compare --outcomes`` takes the geometric one, of which it shows ratios.
-    missing_observations : int
-        Sensing actions without an observation.
-    unexplained_observations : int
-        Observations that no particle explains.
-    lost, suspect_sensors : int
-        Times that the robot was found lost, and a sensing action suspect.
-    fewest_distinct_particles : int or None
-        The least number of different particles that an observation weighed, in any trial.
-    recoveries : int
-        Times that the local service took over, in all processes of the run.
-    sensing_decisions_by_service, task_answers_by_service, longest_wait_ms
-        See :class:`holdfast.journal.timings.AnswerCounts`; None without services.
-    verified_answers, wrong_answers, not_deterministic, unverified_answers
-        See :class:`holdfast.journal.timings.VerificationCounts`; None without services.
-    sensing_ms_median, sensing_ms_p99 : float or None
-        Wall time of choosing a sensing action. Each decision counts once, as it was carried out,
-        also those of earlier processes of a run that was resumed.
-    wall_time_s : float
-        Over all parts of the run, without those that were killed.
-    earlier_code : tuple of EarlierCode
-        What other versions of holdfast decided before this one went on; only if one did.
-    digest : str
-        BLAKE2b-256 over the digests of the trials in order: equal exactly if all decisions of two
-        runs are.
-    """
+    """The content of ``summary.json``."""
 
     problem: str
     seed: int
-    holdfast_version: str
-    trials: int
-    finished: int
+    holdfast_version: str  # of the last part, if the run was resumed
+    trials: int  # trials that the configuration asks for
+    finished: int  # trials that are finished; all other numbers are about these
+    # Trials that reached the goal, and that the environment ended as failed; the rest ran out of
+    # steps.
     successes: int
     failures: int
     success_rate: float | None
-    success_rate_interval_95: tuple[float, float] | None
-    mean_reward: float | None
-    mean_reward_of_successes: float | None
+    success_rate_interval_95: tuple[float, float] | None  # Wilson's interval
+    mean_reward: float | None  # None if a finished trial has no reward
+    mean_reward_of_successes: float | None  # earlier work reports this one
+    # Arithmetic mean; ``compare --outcomes`` takes the geometric one, of which it shows ratios.
     mean_steps: float | None
     sensing_decisions: int
-    missing_observations: int = 0
-    unexplained_observations: int
+    missing_observations: int = 0  # sensing actions without an observation
+    unexplained_observations: int  # observations that no particle explains
+    # Times that the robot was found lost, and a sensing action suspect.
     lost: int = 0
     suspect_sensors: int = 0
+    # The least number of different particles that an observation weighed, in any trial.
     fewest_distinct_particles: int | None = None
-    recoveries: int
+    recoveries: int  # times that the local service took over, in all processes of the run
+    # See :class:`holdfast.journal.timings.AnswerCounts`; None without services.
     sensing_decisions_by_service: dict[str, int] | None = None
     task_answers_by_service: dict[str, int] | None = None
     longest_wait_ms: float | None = None
+    # See :class:`holdfast.journal.timings.VerificationCounts`; None without services.
     verified_answers: int | None = None
     wrong_answers: dict[str, int] | None = None
     not_deterministic: int | None = None
     unverified_answers: int | None = None
+    # Wall time of choosing a sensing action. Each decision counts once, as it was carried out, also
+    # those of earlier processes of a run that was resumed.
     sensing_ms_median: float | None
     sensing_ms_p99: float | None
-    wall_time_s: float
+    wall_time_s: float  # over all parts of the run, without those that were killed
+    # What other versions of holdfast decided before this one went on; only if one did.
     earlier_code: tuple[EarlierCode, ...] | msgspec.UnsetType = msgspec.UNSET
+    # BLAKE2b-256 over the digests of the trials in order: equal exactly if all decisions of two
+    # runs are.
     digest: str
 
     def to_json(self) -> str:

@@ -28,7 +28,8 @@ class EventTable:
     """A table with a row for each event of a kind, open for more.
 
     Its columns are the event's fields, and the times as ``events.jsonl`` has them: the wall
-    clock's, which boot of the machine this is, and how long it lasts.
+    clock's, which boot of the machine this is, and how long it lasts. Raises OutputError if it
+    cannot be written; so does :meth:`add`.
 
     Parameters
     ----------
@@ -36,11 +37,6 @@ class EventTable:
         Timing for ``timings.csv``, VerificationNoted for ``verification.csv``.
     clock : callable
         Returns nanoseconds since 1970.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written; so does :meth:`add`.
     """
 
     def __init__(
@@ -90,24 +86,14 @@ def _cut_off_unfinished_line(path: Path) -> None:
 
 
 class VerificationCounts(NamedTuple):
-    """How many answers of services were computed again.
+    """How many answers of services were computed again."""
 
-    Attributes
-    ----------
-    verified_answers : int
-        Decisions that were compared.
-    wrong_answers : dict of str to int
-        By service: those that differ from the decision of the robot's own planner.
-    not_deterministic : int
-        Those for which the robot's own planner came to two decisions.
-    unverified_answers : int
-        Requests that the robot's own planner was to compute as well and did not: it failed, too
-        many were waiting, or the process ended before.
-    """
-
-    verified_answers: int
+    verified_answers: int  # decisions that were compared
+    # By service: those that differ from the decision of the robot's own planner.
     wrong_answers: dict[str, int]
-    not_deterministic: int
+    not_deterministic: int  # those for which the robot's own planner came to two decisions
+    # Requests that the robot's own planner was to compute as well and did not: it failed, too many
+    # were waiting, or the process ended before.
     unverified_answers: int
 
 
@@ -137,19 +123,13 @@ def count_verified(path: Path) -> VerificationCounts | None:
 
 
 class AnswerCounts(NamedTuple):
-    """Who made the decisions of a run.
+    """Who made the decisions of a run."""
 
-    Attributes
-    ----------
-    sensing_decisions_by_service, task_answers_by_service : dict of str to int
-        An answer with task actions holds those up to the next sensing step. The busiest service
-        comes first.
-    longest_wait_ms : float or None
-        The longest time that the robot stood still for a decision; None if there was none.
-    """
-
+    # An answer with task actions holds those up to the next sensing step. The busiest service comes
+    # first.
     sensing_decisions_by_service: dict[str, int]
     task_answers_by_service: dict[str, int]
+    # The longest time that the robot stood still for a decision; None if there was none.
     longest_wait_ms: float | None
 
 
@@ -203,12 +183,8 @@ class TimingRow(NamedTuple):
 def rows_by_trial(path: Path) -> dict[int, dict[tuple[int, str], TimingRow]]:
     """Return the rows that have a time, by trial, step and kind; empty if there is no table.
 
-    Of a decision that was requested again it is the last row, whose answer was used.
-
-    Raises
-    ------
-    OutputError
-        If the table cannot be read.
+    Of a decision that was requested again it is the last row, whose answer was used. Raises
+    OutputError if the table cannot be read.
     """
     rows: dict[int, dict[tuple[int, str], TimingRow]] = {}
     try:
@@ -248,10 +224,7 @@ def timings_of(lines: Iterable[str]) -> Iterator[TimingRow]:
 def nanoseconds(moment: str) -> int:
     """Return nanoseconds since 1970 of a time in one of our files.
 
-    Raises
-    ------
-    ValueError
-        If it is none, or has no time zone.
+    Raises ValueError if it is none, or has no time zone.
     """
     parsed = datetime.fromisoformat(moment)
     if parsed.tzinfo is None:

@@ -29,49 +29,30 @@ _ENDING = struct.Struct("<cQ32s")
 
 
 class Difference(msgspec.Struct, frozen=True, kw_only=True):
-    """Where two runs first differ.
+    """Where two runs first differ."""
 
-    Attributes
-    ----------
-    what : str
-        Such as ``sensing action``, ``task action[1]`` or ``state digest``.
-    trial, step : int or None
-        Where; None if it is about the runs or the trials as a whole.
-    first, second : str
-        What it is in either run; numbers as Python writes them.
-    """
-
-    what: str
+    what: str  # such as ``sensing action``, ``task action[1]`` or ``state digest``
+    # Where; None if it is about the runs or the trials as a whole.
     trial: int | None = None
     step: int | None = None
+    # What it is in either run; numbers as Python writes them.
     first: str
     second: str
 
 
 class Comparison(msgspec.Struct, frozen=True, kw_only=True):
-    """The result of comparing the decisions of two runs.
-
-    Attributes
-    ----------
-    identical : bool
-    first_run, second_run : str
-        As they were named.
-    trials, sensing_actions, task_actions : int
-        How many were found to be the same.
-    difference : Difference or None
-        The first one.
-    notes : tuple of str
-        Other versions, other settings, other rewards.
-    """
+    """The result of comparing the decisions of two runs."""
 
     identical: bool
+    # As they were named.
     first_run: str
     second_run: str
+    # How many were found to be the same.
     trials: int
     sensing_actions: int
     task_actions: int
-    difference: Difference | None
-    notes: tuple[str, ...]
+    difference: Difference | None  # the first one
+    notes: tuple[str, ...]  # other versions, other settings, other rewards
 
     def describe(self) -> str:
         """Return the finding in words: one line if the runs are identical, else three."""
@@ -99,15 +80,12 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
 def compare_runs(first: Path, second: Path) -> Comparison:
     """Compare the decisions of two runs; neither is changed.
 
+    Raises OutputError if one is no run, or is damaged.
+
     Parameters
     ----------
     first, second : Path
         The directory of a run, or its journal. A run may go on meanwhile.
-
-    Raises
-    ------
-    OutputError
-        If one is no run, or is damaged.
     """
     with ExitStack() as stack:
         one, other = (

@@ -27,19 +27,12 @@ SCORES = {
 
 
 class Decider(NamedTuple):
-    """Who made a decision, and how long it took; from ``timings.csv``.
-
-    Attributes
-    ----------
-    waited_ms : float
-        How long the robot stood still for it.
-    round_trip_ms, computed_ms : float or None
-        None for an action that came in the answer to an earlier request.
-    """
+    """Who made a decision, and how long it took; from ``timings.csv``."""
 
     service: str
     status: str
-    waited_ms: float
+    waited_ms: float  # how long the robot stood still for it
+    # None for an action that came in the answer to an earlier request.
     round_trip_ms: float | None
     computed_ms: float | None
 
@@ -57,33 +50,22 @@ class TrialBeginFact(NamedTuple):
 
 
 class SensingFact(NamedTuple):
-    """A sensing step, and who chose its action; the choice may be not to sense.
-
-    Attributes
-    ----------
-    decided_ns, observed_ns : int
-        When it was chosen, and when its observation was part of the belief.
-    """
+    """A sensing step, and who chose its action; the choice may be not to sense."""
 
     step: SensingStep
+    # When it was chosen, and when its observation was part of the belief.
     decided_ns: int
     observed_ns: int
     decider: Decider | None
 
 
 class TaskFact(NamedTuple):
-    """A task action that was ordered or performed, and who chose it.
-
-    Attributes
-    ----------
-    true_state : array of shape (state_size,) or None
-        Before the action.
-    """
+    """A task action that was ordered or performed, and who chose it."""
 
     step: TaskStep
     time_ns: int
     decider: Decider | None
-    true_state: FloatArray | None = None
+    true_state: FloatArray | None = None  # before the action
 
     @property
     def shown(self) -> tuple[FloatArray | None, FloatArray | None]:
@@ -100,21 +82,14 @@ class LateFact(NamedTuple):
 
 
 class TrialEndFact(NamedTuple):
-    """A trial ends, or its records do.
-
-    Attributes
-    ----------
-    result : TrialResult or None
-        None if the trial is not finished.
-    belief, estimate, true_state
-        After the last action, and the state that stood for the belief; None where the records end
-        before that.
-    """
+    """A trial ends, or its records do."""
 
     trial: int
     time_ns: int
     steps: int
-    result: TrialResult | None
+    result: TrialResult | None  # None if the trial is not finished
+    # After the last action, and the state that stood for the belief; None where the records end
+    # before that.
     belief: Belief | None = None
     estimate: FloatArray | None = None
     true_state: FloatArray | None = None

@@ -112,10 +112,7 @@ STYLE: Any = {
 def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) -> None:
     """Draw a trial and write the picture as PNG.
 
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
+    Raises OutputError if it cannot be written.
     """
     problem = configuration.problem
     scene: Scene | None = checked.scene(problem)

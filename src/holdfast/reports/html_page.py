@@ -114,10 +114,7 @@ class HtmlPage:
     def html(self) -> bytes:
         """Return the file.
 
-        Raises
-        ------
-        OutputError
-            If it is larger than 3 MB.
+        Raises OutputError if it is larger than 3 MB.
         """
         folder = files("holdfast.reports")
         texts = [_library(), (folder / "html_page.js").read_text("utf-8")]

@@ -89,7 +89,8 @@ def run_page(
     """Return the report of a recorded run, and notes on what it lacks.
 
     Without ``problem_directory`` no code that the run names is run: the report of a problem of
-    one's own then lacks the trials step by step, and says so.
+    one's own then lacks the trials step by step, and says so. Raises OutputError if it is no run,
+    is damaged, or its report would be larger than 3 MB.
 
     Parameters
     ----------
@@ -97,11 +98,6 @@ def run_page(
         How many trials are shown step by step, at most 12.
     on_trial : callable
         Gets the number of trials that are computed.
-
-    Raises
-    ------
-    OutputError
-        If it is no run, is damaged, or its report would be larger than 3 MB.
     """
     outcomes = read_outcomes(run, run.name)
     with JournalReader.read_run(run, "report") as journal:
@@ -335,12 +331,8 @@ def comparison_page(runs: Sequence[Path]) -> tuple[bytes, list[str]]:
 def results_page(directory: Path) -> tuple[bytes, list[str]]:
     """Return the report of a tuning, a sweep or a study: of what is in its directory.
 
-    Its texts and tables (Markdown, CSV), figures (SVG), and settings.
-
-    Raises
-    ------
-    OutputError
-        If there is nothing of these in it.
+    Its texts and tables (Markdown, CSV), figures (SVG), and settings. Raises OutputError if there
+    is nothing of these in it.
     """
     page = HtmlPage(f"Results in {directory.absolute().name}")
     found = {path.name: path for path in sorted(directory.glob("*")) if path.is_file()}

@@ -56,17 +56,10 @@ _POLL_S = 0.02
 
 
 class FollowerReport(msgspec.Struct, array_like=True, frozen=True):
-    """What the process that shows a run says: once when it is ready, once at its end.
+    """What the process that shows a run says: once when it is ready, once at its end."""
 
-    Attributes
-    ----------
-    error : str or None
-        Why it shows nothing any more.
-    steps, left_out : int
-        Task actions that it was told of, and those that there was no time to show.
-    """
-
-    error: str | None = None
+    error: str | None = None  # why it shows nothing any more
+    # Task actions that it was told of, and those that there was no time to show.
     steps: int = 0
     left_out: int = 0
 

@@ -63,10 +63,7 @@ class LiveView:
     def __enter__(self) -> Self:
         """Start the other process, and wait until the viewer is there.
 
-        Raises
-        ------
-        ViewError
-            If it cannot be.
+        Raises ViewError if it cannot be.
         """
         self._worker.start()
         error: str | None = f"the view was not ready within {_START_S:g} s"

@@ -228,12 +228,8 @@ def compare_results(
     """Compare results with those of the first run; where their tasks differ, notes say so.
 
     If they were measured ``in_turns``, trial by trial, decision times are judged, too. If
-    ``strict``, other tasks are an error.
-
-    Raises
-    ------
-    OutputError
-        If their limits or (if paired) their seeds differ, or they have too few trials.
+    ``strict``, other tasks are an error. Raises OutputError if their limits or (if paired) their
+    seeds differ, or they have too few trials.
     """
     baseline, *others = runs
     over = "pairs of trials" if paired else "trials"

@@ -24,31 +24,18 @@ MAX_STEPS_KEPT = 100_000
 
 @dataclass
 class TrialRecord:
-    """One trial, step by step.
+    """One trial, step by step."""
 
-    Attributes
-    ----------
-    true_states : list of array
-        The world's states, before the first step and after each; empty if the world hides them.
-    estimates, standard_deviations : list of array
-        Of the belief from which each task action was chosen, and of the last belief.
-    actions : list of array
-        Executed task actions.
-    rewards : list of float
-        NaN where the environment reported none.
-    sensing : list of SensingStep
-        Of their beliefs at most 500 particles each, with weights that are normalised.
-    result : TrialResult or None
-        None while the trial runs.
-    """
-
+    # The world's states, before the first step and after each; empty if the world hides them.
     true_states: list[FloatArray] = field(default_factory=list)
+    # Of the belief from which each task action was chosen, and of the last belief.
     estimates: list[FloatArray] = field(default_factory=list)
     standard_deviations: list[FloatArray] = field(default_factory=list)
-    actions: list[FloatArray] = field(default_factory=list)
-    rewards: list[float] = field(default_factory=list)
+    actions: list[FloatArray] = field(default_factory=list)  # executed task actions
+    rewards: list[float] = field(default_factory=list)  # NaN where the environment reported none
+    # Of their beliefs at most 500 particles each, with weights that are normalised.
     sensing: list[SensingStep] = field(default_factory=list)
-    result: TrialResult | None = None
+    result: TrialResult | None = None  # None while the trial runs
 
 
 class Recorder(TrialObserver):

@@ -61,7 +61,9 @@ class RecordedRun:
 
     ``run`` is its directory, or its journal. It is not changed, and a run may go on meanwhile. A
     record names no code that is run: where its problem is a class of a module (``module:Class``),
-    the caller says in which directory that module lies, and so that its code may run.
+    the caller says in which directory that module lies, and so that its code may run. Raises
+    OutputError if it is no run, or damaged; UntrustedCodeError if its problem is a class of a
+    module, and nobody says where that lies; HoldfastError if its problem cannot be built any more.
 
     Attributes
     ----------
@@ -76,15 +78,6 @@ class RecordedRun:
         times.
     clock_notes : tuple of str
         How the robot's wall clock was set while it ran.
-
-    Raises
-    ------
-    OutputError
-        If it is no run, or damaged.
-    UntrustedCodeError
-        If its problem is a class of a module, and nobody says where that lies.
-    HoldfastError
-        If its problem cannot be built any more.
     """
 
     def __init__(
@@ -129,14 +122,9 @@ class RecordedRun:
     def replay(self, trials: Sequence[int], sinks: Sequence[FactSink]) -> Iterator[int]:
         """Write the facts of some trials to each sink, and yield each trial's number at its end.
 
-        ``trials`` ascend; in a run without times each step takes 0.1 s.
-
-        Raises
-        ------
-        OutputError
-            If a trial is damaged, or of a robot's own world whose observations were not kept.
-        HoldfastError
-            If a trial is decided otherwise when it is run again.
+        ``trials`` ascend; in a run without times each step takes 0.1 s. Raises OutputError if a
+        trial is damaged, or of a robot's own world whose observations were not kept; HoldfastError
+        if a trial is decided otherwise when it is run again.
         """
         clock = StepClock()
         chosen = set(trials)

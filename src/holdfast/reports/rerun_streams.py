@@ -42,10 +42,7 @@ _ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 class RerunStreams:
     """Logs the same to each of its sinks.
 
-    Raises
-    ------
-    ViewError
-        If the viewer cannot be started or reached, or the file not be written.
+    Raises ViewError if the viewer cannot be started or reached, or the file not be written.
     """
 
     def __init__(self, target: ViewTarget) -> None:

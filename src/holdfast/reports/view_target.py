@@ -18,18 +18,11 @@ _PLACE = re.compile(r"(\[[0-9a-fA-F:.%]+\]|[\w.-]+)(?::(\d{1,5}))?")
 
 
 class ViewTarget(NamedTuple):
-    """Where to show a run.
+    """Where to show a run."""
 
-    Attributes
-    ----------
-    viewer : str or None
-        URL of a viewer; empty for one on this machine, which is started if none is there.
-    file : str or None
-        To be written (``.rrd``).
-    """
-
+    # URL of a viewer; empty for one on this machine, which is started if none is there.
     viewer: str | None = None
-    file: str | None = None
+    file: str | None = None  # to be written (``.rrd``)
 
 
 def viewer_url(place: str) -> str:
@@ -49,10 +42,8 @@ def viewer_url(place: str) -> str:
 def require_rerun(target: ViewTarget) -> None:
     """Make sure that a run can be shown there.
 
-    Raises
-    ------
-    ViewError
-        If Rerun is not installed, or a viewer would have to be started without a display.
+    Raises ViewError if Rerun is not installed, or a viewer would have to be started without a
+    display.
     """
     try:
         version("rerun-sdk")

@@ -43,33 +43,18 @@ _EXIT_CODES = {
 
 
 class Option(NamedTuple):
-    """An option or a positional argument of a command.
+    """An option or a positional argument of a command."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        The long name first, by default that of the attribute; empty for a positional argument.
-    read : callable
-        Turns the text into the value; see :func:`bad_value`.
-    many : bool
-        Whether it may be given several times; then the value is a tuple.
-    key : str or None
-        The configuration's ``section.key`` that it replaces.
-    hidden : bool
-        Whether the help leaves it out.
-    least : int
-        How many of a positional argument there must be.
-    """
-
+    # The long name first, by default that of the attribute; empty for a positional argument.
     names: tuple[str, ...]
     help: str
     metavar: str
-    read: Callable[[str], Any]
+    read: Callable[[str], Any]  # turns the text into the value; see :func:`bad_value`
     default: Any
-    many: bool = False
-    key: str | None = None
-    hidden: bool = False
-    least: int = 0
+    many: bool = False  # whether it may be given several times; then the value is a tuple
+    key: str | None = None  # the configuration's ``section.key`` that it replaces
+    hidden: bool = False  # whether the help leaves it out
+    least: int = 0  # how many of a positional argument there must be
 
     @property
     def place(self) -> str:
@@ -207,12 +192,8 @@ class Options:
     def parse(cls, command: str, arguments: Sequence[str]) -> Self:
         """Read the arguments of a command.
 
-        Raises
-        ------
-        OptionError
-            If one of them cannot be used; the message names the option, the value and the limit.
-        SystemExit
-            After the help was shown.
+        Raises OptionError if one of them cannot be used; the message names the option, the value
+        and the limit; SystemExit after the help was shown.
         """
         from holdfast.runtime.files import remember_directory
 

@@ -17,12 +17,8 @@ NEEDED = 64
 def allow_descriptors(wanted: int = NEEDED) -> int:
     """Raise the limit on open files and sockets to ``wanted``, as far as the hard limit allows.
 
-    Returns how many may be open now; ``wanted`` if there is no limit.
-
-    Raises
-    ------
-    DescriptorError
-        If fewer than :data:`NEEDED` are allowed; the message says how to raise the limit.
+    Returns how many may be open now; ``wanted`` if there is no limit. Raises DescriptorError if
+    fewer than :data:`NEEDED` are allowed; the message says how to raise the limit.
     """
     try:
         import resource

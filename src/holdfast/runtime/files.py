@@ -39,10 +39,8 @@ class NewFile(NamedTuple):
 def bounded_lines(path: Path) -> Iterator[str]:
     """Yield the lines of a UTF-8 file that anybody may have written, longer ones in pieces.
 
-    Raises
-    ------
-    OSError
-        If it cannot be read, or is no file: a pipe would be waited for, and a device has no end.
+    Raises OSError if it cannot be read, or is no file: a pipe would be waited for, and a device has
+    no end.
     """
     if not stat.S_ISREG(path.stat().st_mode):
         raise OSError(errno.EINVAL, "it is no file")

@@ -39,6 +39,8 @@ def log_option(
 class EventLog:
     """Writes events as lines; thread-safe, and safe in signal handlers.
 
+    Raises OutputError if the file cannot be opened.
+
     Parameters
     ----------
     target : text stream or path
@@ -50,11 +52,6 @@ class EventLog:
         services, because names are longer than the column.
     clock : callable
         Returns nanoseconds since 1970.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be opened.
     """
 
     def __init__(

@@ -63,10 +63,7 @@ class MonitoringServers:
     async def start(self, offered: Mapping[str, tuple[HttpAddress, Pages]]) -> dict[str, str]:
         """Offer pages for each purpose, in the running loop; return ``HOST:PORT`` for each.
 
-        Raises
-        ------
-        HealthError
-            If it cannot listen at an address; the message names it.
+        Raises HealthError if it cannot listen at an address; the message names it.
         """
         pages: dict[HttpAddress, dict[str, Callable[[], Page]]] = {}
         for address, own in offered.values():

@@ -63,6 +63,9 @@ def arms_of(
 ) -> list[SweptArm]:
     """Return all combinations; the last key varies fastest.
 
+    Raises InvalidValueError if a key has a value twice, there are more than 200 combinations, or
+    they would not have the same worlds: trials, seed or limit of steps differ.
+
     Parameters
     ----------
     axes : mapping
@@ -70,12 +73,6 @@ def arms_of(
         name.
     load : callable
         Gets values by key, and returns the configuration with them.
-
-    Raises
-    ------
-    InvalidValueError
-        If a key has a value twice, there are more than 200 combinations, or they would not have the
-        same worlds: trials, seed or limit of steps differ.
     """
     for key, values in axes.items():
         for index, value in enumerate(values):
@@ -122,12 +119,8 @@ class Sweep:
     """The open directories of all arms, to be used in a ``with`` statement.
 
     ``directory`` gets one for each arm; a sweep that has begun goes on, perhaps with ``new`` arms.
-    ``total`` counts the trials of all arms, ``finished`` those that were finished before.
-
-    Raises
-    ------
-    OutputError
-        On entry, if the directory has a sweep of other keys, or cannot be used.
+    ``total`` counts the trials of all arms, ``finished`` those that were finished before. Raises
+    OutputError on entry, if the directory has a sweep of other keys, or cannot be used.
     """
 
     def __init__(self, directory: Path, arms: Sequence[SweptArm]) -> None:
