@@ -17,8 +17,6 @@ from holdfast.numerics.randomness import Stream
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import ProblemBase, Scene
 
-__all__ = ["BusyRoom"]
-
 _THINGS = 3
 _PLACE_DEVIATION = 2.0
 _STEP_DEVIATION = 0.1

@@ -14,8 +14,6 @@ from holdfast.planning.settings import (
 )
 from studies.trial_batches import TrialSeries
 
-__all__ = ["CASES", "Case"]
-
 
 class Case(msgspec.Struct, frozen=True, kw_only=True):
     """A problem as it is posed in an experiment."""

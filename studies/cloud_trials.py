@@ -37,17 +37,6 @@ from holdfast_lab.testbed.world import (
 from studies.errors import TaskError
 from studies.tables import Cell
 
-__all__ = [
-    "COLUMNS",
-    "MAX_STEPS",
-    "PROBLEM",
-    "SENSING",
-    "SENSING_INTERVAL",
-    "CloudTrials",
-    "rows_of_run",
-    "run_cloud_trials",
-]
-
 COLUMNS = (
     "run", "what", "at_s", "trial", "step", "service", "status", "waited_ms", "round_trip_ms",
     "computed_ms", "found_ms", "first_local_ms", "launch_ms", "away_ms", "failback_ms",

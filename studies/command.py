@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from studies.running import Workload
     from studies.study import Report, Scale, Study
 
-__all__ = ["main", "studies_of", "study_names"]
 
 _ALL = "all"
 

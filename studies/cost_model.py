@@ -26,8 +26,6 @@ import numpy as np
 
 from holdfast.numerics.arrays import FloatArray
 
-__all__ = ["Curve", "Scaling", "break_even", "busy_cores", "parallel_share"]
-
 
 def parallel_share(times: Mapping[int, float]) -> float:
     """Return the share f of a time on one thread that is divided among threads, from 0 to 1.

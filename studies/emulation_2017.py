@@ -44,14 +44,6 @@ from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
 from studies.trial_batches import TrialSeries, problem_of
 
-__all__ = [
-    "drawn_particle",
-    "entropy_of_neighborhoods",
-    "least_of",
-    "likelihoods",
-    "run_emulation",
-]
-
 _TRIALS_AT_A_TIME = 16
 """Trials whose hypothetical weights are in memory together: a megabyte, which caches hold."""
 

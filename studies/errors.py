@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from holdfast.errors import HoldfastError
 
-__all__ = ["TaskCrashError", "TaskError", "TrialFileError"]
-
 
 class TaskCrashError(RuntimeError):
     """An unexpected error in another process; the message holds its traceback."""

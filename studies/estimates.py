@@ -34,7 +34,6 @@ from studies.trial_batches import TrialSeries
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Estimates", "Variant"]
 
 _INTERVALS: Mapping[str, int] = {
     "peg in hole": 8,

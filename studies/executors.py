@@ -26,8 +26,6 @@ from studies.errors import TaskCrashError, TaskError
 from studies.tables import Columns, columns_of
 from studies.tasks import Task, code_of, run_task
 
-__all__ = ["Executor", "LocalExecutor", "RayExecutor", "compute_encoded", "encode_task", "table_of"]
-
 _MOST_RETRIES = 2
 _AT_A_TIME = 256
 """Tasks that a cluster is given at a time."""

@@ -22,19 +22,6 @@ from studies.tables import Cell
 from studies.trial_batches import TrialSeries, trial_tasks
 from studies.trial_files import rounded
 
-__all__ = [
-    "MEASURES",
-    "P_VALUES",
-    "JudgedStudy",
-    "Trials",
-    "compared",
-    "compared_together",
-    "outcome_cells",
-    "over_problems",
-    "shown_as",
-    "steps_and_success",
-]
-
 _TRIALS_IN_EACH = 20
 
 _PURPOSE = ("purpose", "seed")

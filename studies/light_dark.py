@@ -18,8 +18,6 @@ from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
 from holdfast.numerics.randomness import Stream
 from holdfast.problems.problem import ProblemBase, Scene
 
-__all__ = ["LightDark"]
-
 _LIGHT_X = 5.0
 _START = (2.0, 2.0)
 _START_VARIANCE = 5.0

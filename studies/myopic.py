@@ -27,7 +27,6 @@ from studies.trial_batches import TrialSeries
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["CASES", "WAYS", "Myopic", "success"]
 
 _EXAMPLE = "studies.two_ends"
 

@@ -41,22 +41,6 @@ from studies.tables import Cell
 from studies.tasks import Task
 from studies.trial_batches import problem_of
 
-__all__ = [
-    "EXCHANGE_MS",
-    "PATHS_MS",
-    "SAMPLES_DRAWN",
-    "SHOWN",
-    "TIMES_THE_CORES",
-    "Kind",
-    "OffloadBreakEven",
-    "ahead_table",
-    "break_even_table",
-    "kind_of",
-    "numbers_of",
-    "scalings_of",
-    "times_table",
-]
-
 _PROBLEMS = ("peg_in_hole_2d", "peg_in_hole_3d", "capsule_robot")
 _ESTIMATORS = ("nearest_neighbor", "gaussian_mixture_upper")
 _PARTICLES = (100, 300, 1000, 2000, 4000, 8000, 16_000, 32_000, 64_000, 100_000)

@@ -23,8 +23,6 @@ from studies.offload_break_even import (
     kind_of,
 )
 
-__all__ = ["break_even_lines", "sensing_time"]
-
 
 def sensing_time(scalings: Mapping[Kind, Scaling]) -> Figure:
     """Draw time against particles: here, and on more cores further away."""

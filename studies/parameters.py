@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-__all__ = ["Parameters", "Variant", "variants"]
-
 _MOST_QUICK_PARTICLES = 3.0
 """In a quick run, as a multiple of a problem's: ten times would take as long as all the rest."""
 

@@ -17,8 +17,6 @@ from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
 from holdfast.numerics.randomness import Stream
 from holdfast.problems.problem import ProblemBase, Scene
 
-__all__ = ["PasserBy"]
-
 _START = (3.0, 1.0, 0.0)
 _START_DEVIATION = (1.0, 0.5, 4.0)
 _MOTION_DEVIATION = (0.05, 0.05, 0.5)

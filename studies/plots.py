@@ -23,27 +23,6 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from holdfast.reports.figure import STYLE
 from holdfast.runtime.files import write_atomically
 
-__all__ = [
-    "COLORS",
-    "MARKERS",
-    "Dots",
-    "dot_rows",
-    "dots_of",
-    "figure_of",
-    "font_size_of",
-    "grid_of_panels",
-    "label_grid",
-    "legend_below",
-    "line_grid",
-    "make_legible",
-    "mark",
-    "milliseconds",
-    "ratio_axes",
-    "ratio_grid",
-    "save",
-    "stacked_panels",
-]
-
 # Ordered so that neighbours differ in lightness, too.
 COLORS = ("#1D3C78", "#E8A317", "#B5342B", "#54B5A6", "#7D3C98", "#9AA05A", "#4A4F57", "#D98CA6")
 MARKERS = ("s", "o", "D", "^", "v", "P", "X", "*")

@@ -18,8 +18,6 @@ from holdfast.numerics.randomness import Stream
 from holdfast.problems.peg_in_hole_2d import PegInHole2D, PegInHole2DModel
 from holdfast.problems.problem import ProblemBase
 
-__all__ = ["Boat", "Dock", "PricedPeg"]
-
 
 class _Point(ProblemBase):
     """A point robot on its way to the origin; states are (x, y) in metres, a step costs 1."""

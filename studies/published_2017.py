@@ -33,7 +33,6 @@ from studies.trial_batches import TrialSeries, trial_tasks
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Published2017", "PublishedRow", "numbers_of", "published_rows", "series_of"]
 
 _PROBLEMS: Mapping[str, str] = {
     "peg_hole_2d": "peg_in_hole_2d",

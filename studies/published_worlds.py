@@ -54,7 +54,6 @@ from studies.vdp_trials import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["COLUMNS", "WAYS", "PublishedWorlds", "Way", "published_planners", "run_vdp_tag"]
 
 COLUMNS = ("trial", "discounted_reward", "tagged", "steps", "looks", "mean_decision_ms")
 """Columns of the table of a task: a row for each trial."""

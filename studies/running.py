@@ -24,8 +24,6 @@ from studies.tables import Columns, columns_of, to_csv
 from studies.tasks import Task, task_key
 from studies.trial_files import TRIALS_NAME, TrialFile
 
-__all__ = ["ResultCache", "Workload", "compute", "write_report"]
-
 _CACHE = "cache"
 _CHECKSUM_BYTES = 4
 _LONGEST_WRITE_S = 600.0

@@ -38,7 +38,6 @@ from studies.trial_batches import TrialSeries, problem_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["GROUPS", "INTERVALS", "SHOWN", "WAYS", "Selectors"]
 
 INTERVALS = (0, 4, 8, 14)
 """Steps between two sensing steps."""

@@ -39,7 +39,6 @@ from studies.trial_batches import TrialSeries
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["NATS", "PRICES", "PROBLEMS", "RESOLUTIONS", "WAYS", "SensingPrice"]
 
 PRICES = (1.0, 4.0)
 """Prices of a sensing action, in steps."""

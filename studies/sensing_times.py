@@ -37,8 +37,6 @@ from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 from studies.cost_model import parallel_share
 from studies.trial_batches import problem_of
 
-__all__ = ["Measurement", "history_of", "measure_sensing", "state_in"]
-
 _HISTORY_PARTICLES = 500
 """Particles of the trials whose history is replayed."""
 

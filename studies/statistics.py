@@ -29,28 +29,6 @@ if TYPE_CHECKING:
 
     from studies.tables import Cell
 
-__all__ = [
-    "Interval",
-    "RandomEffects",
-    "across_problems",
-    "add_adjusted",
-    "agreement_of_means",
-    "agreement_of_rates",
-    "cells_of",
-    "clustered_median_interval",
-    "exactly",
-    "holm",
-    "independent_difference",
-    "interval_in",
-    "log_steps",
-    "mean_interval",
-    "median_interval",
-    "paired_difference",
-    "paired_rates",
-    "random_effects",
-    "rate_interval",
-    "ratio_of",
-]
 
 _LEVEL = 0.95
 _LARGEST_EXPONENT = 700.0

@@ -21,18 +21,6 @@ from studies.tasks import Task
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = [
-    "CHOICE",
-    "CLAIM",
-    "TRIALS",
-    "Number",
-    "Part",
-    "Report",
-    "Scale",
-    "Study",
-    "TrialStudy",
-    "drawn",
-]
 
 CHOICE = "choice"
 CLAIM = "claim"

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["Cell", "Columns", "columns_of", "to_csv"]
 
 Cell = bool | int | float | str | None
 

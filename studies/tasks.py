@@ -26,7 +26,6 @@ from studies.errors import TaskError
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["Task", "code_of", "run_task", "task_key"]
 
 _FUNCTIONS: Mapping[str, str] = {
     "trials": "studies.trial_batches:run_trials_of",

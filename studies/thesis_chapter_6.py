@@ -57,8 +57,6 @@ from studies.thesis_measurements import (
 )
 from studies.trial_batches import TrialSeries, trial_tasks
 
-__all__ = ["ThesisChapter6", "series_of"]
-
 _TRIALS = 200
 _QUICK_TRIALS = 20
 _TRIALS_IN_EACH = 20

@@ -18,8 +18,6 @@ from studies.thesis_measurements import (
     THESIS_TIMEOUT_MS,
 )
 
-__all__ = ["recovery", "times"]
-
 _Line = tuple[Sequence[float], plots.Dots]
 
 

@@ -10,25 +10,6 @@ import pandas as pd
 from holdfast_lab.testbed.wide_area import Transport
 from studies.statistics import Interval, clustered_median_interval
 
-__all__ = [
-    "FAR",
-    "NEAR",
-    "PARTICLES",
-    "PATHS",
-    "THESIS_CLOUD_ROUND_TRIP_MS",
-    "THESIS_FAILBACK_MS",
-    "THESIS_LAUNCH_MS",
-    "THESIS_SUCCESS",
-    "THESIS_SUCCESS_ABOVE_300",
-    "THESIS_TIMEOUT_MS",
-    "THESIS_TRIALS",
-    "NetworkPath",
-    "clustered_median",
-    "measured",
-    "paths_of",
-    "select",
-]
-
 PARTICLES = (100, 200, 300, 400, 500)
 
 THESIS_TRIALS = 10

@@ -20,8 +20,6 @@ from holdfast.numerics.arrays import FloatArray
 from holdfast.reports.figure import STYLE
 from studies.plots import COLORS, MARKERS, figure_of, milliseconds
 
-__all__ = ["cloud_dies"]
-
 _STATUS_LOOKS = {
     "standard": ("#E9F1FA", "standard:\nthe cloud decides"),
     "local_recovery": ("#F5D79E", "local recovery:\nthe robot's own service decides"),

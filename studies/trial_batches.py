@@ -20,7 +20,6 @@ from studies.tasks import Task
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["COLUMNS", "TrialSeries", "problem_of", "run_trials_of", "trial_tasks"]
 
 COLUMNS = (
     "trial",

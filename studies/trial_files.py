@@ -17,8 +17,6 @@ import pandas as pd
 from studies.errors import TrialFileError
 from studies.study import Scale
 
-__all__ = ["TRIALS_NAME", "TrialFile", "read_trials", "rounded"]
-
 TRIALS_NAME = "trials.parquet"
 
 _ABOUT = b"holdfast"

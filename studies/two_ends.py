@@ -14,8 +14,6 @@ import importlib.util
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Corridor", "Sorting", "TMaze", "TwoCues", "Westward"]
-
 
 def _example(name: str) -> Any:
     path = Path(__file__).parents[1] / "examples" / f"{name}.py"

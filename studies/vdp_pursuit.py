@@ -44,16 +44,6 @@ from studies.vdp_tag import (
     way_length,
 )
 
-__all__ = [
-    "LookRule",
-    "Pursuit",
-    "PursuitSettings",
-    "always",
-    "by_chance",
-    "by_selector",
-    "never",
-]
-
 
 class PursuitSettings(NamedTuple):
     """How much a decision computes, and what it takes for granted."""

@@ -26,24 +26,6 @@ from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
 from holdfast.numerics.randomness import Stream
 from holdfast.problems.problem import ProblemBase, Scene
 
-__all__ = [
-    "DISCOUNT",
-    "MAX_STEPS",
-    "NUM_BEAMS",
-    "VdpTag",
-    "active_beam",
-    "chance_of_tag",
-    "interception",
-    "missing_length",
-    "moved",
-    "reading_log_likelihood",
-    "stop_at_barriers",
-    "target_flow",
-    "toward",
-    "value_of_plan",
-    "way_length",
-]
-
 DISCOUNT = 0.95
 MAX_STEPS = 100
 STEP = 0.5

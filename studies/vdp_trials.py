@@ -24,15 +24,6 @@ from studies.vdp_tag import (
     toward,
 )
 
-__all__ = [
-    "VdpTagPolicy",
-    "VdpTagTrial",
-    "intercept",
-    "manage_uncertainty",
-    "run_vdp_tag_trials",
-    "to_next",
-]
-
 _LARGEST_AREA = 0.01
 """Largest uncertainty of the target without a look: an area, in the unit of the plane, squared."""
 

@@ -15,8 +15,6 @@ from holdfast.cli.added_commands import added_commands
 from holdfast.cli.application import COMMANDS
 from holdfast.runtime.command_line import Options
 
-__all__ = ["Said", "commands", "options_of", "run_here"]
-
 
 class Said(NamedTuple):
     """How a command ended, and what it said."""

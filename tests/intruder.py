@@ -53,8 +53,6 @@ from holdfast.protocol.messages import (
     encode,
 )
 
-__all__ = ["MOMENTS", "Impostor", "Intruder", "Message", "messages", "wrong_actions"]
-
 _PROBE = 0x7FFF_0001
 """Number of the call with which the intruder finds out that all before it was read."""
 

@@ -12,8 +12,6 @@ import sys
 import tomllib
 from pathlib import Path
 
-__all__ = ["lines_of", "main"]
-
 _ROOT = Path(__file__).parents[1]
 _TESTS = {"test", "tests"}
 

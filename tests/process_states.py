@@ -7,8 +7,6 @@ import signal
 import time
 from pathlib import Path
 
-__all__ = ["alive", "state_of", "stop"]
-
 _PATIENCE_S = 30.0
 """Only a process that cannot be stopped takes so long."""
 

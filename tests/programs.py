@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-__all__ = ["completed"]
-
 
 def completed(
     command: Sequence[str | Path], timeout: float = 600.0, **more: Any

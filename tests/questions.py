@@ -11,8 +11,6 @@ from holdfast.planning.planner import Planner, PlanningState, digest
 from holdfast.protocol.messages import DIGEST_SIZE, PROTOCOL_VERSION, Request, decode_request
 from holdfast.robot.environment import SimulatedEnvironment
 
-__all__ = ["questions_of", "received", "request_of"]
-
 
 def received(payload: bytes) -> tuple[Request | MessageError, int]:
     """Return the request of a message, or what is wrong with it, and the size of the message."""

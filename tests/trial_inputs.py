@@ -6,8 +6,6 @@ from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.inputs import Late, Moved, Reinitialised, Sensed, encode_floats
 from holdfast.planning.tracking import Trial
 
-__all__ = ["begin_anew", "come_late", "move", "sense"]
-
 
 def sense(
     trial: Trial, sensing_action: int, observation: FloatArray | None, sensing_ms: float = 0.0

@@ -21,27 +21,6 @@ import msgspec
 
 from holdfast.protocol.messages import Reply, Request, decode_reply, encode
 
-__all__ = [
-    "CALL",
-    "END",
-    "GOODBYE",
-    "HELLO",
-    "KEYS",
-    "KINDS",
-    "LAST",
-    "MAGIC",
-    "MESSAGE",
-    "PATIENCE_S",
-    "PING",
-    "REPLY",
-    "Frame",
-    "RawClient",
-    "RawLink",
-    "frame_of",
-    "hello_of",
-    "robot_context",
-]
-
 MAGIC = b"holdfast"
 HELLO, CALL, REPLY, END, LAST, PING, GOODBYE, KEYS, MESSAGE = range(1, 10)
 KINDS = {

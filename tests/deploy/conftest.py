@@ -6,9 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 from tests.deploy.docker import Engine, Images, build, running_engine
-from tests.processes.conftest import references, site
-
-__all__ = ["engine", "images", "references", "site"]
+from tests.processes.conftest import references, site  # noqa: F401 - fixtures
 
 
 @pytest.fixture(scope="session")

@@ -24,20 +24,6 @@ from typing import Any, NamedTuple, NoReturn
 import pytest
 from tests.programs import completed
 
-__all__ = [
-    "PATIENCE_S",
-    "ROOT",
-    "USER",
-    "Engine",
-    "Images",
-    "build",
-    "give_to",
-    "holdfast",
-    "missing",
-    "running_engine",
-    "wait_until",
-]
-
 ROOT = Path(__file__).parents[2]
 BASE = "debian:bookworm-slim"
 TARGETS = ("cloud", "robot")

@@ -17,8 +17,6 @@ from typing import Any, NamedTuple
 
 from tests.deploy.docker import BASE, Engine, missing, wait_until
 
-__all__ = ["USER", "Machine", "booted"]
-
 USER = "debian"
 """Whom cloud-init makes on Debian's images."""
 

@@ -35,13 +35,6 @@ from holdfast.protocol.messages import (
     with_checksum,
 )
 
-__all__ = [
-    "IN_AN_OBSTACLE",
-    "checkpoints_in_obstacles",
-    "hostile_settings",
-    "odd_requests",
-]
-
 _CONFIGURATION, _SETTINGS = 9, 11
 """Places of a request's fields."""
 

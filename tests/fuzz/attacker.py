@@ -59,8 +59,6 @@ from holdfast.transport.credentials import load_credentials
 from holdfast.transport.datagram_links import RobotDatagramLink
 from holdfast.transport.robot_end import StreamRobotTransport
 
-__all__ = ["TRANSPORTS", "WAYS", "attacked", "main"]
-
 TRANSPORTS = ("tcp", "tls", "udp")
 PROCESSES = 2
 

@@ -43,21 +43,6 @@ from holdfast.protocol.messages import (
 )
 from holdfast.robot.environment import SimulatedEnvironment
 
-__all__ = [
-    "PLANNING",
-    "PROBLEM",
-    "SEED",
-    "Turn",
-    "checkpoints",
-    "configurations",
-    "content_of",
-    "records",
-    "replies",
-    "requests",
-    "session_configuration_of",
-    "turns",
-]
-
 PROBLEM = "capsule_robot"
 """Whose decisions are the cheapest: what is fuzzed is the way to them."""
 

@@ -28,8 +28,6 @@ from holdfast.planning import inputs
 from holdfast.planning import planner as planning
 from holdfast.protocol import messages
 
-__all__ = ["main"]
-
 _INSTRUMENTED: dict[str, tuple[types.ModuleType, ...]] = {
     "request": (targets, message_pack, messages),
     "reply": (targets, message_pack, messages),

@@ -9,8 +9,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-__all__ = ["always", "examples"]
-
 
 def examples(quick: int, slow: int) -> pytest.MarkDecorator:
     """Return a parameter ``examples`` for a test: few of them, and many in the slow tests."""

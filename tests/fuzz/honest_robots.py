@@ -15,8 +15,6 @@ from holdfast.journal.journal import Journal
 from holdfast.planning.planner import Planner
 from holdfast.robot.trial import run_trial
 
-__all__ = ["HonestRobots"]
-
 _RATE_HZ = 50.0
 
 _DISTURBANCES = (

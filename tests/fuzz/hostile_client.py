@@ -21,8 +21,6 @@ from holdfast.planning.settings import (
 )
 from holdfast.protocol.messages import Request, encode, with_checksum
 
-__all__ = ["HostileMessages", "Message"]
-
 _OWN_SESSIONS = 60
 _COSTLY_SHARE = 0.0002
 _FRAMES_SHARE = 0.01

@@ -13,16 +13,6 @@ from msgspec import inspect
 
 from holdfast.planning.settings import Estimator, Method, PlanningSettings, unfit_for_the_method
 
-__all__ = [
-    "Hostile",
-    "NumericKey",
-    "hostile_settings",
-    "keys_of",
-    "numeric_keys",
-    "random_settings",
-    "with_key",
-]
-
 UNBOUNDED = 10**9
 """Tried where a key has no upper bound."""
 

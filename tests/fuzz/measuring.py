@@ -9,8 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-__all__ = ["Held", "Watch", "flatness", "held_by"]
-
 _MOST_GROWTH = 0.05
 _MOST_GROWTH_BYTES = 8 << 20
 

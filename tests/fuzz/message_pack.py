@@ -6,8 +6,6 @@ branches taken learns what messages are made of, and keeps those of a new form.
 
 from __future__ import annotations
 
-__all__ = ["outline"]
-
 _MAX_VALUES = 200
 _NUMBERS = {0xCA: 4, 0xCB: 8, 0xCC: 1, 0xCD: 2, 0xCE: 4, 0xCF: 8}
 _NUMBERS |= {0xD0: 1, 0xD1: 2, 0xD2: 4, 0xD3: 8}

@@ -5,8 +5,6 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Sequence
 
-__all__ = ["Mutator"]
-
 _LENGTHS = (0, 1, 15, 16, 127, 128, 255, 256, 65_535, 65_536, 2**31 - 1, 2**31, 2**32 - 1)
 """What claims to follow: around every width in which MessagePack writes a length."""
 

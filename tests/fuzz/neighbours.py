@@ -28,8 +28,6 @@ from holdfast.planning.belief import Belief
 from holdfast.planning.planner import PlanningState, encode_checkpoint
 from holdfast.protocol.messages import encode
 
-__all__ = ["KINDS", "main"]
-
 _RESET = struct.pack("ii", 1, 0)
 _HTTP = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
 _TLS = b"\x16\x03\x01\x00\xf4\x01\x00\x00\xf0\x03\x03" + bytes(244)

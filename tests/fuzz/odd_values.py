@@ -11,8 +11,6 @@ import random
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
-__all__ = ["STORMS", "OddValues", "replaced"]
-
 _EDGES = (0, 1, 15, 16, 31, 127, 128, 255, 256, 65_535, 65_536, 2**31 - 1, 2**31, 2**32 - 1)
 _FLOATS = (0.0, -0.0, 1e-320, 1e308, -1e308, float("inf"), float("-inf"), float("nan"))
 _TEXTS = (

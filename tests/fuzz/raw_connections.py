@@ -10,8 +10,6 @@ import threading
 
 from tests.wire import CALL, frame_of, hello_of
 
-__all__ = ["RawConnections"]
-
 _MAX_OPEN = 40
 _PAUSE_S = 0.01
 

@@ -32,8 +32,6 @@ from holdfast.journal.journal import Journal
 from holdfast.planning.planner import Planner
 from holdfast.robot.trial import run_trial
 
-__all__ = ["main", "run_soak"]
-
 _SMALL, _BIG = "8", "1000"
 _LIVES_S = (1.5, 6.0)
 """How long a service of the long-lived robot lives."""

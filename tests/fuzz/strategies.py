@@ -44,8 +44,6 @@ from holdfast.protocol.messages import (
     TaskAnswer,
 )
 
-__all__ = ["records", "replies", "requests", "spoilt", "states"]
-
 words = st.integers(0, 2**32 - 1)
 digests = st.binary(min_size=DIGEST_SIZE, max_size=DIGEST_SIZE)
 finite = st.floats(allow_nan=False, allow_infinity=False)

@@ -37,8 +37,6 @@ from holdfast.protocol.messages import (
 )
 from holdfast.transport.frames import WIRE_VERSION, decode_hello
 
-__all__ = ["SPECIMENS", "TARGETS"]
-
 _HELLO_BEGINS = len(MAGIC) + len(frame_of(0))
 
 _CODES = ("malformed", "version", "too_large", "other_code")

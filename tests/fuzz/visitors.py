@@ -25,8 +25,6 @@ from tests.wire import RawClient
 from holdfast.planning.planner import encode_checkpoint
 from holdfast.protocol.messages import NeedState, encode
 
-__all__ = ["main"]
-
 _ROBOTS_OF_A_LINK = 40
 _PROBLEMS = (corpus.PROBLEM, "peg_in_hole_2d")
 

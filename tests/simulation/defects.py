@@ -32,8 +32,6 @@ from holdfast_lab.simulation.schedule import RunSettings, SimulationSchedule
 from holdfast_lab.simulation.schedule_draws import draw_schedule
 from holdfast_lab.simulation.world import Simulator
 
-__all__ = ["DEFECTS", "LIMIT", "Finding", "seeds_needed", "violation_of", "without_faults"]
-
 LIMIT = 2000
 """Seeds within which each defect is to be found."""
 

@@ -10,8 +10,6 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple, TypeAlias
 from unittest import mock
 
-__all__ = ["Change", "Defect", "Edit", "Replacement", "applied"]
-
 
 class Edit(NamedTuple):
     """Lines of a function that are replaced."""

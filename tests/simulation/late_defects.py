@@ -9,8 +9,6 @@ from holdfast.protocol import messages
 from holdfast.protocol.question import Question
 from holdfast.protocol.robot import Robot
 
-__all__ = ["LATE_DEFECTS"]
-
 LATE_DEFECTS: dict[str, Defect] = {}
 
 

@@ -4,16 +4,6 @@ from __future__ import annotations
 
 from holdfast.errors import HoldfastError
 
-__all__ = [
-    "CancelledTrialError",
-    "CannotStartError",
-    "NoProgressError",
-    "ProcessEndedError",
-    "ScheduleError",
-    "SimulationError",
-    "Violation",
-]
-
 
 class CancelledTrialError(HoldfastError):
     """A trial was given up because the series is."""

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from holdfast_lab.chaos.trial import TrialOutcome
     from holdfast_lab.testbed.faults import FaultKind
 
-__all__ = ["SUMMARY", "main"]
 
 SUMMARY = "Inject real faults into real runs, and compare them."
 """Its line in ``holdfast --help``."""

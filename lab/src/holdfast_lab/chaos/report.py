@@ -20,8 +20,6 @@ from holdfast_lab.testbed.fault_times import Spread, spread_of
 from holdfast_lab.testbed.faults import FaultKind
 from holdfast_lab.testbed.machine import describe
 
-__all__ = ["WIDE", "ChaosSummary", "KindRow", "kind_rows", "summarise", "text_of", "write_report"]
-
 WIDE = 142
 """Characters that the whole table needs; on a narrower terminal a part of it is left out."""
 

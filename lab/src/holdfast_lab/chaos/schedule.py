@@ -16,15 +16,6 @@ import msgspec
 from holdfast_lab.testbed.bad_line import Direction
 from holdfast_lab.testbed.faults import NEEDS_NAMESPACE, NEEDS_PROXY, Fault, FaultKind
 
-__all__ = [
-    "WIRES",
-    "Schedule",
-    "Wire",
-    "draw_schedule",
-    "kinds_over",
-]
-
-
 Wire: TypeAlias = Literal["tcp", "tls", "unix", "udp"]
 """The transport between robot and services."""
 

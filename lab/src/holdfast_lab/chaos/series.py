@@ -22,8 +22,6 @@ from holdfast_lab.chaos.trial import Pace, TrialOutcome, run_chaos_trial
 from holdfast_lab.errors import CancelledTrialError
 from holdfast_lab.testbed.faults import FaultKind
 
-__all__ = ["TRIALS_NAME", "Series", "SeriesPlan"]
-
 TRIALS_NAME = "trials.jsonl"
 
 

@@ -28,8 +28,6 @@ from holdfast_lab.testbed.proxy import Place, Proxy, endpoint_at
 from holdfast_lab.testbed.reference_run import ReferenceRun, make_reference_run
 from holdfast_lab.testbed.world import difference_of_performances, witnessed_by
 
-__all__ = ["Pace", "TrialOutcome", "Verdict", "run_chaos_trial"]
-
 Verdict: TypeAlias = Literal["identical", "diverged", "failed", "timed_out"]
 
 _CONFIGURATION_NAME = "trial.yaml"

@@ -16,7 +16,6 @@ from holdfast.runtime.command_line import MAX_SEED, Options, flag, location, opt
 if TYPE_CHECKING:
     from holdfast_lab.demo.scenario import Findings
 
-__all__ = ["SUMMARY", "account", "main"]
 
 SUMMARY = "See a cloud and a robot killed, and no decision change."
 """Its line in ``holdfast --help``."""

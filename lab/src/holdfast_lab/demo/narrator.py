@@ -13,8 +13,6 @@ from holdfast_lab.testbed.driver import ServiceCommand, Testbed
 from holdfast_lab.testbed.processes import Process
 from holdfast_lab.testbed.records import LogEvent
 
-__all__ = ["Activity", "Change", "DemoState", "Line", "Mark", "Narrator", "Row"]
-
 _SENTENCES = {
     "service_appeared": "sees {who}",
     "service_vanished": "sees that {who} is gone",

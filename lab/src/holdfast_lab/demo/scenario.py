@@ -21,14 +21,6 @@ from holdfast_lab.testbed.processes import free_port
 from holdfast_lab.testbed.records import Decision, of_services
 from holdfast_lab.testbed.reference_run import ReferenceRun, make_reference_run
 
-__all__ = [
-    "KILLED_RUN_NAME",
-    "REFERENCE_RUN_NAME",
-    "Demo",
-    "Findings",
-    "Plan",
-]
-
 CONFIGURATION_NAME = "demo.yaml"
 KILLED_RUN_NAME = "killed"
 REFERENCE_RUN_NAME = "undisturbed"

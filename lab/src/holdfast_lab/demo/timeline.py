@@ -22,8 +22,6 @@ from holdfast.printable import printable
 from holdfast.protocol.status import MEANINGS
 from holdfast_lab.demo.narrator import Activity, DemoState, Line, Row
 
-__all__ = ["ASCII", "UNICODE", "legend", "make_show", "plain_line", "timeline"]
-
 _FRAMES_HZ = 12
 _LABEL_WIDTH = 8
 _MIN_WIDTH = 40

@@ -17,8 +17,6 @@ from holdfast.protocol.service_jobs import Job, JobResult
 from holdfast.robot.memo_cache import MemoCache, MemoizingPlanner, key_of
 from holdfast_lab.errors import Violation
 
-__all__ = ["CheckedPlanner", "JobCache", "Memo"]
-
 _MOST = 20_000
 _COMPUTED_AGAIN = 61
 """One of so many that are known is computed all the same."""

@@ -18,8 +18,6 @@ import msgspec
 from holdfast_lab.errors import Violation
 from holdfast_lab.simulation.schedule import LOCAL_SERVICE
 
-__all__ = ["StatusChecker", "WireChecker", "check_size"]
-
 _decode = msgspec.msgpack.Decoder().decode
 
 _SESSION_AT, _EPOCH_AT = 1, 2

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from holdfast_lab.simulation.exploration import ExplorationTally
     from holdfast_lab.simulation.schedule import SimulationSchedule
 
-__all__ = ["SUMMARY", "main"]
 
 SUMMARY = "Search for faults that change a decision."
 """Its line in ``holdfast --help``."""

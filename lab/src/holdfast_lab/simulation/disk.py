@@ -14,8 +14,6 @@ from typing import NamedTuple
 from holdfast.planning.inputs import Record, decode_record, encode_record
 from holdfast.planning.outcome import TrialResult
 
-__all__ = ["Disk", "Unfinished"]
-
 
 class Unfinished(NamedTuple):
     """What a journal holds of a trial that has not ended."""

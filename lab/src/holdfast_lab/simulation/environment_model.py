@@ -31,8 +31,6 @@ from holdfast_lab.simulation.reference_runs import (
     ReferenceStep,
 )
 
-__all__ = ["EnvironmentModel", "Resumed"]
-
 
 class _Coming(NamedTuple):
     """An observation on its way: of which step, and how many task actions it takes."""

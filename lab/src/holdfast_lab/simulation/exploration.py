@@ -20,8 +20,6 @@ from holdfast_lab.simulation.schedule import RunSettings, SimulatedFault, Simula
 from holdfast_lab.simulation.schedule_draws import draw_schedule
 from holdfast_lab.simulation.world import Simulator
 
-__all__ = ["ExplorationTally", "ViolationFound", "explore", "shrink"]
-
 _BATCH = 25
 """Seeds that a process runs between two reports: a fraction of a second's work."""
 

@@ -26,7 +26,6 @@ from holdfast_lab.simulation.service_node import ServiceNode
 if TYPE_CHECKING:
     from holdfast_lab.simulation.world import World
 
-__all__ = ["Network"]
 
 _CONNECT_S = 0.01
 _LOCAL_LATENCY_S = 0.0001

@@ -13,8 +13,6 @@ from holdfast.numerics.arrays import BoolArray, FloatArray
 from holdfast.numerics.randomness import Stream
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 
-__all__ = ["PegWithEncoders"]
-
 _DEVIATION = 0.02
 """Standard deviation of a measured coordinate, in its unit."""
 

@@ -20,20 +20,6 @@ from holdfast.problems.problem import Problem
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast_lab.simulation.checked_memo import Memo
 
-__all__ = [
-    "BEFORE_CHOOSING",
-    "BEFORE_MOVING",
-    "BEFORE_SENSING",
-    "KIDNAPPED_AT",
-    "KIDNAPPED_TO",
-    "UNDISTURBED",
-    "Circumstances",
-    "Delivery",
-    "ReferenceRun",
-    "ReferenceRuns",
-    "ReferenceStep",
-]
-
 BEFORE_SENSING, BEFORE_CHOOSING, BEFORE_MOVING = range(3)
 """Moments of a step in which a late observation may come. The first is the usual one, with the move
 before. The others are those of a robot that was killed: when its next process begins."""

@@ -61,7 +61,6 @@ from holdfast_lab.simulation.schedule import LOCAL_SERVICE
 if TYPE_CHECKING:
     from holdfast_lab.simulation.world import World
 
-__all__ = ["SESSION", "RobotNode"]
 
 SESSION = bytes(range(16))
 """Session of the robot under test."""

@@ -21,27 +21,6 @@ import msgspec
 
 from holdfast_lab.errors import ScheduleError
 
-__all__ = [
-    "LOCAL_SERVICE",
-    "Crash",
-    "Crowd",
-    "Cut",
-    "DiskStall",
-    "KillRobot",
-    "Late",
-    "LaunchFault",
-    "MessageFault",
-    "OutOfMemory",
-    "PauseRobot",
-    "RunSettings",
-    "SimulatedFault",
-    "SimulationSchedule",
-    "Slow",
-    "Stop",
-    "line_of",
-    "parse_schedule",
-]
-
 LOCAL_SERVICE = "local"
 """Name of the service that the robot launches for itself."""
 

@@ -28,8 +28,6 @@ from holdfast_lab.simulation.schedule import (
     Stop,
 )
 
-__all__ = ["draw_schedule"]
-
 _SPAN_S = 0.7
 """Faults begin within this time: a run without any takes about half a second."""
 

@@ -23,8 +23,6 @@ from holdfast_lab.simulation.event_queue import Clock
 if TYPE_CHECKING:
     from holdfast_lab.simulation.world import World
 
-__all__ = ["ServiceNode"]
-
 
 class ServiceNode:
     """One service.

@@ -8,8 +8,6 @@ from typing import NamedTuple
 
 from holdfast_lab.simulation.schedule import MessageFault, SimulatedFault, line_of
 
-__all__ = ["RunOutcome", "StoryLine", "story_lines"]
-
 _ACTION = re.compile(r"performs task action (\d+)")
 
 

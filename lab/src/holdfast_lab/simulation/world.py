@@ -63,8 +63,6 @@ from holdfast_lab.simulation.schedule import (
 from holdfast_lab.simulation.service_node import ServiceNode
 from holdfast_lab.simulation.story import RunOutcome, StoryLine
 
-__all__ = ["FAILBACK_S", "RECOVERY_S", "STANDSTILL_S", "Simulator", "World"]
-
 STANDSTILL_S = 1.5
 """How long the robot may stand still for a decision once the last fault is over."""
 

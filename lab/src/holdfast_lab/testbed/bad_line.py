@@ -20,8 +20,6 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, Literal, Self, TypeAlias, get_args
 
-__all__ = ["CARRIERS", "BadLine", "Carrier", "Direction", "Impairment"]
-
 Direction: TypeAlias = Literal["both", "to_service", "to_robot"]
 
 Carrier: TypeAlias = Literal["streams", "datagrams"]

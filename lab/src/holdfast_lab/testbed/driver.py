@@ -25,8 +25,6 @@ from holdfast_lab.testbed.processes import HOLDFAST, Process, ProcessGroup
 from holdfast_lab.testbed.proxy import Proxy
 from holdfast_lab.testbed.records import Decision, DecisionTable, LogEvent
 
-__all__ = ["RobotCommand", "Script", "ServiceCommand", "Testbed", "after"]
-
 Script: TypeAlias = Generator[Callable[[], bool], None, None]
 """Yields what it waits for, and goes on once that is true."""
 

@@ -22,15 +22,6 @@ from holdfast.protocol.status import Status
 from holdfast.robot.links import RECOVERY_SERVICE
 from holdfast_lab.testbed.records import Decision, LogEvent, of_services
 
-__all__ = [
-    "ROBOT",
-    "FaultTimes",
-    "InjectedFault",
-    "Spread",
-    "spread_of",
-    "times_of_faults",
-]
-
 ROBOT = "robot"
 """The target of faults of the robot's own process; others are named by their endpoints."""
 

@@ -21,8 +21,6 @@ from holdfast_lab.testbed.driver import Script, Testbed, after
 from holdfast_lab.testbed.fault_times import ROBOT
 from holdfast_lab.testbed.processes import Process, local_services_of
 
-__all__ = ["DESCRIPTIONS", "NEEDS_NAMESPACE", "NEEDS_PROXY", "Fault", "FaultKind", "inject"]
-
 _LOCAL_DECIDES_S = 5.0
 """How long the script that kills the local service waits for a decision of it."""
 

@@ -16,8 +16,6 @@ from holdfast.protocol.events import TransportEvent
 from holdfast.transport.calls import CallTable, too_large
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, IncomingCall
 
-__all__ = ["InProcessNetwork", "InProcessRobotTransport", "InProcessServiceTransport"]
-
 
 class InProcessNetwork:
     """Connects the robot's ends and the service's ends that it has made.

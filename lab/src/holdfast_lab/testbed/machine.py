@@ -13,8 +13,6 @@ from holdfast import __version__, _kernel
 from holdfast.config.source_digest import machines
 from holdfast.runtime.machine import machine_of_here
 
-__all__ = ["commit", "describe", "kernel_hash"]
-
 _HERE = Path(holdfast.__file__).resolve().parent
 _GIT_TIMEOUT_S = 10.0
 _SOURCES = ("src", "cpp", "cmake", "CMakeLists.txt")

@@ -20,8 +20,6 @@ from typing import Self
 from holdfast_lab.errors import CannotStartError
 from holdfast_lab.testbed.bad_line import Direction
 
-__all__ = ["NetworkNamespace", "why_no_namespace"]
-
 _TOOLS = {"unshare": "util-linux", "nsenter": "util-linux", "ip": "iproute2", "nft": "nftables"}
 _PATIENCE_S = 10.0
 _TABLE = "inet holdfast_chaos"

@@ -24,16 +24,6 @@ from pathlib import Path
 from holdfast_lab.errors import CannotStartError, NoProgressError, ProcessEndedError
 from holdfast_lab.testbed.records import LogEvent, log_event_of
 
-__all__ = [
-    "HOLDFAST",
-    "Ports",
-    "Process",
-    "ProcessGroup",
-    "free_port",
-    "local_services_of",
-    "marked_processes",
-]
-
 HOLDFAST = (sys.executable, "-m", "holdfast")
 
 _MARK = "HOLDFAST_TESTBED"

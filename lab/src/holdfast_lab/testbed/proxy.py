@@ -25,8 +25,6 @@ from typing import Any, TypeAlias
 from holdfast_lab.errors import CannotStartError
 from holdfast_lab.testbed.bad_line import CARRIERS, BadLine, Carrier, Direction, Impairment
 
-__all__ = ["Place", "Proxy", "endpoint_at"]
-
 Place: TypeAlias = int | Path
 """A port of 127.0.0.1, or the path of a local socket."""
 

@@ -16,8 +16,6 @@ import msgspec
 
 from holdfast.protocol.question import OWN_PLANNER
 
-__all__ = ["Decision", "DecisionTable", "LogEvent", "log_event_of", "of_services", "time_of"]
-
 
 @dataclass(frozen=True)
 class LogEvent:

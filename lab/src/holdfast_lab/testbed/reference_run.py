@@ -22,8 +22,6 @@ from holdfast.robot.trial import run_trial
 from holdfast.runtime.files import write_atomically
 from holdfast_lab.testbed.world import WitnessedWorld
 
-__all__ = ["ReferenceRun", "make_reference_run"]
-
 _MAX_TRIALS = 1000
 
 

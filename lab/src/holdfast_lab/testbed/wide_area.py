@@ -28,8 +28,6 @@ from holdfast_lab.testbed.namespace import NetworkNamespace, why_no_namespace
 from holdfast_lab.testbed.processes import free_port
 from holdfast_lab.testbed.proxy import Proxy
 
-__all__ = ["Emulation", "Route", "Transport", "lay_route", "why_no_wide_area"]
-
 Transport: TypeAlias = Literal["tcp", "tls", "udp"]
 
 Emulation: TypeAlias = Literal["nothing", "packets", "tcp proxy", "datagram proxy"]

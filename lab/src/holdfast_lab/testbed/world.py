@@ -25,14 +25,6 @@ from holdfast.planning.outcome import Done, MoveResult
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import SimulatedEnvironment
 
-__all__ = [
-    "Performance",
-    "WitnessedWorld",
-    "difference_of_performances",
-    "performances",
-    "witnessed_by",
-]
-
 _FIELDS = 5
 
 
