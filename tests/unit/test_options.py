@@ -9,73 +9,32 @@ import pytest
 from tests.command_line import commands, options_of
 
 from holdfast.cli import main
+from holdfast.runtime.command_line import Option, location
+
+
+def values_of(command: str) -> list[Option]:
+    """Return the options of a command that read a number, a path or the like."""
+    return [
+        each
+        for each in options_of(command).table().values()
+        if not (each.is_flag or each.hidden or each.read is str)
+        and not (each.many and each.names)
+        and "one_of" not in each.read.__qualname__
+    ]
+
 
 NUMBERS = [
-    ["run", "peg.yaml", "--trials"],
-    ["run", "peg.yaml", "--seed"],
-    ["run", "peg.yaml", "--jobs"],
-    ["run", "peg.yaml", "-j"],
-    ["run", "peg.yaml", "--rate"],
-    ["run", "peg.yaml", "--watchdog-s"],
-    ["run", "peg.yaml", "--health"],
-    ["run", "peg.yaml", "--view"],
-    ["run", "peg.yaml", "--metrics"],
-    ["demo", "--seed"],
-    ["chaos", "--trials"],
-    ["chaos", "--seed"],
-    ["chaos", "--jobs"],
-    ["chaos", "--first"],
-    ["simulate", "--jobs"],
-    ["simulate", "--seeds"],
-    ["keys", "mine", "--days"],
-    *(["check", "peg.yaml", f"--{name}"] for name in ("seed", "budget", "trials")),
-    ["export", "run", "--trials"],
-    ["view", "run", "--trials"],
-    ["report", "run", "--worst"],
-    ["serve", "--workers"],
-    ["serve", "--lease-ms"],
-    ["serve", "--max-sessions"],
-    ["serve", "--metrics"],
-    ["serve", "--health"],
-    ["serve", "--processes"],
-    ["serve", "--drain-s"],
-    ["serve", "--watchdog-s"],
-    ["serve", "--max-sessions-per-robot"],
-    ["serve", "--max-decision-s"],
-    ["serve", "--max-decision-mb"],
-    *(["sweep", "peg.yaml", f"--{name}"] for name in ("trials", "seed", "jobs")),
-    *(["tune", "peg.yaml", f"--{name}"] for name in ("vary", "budget", "trials", "seed", "jobs")),
-    ["tune", "peg.yaml", "--max-decision-ms"],
+    ([command, name], each.names[0])
+    for command in commands()
+    for each in values_of(command)
+    if each.read is not location
+    for name in each.names
 ]
 PATHS = [
-    ["run"],
-    ["tune"],
-    ["tune", "peg.yaml", "--out"],
-    ["sweep"],
-    ["sweep", "peg.yaml", "--out"],
-    ["run", "peg.yaml", "--out"],
-    ["run", "peg.yaml", "--tls"],
-    ["run", "peg.yaml", "--view-file"],
-    ["demo", "--out"],
-    ["chaos", "--out"],
-    ["simulate", "--schedule"],
-    ["doctor", "--tls"],
-    ["check", "peg.yaml", "--problem-directory"],
-    ["compare"],
-    ["compare", "one"],
-    ["export"],
-    ["export", "run", "--mcap"],
-    ["export", "run", "--csv"],
-    ["export", "run", "--problem-directory"],
-    ["view"],
-    ["view", "run", "--save"],
-    ["view", "run", "--problem-directory"],
-    ["report"],
-    ["report", "run", "--out"],
-    ["report", "run", "--problem-directory"],
-    ["keys"],
-    ["serve", "--tls"],
-    ["serve", "--problem-directory"],
+    [command, *each.names[:1]]
+    for command in commands()
+    for each in values_of(command)
+    if each.read is location
 ]
 
 
@@ -102,14 +61,14 @@ def last_words(
 
 
 @pytest.mark.parametrize("value", ["ten", "-1", "1e400"])
-@pytest.mark.parametrize("words", NUMBERS, ids=" ".join)
+@pytest.mark.parametrize(("words", "option"), NUMBERS, ids=lambda each: "".join(each))
 def test_a_number(
     words: list[str],
+    option: str,
     value: str,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    option = {"-j": "--jobs"}.get(words[-1], words[-1])
     line = last_words([*words, value], capsys, monkeypatch)
     assert option in line
     assert value in line
@@ -129,8 +88,7 @@ def test_a_rate(
 def test_an_empty_path_is_not_the_current_directory(
     words: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    more = ["two"] if words[0] == "compare" and len(words) == 1 else []
-    line = last_words([*words, "", *more], capsys, monkeypatch)
+    line = last_words([*words, ""], capsys, monkeypatch)
     assert "''" in line
     assert "(. is the current directory)" in line
 
@@ -185,13 +143,3 @@ def test_without_arguments_there_is_help(
     said = capsys.readouterr()
     assert ended.value.code in (0, 2)
     assert (said.out + said.err).startswith("usage: holdfast")
-
-
-@pytest.mark.parametrize("command", commands())
-def test_every_number_and_path_is_in_these_tables(command: str) -> None:
-    """So that a new option gets a line above."""
-    listed = {(words[0], words[-1]) for words in [*NUMBERS, *PATHS]}
-    for each in options_of(command).table().values():
-        is_text = each.is_flag or each.read is str or "one_of" in each.read.__qualname__
-        if each.names and not (is_text or each.many or each.hidden):
-            assert any((command, name) in listed for name in each.names), each.names
