@@ -36,10 +36,10 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import msgspec
-from tests.fuzz import corpus
+from tests.fuzz import corpus, neighbours
 from tests.fuzz.attack_messages import (
     checkpoints_in_obstacles,
     hostile_settings,
@@ -48,7 +48,6 @@ from tests.fuzz.attack_messages import (
 from tests.fuzz.honest_robots import HonestRobots
 from tests.fuzz.hostile_client import HostileMessages
 from tests.fuzz.measuring import Watch, flatness
-from tests.fuzz.raw_connections import RawConnections
 from tests.ports import free_port
 from tests.processes.faults import Service, Site
 from tests.wire import CALL, PING, RawClient, RawLink, frame_of, hello_of
@@ -64,7 +63,6 @@ PROCESSES = 2
 
 _OUTSTANDING = 32
 _ROOM_S = 0.5
-_DEAF_LINKS = 24
 _CALLS_OF_A_LINK = 400
 _LONG_S = 120.0
 """Shorter runs end before the service's tables are full, and so may grow all the time."""
@@ -90,6 +88,8 @@ class Target(NamedTuple):
         """Return a link that has said hello."""
         return RawClient(self.endpoint, self.keys)
 
+
+Way: TypeAlias = Callable[[Target, random.Random], None]
 
 # -- ways of attacking ---------------------------------------------------------------------------
 
@@ -184,43 +184,17 @@ def _abandoned(target: Target, chance: random.Random) -> None:
                 link.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
 
 
-def _deaf(target: Target, chance: random.Random) -> None:
-    """Links on which much is asked, and no answer is read."""
-    request = corpus.requests(b"reads no answer.")[1]
-    links: collections.deque[RawLink] = collections.deque()
-    numbers = itertools.count(1)
-    try:
-        while target.goes_on:
-            with contextlib.suppress(OSError):
-                if len(links) < _DEAF_LINKS:
-                    link = RawLink(target.endpoint, target.keys)
-                    links.append(link)
-                    link.say(hello_of(incarnation=f"deaf-{len(links)}"))
-                link = links[0]
-                links.rotate()
-                if not select.select([], [link.socket], [], 0.01)[1]:
-                    continue
-                number = next(numbers)
-                session = chance.choice((request.session, chance.randbytes(16)))
-                asked = msgspec.structs.replace(request, number=number, session=session)
-                try:
-                    link.say(frame_of(CALL, number % 2**32, encode(asked)))
-                    target.counts["unread answers"] += 1
-                except OSError:
-                    links.remove(link)
-                    link.close()
-            time.sleep(0.001)
-    finally:
-        for link in links:
-            link.close()
+def _as_neighbour(kind: str) -> Way:
+    """Return what a bad neighbour does: clients that never read, scanners, browsers, slow bytes."""
 
+    def attack(target: Target, _: random.Random) -> None:
+        visit = neighbours.Visit(target.endpoint, target.keys, target.until)
+        try:
+            neighbours.KINDS[kind](visit)
+        finally:
+            target.counts[kind] += visit.done
 
-def _bytes(target: Target, chance: random.Random) -> None:
-    """Bytes that are not ours, or only the beginning of it."""
-    raw = RawConnections(int(target.endpoint.rpartition(":")[2]), chance.randrange(2**32))
-    target.until.wait()
-    raw.stop()
-    target.counts["raw connections"] = raw.made
+    return attack
 
 
 def _datagrams(target: Target, chance: random.Random) -> None:
@@ -286,8 +260,6 @@ def _flood(target: Target, chance: random.Random) -> None:
             time.sleep(0.02)
 
 
-Way = Callable[[Target, random.Random], None]
-
 WAYS: dict[str, Way] = {
     "odd": _odd_values,
     "settings": _hostile_settings,
@@ -295,8 +267,7 @@ WAYS: dict[str, Way] = {
     "messages": _messages,
     "cut": _cut_frames,
     "abandoned": _abandoned,
-    "deaf": _deaf,
-    "bytes": _bytes,
+    **{kind: _as_neighbour(kind) for kind in ("deaf", "slow", "scanner", "greetings")},
     "datagrams": _datagrams,
     "flood": _flood,
 }

@@ -2,10 +2,9 @@
 
     python -m tests.fuzz.decoders TARGET --runs 100000 --seed 1
 
-What is Python is instrumented. msgspec's C code is not, so a small reader in Python goes over each
-message as well (``message_pack.py``), and half of the messages are made from valid ones by what
-knows the format (``mutations.py``). A finding ends the process with an error and leaves the bytes
-in a file ``crash-*`` in the directory of ``--crashes``.
+What is Python is instrumented. msgspec's C code is not, so half of the messages are made from valid
+ones by what knows the format (``mutations.py``). A finding ends the process with an error and
+leaves the bytes in a file ``crash-*`` in the directory of ``--crashes``.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from tests.fuzz import message_pack, targets
+from tests.fuzz import targets
 from tests.fuzz.mutations import Mutator
 
 from holdfast.config import yaml_document
@@ -29,10 +28,10 @@ from holdfast.planning import planner as planning
 from holdfast.protocol import messages
 
 _INSTRUMENTED: dict[str, tuple[types.ModuleType, ...]] = {
-    "request": (targets, message_pack, messages),
-    "reply": (targets, message_pack, messages),
-    "record": (targets, message_pack, inputs),
-    "checkpoint": (targets, message_pack, planning),
+    "request": (targets, messages),
+    "reply": (targets, messages),
+    "record": (targets, inputs),
+    "checkpoint": (targets, planning),
     "configuration": (
         targets,
         yaml_document,
@@ -81,12 +80,6 @@ def main() -> None:
             # In place: an editable installation has an importer of its own, which atheris misses.
             atheris.instrument_func(function)
     check = targets.TARGETS[options.target]
-    packed = options.target != "configuration"
-
-    def look(data: bytes) -> None:
-        if packed:
-            message_pack.outline(data)
-        check(data)
 
     def mutate(data: bytes, max_size: int, seed: int) -> bytes:
         chance = random.Random(seed)
@@ -110,7 +103,7 @@ def main() -> None:
                 f"-artifact_prefix={options.crashes}/",
                 corpus,
             ],
-            look,
+            check,
             custom_mutator=mutate,
         )
         atheris.Fuzz()

@@ -15,6 +15,7 @@ import select
 import signal
 import socket
 import struct
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -35,27 +36,22 @@ _OPEN = 200
 _PARTICLES = 1_900_000
 
 
-class _Visit:
-    """What a neighbour knows: where to go, with which certificate, and until when."""
+class Visit:
+    """What a neighbour knows: where to go, with which certificate, and when to leave."""
 
-    def __init__(self, endpoint: str, keys: Path | None, seconds: float) -> None:
+    def __init__(self, endpoint: str, keys: Path | None, until: threading.Event) -> None:
         self.endpoint = endpoint
         self.keys = keys
-        self._until = time.monotonic() + seconds
+        self._until = until
         self.done = 0
-
-    def end(self) -> None:
-        self._until = 0.0
 
     @property
     def goes_on(self) -> bool:
-        return time.monotonic() < self._until
+        return not self._until.is_set()
 
     def connect(self) -> socket.socket:
         """Return a connection on which nothing was said."""
-        protocol, _, place = self.endpoint.partition("/")
-        assert protocol in ("tcp", "tls")
-        host, _, port = place.rpartition(":")
+        host, _, port = self.endpoint.partition("/")[2].rpartition(":")
         return socket.create_connection((host, int(port)), 10.0)
 
     def pause(self, often_hz: float, began: float) -> None:
@@ -64,7 +60,7 @@ class _Visit:
         time.sleep(max(0.0, due - time.monotonic()))
 
 
-def _deaf(visit: _Visit) -> None:
+def _deaf(visit: Visit) -> None:
     """Two clients that ask, and never read what they are sent."""
     request = msgspec.structs.replace(corpus.requests()[1], session=b"never reads it..")
     numbers = itertools.count(1)
@@ -86,7 +82,7 @@ def _deaf(visit: _Visit) -> None:
         time.sleep(0.0005)
 
 
-def _slow(visit: _Visit) -> None:
+def _slow(visit: Visit) -> None:
     """Connections that say a byte now and then, and never come to an end."""
     greeting = hello_of()
     connections: list[tuple[socket.socket, bytearray]] = []
@@ -106,7 +102,7 @@ def _slow(visit: _Visit) -> None:
         time.sleep(0.1)
 
 
-def _scanner(visit: _Visit) -> None:
+def _scanner(visit: Visit) -> None:
     """Connections that are closed, or reset, as soon as they are there: 500 a second."""
     began = time.monotonic()
     while visit.goes_on:
@@ -117,7 +113,7 @@ def _scanner(visit: _Visit) -> None:
         visit.pause(500.0, began)
 
 
-def _greetings(visit: _Visit) -> None:
+def _greetings(visit: Visit) -> None:
     """Browsers, and clients of TLS, at a port where neither belongs: 200 a second."""
     began = time.monotonic()
     while visit.goes_on:
@@ -128,14 +124,14 @@ def _greetings(visit: _Visit) -> None:
         visit.pause(200.0, began)
 
 
-def _hasty(visit: _Visit) -> None:
+def _hasty(visit: Visit) -> None:
     """2,000 connections, as fast as they come about, closed before their handshake."""
     while visit.done < 2000:
         visit.connect().close()
         visit.done += 1
 
 
-def _trickle(visit: _Visit) -> None:
+def _trickle(visit: Visit) -> None:
     """50 connections a second, closed before their handshake."""
     began = time.monotonic()
     while visit.goes_on:
@@ -144,7 +140,7 @@ def _trickle(visit: _Visit) -> None:
         visit.pause(50.0, began)
 
 
-def _silent(visit: _Visit) -> None:
+def _silent(visit: Visit) -> None:
     """2,000 connections that are held, and on which nothing is ever said."""
     held: list[socket.socket] = []
     while visit.goes_on:
@@ -155,7 +151,7 @@ def _silent(visit: _Visit) -> None:
         time.sleep(0.0005)
 
 
-def _large(visit: _Visit) -> None:
+def _large(visit: Visit) -> None:
     """A robot that hands over a belief as large as a message can be, again and again."""
     belief = Belief(np.zeros((_PARTICLES, 3)), np.full(_PARTICLES, 1.0 / _PARTICLES))
     request = next(
@@ -172,7 +168,7 @@ def _large(visit: _Visit) -> None:
             visit.done += 1
 
 
-def _flood(visit: _Visit) -> None:
+def _flood(visit: Visit) -> None:
     """Datagrams to a port for udp as fast as they go: nonsense, and some in a robot's name."""
     host, _, port = visit.endpoint.partition("/")[2].rpartition(":")
     with socket.socket(type=socket.SOCK_DGRAM) as sender:
@@ -185,7 +181,7 @@ def _flood(visit: _Visit) -> None:
                 visit.done += 1
 
 
-KINDS: dict[str, Callable[[_Visit], None]] = {
+KINDS: dict[str, Callable[[Visit], None]] = {
     "deaf": _deaf,
     "slow": _slow,
     "scanner": _scanner,
@@ -207,8 +203,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=5.0)
     options = parser.parse_args()
     corpus.requests()
-    visit = _Visit(options.endpoint, options.tls, options.seconds)
-    signal.signal(signal.SIGTERM, lambda *_: visit.end())
+    until = threading.Event()
+    timer = threading.Timer(options.seconds, until.set)
+    timer.daemon = True
+    timer.start()
+    visit = Visit(options.endpoint, options.tls, until)
+    signal.signal(signal.SIGTERM, lambda *_: until.set())
     print("begins", flush=True)
     KINDS[options.kind](visit)
     print(visit.done, flush=True)

@@ -24,35 +24,13 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from tests.fuzz.honest_robots import compared
 from tests.fuzz.measuring import Watch, flatness
 from tests.processes.faults import PROBLEMS, Robot, Service, Site, document_of, events_of
-
-from holdfast.config.loader import load
-from holdfast.journal.journal import Journal
-from holdfast.planning.planner import Planner
-from holdfast.robot.trial import run_trial
 
 _SMALL, _BIG = "8", "1000"
 _LIVES_S = (1.5, 6.0)
 """How long a service of the long-lived robot lives."""
-
-
-def _compare(file: Path, out: Path, most: int = 200) -> tuple[int, list[str]]:
-    """Compare the last trials of a run with the planner by itself; return how many, and which."""
-    configuration = load(file)
-    findings = []
-    with Journal.read(out / "journal.bin") as journal:
-        results = list(journal.results())[-most:]
-    for result in results:
-        expected = run_trial(
-            Planner(configuration.problem, configuration.planning),
-            configuration.simulator.seed,
-            result.trial,
-            max_steps=configuration.simulator.max_steps,
-        )
-        if (result.digest, result.reward) != (expected.digest, expected.reward):
-            findings.append(f"{out.name}, trial {result.trial}: other decisions")
-    return len(results), findings
 
 
 class _Passers:
@@ -92,7 +70,7 @@ class _Passers:
             if robot.wait() != 0:
                 self.findings.append(robot.account()[-2000:])
                 return
-            trials, findings = _compare(file, robot.out)
+            trials, findings = compared(file, robot.out, 200)
             self.finished += 1
             self.trials += trials
             self.findings += findings
@@ -189,7 +167,7 @@ def run_soak(
         code = robot.wait()
         if code not in (-signal.SIGTERM, 128 + signal.SIGTERM):
             findings.append(f"the robot ends with {code}: {robot.account()[-2000:]}")
-        trials, others = _compare(file, robot.out)
+        trials, others = compared(file, robot.out, 200)
         findings += others
         for name, service in visited.items():
             said = service.process.output

@@ -152,6 +152,7 @@ def test_assignments(assignments: list[str], expected: dict[str, object]) -> Non
         (["a.b"], "--set a.b: must be SECTION.KEY=VALUE"),
         (["a.b="], "--set a.b=: has no value"),
         (["a.b=[1"], "--set a.b, line 1"),
+        (["a.b.c=0.2"], "write --set 'a.b={c: 0.2}'"),
     ],
 )
 def test_assignments_that_are_refused(assignments: list[str], message: str) -> None:
@@ -161,7 +162,10 @@ def test_assignments_that_are_refused(assignments: list[str], message: str) -> N
 
 
 def test_what_needs_a_service_is_refused_without_one(path: Path) -> None:
-    for words in (["--recovery", "never"], ["--set", "recovery.launch=never"]):
+    for words in (
+        *(["--recovery", "never"], ["--set", "recovery.launch=never"]),
+        *(["--tls", "keys"], ["--set", "offload.tls=keys"]),
+    ):
         with pytest.raises(HoldfastError, match=f"^{' '.join(words)} needs --service"):
             run.main([str(path), *words])
 

@@ -107,19 +107,6 @@ class TestDecisions:
         first = run_of(tmp_path / "first", [*same, result_of(trial)])
         return compare_runs(first, run_of(tmp_path / "second", [*same, second]))
 
-    def differs(self, tmp_path: Path, second: TrialResult) -> tuple[str, int | None, str, str]:
-        found = self.compare(tmp_path, second)
-        assert not found.identical
-        assert found.trials == 1
-        assert found.difference is not None
-        assert found.difference.trial == 1
-        return (
-            found.difference.what,
-            found.difference.step,
-            found.difference.first,
-            found.difference.second,
-        )
-
     def test_times_and_recoveries_do_not_matter(self, tmp_path: Path) -> None:
         first = run_of(tmp_path / "first", [result_of(0), result_of(1), result_of(2)])
         results = [result_of(trial) for trial in (2, 0, 1)]
@@ -132,23 +119,44 @@ class TestDecisions:
             "identical: 3 trials, 6 sensing actions, 9 task actions and every state digest"
         )
 
-    def test_sensing_action(self, tmp_path: Path) -> None:
-        second = result_of(1, changed(2, (3, b"\x05" * 32, (0.3, 0.3))))
-        assert self.differs(tmp_path, second) == ("sensing action", 2, "1", "3")
-
-    def test_state_digest(self, tmp_path: Path) -> None:
-        second = result_of(1, changed(0, (2, b"\x05" * 32, (0.1, 0.0))))
-        expected = ("state digest after sensing", 0, "01" * 32, "05" * 32)
-        assert self.differs(tmp_path, second) == expected
-
-    def test_the_last_bit_of_a_task_action(self, tmp_path: Path) -> None:
-        second = result_of(1, changed(2, (1, b"\x02" * 32, (0.3, 0.3))))
-        expected = ("task action[1]", 2, "0.30000000000000004", "0.3")
-        assert self.differs(tmp_path, second) == expected
-
-    def test_the_sign_of_a_zero(self, tmp_path: Path) -> None:
-        second = result_of(1, changed(0, (2, b"\x01" * 32, (0.1, -0.0))))
-        assert self.differs(tmp_path, second) == ("task action[1]", 0, "0.0", "-0.0")
+    @pytest.mark.parametrize(
+        ("second", "difference"),
+        [
+            (changed(2, (3, b"\x05" * 32, (0.3, 0.3))), ("sensing action", 2, "1", "3")),
+            (
+                changed(0, (2, b"\x05" * 32, (0.1, 0.0))),
+                ("state digest after sensing", 0, "01" * 32, "05" * 32),
+            ),
+            (  # the last bit of a task action
+                changed(2, (1, b"\x02" * 32, (0.3, 0.3))),
+                ("task action[1]", 2, "0.30000000000000004", "0.3"),
+            ),
+            (changed(0, (2, b"\x01" * 32, (0.1, -0.0))), ("task action[1]", 0, "0.0", "-0.0")),
+            (
+                changed(1, (4, b"\x05" * 32, (0.2, 1.0))),
+                ("next decision", 1, "a task action at step 1", "sensing action 4 at step 1"),
+            ),
+            (STEPS[:2], ("next decision", 2, "sensing action 1 at step 2", "none, the trial ends")),
+            (
+                result_of(1, last=b"\x08" * 32),
+                ("digest of the last state", 3, "09" * 32, "08" * 32),
+            ),
+            (
+                result_of(1, [(2, b"\x01" * 32, (0.1,))], action_size=1),
+                ("size of the task actions", None, "2", "1"),
+            ),
+        ],
+    )
+    def test_what_differs_is_named(
+        self, tmp_path: Path, second: TrialResult | list[Step], difference: tuple[object, ...]
+    ) -> None:
+        other = second if isinstance(second, TrialResult) else result_of(1, second)
+        found = self.compare(tmp_path, other)
+        assert not found.identical
+        assert found.trials == 1
+        what, step, first, last = difference
+        expected = {"what": what, "trial": 1, "step": step, "first": first, "second": last}
+        assert msgspec.to_builtins(found.difference) == expected
 
     def test_numbers_that_print_alike_are_shown_by_their_bits(self, tmp_path: Path) -> None:
         assert math.isnan(NAN)
@@ -161,24 +169,6 @@ class TestDecisions:
         assert (difference.what, difference.step) == ("task action[0]", 1)
         assert difference.first == "nan (0x7ff8000000000000)"
         assert difference.second == "nan (0x7ff8000000000001)"
-
-    def test_sensing_where_the_other_does_not(self, tmp_path: Path) -> None:
-        second = result_of(1, changed(1, (4, b"\x05" * 32, (0.2, 1.0))))
-        expected = ("next decision", 1, "a task action at step 1", "sensing action 4 at step 1")
-        assert self.differs(tmp_path, second) == expected
-
-    def test_a_trial_that_ends_before_the_other(self, tmp_path: Path) -> None:
-        expected = ("next decision", 2, "sensing action 1 at step 2", "none, the trial ends")
-        assert self.differs(tmp_path, result_of(1, STEPS[:2])) == expected
-
-    def test_last_state(self, tmp_path: Path) -> None:
-        second = result_of(1, last=b"\x08" * 32)
-        expected = ("digest of the last state", 3, "09" * 32, "08" * 32)
-        assert self.differs(tmp_path, second) == expected
-
-    def test_size_of_the_actions(self, tmp_path: Path) -> None:
-        second = result_of(1, [(2, b"\x01" * 32, (0.1,))], action_size=1)
-        assert self.differs(tmp_path, second) == ("size of the task actions", None, "2", "1")
 
     def test_the_first_difference_is_told(self, tmp_path: Path) -> None:
         first = run_of(tmp_path / "first", [result_of(trial) for trial in range(4)])

@@ -88,12 +88,6 @@ def test_the_resolved_configuration_runs_again_to_the_same(workplace: Workplace)
     assert workplace.summary("second")["seed"] == 8
 
 
-def test_without_out_directories_are_numbered(workplace: Workplace) -> None:
-    for name in ("peg-seed3", "peg-seed3-2"):
-        workplace.runs("run", "peg.yaml", "--trials", "1")
-        assert (workplace.directory / "runs" / name / "trials.csv").is_file()
-
-
 def test_without_matplotlib_there_is_no_figure_but_all_else(workplace: Workplace) -> None:
     said = workplace.runs("run", "peg.yaml", "--trials", "1", "--out", "out")
     assert "pip install matplotlib" in said.stderr
@@ -324,23 +318,6 @@ def test_what_a_finished_run_can_do_without_may_fail(
     assert workplace.summary("out")["finished"] == 1
 
 
-def test_a_directory_that_cannot_be_made(workplace: Workplace) -> None:
-    assert "is a file" in workplace.fails("run", "peg.yaml", "--out", "peg.yaml")
-
-
-def test_a_directory_that_holds_a_run(workplace: Workplace) -> None:
-    one = ("run", "peg.yaml", "--jobs", "1", "--trials", "1", "--out", "out")
-    assert workplace.run(*one, "--quiet").code == 0
-    summary = workplace.directory / "out" / "summary.json"
-    before = summary.read_bytes()
-    assert "--resume" in workplace.fails(*one)
-    error = workplace.fails(*one, "--seed", "4", "--resume")
-    assert "simulator.seed is 3 there and 4 here" in error
-    assert summary.read_bytes() == before
-    error = workplace.fails("compare", "out", "out/trials.csv")
-    assert "out/trials.csv: is not a journal" in error
-
-
 def test_values_instead_of_the_files_are_a_part_of_what_must_be_the_same_to_go_on(
     workplace: Workplace,
 ) -> None:
@@ -363,10 +340,6 @@ def test_too_few_particles_are_noted(workplace: Workplace) -> None:
     said = workplace.runs("run", "peg.yaml", "--out", "few", *options)
     assert workplace.summary("few")["unexplained_observations"]
     assert "take more particles (particle_filter.num_particles)" in " ".join(said.stdout.split())
-
-
-def test_nothing_to_resume(workplace: Workplace) -> None:
-    assert "no run to resume" in workplace.fails("run", "peg.yaml", "--resume")
 
 
 @pytest.mark.parametrize(
@@ -437,54 +410,19 @@ def test_with_log_json_the_error_is_an_event(
     assert event["component"] == ("service" if command[0] == "serve" else "robot")
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        (("--recovery", "at_start"), "--recovery at_start needs --service (or "),
-        (("--tls", "keys"), "--tls keys needs --service (or "),
-        (("--problem", "held_problem"), "did you mean held_problem:Held?"),
-    ],
-)
-def test_what_would_do_nothing_is_refused(
-    workplace: Workplace, options: tuple[str, str], expected: str
-) -> None:
-    (workplace.directory / "keys").mkdir()
+def test_a_problem_whose_class_is_not_named(workplace: Workplace) -> None:
     workplace.write(
         "held_problem.py",
         "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
         "class Held(PegInHole2D): name = 'held'\n",
     )
-    assert expected in workplace.fails("run", "peg.yaml", "--out", "out", *options)
+    said = workplace.fails("run", "peg.yaml", "--out", "out", "--problem", "held_problem")
+    assert "did you mean held_problem:Held?" in said
 
 
 def test_a_configuration_without_a_command(workplace: Workplace) -> None:
     error = workplace.fails("peg.yaml", "--jobs", "2")
     assert error.endswith("did you mean: holdfast run peg.yaml --jobs 2\n")
-
-
-@pytest.mark.parametrize(
-    ("assignment", "message"),
-    [
-        (
-            "selector.method=dance",
-            'selector.method, given instead of what peg.yaml says, is "dance',
-        ),
-        (
-            "simulator.max_step=9",
-            "holdfast: error: simulator.max_step is not a known key; did you mean max_steps?",
-        ),
-        (
-            "environment.arguments.noise=0.2",
-            "write --set 'environment.arguments={noise: 0.2}'",
-        ),
-    ],
-)
-def test_a_wrong_value_instead_of_the_files(
-    workplace: Workplace, assignment: str, message: str
-) -> None:
-    error = workplace.fails("run", "peg.yaml", "--out", "wrong", "--set", assignment)
-    assert message in error
-    assert workplace.names() == {"peg.yaml"}
 
 
 class TestAfterAReboot:
