@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.common import Context
 from benchmarks.measure import alternate
 from benchmarks.report import Bar, Result, Table, milliseconds, paragraph
-from holdfast.robot.trials import available_cores
+from holdfast.runtime.machine import available_cores
 
 __all__ = ["startup", "trials"]
 

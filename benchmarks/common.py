@@ -16,7 +16,7 @@ from benchmarks.report import Result
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
-from holdfast.robot.trials import available_cores
+from holdfast.runtime.machine import available_cores
 
 __all__ = [
     "SIZES",

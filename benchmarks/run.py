@@ -35,8 +35,8 @@ from benchmarks import (
 from benchmarks.common import Case, Context
 from benchmarks.measure import OtherLoad
 from benchmarks.report import BARS_HEADER, Result, Table, markdown_of, show
-from holdfast.robot.trials import available_cores
 from holdfast.runtime.files import write_atomically
+from holdfast.runtime.machine import available_cores
 from holdfast_lab.testbed.machine import describe, kernel_hash
 
 RESULTS = Path(__file__).with_name("RESULTS.md")

@@ -191,7 +191,7 @@ def _make_anew(studies: list[Study], source: Path, directory: Path) -> None:
 
 
 def _executor_of(place: str, jobs: int) -> Executor:
-    from holdfast.robot.trials import available_cores
+    from holdfast.runtime.machine import available_cores
     from studies.executors import LocalExecutor, RayExecutor
 
     if place == "local":

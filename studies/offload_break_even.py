@@ -27,7 +27,7 @@ import pandas as pd
 
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.settings import PlanningSettings
-from holdfast.robot.trials import available_cores
+from holdfast.runtime.machine import available_cores
 from studies.cost_model import Scaling, break_even
 from studies.sensing_times import Measurement
 from studies.statistics import (

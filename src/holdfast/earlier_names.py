@@ -9,8 +9,6 @@ from __future__ import annotations
 import functools
 import warnings
 
-__all__ = ["EARLIER_NAMES", "warn_of_earlier_name"]
-
 EARLIER_NAMES = {"execute": ("limit_action", "0.3")}
 """What is said now, and the release without the earlier name."""
 

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-__all__ = ["cell", "cells", "csv_rows", "did_you_mean", "one_line", "printable"]
-
 
 def printable(text: str, *, keep: str = "\n\t") -> str:
     """Return the text with each unprintable character escaped."""

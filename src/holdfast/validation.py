@@ -21,20 +21,6 @@ from msgspec.inspect import FloatType, IntType, ListType, StrType, VarTupleType
 from holdfast.errors import InvalidValueError
 from holdfast.printable import did_you_mean
 
-__all__ = [
-    "KeyPath",
-    "Mismatch",
-    "as_function",
-    "as_path",
-    "close_match",
-    "described",
-    "dotted",
-    "field_names",
-    "find_mismatch",
-    "shown",
-]
-
-
 KeyPath = tuple[str | int, ...]
 """Keys and list indices that lead from the top of a document to a value."""
 

@@ -11,10 +11,11 @@ from tests.robot_world import PLANNING, PROBLEM, World
 
 from holdfast.errors import HeldError
 from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.belief import ObservationInfo
 from holdfast.planning.inputs import Record, Reinitialised, Sensed
 from holdfast.planning.lost import MOVE, Verdict
 from holdfast.planning.outcome import MoveResult, TrialResult
-from holdfast.planning.planner import ObservationInfo, Planner
+from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings, OnLost, SimulatorSettings
 from holdfast.planning.tracking import Trial, replay
 from holdfast.protocol.events import Effects, Halt, LogEvent, RobotEffect, WriteRecords

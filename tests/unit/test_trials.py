@@ -9,7 +9,7 @@ import pytest
 from tests.unit.test_trial import configuration_of, failing_configuration, one
 
 from holdfast.config.loader import Configuration, load
-from holdfast.errors import InvalidValueError, TrialCrashError
+from holdfast.errors import InvalidValueError, TrialCrashError, TrialError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
@@ -17,7 +17,7 @@ from holdfast.robot import trial_pool
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import run_trial
 from holdfast.robot.trial_pool import Arm, TrialPool
-from holdfast.robot.trials import TrialError, run_trials
+from holdfast.robot.trials import run_trials
 
 
 def defective_configuration(tmp_path: Path) -> Configuration:

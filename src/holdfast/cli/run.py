@@ -82,7 +82,8 @@ def _run(options: RunOptions) -> int:
     from holdfast.reports.recorder import Recorder
     from holdfast.robot.environment_maker import load_environment
     from holdfast.robot.recomputing import resume_run, resume_run_if_begun
-    from holdfast.robot.trials import available_cores, run_trials
+    from holdfast.robot.trials import run_trials
+    from holdfast.runtime.machine import available_cores
     from holdfast.runtime.service_manager import ServiceManager
 
     manager = ServiceManager(options.watchdog_s)

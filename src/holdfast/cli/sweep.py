@@ -111,7 +111,7 @@ def main(arguments: Sequence[str]) -> int:
         raise InvalidValueError("--set is missing: which values of which key shall be compared?")
     if options.resume and options.out is None:
         raise InvalidValueError("--resume needs --out, the directory of the sweep that goes on")
-    from holdfast.robot.trial_pool import available_cores
+    from holdfast.runtime.machine import available_cores
     from holdfast.tuning.sweep import Sweep
 
     runs = _RUNS.absolute()  # before the user's code, which may change the current directory

@@ -18,23 +18,6 @@ import numpy.typing as npt
 from holdfast.errors import InvalidValueError
 from holdfast.printable import one_line
 
-__all__ = [
-    "NOTHING_ELSE",
-    "BoolArray",
-    "FloatArray",
-    "IntArray",
-    "KeepsReadOnly",
-    "floats",
-    "floats_or_none",
-    "in_brief",
-    "integer",
-    "is_masked",
-    "plain",
-    "real_number",
-    "real_numbers",
-    "whole",
-]
-
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]

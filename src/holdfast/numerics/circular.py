@@ -19,8 +19,6 @@ from holdfast import _kernel
 from holdfast.numerics import reproducible as numerics
 from holdfast.numerics.arrays import FloatArray
 
-__all__ = ["differences", "embedded", "mean_angles", "unwrapped"]
-
 _TURN = 2.0 * np.pi
 
 

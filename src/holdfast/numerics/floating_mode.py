@@ -19,8 +19,6 @@ import numpy as np
 
 from holdfast import _kernel
 
-__all__ = ["as_caller", "in_own_mode"]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 

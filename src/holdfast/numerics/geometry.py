@@ -32,15 +32,6 @@ from holdfast.numerics.randomness import NoiseFreeStream
 if TYPE_CHECKING:
     from holdfast.numerics.randomness import Stream
 
-__all__ = [
-    "FAR",
-    "MAX_NOISE_ATTEMPTS",
-    "BoxWorld",
-    "DiscWorld",
-    "KernelObject",
-    "RectangleWorld",
-    "RolloutSettings",
-]
 
 FAR = 1.0e6
 """Extent of an unbounded obstacle, in metres."""

@@ -32,8 +32,6 @@ from holdfast.numerics.arrays import (
     whole,
 )
 
-__all__ = ["NOISE_FREE", "NoiseFreeStream", "Purpose", "Stream", "stream"]
-
 Words: TypeAlias = tuple[int, int, int, int, int]
 
 Size: TypeAlias = int | Sequence[int]

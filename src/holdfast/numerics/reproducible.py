@@ -16,19 +16,6 @@ from holdfast import _kernel
 from holdfast.errors import ConfigurationError, InvalidValueError
 from holdfast.numerics.arrays import FloatArray
 
-__all__ = [
-    "all_finite",
-    "arcsin",
-    "arctan2",
-    "cos",
-    "exp",
-    "log",
-    "sin",
-    "sum",
-    "weighted_mean",
-    "wrapped",
-]
-
 _TURN = 2.0 * np.pi
 
 

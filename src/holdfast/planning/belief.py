@@ -31,20 +31,6 @@ from holdfast.planning.validation_gate import gate, is_typical, is_within
 from holdfast.problems import checked
 from holdfast.problems.attributes import circular_observation, has_general_observations
 
-__all__ = [
-    "Belief",
-    "ObservationInfo",
-    "distinct_particles",
-    "effective_sample_size",
-    "estimate",
-    "regularised",
-    "resample",
-    "standard_deviation",
-    "update",
-    "update_by_move",
-]
-
-
 VALIDATION_GATE_SQUARED = 64.0
 """Square of eight standard deviations. An observation further than this from every particle lies
 outside the validation gate; under a correct model in one dimension its probability is below

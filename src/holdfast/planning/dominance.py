@@ -15,8 +15,6 @@ import numpy as np
 
 from holdfast.numerics.arrays import BoolArray, FloatArray
 
-__all__ = ["dominated"]
-
 _ROUNDING = 1e-9
 """Relative differences below which means, or variances, are the same."""
 

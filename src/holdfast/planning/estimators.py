@@ -27,9 +27,6 @@ from holdfast.numerics.circular import unwrapped
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.planning.settings import MAX_PRIOR_NEIGHBORS_POINTS
 
-__all__ = ["GaussianMixture", "NearestNeighbor", "PriorNeighbors", "entropy"]
-
-
 MAX_DIMENSION = 64
 
 LARGEST = 1e150

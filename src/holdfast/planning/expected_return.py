@@ -54,9 +54,6 @@ from holdfast.problems import checked
 from holdfast.problems.attributes import circular_states, has_own, sensing_costs
 from holdfast.problems.problem import Problem, ProblemBase
 
-__all__ = ["Posteriors", "Returns", "expected_returns", "has_own_rollouts", "rollout_returns"]
-
-
 Posteriors = Callable[[Sequence[int], int, Stream], tuple[IntArray, FloatArray]]
 """Called with sensing actions, a number M of samples and a stream. Returns the M particles that are
 the true states, and the weights of the posteriors, shape ``(len(sensing_actions), M, N)``, an array

@@ -20,8 +20,9 @@ import numpy.typing as npt
 from holdfast.errors import MessageError, RecordError
 from holdfast.numerics import reproducible as numerics
 from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.belief import ObservationInfo
 from holdfast.planning.outcome import SensingDecision, TaskDecision
-from holdfast.planning.planner import ObservationInfo, Planner, PlanningState
+from holdfast.planning.planner import Planner, PlanningState
 
 MAX_INPUTS = 64
 """Bound on the inputs of one request; a service further behind is sent the state."""

@@ -21,8 +21,6 @@ import numpy as np
 from holdfast import _kernel
 from holdfast.errors import InterruptedComputationError
 
-__all__ = ["Interruption", "check", "interruptible"]
-
 _AWAITED, _NOT_AWAITED, _TOO_LONG = range(3)
 """Values of the flag; the kernel sets the last one."""
 

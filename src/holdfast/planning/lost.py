@@ -29,8 +29,6 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-__all__ = ["MAX_OUTSIDE", "MOVE", "LostTest", "Verdict"]
-
 MAX_OUTSIDE = 0.05
 """Share of a sound belief's observations that may be outside the gate."""
 

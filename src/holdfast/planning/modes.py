@@ -30,8 +30,6 @@ from holdfast.numerics import reproducible as numerics
 from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.circular import unwrapped
 
-__all__ = ["heaviest_mode"]
-
 _STARTS = 16
 """Places from which peaks are looked for."""
 

@@ -21,23 +21,6 @@ from holdfast.numerics.arrays import FloatArray
 from holdfast.printable import one_line
 from holdfast.problems.attributes import sensing_costs
 
-__all__ = [
-    "DONE_VALUES",
-    "TRIAL_COLUMNS",
-    "DecisionLog",
-    "Decisions",
-    "Done",
-    "Ending",
-    "MoveResult",
-    "Outcome",
-    "RewardAccount",
-    "SensingDecision",
-    "TaskDecision",
-    "TrialResult",
-    "ending_of",
-]
-
-
 Outcome: TypeAlias = Literal["succeeded", "failed", "truncated"]
 """How a trial ended: the environment terminated it, or it was cut off, by a limit (truncated)."""
 

@@ -66,20 +66,6 @@ from holdfast.problems.attributes import (
 )
 from holdfast.problems.problem import Problem
 
-__all__ = [
-    "Decision",
-    "ObservationInfo",
-    "Planner",
-    "PlanningState",
-    "SensingInfo",
-    "TaskInfo",
-    "decode_checkpoint",
-    "digest",
-    "encode_checkpoint",
-    "needs_sensing",
-]
-
-
 CHECKPOINT_VERSION = 1
 
 

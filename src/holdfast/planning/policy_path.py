@@ -22,9 +22,6 @@ from holdfast.problems import checked
 from holdfast.problems.attributes import has_own
 from holdfast.problems.problem import Problem
 
-__all__ = ["PathPoints", "path_points"]
-
-
 _STEP = ("policy", "limit_action", "move", "expected_move", "next_stage")
 """Functions that a step of the path calls."""
 

@@ -63,9 +63,6 @@ from holdfast.problems.attributes import (
 )
 from holdfast.problems.problem import Problem
 
-__all__ = ["SensingInfo", "choose_sensing_action"]
-
-
 # Substreams of the stream of hypotheses; 1 is the kernel's own, for the observation noise.
 _HORIZON_MOTION = 2
 _GENERAL_OBSERVATIONS = 3

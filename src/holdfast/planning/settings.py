@@ -16,22 +16,6 @@ import msgspec
 
 from holdfast.errors import InvalidValueError
 
-__all__ = [
-    "ActiveSensingSettings",
-    "EnvironmentSettings",
-    "LostSettings",
-    "OffloadSettings",
-    "ParticleFilterSettings",
-    "PlanningSettings",
-    "RecoverySettings",
-    "SelectorSettings",
-    "SimulatorSettings",
-    "check_settings",
-    "estimator_of",
-    "path_steps",
-    "unfit_for_the_method",
-]
-
 MAX_PARTICLES = 10_000_000
 """Bound on ``num_particles``: states of six coordinates then fill 480 MB."""
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from holdfast.errors import InvalidValueError, MessageError, RecordError
 from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.belief import ObservationInfo
 from holdfast.planning.inputs import (
     MAX_INPUTS,
     ActingRecord,
@@ -34,10 +35,8 @@ from holdfast.planning.inputs import (
 )
 from holdfast.planning.lost import MOVE, LostTest, Verdict
 from holdfast.planning.outcome import DecisionLog, Ending, RewardAccount, TaskDecision, TrialResult
-from holdfast.planning.planner import ObservationInfo, Planner, PlanningState
+from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.settings import LostSettings
-
-__all__ = ["MAX_AWAITED", "MAX_INPUTS_SINCE", "Trial", "replay"]
 
 _GivenT = TypeVar("_GivenT", bound=Record)
 

@@ -27,8 +27,6 @@ from holdfast import _kernel
 from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.circular import differences, mean_angles
 
-__all__ = ["OUTSIDE_PROBABILITY", "gate", "is_typical", "is_within"]
-
 OUTSIDE_PROBABILITY = 0.01
 """Probability that an observation is outside, if the belief and the model are right."""
 

@@ -34,18 +34,6 @@ from holdfast.problems.problem import Problem, ProblemBase
 from holdfast.protocol.events import Acted, EnvironmentReady, NoReading
 from holdfast.protocol.messages import MAX_ACTION_SIZE
 
-__all__ = [
-    "LATER",
-    "CheckedEnvironment",
-    "Environment",
-    "Later",
-    "ObservationSizes",
-    "SimulatedEnvironment",
-    "is_no_reading",
-    "require_methods",
-]
-
-
 _NUMBERS = f"numbers {NOTHING_ELSE}"
 
 _REQUIRED = ("perform_sensing", "perform", "is_done")

@@ -47,8 +47,6 @@ from holdfast.problems.attributes import (
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import SimulatedEnvironment
 
-__all__ = ["ProblemEnv"]
-
 _SCOUTS = 64
 """Simulated robots whose ways give the range of each coordinate."""
 

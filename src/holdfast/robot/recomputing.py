@@ -51,8 +51,6 @@ from holdfast.robot.trial import (
     take_sensing,
 )
 
-__all__ = ["ComparedTrial", "RecordedTrials", "compute_again", "resume_run", "resume_run_if_begun"]
-
 _FINISHED_S = 30.0
 """No further finished trial is begun after this time."""
 

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from holdfast.robot.health import RobotWatch
     from holdfast.runtime.events import EventSink
 
-__all__ = ["RobotObserver", "perform_trials"]
-
 
 class RobotObserver(NamedTuple):
     """Callbacks on the robot's event loop, so each must return at once.

@@ -16,9 +16,11 @@ from typing import NamedTuple
 
 from holdfast.errors import HeldError, InvalidValueError
 from holdfast.numerics.arrays import FloatArray, whole
+from holdfast.planning.belief import ObservationInfo
 from holdfast.planning.inputs import Late, Moved, Reinitialised, Sensed
 from holdfast.planning.outcome import TrialResult
-from holdfast.planning.planner import ObservationInfo, Planner, PlanningState, SensingInfo, TaskInfo
+from holdfast.planning.planner import Planner, PlanningState, TaskInfo
+from holdfast.planning.sensing import SensingInfo
 from holdfast.planning.settings import (
     EnvironmentSettings,
     LostSettings,

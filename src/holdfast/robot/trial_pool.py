@@ -55,8 +55,6 @@ from holdfast.runtime.machine import available_cores
 from holdfast.runtime.ray_workers import RayCluster, RayProcess
 from holdfast.runtime.workers import WorkerProcess, end_workers
 
-__all__ = ["Arm", "FinishedTrial", "TrialPool", "available_cores"]
-
 _WORKER_START_S = 1.0  # about what it costs to start workers; they must save more than this
 _LOOKAHEAD_S = 0.1  # of trials that a worker is sent, so that it never waits for the next one
 _MAX_LOOKAHEAD = 16

@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 
 from holdfast.config.loader import Configuration
-from holdfast.errors import TrialError
 from holdfast.planning.outcome import TrialResult
 from holdfast.robot.trial import NULL_OBSERVER, TrialObserver
-from holdfast.robot.trial_pool import Arm, TrialPool, available_cores
-
-__all__ = ["TrialError", "available_cores", "run_trials"]
+from holdfast.robot.trial_pool import Arm, TrialPool
 
 
 def run_trials(

@@ -30,8 +30,9 @@ from holdfast.reports.outcome_comparison import (
     shown_estimate,
 )
 from holdfast.reports.table_formats import Table
-from holdfast.robot.trial_pool import Arm, TrialPool, available_cores
+from holdfast.robot.trial_pool import Arm, TrialPool
 from holdfast.runtime.command_line import MAX_SEED, MAX_TRIALS
+from holdfast.runtime.machine import available_cores
 from holdfast.validation import as_function, as_path
 
 _SHOWN = ("trial", "outcome", "steps", "reward", "sensing_decisions", "mean_sensing_ms")

@@ -28,8 +28,9 @@ from holdfast.config.loader import Configuration, load
 from holdfast.errors import InvalidValueError, TrialCrashError, TrialError, WorkerDiedError
 from holdfast.journal.fingerprint import fingerprint
 from holdfast.numerics.arrays import FloatArray, real_number, whole
-from holdfast.robot.trial_pool import Arm, TrialPool, available_cores
+from holdfast.robot.trial_pool import Arm, TrialPool
 from holdfast.runtime.command_line import MAX_JOBS
+from holdfast.runtime.machine import available_cores
 from holdfast.runtime.ray_workers import RayCluster
 from holdfast.tuning.candidates import (
     AS_CONFIGURED,

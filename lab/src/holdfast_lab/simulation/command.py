@@ -158,7 +158,7 @@ def _tell(schedule: SimulationSchedule) -> bool:
 
 def _explore(seeds: range, jobs: int, *, shrink: bool) -> bool:
     from holdfast.cli.terminal import counted, progress_line
-    from holdfast.robot.trials import available_cores
+    from holdfast.runtime.machine import available_cores
     from holdfast_lab.simulation.exploration import ExplorationTally, explore
 
     tally = ExplorationTally()

@@ -13,8 +13,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.belief import ObservationInfo
 from holdfast.planning.outcome import DecisionLog, Done, MoveResult
-from holdfast.planning.planner import ObservationInfo, Planner, PlanningState
+from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import SimulatedEnvironment
