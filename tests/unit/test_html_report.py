@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +92,12 @@ def test_code_that_a_run_names_is_not_run(
     assert len(charts_of(page)) == 1
     page, notes = run_page(tmp_path / "out", worst=1, problem_directory=tmp_path)
     assert (notes, len(charts_of(page))) == ([], 2)
+    with (tmp_path / "own.py").open("a") as module:
+        module.write("    def scene(self):\n        return 1 / 0\n")
+    sys.modules.pop("own")
+    page, (note,) = run_page(tmp_path / "out", worst=1, problem_directory=tmp_path)
+    assert "ZeroDivisionError" in note
+    assert len(charts_of(page)) == 1
 
 
 def test_runs_a_sweep_and_a_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -223,7 +223,7 @@ class TestRunDirectory:
         RunDirectory.create(out, configuration).close()
         damaged = (out / "journal.bin").read_bytes()[:-100]
         (out / "journal.bin").write_bytes(damaged)
-        with pytest.raises(OutputError, match=r"the journal is damaged .*--out"):
+        with pytest.raises(OutputError, match=r"the journal is damaged .*another directory"):
             resume_run(out, configuration)
         with pytest.raises(OutputError, match=r"holds config"):
             RunDirectory.create(out, configuration)

@@ -251,8 +251,8 @@ os.register_at_fork(after_in_child=_close_all)  # a fork has the lock, too, and 
 def damaged(path: Path, how: str) -> OutputError:
     """Return the error of a damaged journal."""
     return OutputError(
-        f"{path}: the journal is damaged ({how}), so the run cannot go on; restore the file, or "
-        f"{START_ANEW}"
+        f"{path}: the journal is damaged ({how}); restore the file, or run anew in another "
+        "directory"
     )
 
 

@@ -111,12 +111,15 @@ def _mean(total: float | None, count: int) -> float | None:
     return None if total is None or not count else total / count
 
 
-_COUNTS = tuple(
-    name
-    for name in RunSummary.__struct_fields__
-    if name in TRIAL_COLUMNS and name not in ("seed", "digest", "fewest_distinct_particles")
+_COUNTS = (
+    "sensing_decisions",
+    "missing_observations",
+    "unexplained_observations",
+    "lost",
+    "suspect_sensors",
+    "recoveries",
 )
-"""What the summary has of a trial's counts, under the same names: their sums."""
+"""What the summary has the sum of, under the name that a trial's result has it."""
 
 
 class SummaryBuilder:

@@ -14,6 +14,7 @@ from typing import Any
 
 from holdfast.config.loader import Configuration
 from holdfast.config.source_digest import core_version
+from holdfast.config.user_code import describe_problem_error
 from holdfast.errors import HoldfastError, OutputError, UntrustedCodeError
 from holdfast.journal.fingerprint import read_earlier
 from holdfast.journal.journal_reader import JournalReader
@@ -26,6 +27,7 @@ from holdfast.reports.html_page import HtmlPage, chart_part
 from holdfast.reports.outcome_comparison import (
     compare_results,
     estimates_of,
+    outcomes_of,
     read_outcomes,
     shown_estimate,
 )
@@ -99,8 +101,8 @@ def run_page(
     on_trial : callable
         Gets the number of trials that are computed.
     """
-    outcomes = read_outcomes(run, run.name)
     with JournalReader.read_run(run, "report") as journal:
+        outcomes = outcomes_of(journal, run.name)
         meta, directory = journal.meta(), journal.path.parent
         unfinished = journal.unfinished()
     results = [outcomes.results[trial] for trial in sorted(outcomes.results)]
@@ -254,14 +256,19 @@ def _add_worst(
             for number, result in enumerate(worst, start=1):
                 page.heading(_title(result))
                 most = max(20, _STEPS // len(worst))
-                chart = TrialChart(recorded.configuration, result, most)
+                settings, why = recorded.configuration, ""
                 try:
+                    chart = TrialChart(settings, result, most)
                     list(recorded.replay([result.trial], [chart]))
                 except HoldfastError as error:
-                    notes.append(str(error))
-                    page.paragraph("It cannot be shown step by step: see the note below.")
+                    why = str(error)
+                except Exception as error:  # noqa: BLE001 - of the problem's own code
+                    why = describe_problem_error(settings.problem_name, error)
                 else:
-                    _add_trial(page, chart, recorded.configuration)
+                    _add_trial(page, chart, settings)
+                if why:
+                    notes.append(why)
+                    page.paragraph("It cannot be shown step by step: see the note below.")
                 on_trial(number)
     except UntrustedCodeError as error:
         notes.append(str(error))

@@ -260,8 +260,13 @@ class ComparedRun(NamedTuple):
 def read_outcomes(path: Path, name: str) -> ComparedRun:
     """Read what is compared of a recorded run; OutputError if it is none or is damaged."""
     with JournalReader.read_run(path, "compare") as journal:
-        meta = journal.meta()
-        results = {result.trial: result for result in journal.results()}
+        return outcomes_of(journal, name)
+
+
+def outcomes_of(journal: JournalReader, name: str) -> ComparedRun:
+    """Return what is compared of a run whose journal is open; OutputError if it is damaged."""
+    meta = journal.meta()
+    results = {result.trial: result for result in journal.results()}
     configuration = recorded_configuration(meta.get("configuration", ""), journal.path)
     simulator = configuration["simulator"]
     environment = world_of(configuration.get("environment") or {})

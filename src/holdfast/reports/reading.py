@@ -17,7 +17,6 @@ import numpy.typing as npt
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import OutputError
-from holdfast.journal.journal_reader import JournalReader
 from holdfast.journal.tables import trial_row
 from holdfast.numerics.arrays import FloatArray, IntArray, whole
 from holdfast.planning.belief import Belief
@@ -157,9 +156,7 @@ def open_run(path: str | Path, *, problem_directory: str | Path | None = None) -
     directory = None if problem_directory is None else Path(problem_directory).absolute()
     with RecordedRun(run, "open", problem_directory=directory) as recorded:
         configuration, trials = recorded.configuration, recorded.trials
-    with JournalReader.read_run(run, "open") as journal:
-        # Those that are known to the first: the run may have gone on.
-        rows = [trial_row(each) for each in journal.results() if each.trial in trials]
+        rows = [trial_row(each) for each in recorded.journal.results()]
     columns = zip(*rows, strict=True) if rows else ([] for _ in TRIAL_COLUMNS)
     results = {
         name: np.array([np.nan if value is None else value for value in column])

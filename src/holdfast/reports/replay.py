@@ -69,6 +69,7 @@ class RecordedRun:
     ----------
     configuration : Configuration
         The settings that decide; it names no services and no environment.
+    journal : JournalReader
     trials : tuple of int
         All trials that have facts, in order: the finished ones, and the unfinished one.
     has_times : bool
@@ -85,18 +86,18 @@ class RecordedRun:
     ) -> None:
         self.path = run
         with contextlib.ExitStack() as stack:
-            self._journal = stack.enter_context(JournalReader.read_run(run, purpose))
-            path = self._journal.path
-            self._meta = self._journal.meta()
+            self.journal = stack.enter_context(JournalReader.read_run(run, purpose))
+            path = self.journal.path
+            self._meta = self.journal.meta()
             self.configuration, simulated = _configuration(
                 self._meta, path, purpose, problem_directory
             )
             self._recorded = RecordedTrials(
-                self._journal, self.configuration, world_is_simulated=simulated
+                self.journal, self.configuration, world_is_simulated=simulated
             )
-            self._begun = self._journal.unfinished()
+            self._begun = self.journal.unfinished()
             self.unfinished = None if self._begun is None else self._begun.trial
-            trials = self._journal.finished()
+            trials = self.journal.finished()
             if self.unfinished is not None:
                 trials.add(self.unfinished)
             self.trials = tuple(sorted(trials))
@@ -106,7 +107,7 @@ class RecordedRun:
             # use. A trial in which nothing was decided needs none.
             lacking = [
                 result.trial
-                for result in self._journal.results()
+                for result in self.journal.results()
                 if result.steps and result.trial not in self._rows
             ]
             self.has_times = bool(self._rows) and not lacking
@@ -131,7 +132,7 @@ class RecordedRun:
         events = self._events if self.has_times else []
         output = _Output(sinks, events, with_others=chosen.issuperset(self.trials))
         begun = self._begun if self._begun is not None and self._begun.trial in chosen else None
-        for result in self._journal.results(with_decisions=True):
+        for result in self.journal.results(with_decisions=True):
             if begun is not None and begun.trial < result.trial:
                 yield self._replay(begun, output, clock)
                 begun = None

@@ -43,6 +43,7 @@ from holdfast.errors import (
     TrialCrashError,
     TrialError,
     WorkerDiedError,
+    how_to_install,
 )
 from holdfast.numerics.arrays import integer
 from holdfast.planning.outcome import TrialResult
@@ -440,8 +441,9 @@ class _Worker(WorkerProcess):
 _OF_THE_PROBLEM = ("problem", "problem_directory", "model", "state_space_planner")  # sections
 
 _NEEDS_CLOUDPICKLE = (
-    "a problem that a notebook or a script defines needs cloudpickle: pip install "
-    "'holdfast-sensing[tune]', or put its class into a module of its own, or use jobs=1"
+    "a problem that a notebook or a script defines needs cloudpickle: "
+    f"{how_to_install('cloudpickle', 'tune')}, or put its class into a module of its own, or use "
+    "jobs=1"
 )
 
 
