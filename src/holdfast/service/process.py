@@ -188,7 +188,7 @@ def _serve(
         sockets = sockets or [_listen_early(each, files, stack) for each in endpoints]
         # From here and not from a module that a module needs: CPython keeps the frames of calls
         # in pieces of 16 KB, and imports this deep would take and return one thousands of times.
-        import numpy  # noqa: F401
+        import numpy as np  # noqa: F401
 
         extension = None if make_extension is None else make_extension()
         process = _ServiceProcess(options, credentials, extension, supervised, sockets)
