@@ -21,6 +21,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from tests.ports import free_port
 from tests.processes.faults import PATIENT
 from tests.programs import completed
 from tests.unit.test_protocol_service import Robot, content
@@ -534,10 +535,22 @@ sys.exit(service_process.main(["--listen", "tcp/127.0.0.1:0", "--until-stdin-clo
     for heavy in (
         "cryptography", "holdfast.config.loader", "holdfast.config.user_code",
         "holdfast.runtime.monitoring",
-        "importlib.metadata", "matplotlib", "multiprocessing", "prometheus_client", "rich",
-        "scipy", "sqlite3", "ssl", "yaml",
+        "importlib.metadata", "matplotlib", "multiprocessing", "numpy.ma", "prometheus_client",
+        "rich", "scipy", "sqlite3", "ssl", "yaml",
     ):  # fmt: skip
         assert heavy not in modules
+
+
+def test_robots_can_connect_while_it_loads(tmp_path: Path) -> None:
+    port = free_port()
+    (tmp_path / "far.py").write_text(
+        "import socket\nfrom holdfast.problems.capsule_robot import CapsuleRobot as Far\n"
+        f"robot = socket.create_connection(('127.0.0.1', {port}))\n"
+    )
+    with served(
+        "--listen", f"tcp/127.0.0.1:{port}", "--problem", "far:Far", directory=tmp_path
+    ) as service:
+        assert str(port) in service.endpoint
 
 
 def test_whoever_sees_the_service_can_use_it() -> None:

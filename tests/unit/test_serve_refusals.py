@@ -29,7 +29,7 @@ from holdfast.transport.key_ring import make_credentials
         (["--max-sessions", "many"], ["from 1 to"]),
         (["--metrics", "65536"], ["from 0 to 65535"]),
         (["--name", "a b"], ["a b"]),
-        (["--problem", "nix"], ["nix"]),
+        (["--problem", "nix", "--listen", "unix/nix"], ["problem: nix"]),
         (["--tls", "/nowhere"], ["/nowhere"]),
         (["--lis", "tcp/127.0.0.1:0"], ["--lis"]),
         (["--processes", "2", "--until-stdin-closes"], ["--until-stdin-closes"]),

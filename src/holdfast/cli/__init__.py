@@ -12,6 +12,7 @@ mistyped option answer at once, and a service that replaces a dead one starts qu
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -25,6 +26,7 @@ def main(application: Callable[[Sequence[str]], int] | None = None) -> None:
     ``application`` is run with the arguments instead of the commands of ``holdfast``; it returns
     the exit code.
     """
+    gc.disable()  # importing modules leaves no garbage
     if os.getpid() == 1:
         # The first process of a container does not get what it has no handler for.
         signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
@@ -50,6 +52,7 @@ def main(application: Callable[[Sequence[str]], int] | None = None) -> None:
 
             application, is_service = find_command(arguments)
             arguments = arguments[1:]
+        gc.enable()
         # A service, and what guards one, go on when nobody reads their output.
         if is_service:
             sys.exit(application(arguments))

@@ -143,7 +143,7 @@ def _misspelt(kind: type, of_instance: frozenset[str]) -> str:
     theirs = [base for base in kind.__mro__ if not base.__module__.startswith("holdfast.")]
     names = {name for base in theirs for name in vars(base) if name[0] != "_"} | of_instance
     known = {*PARAMETERS, *KNOWN_ATTRIBUTES}
-    if names <= known:
+    if names <= known or kind.__module__.startswith("holdfast."):
         return ""
     import difflib
 

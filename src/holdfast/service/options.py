@@ -198,8 +198,9 @@ def checked_endpoints(options: ServeOptions) -> list[Endpoint]:
     machines can reach although they do not have to prove who they are; the message names the
     option; InvalidValueError if health or metrics are to be offered at the same port.
     """
-    from holdfast.transport.endpoints import check_endpoint
+    from holdfast.transport.endpoints import check_endpoint, check_name
 
+    check_name("name of a service", options.name)
     listen = []
     for text in options.listen:
         try:

@@ -18,7 +18,13 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
-from holdfast.errors import DEFECT, HoldfastError, InvalidValueError, defect_fields
+from holdfast.errors import (
+    DEFECT,
+    HoldfastError,
+    InvalidValueError,
+    TransportError,
+    defect_fields,
+)
 from holdfast.printable import printable
 from holdfast.service.garbage import collect_in_loop
 from holdfast.service.options import ServeOptions, checked_endpoints, parse_options
@@ -31,6 +37,7 @@ if TYPE_CHECKING:
     from holdfast.service.metrics import ServiceReport
     from holdfast.service.shell import ServiceShell
     from holdfast.service.supervisor import Supervised
+    from holdfast.transport.endpoints import Endpoint, TlsFiles
 
 IS_SERVICE = True
 
@@ -170,20 +177,29 @@ def _serve(
         raise InvalidValueError("--until-stdin-closes: this process has no standard input")
     # In this order, so that wrong options are reported before anything is loaded.
     credentials = _credentials(options)
-    checked_endpoints(options)
+    endpoints = checked_endpoints(options)
 
     if credentials is None:
         _import_without_openssl()
-    extension = None if make_extension is None else make_extension()
-    process = _ServiceProcess(options, credentials, extension, supervised)
+    with contextlib.ExitStack() as stack:
+        files = None if credentials is None else credentials.files
+        sockets: list[socket.socket | None]
+        sockets = [socket.socket(fileno=each) for each in options.sockets]
+        sockets = sockets or [_listen_early(each, files, stack) for each in endpoints]
+        # From here and not from a module that a module needs: CPython keeps the frames of calls
+        # in pieces of 16 KB, and imports this deep would take and return one thousands of times.
+        import numpy as np  # noqa: F401
 
-    import asyncio
+        extension = None if make_extension is None else make_extension()
+        process = _ServiceProcess(options, credentials, extension, supervised, sockets)
 
-    sys.setswitchinterval(_SWITCH_INTERVAL_S)
-    try:
-        status = asyncio.run(process.run())
-    finally:
-        process.events.close()
+        import asyncio
+
+        sys.setswitchinterval(_SWITCH_INTERVAL_S)
+        try:
+            status = asyncio.run(process.run())
+        finally:
+            process.events.close()
     if process.is_computing:
         # A thread that returns from native code during interpreter shutdown would abort the
         # process.
@@ -200,6 +216,7 @@ class _ServiceProcess:
         credentials: ServiceCredentials | None,
         extension: Extension | None,
         supervised: Supervised | None,
+        sockets: Sequence[socket.socket | None],
     ) -> None:
         # First the transport, which refuses options.
         from holdfast.runtime.descriptors import NEEDED, allow_descriptors
@@ -219,7 +236,7 @@ class _ServiceProcess:
             incarnation=self._incarnation,
             listen=options.listen,
             robot=None if options.robot is None else socket.socket(fileno=options.robot),
-            shared=[socket.socket(fileno=each) for each in options.sockets],
+            shared=sockets,
             lease_ms=options.lease_ms,
             # Otherwise robots with many links would leave no descriptor for a new one.
             max_links=min(MAX_LINKS, max(allowed // 4, allowed - reserved)),
@@ -448,6 +465,24 @@ async def _watched(
         yield await watched.start(offered)
     finally:
         await watched.close()
+
+
+def _listen_early(
+    endpoint: Endpoint, files: TlsFiles | None, stack: contextlib.ExitStack
+) -> socket.socket | None:
+    """Listen before anything slow is loaded; None if the transport is to do it, or to refuse.
+
+    The system answers who connects meanwhile. So a robot far away, which tries all the time, has
+    its connection when this service can decide: it uses a relaunched service a round trip sooner.
+    """
+    from holdfast.transport.endpoints import check_credentials
+    from holdfast.transport.listener import listen
+
+    if not endpoint.is_local_socket:
+        with contextlib.suppress(OSError, TransportError):
+            check_credentials(endpoint, files)
+            return stack.enter_context(listen(endpoint))
+    return None
 
 
 def _import_without_openssl() -> None:

@@ -127,8 +127,9 @@ class StreamServiceTransport(LinkOwner):
         listen: Sequence[str] = (),  # endpoints at which robots connect
         # The connection to the robot that has launched this service.
         robot: socket.socket | None = None,
-        # If given, a socket for each of ``listen`` that is bound there, for several processes.
-        shared: Sequence[socket.socket] = (),
+        # If given, a socket for each of ``listen`` that listens there, or is bound there for
+        # several processes; None has this process make it.
+        shared: Sequence[socket.socket | None] = (),
         # After this much silence robots consider this service lost. A robot's own lease is in its
         # hello.
         lease_ms: float = 400.0,
@@ -148,7 +149,7 @@ class StreamServiceTransport(LinkOwner):
         for endpoint in self._listen:
             check_credentials(endpoint, tls)
         self._robot = robot
-        self._shared: Sequence[socket.socket | None] = shared or [None] * len(listen)
+        self._shared = shared or [None] * len(listen)
         self._makers = {at.protocol: link_maker(at.protocol, "service") for at in self._listen}
         self._incarnation = incarnation
         self._max_links = MAX_LINKS if max_links is None else max_links
