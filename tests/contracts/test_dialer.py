@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import random
 import socket
+from collections import Counter
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -28,7 +30,7 @@ from holdfast.protocol.events import (
     ServiceVanished,
 )
 from holdfast.transport import dialer, frames
-from holdfast.transport.dialer import Dialer
+from holdfast.transport.dialer import Dialer, RetryPauses
 from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.service_end import StreamServiceTransport
@@ -259,6 +261,26 @@ def let_time_fly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop._selector, "select", select)
 
 
+def test_robots_that_have_lost_one_service_do_not_stay_in_step() -> None:
+    """After an outage of T seconds they come within 0.02 T: as evenly as if each had its own clock.
+
+    Of 1,000 robots a tenth of that time has 100; no more than 160 in any (false alarms: 1e-8).
+    """
+    chance = random.Random(7).random
+    for outage_s in (5.0, 60.0, 600.0):
+        came = []
+        for _ in range(1000):
+            pauses, now = RetryPauses(chance), 0.0
+            pauses.begin(now)
+            while now < outage_s:
+                now += pauses.next_attempt_s(now)
+            came.append(now - outage_s)
+        window_s = min(0.02 * outage_s, 10.0)
+        assert max(came) < 1.26 * window_s
+        tenths = Counter(int(10.0 * each / window_s) for each in came)
+        assert max(tenths.values()) < 160
+
+
 class TestRedialling:
     @pytest.fixture
     def dialled(self, monkeypatch: pytest.MonkeyPatch) -> list[float]:
@@ -344,7 +366,10 @@ class TestRedialling:
             assert len(dialled) - before > 30
         await robot.close()
 
-    @pytest.mark.parametrize(("robots", "services"), [("tcp", "tls"), ("tls", "tcp")])
+    # A refusal, which costs both ends a handshake, is followed by ever longer pauses.
+    @pytest.mark.parametrize(
+        ("robots", "services", "least", "most"), [("tcp", "tls", 20, 40), ("tls", "tcp", 55, 310)]
+    )
     async def test_an_end_that_speaks_no_tls_is_not_dialled_all_the_time(
         self,
         tls: StreamWire,
@@ -352,6 +377,8 @@ class TestRedialling:
         monkeypatch: pytest.MonkeyPatch,
         robots: str,
         services: str,
+        least: int,
+        most: int,
     ) -> None:
         place = tls.endpoint("cloud").partition("/")[2]
         let_time_fly(monkeypatch)
@@ -371,5 +398,5 @@ class TestRedialling:
         await asyncio.sleep(60.0)
         await robot.close()
         await service.close()
-        assert 55 < len(dialled) < 310
+        assert least < len(dialled) < most
         assert inbox.events == []

@@ -181,6 +181,38 @@ class TestManyFromOneAddress:
                         await robot.say(stream.take())
         assert heard.startswith(frames.MAGIC)
 
+    async def test_handshakes_wait_in_turns_by_address_and_cost_nothing_once_given_up(
+        self, tls: StreamWire, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Beside a storm from one address, a robot from another is next."""
+        monkeypatch.setattr(listener, "MAX_WAITING", 500)
+        service = tls.service("cloud", "b1")
+        begun: list[bytes] = []
+        may_begin = False
+
+        def accepted(_: object, connection: socket.socket, network: bytes) -> None:
+            connection.close()
+            begun.append(network)
+
+        monkeypatch.setattr(service, "_may_shake_hands", lambda: may_begin)
+        monkeypatch.setattr(service, "_accepted", accepted)
+        await service.start(echo)
+        (place,) = service._listeners
+        with contextlib.ExitStack() as stack:
+            others = self.flood(stack, tls.endpoint("cloud"), b"\x16\x03\x01")
+            # The newest are closed: the others have waited for longer.
+            await self.until_closed(others, self.MANY - 500)
+            assert all(map(self.is_open, others[:400]))
+            for other in others[:100]:
+                other.close()
+            with await Visitor(tls.endpoint("cloud")).connect() as robot:
+                await robot.say(b"\x16\x03\x01")
+                await until(lambda: len(place._waiting) == 2)
+                may_begin = True
+                await until(lambda: not place._waiting)
+        assert begun.index(listener._network_of(socket.AF_INET, ("127.0.0.1", 1))) <= 1
+        assert len(begun) == 400
+
     def test_an_owner_of_many_addresses_of_ipv6_is_one(self) -> None:
         def network(address: str) -> bytes:
             return listener._network_of(socket.AF_INET6, (address, 1, 0, 0))

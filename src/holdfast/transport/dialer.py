@@ -1,12 +1,8 @@
 """Connects to an endpoint, and retries until a peer is there.
 
 A restarted service should be used at once, however far away it is. So a new attempt begins every 20
-ms, in parallel to earlier ones, which may hang on a cut path or a stopped process. The pause grows
-in proportion to the outage, so that waiting for the next attempt adds two per cent to it.
-
-A peer that soon ends its connections is tried less often: the pause doubles with each, up to 0.2 s.
-(It may be a proxy that accepts while its service starts.) A link that brought an answer, or lasted,
-resets the pause, so that a service that dies and restarts is found as fast as ever.
+ms, in parallel to earlier ones, which may hang on a cut path or a stopped process. The pauses grow
+with the outage (:class:`RetryPauses`).
 
 A name may have several addresses, each of another process. Each robot tries them in its own order.
 So robots spread over the processes, and a robot that loses a link returns to the process that knows
@@ -18,6 +14,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ipaddress
+import random
 import socket
 import threading
 from collections.abc import Callable
@@ -28,8 +25,9 @@ from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.links import Link
 
 _FIRST_PAUSE_S: Final = 0.02
-_LAST_PAUSE_S: Final = 1.0
+_LAST_PAUSE_S: Final = 10.0
 _SHARE_OF_OUTAGE: Final = 0.02
+_JITTER: Final = 0.25
 
 _LAST_PAUSE_AFTER_NOTHING_S: Final = 0.2
 _LASTING_S: Final = 1.0
@@ -39,15 +37,77 @@ _CONNECT_TIMEOUT_S: Final = 2.0
 """For one attempt; later ones run in parallel."""
 
 _NEXT_LINK_S: Final = 0.25
-"""After a connection, no second one is made for so long."""
+_LAST_NEXT_LINK_S: Final = 2.0
+"""After a connection, no second one is made for so long: it may wait for its handshake."""
 
 _LOOKUP_INTERVAL_S = 1.0
 """Between two look-ups of a host while no peer is reached."""
 
 _REFUSED_PAUSE_S: Final = 1.0
-"""After one end has refused the other."""
+_REFUSED_SHARE: Final = 0.1
+"""After one end has refused the other, which has cost both a handshake."""
 
 _Address: TypeAlias = str | tuple[Any, ...]
+
+
+class RetryPauses:
+    """How long to wait before each attempt: the longer, the longer the peer is gone.
+
+    Waiting for the next attempt adds two per cent to an outage, and ten seconds at most. Pauses are
+    up to a quarter longer by chance: many robots that have lost one service do not stay in step.
+
+    A peer that soon ends its connections is tried less often: the pause doubles with each, up to
+    0.2 s. (It may be a proxy that accepts while its service starts.) A link that brought an answer,
+    or lasted, resets the pause, so that a service that dies and restarts is found as fast as ever.
+
+    A connection without a hello may wait behind a thousand others, and another one would only make
+    the queue longer, or the peer may hang. So a second one follows after 0.25 s, and further ones
+    after twice the time each, up to 2 s.
+    """
+
+    def __init__(self, chance: Callable[[], float] = random.random) -> None:
+        self._chance = chance
+        self._absent_since: float | None = None
+        self._next_link_s = _NEXT_LINK_S
+        self.least_s = _FIRST_PAUSE_S
+
+    def begin(self, now: float) -> None:
+        """Note that the peer is gone."""
+        if self._absent_since is None:
+            self._absent_since = now
+
+    def succeeded(self) -> None:
+        """Note that the right peer is there: the outage is over."""
+        self._absent_since = None
+        self._next_link_s = _NEXT_LINK_S
+
+    def ended(self, *, useful: bool) -> None:
+        """Note the end of a link, and whether it had answered or lasted."""
+        self.least_s = min(2.0 * self.least_s, _LAST_PAUSE_AFTER_NOTHING_S)
+        if useful:
+            self.least_s = _FIRST_PAUSE_S
+
+    def next_attempt_s(self, now: float) -> float:
+        """Return the pause after an attempt."""
+        share_s = min(_SHARE_OF_OUTAGE * self._absent_s(now), _LAST_PAUSE_S)
+        return self._spread(max(self.least_s, share_s))
+
+    def refused_s(self, now: float) -> float:
+        """Return the pause after a refusal."""
+        share_s = min(_REFUSED_SHARE * self._absent_s(now), _LAST_PAUSE_S)
+        return self._spread(max(_REFUSED_PAUSE_S, share_s))
+
+    def next_link_s(self) -> float:
+        """Return how long a new connection may take to its hello before there is another."""
+        pause_s = self._next_link_s
+        self._next_link_s = min(2.0 * pause_s, _LAST_NEXT_LINK_S)
+        return self._spread(pause_s)
+
+    def _absent_s(self, now: float) -> float:
+        return 0.0 if self._absent_since is None else now - self._absent_since
+
+    def _spread(self, seconds: float) -> float:
+        return seconds * (1.0 + _JITTER * self._chance())
 
 
 class Dialer:
@@ -74,10 +134,9 @@ class Dialer:
         self._attempts: set[asyncio.Task[None]] = set()
         self._links: set[Link] = set()
         self._winner: Link | None = None
-        self._least_pause_s = _FIRST_PAUSE_S
+        self._pauses = RetryPauses()
         self._next: asyncio.TimerHandle | None = None
-        self._absent_since: float | None = None
-        self._attempted_at = self._connected_at = float("-inf")
+        self._attempted_at = self._next_link_at = float("-inf")
         self._next_address = 0
         self._resolve_at = float("-inf")
         self._addresses: list[tuple[socket.AddressFamily, _Address]] = []
@@ -93,17 +152,15 @@ class Dialer:
     def start(self, *, refused: bool = False) -> None:
         """Begin to connect, or go on; after a refusal with a pause."""
         now = self._loop.time()
-        if self._absent_since is None:
-            self._absent_since = now
+        self._pauses.begin(now)
         if self._next is not None:
             if not refused:
                 return
             self._next.cancel()
-        self._connected_at = float("-inf")
+        self._next_link_at = float("-inf")
         # A flapping service is not tried more often than an absent one.
-        at = max(
-            now + (_REFUSED_PAUSE_S if refused else 0.0), self._attempted_at + self._least_pause_s
-        )
+        pause_s = self._pauses.refused_s(now) if refused else 0.0
+        at = max(now + pause_s, self._attempted_at + self._pauses.least_s)
         self._next = self._loop.call_at(at, self._attempt)
 
     def selected(self, winner: Link) -> None:
@@ -125,39 +182,34 @@ class Dialer:
 
     def succeeded(self) -> None:
         """Note that the right peer is there: the outage is over."""
-        self._absent_since = None
+        self._pauses.succeeded()
         self._failures.clear()
 
     def ended(self, link: Link) -> None:
         """Note that a link has ended."""
         if link not in self._links and link is not self._winner:
             return  # it was not needed
-        now = self._loop.time()
-        if link.has_answered or now >= link.began_at + _LASTING_S:
-            self._least_pause_s = _FIRST_PAUSE_S
-        else:
-            self._least_pause_s = min(2.0 * self._least_pause_s, _LAST_PAUSE_AFTER_NOTHING_S)
+        has_lasted = self._loop.time() >= link.began_at + _LASTING_S
+        self._pauses.ended(useful=link.has_answered or (link.hello is not None and has_lasted))
         if link in self._links:
             self._links.discard(link)
             if not self._links:
-                self._connected_at = float("-inf")
+                self._next_link_at = float("-inf")
         if self._next is not None:
             self._next.cancel()
-            at = max(self._next.when(), self._attempted_at + self._least_pause_s)
+            at = max(self._next.when(), self._attempted_at + self._pauses.least_s)
             self._next = self._loop.call_at(at, self._attempt)
 
     # -- attempts --------------------------------------------------------------------------------
 
     def _attempt(self) -> None:
         now = self._loop.time()
-        absent_s = 0.0 if self._absent_since is None else now - self._absent_since
-        pause_s = min(max(self._least_pause_s, _SHARE_OF_OUTAGE * absent_s), _LAST_PAUSE_S)
-        self._next = self._loop.call_later(pause_s, self._attempt)
+        self._next = self._loop.call_later(self._pauses.next_attempt_s(now), self._attempt)
         if self._is_name and now >= self._resolve_at:
             self._resolve_at = float("inf")
             # A look-up can take many seconds and cannot be cancelled.
             threading.Thread(target=self._resolve, name="holdfast-resolve", daemon=True).start()
-        if not self._addresses or now < self._connected_at + _NEXT_LINK_S:
+        if not self._addresses or now < self._next_link_at:
             return
         self._attempted_at = now
         family, address = self._addresses[self._next_address % len(self._addresses)]
@@ -186,10 +238,10 @@ class Dialer:
             self._failed(address, None if no_answer else error.errno)
             return
         now = self._loop.time()
-        if now < self._connected_at + _NEXT_LINK_S:
+        if now < self._next_link_at:
             stream.close()
             return
-        self._connected_at = now
+        self._next_link_at = now + self._pauses.next_link_s()
         link = self._make_link()
         self._links.add(link)
         link.begin(stream)

@@ -58,6 +58,10 @@ class FairScheduler:
             and self._all_used_s < _WINDOW_S / 2
         )
 
+    def num_waiting(self, owner: object) -> int:
+        """Return how many links of an owner wait for a slice."""
+        return len(self._waiting.get(owner, ()))
+
     def charge(self, owner: object, seconds: float) -> None:
         """Add time that an owner has used."""
         self._used_s[owner] = self._used_s.get(owner, 0.0) + seconds

@@ -3,6 +3,10 @@
 Anybody can open a connection, and most connections to a public port send nothing or nonsense. So a
 connection costs very little before its first byte. Silent ones are closed after a while; if there
 are too many, one of the network with the most is closed.
+
+When a region's robots come back, a thousand handshakes wait at once. To begin them all would help
+nobody. So connections wait with their first byte unread, in turns by network, and are delivered as
+fast as handshakes are computed. One whose peer has given up meanwhile costs no handshake.
 """
 
 from __future__ import annotations
@@ -12,10 +16,11 @@ import contextlib
 import errno
 import fcntl
 import os
+import select
 import socket
 import stat
 import time
-from collections import Counter
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -25,7 +30,7 @@ from holdfast.runtime.addresses import why_not_bound
 from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.links import OPENING_TIMEOUT_S
 
-_BACKLOG: Final = 1024
+_BACKLOG: Final = 4096
 """Connections that wait to be accepted."""
 
 _ACCEPTED_AT_ONCE: Final = 2
@@ -40,6 +45,12 @@ _LOCK_PAUSE_S: Final = 0.01
 
 MAX_SILENT: Final = 256
 """Connections without a first byte."""
+
+MAX_WAITING: Final = 1024
+"""Connections with a first byte that are not delivered yet."""
+
+_DELIVERED_AT_ONCE: Final = 4
+_DELIVERY_PAUSE_S: Final = 0.001
 
 _MAPPED = b"\0" * 10 + b"\xff\xff"
 """Prefix of an IPv4 address within IPv6."""
@@ -59,11 +70,14 @@ class Listener:
         # Gets the socket of such a connection, and the network from which it came.
         accepted: Callable[[socket.socket, bytes], None],
         *,
+        # Whether another connection can be taken now.
+        may_deliver: Callable[[], bool] = lambda: True,
         # A socket that listens there already, or is bound there for several processes, of which
         # this one listens, too.
         shared: socket.socket | None = None,
     ) -> None:
         self._accepted = accepted
+        self._may_deliver = may_deliver
         self._loop = asyncio.get_running_loop()
         try:
             self._socket = listen(endpoint) if shared is None else _listen_beside(shared)
@@ -78,6 +92,9 @@ class Listener:
             self._socket_file = Path(endpoint.host).stat()
         self._silent: dict[socket.socket, bytes] = {}
         self._timers: dict[socket.socket, asyncio.TimerHandle] = {}
+        self._waiting: OrderedDict[bytes, deque[socket.socket]] = OrderedDict()
+        self._num_waiting = 0
+        self._delivery: asyncio.TimerHandle | None = None
         self._pause: asyncio.TimerHandle | None = None
         self._loop.add_reader(self._socket, self._accept)
 
@@ -94,6 +111,12 @@ class Listener:
         for connection in list(self._silent):
             self._forget(connection)
             connection.close()
+        if self._delivery is not None:
+            self._delivery.cancel()
+        for waiting in self._waiting.values():
+            for connection in waiting:
+                connection.close()
+        self._waiting.clear()
 
     def _accept(self) -> None:
         for _ in range(_ACCEPTED_AT_ONCE):
@@ -114,29 +137,65 @@ class Listener:
                 other.close()
             self._silent[connection] = network
             self._timers[connection] = self._loop.call_later(
-                OPENING_TIMEOUT_S, self._deliver_or_close, connection
+                OPENING_TIMEOUT_S, self._queue_or_close, connection
             )
-            self._loop.add_reader(connection, self._deliver_or_close, connection)
+            self._loop.add_reader(connection, self._queue_or_close, connection)
 
     def _resume(self) -> None:
         self._loop.add_reader(self._socket, self._accept)
 
-    def _deliver_or_close(self, connection: socket.socket) -> None:
-        """Deliver a connection that has a first byte; else close it."""
+    def _queue_or_close(self, connection: socket.socket) -> None:
+        """Let a connection that has a first byte wait for its delivery; else close it."""
         network = self._forget(connection)
         try:
             first = connection.recv(1, socket.MSG_PEEK)
         except OSError:
             first = b""
-        if first:
-            self._accepted(connection, network)
-        else:
+        if not first:
             connection.close()
+            return
+        if self._num_waiting >= MAX_WAITING:
+            # The newest of the network with the most: others have waited for longer.
+            most = max(self._waiting, key=lambda each: len(self._waiting[each]))
+            if len(self._waiting.get(network, ())) >= len(self._waiting[most]):
+                connection.close()
+                return
+            self._waiting[most].pop().close()
+            self._num_waiting -= 1
+        self._waiting.setdefault(network, deque()).append(connection)
+        self._num_waiting += 1
+        if self._delivery is None:
+            self._deliver(have_waited=False)
+
+    def _deliver(self, *, have_waited: bool = True) -> None:
+        """Deliver connections that wait: a few at a time."""
+        self._delivery = None
+        delivered = 0
+        while self._waiting and delivered < _DELIVERED_AT_ONCE and self._may_deliver():
+            network, waiting = self._waiting.popitem(last=False)
+            connection = waiting.popleft()
+            self._num_waiting -= 1
+            if waiting:
+                self._waiting[network] = waiting
+            if have_waited and _has_hung_up(connection):
+                connection.close()
+            else:
+                delivered += 1
+                self._accepted(connection, network)
+        if self._waiting or delivered:
+            self._delivery = self._loop.call_later(_DELIVERY_PAUSE_S, self._deliver)
 
     def _forget(self, connection: socket.socket) -> bytes:
         self._timers.pop(connection).cancel()
         self._loop.remove_reader(connection)
         return self._silent.pop(connection)
+
+
+def _has_hung_up(connection: socket.socket) -> bool:
+    """Return whether the peer has closed a connection, whatever it has sent before."""
+    looked_at = select.poll()
+    looked_at.register(connection, select.POLLRDHUP)
+    return bool(looked_at.poll(0))
 
 
 def connection_to_drop(networks: Mapping[_T, bytes]) -> _T:

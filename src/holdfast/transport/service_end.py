@@ -39,7 +39,12 @@ from holdfast.transport.frames import (
 )
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
-from holdfast.transport.listener import MAX_SILENT, Listener, connection_to_drop
+from holdfast.transport.listener import (
+    MAX_SILENT,
+    MAX_WAITING,
+    Listener,
+    connection_to_drop,
+)
 from holdfast.transport.schemes import link_maker
 
 if TYPE_CHECKING:
@@ -62,7 +67,13 @@ _FOREIGN: Final = "has a certificate of an authority that is no longer trusted"
 _MAX_WITHOUT_HELLO: Final = 256
 """Connections that have sent bytes, but no hello yet."""
 
-MAX_UNKNOWN: Final = MAX_SILENT + _MAX_WITHOUT_HELLO
+_MAX_UNCOMPUTED: Final = 8
+"""Handshakes that wait for the processor before others are begun."""
+
+_HELLO_S: Final = 0.5
+"""For its handshake and hello a connection has so long before it must make room for another."""
+
+MAX_UNKNOWN: Final = MAX_SILENT + MAX_WAITING + _MAX_WITHOUT_HELLO
 """Connections without a hello: the number of sockets beyond the links."""
 
 
@@ -193,7 +204,9 @@ class StreamServiceTransport(LinkOwner):
         try:
             for endpoint, shared in zip(self._listen, self._shared, strict=True):
                 accepted = partial(self._accepted, endpoint)
-                self._listeners.append(Listener(endpoint, accepted, shared=shared))
+                self._listeners.append(
+                    Listener(endpoint, accepted, may_deliver=self._may_shake_hands, shared=shared)
+                )
         except TransportError:
             self._stop_listening()
             raise
@@ -303,6 +316,15 @@ class StreamServiceTransport(LinkOwner):
                 "revoked before; a list only grows, so this is an older one, or it is gone"
             )
         self._revoked, self._trusted, self._context = revoked, trusted, context
+
+    def _may_shake_hands(self) -> bool:
+        """Return whether another handshake would be computed soon, and ends none just begun."""
+        if self._settings.scheduler.num_waiting(None) >= _MAX_UNCOMPUTED:
+            return False
+        if len(self._without_hello) < _MAX_WITHOUT_HELLO:
+            return True
+        oldest = next(iter(self._without_hello))
+        return asyncio.get_running_loop().time() >= oldest.began_at + _HELLO_S
 
     def _accepted(self, endpoint: Endpoint, connection: socket.socket, network: bytes) -> None:
         tls = None
