@@ -127,9 +127,11 @@ def finish(navigator, what, accepted):
 
 def drive(looker, say=print):
     """Look until the particles agree on the drive, then go through the door."""
-    import rclpy
-    from nav2_simple_commander.robot_navigator import BasicNavigator
-
+    try:
+        import rclpy
+        from nav2_simple_commander.robot_navigator import BasicNavigator
+    except ModuleNotFoundError as error:
+        sys.exit(f"{error}: source a ROS 2 with Nav2; or use --particles or --simulate")
     rclpy.init()
     navigator = BasicNavigator()
     try:
