@@ -320,8 +320,7 @@ WIRES = ["in_process", "tcp", "tls", "udp", "unix", "launched"]
 
 
 def echo(call: IncomingCall) -> None:
-    call.reply(call.payload)
-    call.end()
+    call.reply(call.payload, last=True)
 
 
 def echo_of_size(call: IncomingCall) -> None:

@@ -107,7 +107,7 @@ class Bench:
         self.trace: list[tuple[str, int]] = []
 
     def apply(self, effects: list[ServiceEffect]) -> None:
-        for effect in effects:
+        for effect in (*effects, *self.service.next_jobs(self.now)):
             if isinstance(effect, SendReply):
                 assert effect.call not in self.ended
                 reply = decode_reply(effect.payload)
@@ -841,13 +841,13 @@ def test_with_no_worker_there_is_no_service() -> None:
 def runs_of(service: Service, call: int, request: Request, now: float) -> list[float]:
     """Have a request answered; return how long each of its jobs was expected to take."""
     expected = []
-    effects = service.receive(call, request, len(encode(request)), now)
-    while runs := [effect for effect in effects if isinstance(effect, StartJob)]:
+    service.receive(call, request, len(encode(request)), now)
+    while runs := [each for each in service.next_jobs(now) if isinstance(each, StartJob)]:
         (run,) = runs
         expected.append(run.expected_s)
         service.started(run.job, now)
         now += 0.001
-        effects = service.finished(run.job, run.job.run(), now)
+        service.finished(run.job, run.job.run(), now)
     return expected
 
 

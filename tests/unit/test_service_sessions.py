@@ -137,7 +137,7 @@ class _Split:
             self._apply(owner, self.service.finished(job, job.run(), 0.0))
 
     def _apply(self, owner: str | None, effects: list[ServiceEffect]) -> None:
-        for effect in effects:
+        for effect in (*effects, *self.service.next_jobs(0.0)):
             if isinstance(effect, StartJob):
                 self.jobs[owner].append(effect.job)
             elif isinstance(effect, SendReply | EndCall):

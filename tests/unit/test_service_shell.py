@@ -298,8 +298,10 @@ class LargeCall:
         self.replies: list[bytes] = []
         self.ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
-    def reply(self, payload: bytes) -> None:
+    def reply(self, payload: bytes, *, last: bool = False) -> None:
         self.replies.append(payload)
+        if last:
+            self.end()
 
     def end(self) -> None:
         self.ended.set_result(None)
@@ -461,8 +463,8 @@ class Call:
     def __init__(self, trace: list[str]) -> None:
         self._trace = trace
 
-    def reply(self, payload: bytes) -> None:
-        self._trace.append(f"reply {payload.decode()}")
+    def reply(self, payload: bytes, *, last: bool = False) -> None:
+        self._trace.append(f"{'last' if last else 'reply'} {payload.decode()}")
 
     def end(self) -> None:
         self._trace.append("end")

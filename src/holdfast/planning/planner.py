@@ -148,6 +148,8 @@ class Planner:
         if particles is not None or method is not None:
             settings = check_settings(settings, PlanningSettings)
         self.settings = settings
+        # A state whose stage was found last: its action is chosen, then it advances by that.
+        self._staged: tuple[PlanningState | None, int] = None, 0
 
     @in_own_mode
     def init(self, seed: int, trial: int = 0) -> PlanningState:
@@ -376,8 +378,10 @@ class Planner:
                 f"task action {in_brief(action)}: {problem.name} needs "
                 f"{problem.action_size} finite coordinates"
             )
-        # Computed again, not taken from the caller: the action may come from another machine.
-        _, stage = self._estimate(state)
+        # Not taken from the caller: the action may come from another machine.
+        staged, stage = self._staged
+        if staged is not state:
+            _, stage = self._estimate(state)
         states, weights = state.belief
         random = stream(state.seed, state.trial, state.step, Purpose.PREDICTION)
         if motion is None:
@@ -447,7 +451,9 @@ class Planner:
         estimated = estimate(
             state.belief, self.settings.particle_filter.estimate, circular_states(self.problem)
         )
-        return estimated, checked.next_stage(self.problem, estimated, state.stage)
+        stage = checked.next_stage(self.problem, estimated, state.stage)
+        self._staged = state, stage
+        return estimated, stage
 
 
 def _replaced(

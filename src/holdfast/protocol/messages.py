@@ -322,9 +322,9 @@ def decode_request(payload: bytes) -> Request:
         raise _other_version(sent.version)
     if sent.checkpoint is not None and sent.inputs:
         raise MessageError("malformed", "a request has a checkpoint and inputs as well")
-    fields = msgspec.structs.asdict(sent) | {"session_configuration": session_configuration}
-    del fields["settings"]
-    return Request(**fields | {"inputs": tuple(map(_received, sent.inputs))})
+    inputs = tuple(map(_received, sent.inputs))
+    fields = msgspec.structs.astuple(sent)[:8]  # those before the inputs
+    return Request(*fields, inputs, session_configuration, sent.checkpoint)
 
 
 def _sent(given: CatchUpInput) -> _SentSensed | _SentMoved:

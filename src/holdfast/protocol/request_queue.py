@@ -158,9 +158,11 @@ class RequestQueue:
 
     def _count(self, task: PendingTask, sign: int) -> None:
         owner = task.session.owner
-        load = self._waiting_of.setdefault(owner, _Load())
-        for each in (self._waiting, load):
-            each.count(task, sign)
+        load = self._waiting_of.get(owner)
+        if load is None:
+            load = self._waiting_of[owner] = _Load()
+        self._waiting.count(task, sign)
+        load.count(task, sign)
         if not load.num:
             del self._waiting_of[owner]
 
@@ -235,7 +237,7 @@ class RequestQueue:
 
     def release_held(self, session: Session) -> None:
         """Queue a session's tasks that were held back behind those that have run."""
-        for slot in ((session, REQUESTED), (session, PREFETCHED)):
+        for slot in ((session, REQUESTED), (session, PREFETCHED)) if self._held else ():
             if slot in self._held and slot not in self._running_of:
                 held = self._held.pop(slot)
                 self._order_of(held).append(held)

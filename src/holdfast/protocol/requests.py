@@ -149,7 +149,7 @@ class OpenRequests:
 
     def is_asked(self, replica: Replica, question: Question) -> bool:
         """Return whether a service has the question."""
-        return any(call.replica is replica for call in self.about(question))
+        return any([call.replica is replica for call in self.about(question)])
 
     def retry_at(self, replica: Replica, question: Question) -> float:
         """Return when a service that may not hear the robot is sent the question again."""
@@ -168,7 +168,7 @@ class OpenRequests:
 
     def first_sent_at(self) -> float:
         """Return when the oldest open request was sent."""
-        return min(call.sent_at for call in self._open.values())
+        return next(iter(self._open.values())).sent_at
 
     def settle(self, call: OpenRequest) -> None:
         """Close a request from which nothing is awaited."""

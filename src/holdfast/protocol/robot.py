@@ -539,9 +539,10 @@ class Robot:
 
     def _write(self, *records: Record) -> None:
         history = self._history
-        if history is not None and (records or self._unwritten or history.begun):
+        if self._source.tracker.recoveries != self._recoveries_counted and history is not None:
             # A recovery alone does not begin a trial.
-            self._count_recoveries()
+            if records or self._unwritten or history.begun:
+                self._count_recoveries()
         self._unwritten += records
         if self._unwritten:
             # The effects that follow may rest on these records.

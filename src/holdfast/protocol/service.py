@@ -12,9 +12,10 @@ performed. So the task part is sent before the sensing part is begun, and other 
 go first, within limits.
 
 The machine computes nothing itself and has no clock, thread or socket. Methods take an event and
-the time and return effects, to be carried out in order. The caller runs each :class:`Job` that it
-is handed (at most ``max_running`` at a time) anywhere, and returns its :class:`JobResult` with
-:meth:`Service.finished`.
+the time and return effects, to be carried out in order. Then the caller asks for
+:meth:`Service.next_jobs`, so that no reply waits until they are chosen. It runs each :class:`Job`
+that it is handed (at most ``max_running`` at a time) anywhere, and returns its :class:`JobResult`
+with :meth:`Service.finished`.
 
 This module decides what requests and results mean. Memory is in
 :mod:`~holdfast.protocol.service_sessions`, the order of work in
@@ -150,7 +151,6 @@ class Service:
             self._calls.send_refused(call, 0, request.code, str(request))
             return self._effects.take()
         self._handle(call, request, (owner, request.session), size, now)
-        self._dispatch(now)
         return self._effects.take()
 
     def started(self, job: Job, now: float) -> None:
@@ -194,7 +194,6 @@ class Service:
                     task.expected_time.learn(computed_s)
                 self._succeeded(task, outcome, now)
             self._queue.release_held(session)
-        self._dispatch(now)
         return self._effects.take()
 
     def gone(self, call: int, now: float) -> list[ServiceEffect]:
@@ -202,7 +201,12 @@ class Service:
         task = self._calls.drop(call)
         if task is not None and not task.calls:
             self._statistics.superseded += self._queue.drop(task)
-        self._dispatch(now)
+        return self._effects.take()
+
+    def next_jobs(self, now: float) -> list[ServiceEffect]:
+        """Hand out jobs while workers are free; called whenever effects were carried out."""
+        while (task := self._queue.take(now)) is not None:
+            self._start_job(task, now)
         return self._effects.take()
 
     def tick(self, now: float) -> list[ServiceEffect]:
@@ -418,11 +422,6 @@ class Service:
         session.pending[digest] = task
         self._queue[task.lane].enqueue(task)
         return task
-
-    def _dispatch(self, now: float) -> None:
-        """Hand out jobs while workers are free."""
-        while (task := self._queue.take(now)) is not None:
-            self._start_job(task, now)
 
     def _start_job(self, task: PendingTask, now: float) -> None:
         session, request = task.session, task.request

@@ -81,7 +81,7 @@ class Lanes:
         """Return whether a task that is to be started may have all cores."""
         if task.lane == LONG and self._fewer == 1:
             return True  # no other long one runs beside it
-        return self.num_running == 0 and self.num_waiting == 0
+        return not any([lane.num_running or lane.num_waiting for lane in self._lanes])
 
     def most_s(self, task: PendingTask) -> float:
         """Return how long a job of a task may compute."""
@@ -97,6 +97,8 @@ class Lanes:
     def take(self, now: float) -> PendingTask | None:
         """Remove and return the next task; None if none waits or no thread is free."""
         for number, lane in enumerate(self._lanes):
+            if not lane.num_waiting:
+                continue
             room_bytes = math.inf
             if number == LONG and lane.num_running:
                 room_bytes = self._limits.max_decision_bytes - lane.running_bytes

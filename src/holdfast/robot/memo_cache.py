@@ -69,7 +69,7 @@ class MemoizingPlanner(Planner):
 
 def key_of(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Hashable:
     """Return what identifies a call."""
-    return (function.__name__, *(_part_of(each) for each in arguments if each is not None))
+    return (function.__name__, *[_part_of(each) for each in arguments if each is not None])
 
 
 def _part_of(argument: Any) -> Hashable:

@@ -24,6 +24,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import itertools
+import os
 from collections import Counter, deque
 from collections.abc import Callable
 from typing import Literal, TypeAlias
@@ -98,6 +99,7 @@ class ServiceShell:
         self._unread = 0
         self._rates = EventRates()
         self._brief_jobs: deque[Job] = deque()
+        self._has_replied = False  # since the last brief job
         self._timer: asyncio.TimerHandle | None = None
         self._idle: asyncio.Future[None] | None = None
         self._closed = False
@@ -215,8 +217,7 @@ class ServiceShell:
 
     def _reject_unread(self, call: IncomingCall) -> None:
         self._unread += 1
-        call.reply(_UNREAD_BUSY[self._unread % len(_UNREAD_BUSY)])
-        call.end()
+        call.reply(_UNREAD_BUSY[self._unread % len(_UNREAD_BUSY)], last=True)
         self.note("busy", turned_away_unread=self._unread)
 
     def _large_one_decoded(
@@ -239,15 +240,15 @@ class ServiceShell:
             effects = self._service.receive(number, request, size, now, call.robot)
         except Exception as error:
             del self._calls[number]
-            call.reply(encode(Refused(0, "failed", _in_words(error))))
-            call.end()
+            call.reply(encode(Refused(0, "failed", _in_words(error))), last=True)
             raise
-        self._carry_out(effects)
+        self._carry_out(effects, now)
 
     def _gone(self, number: int) -> None:
         """Handle the end of a link on which a call was open."""
         if self._calls.pop(number, None) is not None:
-            self._carry_out(self._service.gone(number, self._loop.time()))
+            now = self._loop.time()
+            self._carry_out(self._service.gone(number, now), now)
 
     def _run_brief_job(self) -> None:
         if not self._brief_jobs:
@@ -255,6 +256,10 @@ class ServiceShell:
         job = self._brief_jobs.popleft()
         if self._brief_jobs:
             self._run_brief_job_soon()
+        elif self._has_replied:
+            # A robot on this machine may wait for this very core: it acts on its reply first.
+            os.sched_yield()
+        self._has_replied = False
         self._finished(job, *self._computed(job))
 
     def _run_brief_job_soon(self) -> None:
@@ -282,7 +287,7 @@ class ServiceShell:
         # Without the time to a thread and back: with it a brief job that once ran there would
         # never count as brief again.
         self._service.started(job, now - computed_s)
-        self._carry_out(self._service.finished(job, outcome, now))
+        self._carry_out(self._service.finished(job, outcome, now), now)
 
     def _tick(self) -> None:
         """Advance the machine's clock, and log dropped events that are due."""
@@ -290,14 +295,22 @@ class ServiceShell:
         now = self._loop.time()
         for name, told in self._rates.due(now):
             self._events.event(name, **told)
-        self._carry_out(self._service.tick(now))
+        self._carry_out(self._service.tick(now), now)
 
     # -- effects ---------------------------------------------------------------------------------
 
-    def _carry_out(self, effects: list[ServiceEffect]) -> None:
-        for effect in effects:
+    def _carry_out(self, effects: list[ServiceEffect], now: float) -> None:
+        self._perform(effects)
+        self._perform(self._service.next_jobs(now))  # the replies are on their way
+        self._set_timer()
+        self._note_if_idle()
+
+    def _perform(self, effects: list[ServiceEffect]) -> None:
+        for effect, following in itertools.zip_longest(effects, effects[1:]):
             if isinstance(effect, SendReply):
-                self._calls[effect.call].reply(effect.payload)
+                is_last = isinstance(following, EndCall) and following.call == effect.call
+                self._calls[effect.call].reply(effect.payload, last=is_last)
+                self._has_replied = True
             elif isinstance(effect, EndCall):
                 self._calls.pop(effect.call).end()
             elif isinstance(effect, StartJob):
@@ -306,8 +319,6 @@ class ServiceShell:
                 self.note(effect.name, **effect.fields)
             elif self._on_decision is not None:
                 self._on_decision(effect.kind, effect.computed_s, effect.waited_s)
-        self._set_timer()
-        self._note_if_idle()
 
     def _note_if_idle(self) -> None:
         if self._idle is not None and not self._calls and not self._undecoded:

@@ -61,14 +61,14 @@ class IncomingCall(Protocol):
     def robot(self) -> str | None:
         """Name in the robot's certificate; None without one."""
 
-    def reply(self, payload: bytes) -> None:
-        """Send a reply; may be repeated. A robot that is gone is no error.
+    def reply(self, payload: bytes, *, last: bool = False) -> None:
+        """Send a reply; the last one ends the call. A robot that is gone is no error.
 
         A robot that does not read loses its link, and nothing waits for it.
         """
 
     def end(self) -> None:
-        """End the call; the robot waits for the end of every call."""
+        """End the call; the robot waits for the end of every call. May be repeated."""
 
 
 class ServiceTransport(Protocol):

@@ -128,6 +128,8 @@ class MemoryBudget:
 
     def note(self, link: _Holder, size_bytes: int) -> None:
         """Note how many bytes a link holds now."""
+        if not size_bytes and link not in self._sizes:
+            return  # nearly always
         self._set(link, size_bytes)
         if self._total > self._max_bytes and self._measure is not None:
             for each in list(self._sizes):

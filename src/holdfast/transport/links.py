@@ -241,8 +241,7 @@ class Link(asyncio.BufferedProtocol):
         self._note_unsent()
 
     def _note_unsent(self) -> None:
-        unsent_bytes = self.unsent_bytes
-        if unsent_bytes > self._max_unsent_bytes:
+        if (unsent_bytes := self.unsent_bytes) > self._max_unsent_bytes:
             self.end("does not read what it is sent", abort=True)
         else:
             self._settings.unsent.note(self, unsent_bytes)
@@ -421,7 +420,7 @@ class Link(asyncio.BufferedProtocol):
             while self._handle_next():
                 if self.ended or self._is_paused:
                     break
-                if thread_time() >= began + SLICE_S and (self._frames or self._unread):
+                if (self._frames or self._unread) and thread_time() >= began + SLICE_S:
                     self._enqueue()
                     break
             else:
@@ -435,12 +434,13 @@ class Link(asyncio.BufferedProtocol):
         self._settings.scheduler.charge(owner, thread_time() - began)
 
     def _handle_next(self) -> bool:
-        """Handle one frame, or decode the next bytes; return whether there was anything."""
-        if self._frames:
-            self._take(self._frames.popleft())
+        """Handle one frame, decoded if need be; return whether there was anything."""
+        frames, decoder = self._frames, self._decoder
+        if frames:
+            self._take(frames.popleft())
             return True
-        if self._decoder.error is not None:
-            raise self._decoder.error
+        if decoder.error is not None:
+            raise decoder.error
         tls, data, at = self.tls, self._unread, self._unread_at
         if tls is not None and tls.ended:
             self.end("")
@@ -456,8 +456,10 @@ class Link(asyncio.BufferedProtocol):
             data = self._decrypted(tls, data)
             if self.ended:
                 return True
-        self._frames.extend(self._decoder.feed(data))
+        frames.extend(decoder.feed(data))
         self._note_held_bytes()
+        if frames:
+            self._take(frames.popleft())
         return True
 
     def _note_held_bytes(self) -> None:

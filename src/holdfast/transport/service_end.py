@@ -85,8 +85,6 @@ class _StreamCall(msgspec.Struct, eq=False):
     payload: bytes
     calls: set[_StreamCall]
     is_open: bool = True
-    is_being_delivered: bool = True
-    waiting: bytes | None = None  # a reply
     on_gone: Callable[[], object] | None = None
 
     @property
@@ -94,33 +92,25 @@ class _StreamCall(msgspec.Struct, eq=False):
         """The name in the robot's certificate."""
         return _certified(self.link)
 
-    def reply(self, payload: bytes) -> None:
-        """Send a reply. A robot that is gone is no error."""
-        if not self.is_open or len(payload) > self.link.max_message_bytes:
-            return
-        if self.waiting is not None:
-            self.flush()
-        elif not self.is_being_delivered:
-            asyncio.get_running_loop().call_soon(self.flush)
-        self.waiting = payload
+    def reply(self, payload: bytes, *, last: bool = False) -> None:
+        """Send a reply, and end the call with the last one. A robot that is gone is no error."""
+        if len(payload) > self.link.max_message_bytes:
+            if last:
+                self.end()
+        elif self.is_open:
+            if last:
+                self._close()
+            self.link.send_message(LAST if last else REPLY, self.number, payload)
 
     def end(self) -> None:
         """End the call. May be repeated."""
-        if not self.is_open:
-            return
+        if self.is_open:
+            self._close()
+            self.link.send_message(END, self.number)
+
+    def _close(self) -> None:
         self.is_open = False
         self.calls.discard(self)
-        reply, self.waiting = self.waiting, None
-        if reply is None:
-            self.link.send_message(END, self.number)
-        else:
-            self.link.send_message(LAST, self.number, reply)
-
-    def flush(self) -> None:
-        """Send the pending reply."""
-        reply, self.waiting = self.waiting, None
-        if reply is not None:
-            self.link.send_message(REPLY, self.number, reply)
 
 
 class StreamServiceTransport(LinkOwner):
@@ -404,8 +394,6 @@ class StreamServiceTransport(LinkOwner):
         call = _StreamCall(link, frame.call, frame.payload, calls)
         calls.add(call)
         deliver(call)
-        call.is_being_delivered = False
-        call.flush()
 
     def on_goodbye(self, link: Link) -> None:
         """End the link: a robot that leaves waits for no reply."""

@@ -128,7 +128,7 @@ class ServiceNode:
     def _carry_out(self, effects: list[ServiceEffect]) -> None:
         machine, network, queue = self.machine, self._world.network, self._world.queue
         assert machine is not None
-        for effect in effects:
+        for effect in (*effects, *machine.next_jobs(self._clock.now())):
             if isinstance(effect, SendReply):
                 network.reply(self, effect.call, effect.payload)
             elif isinstance(effect, EndCall):

@@ -62,10 +62,12 @@ class _InProcessCall(msgspec.Struct, eq=False):
     def robot(self) -> str | None:
         return self.service_end.robot
 
-    def reply(self, payload: bytes) -> None:
+    def reply(self, payload: bytes, *, last: bool = False) -> None:
         if len(payload) <= self.service_end.max_message_bytes:
             calls = self.robot_end.calls
             asyncio.get_running_loop().call_soon(calls.replied, self.number, payload)
+        if last:
+            self.end()
 
     def end(self) -> None:
         asyncio.get_running_loop().call_soon(self.robot_end.calls.ended, self.number)
