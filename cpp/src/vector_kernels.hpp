@@ -58,7 +58,7 @@ struct CompactPosterior {
     std::size_t dimension;
     const double* coordinates;
     const double* weights;
-    double* scratch;  // [stride + the k of the nearest neighbours]
+    double* scratch;  // [stride + the k of the nearest neighbours][8]
 };
 
 /// Points of a prior and posteriors over them, side by side (prior_neighbors.hpp).

@@ -250,6 +250,12 @@ HOLDFAST_INLINE double sum_of(const Lanes& x) {
     return (a0 + a2) + (a1 + a3);
 }
 
+/// The same for eight sums beside each other, of which x[i] has the i-th elements.
+HOLDFAST_INLINE Lanes sum_of_each(const Lanes (&x)[lane_count]) {
+    const Lanes a0 = x[0] + x[4], a1 = x[1] + x[5], a2 = x[2] + x[6], a3 = x[3] + x[7];
+    return (a0 + a2) + (a1 + a3);
+}
+
 HOLDFAST_INLINE double maximum_of(const Lanes& x) {
     double largest = x[0];
     for (std::size_t i = 1; i < lane_count; ++i) largest = x[i] > largest ? x[i] : largest;
