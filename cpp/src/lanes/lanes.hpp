@@ -284,6 +284,15 @@ HOLDFAST_INLINE unsigned bits_of(const IntLanes& mask) {
 #endif
 }
 
+/// bits_of(a <= b), where the compiler would go by way of eight truth values.
+HOLDFAST_INLINE unsigned bits_at_most(const Lanes& a, const Lanes& b) {
+#if defined(__AVX512DQ__)
+    return _mm512_cmp_pd_mask(a.part[0], b.part[0], _CMP_LE_OQ);
+#else
+    return bits_of(a <= b);
+#endif
+}
+
 #undef HOLDFAST_EACH_REGISTER
 
 }  // namespace HOLDFAST_ISA
