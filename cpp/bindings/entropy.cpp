@@ -233,7 +233,8 @@ void holdfast::bind_entropy(nb::module_& module) {
     define(module, "measure_visit", [](std::size_t count, std::size_t dimension, int repetitions) {
         // All pairs of `count` points, no selection: every neighbour lies within the resolution.
         const std::size_t stride = (count + lane_count - 1) / lane_count * lane_count;
-        std::vector<double> coordinates(stride * dimension), weights(stride), scratch(stride + 1);
+        std::vector<double> coordinates(stride * dimension), weights(stride),
+            scratch((stride + 1) * lane_count);
         for (std::size_t i = 0; i < coordinates.size(); ++i) {
             coordinates[i] = 1e-3 * static_cast<double>(i % 17);
         }

@@ -1,6 +1,6 @@
 #include <nanobind/stl/array.h>
 
-#include <cmath>
+#include <limits>
 
 #include "bindings.hpp"
 #include "deterministic_math.hpp"
@@ -26,11 +26,17 @@ Output<double> elementwise(const Input<1>& in) {
 // Of any rank: it is asked of whatever somebody's code returned.
 using AnyArray = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
 
-bool all_finite(const AnyArray& in) {
+/// False for a NaN.
+bool all_within(const AnyArray& in, double least, double most) {
     const double* values = in.data();
-    bool finite = true;
-    for (std::size_t i = 0; i < in.size(); ++i) finite &= std::isfinite(values[i]);
-    return finite;
+    bool within = true;
+    for (std::size_t i = 0; i < in.size(); ++i) within &= least <= values[i] && values[i] <= most;
+    return within;
+}
+
+bool all_finite(const AnyArray& in) {
+    constexpr double largest = std::numeric_limits<double>::max();
+    return all_within(in, -largest, largest);
 }
 
 }  // namespace
@@ -51,6 +57,7 @@ void holdfast::bind_numerics(nb::module_& module) {
     define(module, "sum",
            [](const Input<1>& in) { return vector_kernels().sum(in.data(), in.shape(0)); });
     define(module, "all_finite", &all_finite);
+    define(module, "all_within", &all_within);
     define(module, "weighted_sums", [](const Input<1>& weights, const Input<2>& rows) {
         double* out;
         auto result = make_array<double>({rows.shape(1)}, out);

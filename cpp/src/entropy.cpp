@@ -102,7 +102,7 @@ double compact_entropy(const Task& task, const double* weights, std::size_t surv
                        std::uint64_t& visits) {
     const std::size_t stride = (survivors + lane_count - 1) / lane_count * lane_count;
     thread_local std::vector<double> buffer;
-    buffer.resize(stride * (task.dimension + 2) + task.settings->neighbors);
+    buffer.resize(stride * (task.dimension + 1) + lane_count * (stride + task.settings->neighbors));
     double* coordinates = buffer.data();
     double* compact_weights = coordinates + stride * task.dimension;
     std::size_t at = 0;

@@ -42,18 +42,27 @@ class Lined {
     std::vector<Line> lines_;
 };
 
-/// The points of positive prior weight of one set, coordinate by coordinate.
-Lined coordinates_of(const PointSets& sets, std::size_t set,
-                     const std::vector<std::uint32_t>& present, std::size_t stride) {
-    Lined coordinates(sets.dimension * stride, infinity);
-    const double* points = sets.points + set * sets.count * sets.dimension;
-    for (std::size_t i = 0; i < present.size(); ++i) {
+/// The points of positive prior weight of one set, coordinate by coordinate, without those that are
+/// the same in all points: a policy often leaves some alone, and they add nothing to a distance.
+struct Coordinates {
+    std::size_t varying = 0;
+    Lined values;
+
+    Coordinates(const PointSets& sets, std::size_t set, const std::vector<std::uint32_t>& present,
+                std::size_t stride)
+        : values(sets.dimension * stride, infinity) {
+        const double* points = sets.points + set * sets.count * sets.dimension;
         for (std::size_t c = 0; c < sets.dimension; ++c) {
-            coordinates[c * stride + i] = points[present[i] * sets.dimension + c];
+            double* const own = values.data() + varying * stride;
+            bool varies = varying == 0 && c + 1 == sets.dimension;
+            for (std::size_t i = 0; i < present.size(); ++i) {
+                own[i] = points[present[i] * sets.dimension + c];
+                varies |= own[i] != own[0];
+            }
+            varying += varies ? 1 : 0;
         }
     }
-    return coordinates;
-}
+};
 
 /// Point by point, the prior and the posteriors beside each other.
 Lined rows_of(const std::vector<std::uint32_t>& present, const double* prior, const double* weights,
@@ -96,9 +105,9 @@ void prior_entropies(const PointSets& sets, const double* weights, std::size_t n
         Lined gains(together * size * columns), terms(together * size);
         for (std::size_t from = 0; from < sets.number; from += together) {
             const std::size_t of_sets = std::min(together, sets.number - from);
-            std::vector<Lined> coordinates;
+            std::vector<Coordinates> coordinates;
             for (std::size_t h = 0; h < of_sets; ++h) {
-                coordinates.push_back(coordinates_of(sets, from + h, present, stride));
+                coordinates.emplace_back(sets, from + h, present, stride);
             }
             const double work =
                 static_cast<double>(of_sets * size) * (cost_of_a_pair * static_cast<double>(size) +
@@ -109,12 +118,12 @@ void prior_entropies(const PointSets& sets, const double* weights, std::size_t n
                 thread_local Lined scratch;
                 thread_local std::vector<std::uint32_t> numbers;
                 scratch.resize(2 * stride + k);
-                numbers.resize(stride + lane_count);
-                vector_kernels().prior_block({size, stride, sets.dimension, coordinates[h].data(),
-                                              vectors, rows.data(), k, constants},
-                                             begin, std::min(begin + block_size, size),
-                                             scratch.data(), numbers.data(), &terms[h * size],
-                                             &gains[h * size * columns]);
+                numbers.resize(stride + 2 * lane_count);
+                vector_kernels().prior_block(
+                    {size, stride, sets.dimension, coordinates[h].varying,
+                     coordinates[h].values.data(), vectors, rows.data(), k, constants},
+                    begin, std::min(begin + block_size, size), scratch.data(), numbers.data(),
+                    &terms[h * size], &gains[h * size * columns]);
             });
             for (std::size_t h = 0; h < of_sets; ++h) {
                 // A single point is known to within the resolution.

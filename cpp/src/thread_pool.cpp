@@ -25,10 +25,10 @@ namespace holdfast {
 namespace {
 
 constexpr int max_threads = 256;
-/// Turns of a waiting loop before a thread goes to sleep: some tens of microseconds, about what
-/// waking costs. Each turn offers the processor to others, first of all to the caller, who may be
-/// on it.
-constexpr int patience = 100;
+/// How long a thread watches for what comes soon before it goes to sleep: about what waking costs.
+/// It keeps its processor meanwhile: who yields it to a process that computes without pause gets it
+/// back only after that one's time slice, while a sleeper is woken at once.
+constexpr double patience = 30e-6;
 
 constexpr std::uint8_t took_too_long = 2;
 
@@ -42,6 +42,22 @@ double seconds_of(clockid_t clock) {
     timespec time{};
     clock_gettime(clock, &time);
     return static_cast<double>(time.tv_sec) + 1e-9 * static_cast<double>(time.tv_nsec);
+}
+
+/// Waits until `happened()`, but no longer than the patience.
+template <class Happened>
+void watch_for(Happened&& happened) {
+    const double until = seconds_of(CLOCK_MONOTONIC) + patience;
+    do {
+        for (int turn = 0; turn < 16; ++turn) {
+            if (happened()) return;
+#if defined(__x86_64__)
+            __builtin_ia32_pause();
+#elif defined(__aarch64__)
+            asm volatile("yield");
+#endif
+        }
+    } while (seconds_of(CLOCK_MONOTONIC) < until);
 }
 
 /// Sets the flag once the calling thread's time is used up; helpers have no limit of their own.
@@ -115,14 +131,10 @@ class Pool {
         for (int i = 1; i < threads; ++i) wake_.notify_one();
         job->work();
         // A task that a helper has begun: soon done, unless the helper was put aside in the middle.
-        for (int turn = 0;; ++turn) {
-            const std::size_t finished = job->finished.load(std::memory_order_acquire);
-            if (finished == tasks) break;
-            if (turn < patience) {
-                std::this_thread::yield();
-            } else {
-                job->finished.wait(finished, std::memory_order_acquire);
-            }
+        const auto finished = [&] { return job->finished.load(std::memory_order_acquire); };
+        watch_for([&] { return finished() == tasks; });
+        for (std::size_t so_far; (so_far = finished()) < tasks;) {
+            job->finished.wait(so_far, std::memory_order_acquire);
         }
         {
             // Another caller's job may have taken the place already.
@@ -155,10 +167,8 @@ class Pool {
         bool worked = false;
         for (;;) {
             // Whoever has just worked may soon be wanted again.
-            for (int turn = 0; worked && turn < patience; ++turn) {
-                if (generation_.load(std::memory_order_acquire) != seen) break;
-                std::this_thread::yield();
-            }
+            if (worked)
+                watch_for([&] { return generation_.load(std::memory_order_acquire) != seen; });
             std::shared_ptr<Job> job;
             {
                 std::unique_lock lock(mutex_);

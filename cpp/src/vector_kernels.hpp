@@ -58,7 +58,7 @@ struct CompactPosterior {
     std::size_t dimension;
     const double* coordinates;
     const double* weights;
-    double* scratch;  // [stride + the k of the nearest neighbours]
+    double* scratch;  // [stride + the k of the nearest neighbours][8]
 };
 
 /// Points of a prior and posteriors over them, side by side (prior_neighbors.hpp).
@@ -66,7 +66,8 @@ struct PriorGroup {
     std::size_t count;   // points of positive prior weight
     std::size_t stride;  // a multiple of 8
     std::size_t dimension;
-    const double* coordinates;  // [dimension][stride], +infinity beyond count
+    std::size_t varying;        // coordinates that are not the same in all points, or one
+    const double* coordinates;  // [varying][stride], +infinity beyond count
     std::size_t vectors;        // Lanes in a row
     const double* weights;      // [count][vectors * 8]: in column 0 of the prior
     std::uint32_t neighbors;    // the k, 0 if there is one point

@@ -29,60 +29,89 @@ HOLDFAST_INLINE double nearest_term(double weight, double mass, double log_radiu
                      log_of(mass / (1.0 - weight)) + constants.bias_correction[within]);
 }
 
+/// For each n the squared distances of eight points, from the `query`-th on, to point n; a point's
+/// own is infinite. Returns those to the k-th neighbours, and in `within` how many are within the
+/// resolution. A k that is known beforehand, not 0, keeps the least distances in registers.
+template <std::uint32_t known>
+static Lanes compact_distances(const CompactPosterior& posterior, std::size_t query,
+                               std::uint32_t neighbors, double resolution_squared, Lanes& within) {
+    double* const squared = posterior.scratch;
+    double* const kept = squared + posterior.stride * lane_count;
+    const Lanes far = splat(__builtin_inf());
+    Lanes smallest[known == 0 ? 1 : known];
+    for (Lanes& each : smallest) each = far;
+    for (std::uint32_t i = 0; known == 0 && i < neighbors; ++i) store(kept + i * lane_count, far);
+    for (std::size_t n = posterior.count; n % lane_count != 0; ++n) {
+        store(squared + n * lane_count, far);
+    }
+    within = Lanes{};
+    for (std::size_t n = 0; n < posterior.count; ++n) {
+        Lanes distance{};
+        for (std::size_t c = 0; c < posterior.dimension; ++c) {
+            const double* x = posterior.coordinates + c * posterior.stride;
+            const Lanes difference = load(x + query) - x[n];
+            distance += difference * difference;
+        }
+        if (n - query < lane_count) distance[n - query] = __builtin_inf();
+        store(squared + n * lane_count, distance);
+        within += select(distance <= resolution_squared, splat(1.0), Lanes{});
+        if constexpr (known != 0) {
+            for (Lanes& each : smallest) order(each, distance);
+        } else {
+            for (std::uint32_t i = 0; i < neighbors; ++i) {
+                Lanes each = load(kept + i * lane_count);
+                order(each, distance);
+                store(kept + i * lane_count, each);
+            }
+        }
+    }
+    return known != 0 ? smallest[known == 0 ? 0 : known - 1]
+                      : load(kept + (neighbors - 1) * lane_count);
+}
+
+/// The k of the settings, unless it is changed.
+inline constexpr std::uint32_t usual_neighbors = 5;
+
+/// Eight points beside each other, each with its distances to all points.
 static double compact_nearest(const CompactPosterior& posterior, std::uint32_t neighbors,
                               const NearestNeighborConstants& constants, std::uint64_t* visits) {
     const std::size_t count = posterior.count;
-    const std::size_t blocks = (count + lane_count - 1) / lane_count;
     const double resolution_squared = constants.resolution * constants.resolution * tie_tolerance;
     const double log_resolution = log_of(constants.resolution);
-    double* squared = posterior.scratch;
-    double* smallest = squared + posterior.stride;
+    const double* const squared = posterior.scratch;
     double entropy = 0.0;
-    for (std::size_t n = 0; n < count; ++n) {
-        Lanes mass{};
-        std::uint32_t within = 0;
-        for (std::size_t b = 0; b < blocks; ++b) {
-            Lanes distance{};
-            for (std::size_t c = 0; c < posterior.dimension; ++c) {
-                const double* x = posterior.coordinates + c * posterior.stride;
-                const Lanes difference = load(x + b * lane_count) - x[n];
-                distance += difference * difference;
+    for (std::size_t query = 0; query < count; query += lane_count) {
+        Lanes within;
+        const Lanes furthest =
+            neighbors == usual_neighbors
+                ? compact_distances<usual_neighbors>(posterior, query, neighbors,
+                                                     resolution_squared, within)
+                : compact_distances<0>(posterior, query, neighbors, resolution_squared, within);
+        const IntLanes resolved = within >= static_cast<double>(neighbors);
+        const Lanes reached = furthest * tie_tolerance;
+        const Lanes radius_squared = select(resolved, splat(resolution_squared), reached);
+        // Eight partial sums, as if eight points were added at a time.
+        Lanes partial[lane_count] = {};
+        for (std::size_t n = 0; n < count; n += lane_count) {
+            for (std::size_t i = 0; i < lane_count; ++i) {
+                partial[i] += select(load(squared + (n + i) * lane_count) <= radius_squared,
+                                     splat(posterior.weights[n + i]), Lanes{});
             }
-            store(squared + b * lane_count, distance);
         }
-        squared[n] = __builtin_inf();  // a point is no neighbour of its own
-        for (std::size_t b = 0; b < blocks; ++b) {
-            const IntLanes inside = load(squared + b * lane_count) <= resolution_squared;
-            within += static_cast<std::uint32_t>(__builtin_popcount(bits_of(inside)));
-            mass += select(inside, load(posterior.weights + b * lane_count), Lanes{});
+        const Lanes mass = sum_of_each(partial);
+        const Lanes weight = load(posterior.weights + query);
+        const Lanes log_radius =
+            select(resolved, splat(log_resolution), 0.5 * log_of(radius_squared));
+        Lanes correction{};
+        const std::size_t used = count - query < lane_count ? count - query : lane_count;
+        for (std::size_t lane = 0; lane < used; ++lane) {
+            const auto number = static_cast<std::uint32_t>(within[lane]);
+            correction[lane] = constants.bias_correction[number < neighbors ? neighbors : number];
         }
-        double log_radius = log_resolution;
-        if (within < neighbors) {
-            std::uint32_t kept = 0;
-            for (std::size_t b = 0; b < blocks; ++b) {
-                const Lanes distance = load(squared + b * lane_count);
-                const double limit = kept < neighbors ? __builtin_inf() : smallest[neighbors - 1];
-                unsigned bits = bits_of(distance < limit);
-                while (bits != 0) {
-                    const unsigned lane = static_cast<unsigned>(__builtin_ctz(bits));
-                    bits &= bits - 1;
-                    const double value = squared[b * lane_count + lane];
-                    if (kept < neighbors || value < smallest[neighbors - 1]) {
-                        insert_smallest(smallest, kept, neighbors, value);
-                    }
-                }
-            }
-            const double radius_squared = smallest[neighbors - 1] * tie_tolerance;
-            mass = Lanes{};
-            for (std::size_t b = 0; b < blocks; ++b) {
-                mass += select(load(squared + b * lane_count) <= radius_squared,
-                               load(posterior.weights + b * lane_count), Lanes{});
-            }
-            within = neighbors;
-            log_radius = 0.5 * log_of(radius_squared);
-        }
-        entropy += nearest_term(posterior.weights[n], sum_of(mass), log_radius, posterior.dimension,
-                                within, constants);
+        const Lanes terms = weight * (constants.log_ball_volume +
+                                      static_cast<double>(posterior.dimension) * log_radius -
+                                      log_of(mass / (1.0 - weight)) + correction);
+        for (std::size_t lane = 0; lane < used; ++lane) entropy += terms[lane];
     }
     *visits += count * count;
     return entropy;

@@ -250,6 +250,12 @@ HOLDFAST_INLINE double sum_of(const Lanes& x) {
     return (a0 + a2) + (a1 + a3);
 }
 
+/// The same for eight sums beside each other, of which x[i] has the i-th elements.
+HOLDFAST_INLINE Lanes sum_of_each(const Lanes (&x)[lane_count]) {
+    const Lanes a0 = x[0] + x[4], a1 = x[1] + x[5], a2 = x[2] + x[6], a3 = x[3] + x[7];
+    return (a0 + a2) + (a1 + a3);
+}
+
 HOLDFAST_INLINE double maximum_of(const Lanes& x) {
     double largest = x[0];
     for (std::size_t i = 1; i < lane_count; ++i) largest = x[i] > largest ? x[i] : largest;
@@ -275,6 +281,15 @@ HOLDFAST_INLINE unsigned bits_of(const IntLanes& mask) {
         bits |= (reinterpret_cast<const std::int64_t*>(mask.part)[i] != 0 ? 1u : 0u) << i;
     }
     return bits;
+#endif
+}
+
+/// bits_of(a <= b), where the compiler would go by way of eight truth values.
+HOLDFAST_INLINE unsigned bits_at_most(const Lanes& a, const Lanes& b) {
+#if defined(__AVX512DQ__)
+    return _mm512_cmp_pd_mask(a.part[0], b.part[0], _CMP_LE_OQ);
+#else
+    return bits_of(a <= b);
 #endif
 }
 

@@ -25,7 +25,8 @@ HOLDFAST_INLINE T mass_around(T others, T own) {
 static Lanes distances_from(const PriorGroup& group, std::size_t n, const double* first,
                             std::size_t begin, std::size_t end, double* distances) {
     constexpr std::size_t together = 4;
-    Lanes least = splat(largest_finite);
+    Lanes least[together];
+    for (Lanes& each : least) each = splat(largest_finite);
     const auto rows = [&]<std::size_t number>(std::size_t block,
                                               Lanes(&sums)[number]) HOLDFAST_LAMBDA {
         const Lanes own_first = splat(group.coordinates[n]);
@@ -33,7 +34,7 @@ static Lanes distances_from(const PriorGroup& group, std::size_t n, const double
             const Lanes difference = load(first + (block + i) * lane_count) - own_first;
             sums[i] = difference * difference;
         }
-        for (std::size_t c = 1; c < group.dimension; ++c) {
+        for (std::size_t c = 1; c < group.varying; ++c) {
             const double* column = group.coordinates + c * group.stride;
             const Lanes own = splat(column[n]);
             for (std::size_t i = 0; i < number; ++i) {
@@ -43,7 +44,7 @@ static Lanes distances_from(const PriorGroup& group, std::size_t n, const double
         }
         for (std::size_t i = 0; i < number; ++i) {
             store(distances + (block + i) * lane_count, sums[i]);
-            order(least, sums[i]);
+            order(least[i], sums[i]);
         }
     };
     std::size_t block = begin;
@@ -55,27 +56,33 @@ static Lanes distances_from(const PriorGroup& group, std::size_t n, const double
         Lanes sums[1];
         rows(block, sums);
     }
-    return least;
+    for (std::size_t i = 1; i < together; ++i) order(least[0], least[i]);
+    return least[0];
 }
 
-/// Writes the numbers of the distances up to `bound`; returns how many there are.
+/// Writes the numbers of the distances up to `bound`, and up to sixteen more; returns how many
+/// there are.
 static std::size_t numbers_within(const double* distances, std::size_t stride, double bound,
                                   std::uint32_t* numbers) {
-    std::size_t found = 0;
-    for (std::size_t j = 0; j < stride; j += lane_count) {
-        unsigned bits = bits_of(load(distances + j) <= bound);
+    const Lanes bounds = splat(bound);
+    std::size_t found = 0, j = 0;
 #if defined(__AVX512VL__)
-        const __m256i own = _mm256_add_epi32(_mm256_set1_epi32(static_cast<int>(j)),
-                                             _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7));
-        _mm256_storeu_si256(reinterpret_cast<__m256i*>(numbers + found),
-                            _mm256_maskz_compress_epi32(static_cast<__mmask8>(bits), own));
+    __m512i own = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    for (; j + 2 * lane_count <= stride; j += 2 * lane_count) {
+        const unsigned bits = bits_at_most(load(distances + j), bounds) |
+                              bits_at_most(load(distances + j + lane_count), bounds) << lane_count;
+        _mm512_storeu_si512(numbers + found,
+                            _mm512_maskz_compress_epi32(static_cast<__mmask16>(bits), own));
         found += static_cast<std::size_t>(__builtin_popcount(bits));
-#else
-        for (; bits != 0; bits &= bits - 1) {
+        own = _mm512_add_epi32(own, _mm512_set1_epi32(2 * lane_count));
+    }
+#endif
+    for (; j < stride; j += lane_count) {
+        for (unsigned bits = bits_at_most(load(distances + j), bounds); bits != 0;
+             bits &= bits - 1) {
             numbers[found++] =
                 static_cast<std::uint32_t>(j) + static_cast<std::uint32_t>(__builtin_ctz(bits));
         }
-#endif
     }
     return found;
 }
@@ -99,7 +106,8 @@ static Neighborhood neighborhood_of(const PriorGroup& group, std::size_t n, cons
     for (std::size_t part = 0; part < parts; ++part) {
         const Lanes least = distances_from(group, n, first, part * blocks / parts,
                                            (part + 1) * blocks / parts, distances);
-        within += static_cast<std::uint32_t>(__builtin_popcount(bits_of(least <= resolved_above)));
+        within += static_cast<std::uint32_t>(
+            __builtin_popcount(bits_at_most(least, splat(resolved_above))));
         if (within >= k) continue;
         for (std::size_t lane = 0; lane < lane_count; ++lane) {
             if (kept < k || least[lane] < smallest[k - 1]) {
@@ -146,7 +154,7 @@ HOLDFAST_INLINE void sum_rows(const PriorGroup& group, const std::uint32_t* numb
 }
 
 /// For the points [begin, end): terms[n] of the prior's entropy, gains[n][vectors * 8] of the
-/// posteriors' information. `scratch` has 2 stride + k doubles, `numbers` stride + 8.
+/// posteriors' information. `scratch` has 2 stride + k doubles, `numbers` stride + 16.
 static void prior_block(const PriorGroup& group, std::size_t begin, std::size_t end,
                         double* scratch, std::uint32_t* numbers, double* terms, double* gains) {
     const NearestNeighborConstants& constants = group.constants;

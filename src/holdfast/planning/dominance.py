@@ -28,13 +28,16 @@ def dominated(
     shifted alike, with noise added; they are fewer, or noisier. ``sizes``, ``means`` and
     ``variances`` are what :func:`holdfast.problems.checked.predictions` returns.
     """
-    rows = [range(end - size, end) for end, size in zip(np.cumsum(sizes), sizes, strict=True)]
     # Three particles rule out nearly all pairs.
-    some = means[:, [0, means.shape[1] // 2, -1]]
-    one, two = (some[:, 1:] - some[:, :1]).T
-    products = np.outer(one, two)
-    off, size = np.abs(products - products.T), np.abs(products)
-    alike = (off <= 1e-6 * (size + size.T)).tolist()
+    first = means[:, 0]
+    one, two = means[:, means.shape[1] // 2] - first, means[:, -1] - first
+    products = one[:, np.newaxis] * two
+    size = np.abs(products)
+    matches = np.abs(products - products.T) <= 1e-6 * (size + size.T)
+    if np.count_nonzero(matches) == len(means):  # each only itself
+        return np.zeros(len(sizes), dtype=bool)
+    alike = matches.tolist()
+    rows = [range(end - size, end) for end, size in zip(np.cumsum(sizes), sizes, strict=True)]
 
     def makes(better: int, worse: int) -> bool:
         left, noisier = list(rows[better]), False

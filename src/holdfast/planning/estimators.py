@@ -197,9 +197,10 @@ def scaled(points: FloatArray, estimator: KernelEstimator) -> FloatArray:
 
 def first_unbounded(points: FloatArray) -> int | None:
     """Return the index of the first point with a coordinate that is NaN or too large, or None."""
+    if _kernel.all_within(points, -LARGEST, LARGEST):
+        return None
     # A comparison with NaN is false.
-    bounded = np.abs(points) <= LARGEST
-    return None if bounded.all() else int(np.argmin(bounded.all(axis=1)))
+    return int(np.argmin((np.abs(points) <= LARGEST).all(axis=1)))
 
 
 def scale_of(resolution: npt.ArrayLike, dimension: int) -> tuple[FloatArray, float]:

@@ -89,8 +89,9 @@ def _followed(
     if has_own(problem, "expected_path", _STEP):
         states_at, stages_at = checked.expected_path(problem, states, stage, offsets, threads)
         # An integer is faster than equal stages for all: most policies then select once.
-        first = stages_at.flat[0]
-        return states_at, int(first) if (stages_at == first).all() else stages_at
+        if problem.num_stages == 1 or (stages_at == stages_at.flat[0]).all():
+            return states_at, int(stages_at.flat[0])
+        return states_at, stages_at
     states_at = np.empty((len(offsets), *states.shape))
     stages_at = np.full(states_at.shape[:2], stage, dtype=np.int64)
     several_stages = problem.num_stages > 1

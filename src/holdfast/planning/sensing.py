@@ -38,10 +38,10 @@ from holdfast.planning.dominance import dominated
 from holdfast.planning.estimators import (
     LARGEST,
     TOTAL_VARIANCE,
+    EstimatorKind,
     GaussianMixture,
     KernelEstimator,
     NearestNeighbor,
-    PriorNeighbors,
     first_unbounded,
     kernel_estimator,
     scale_of,
@@ -181,10 +181,8 @@ def choose_sensing_action(
         hypothetical, _GaussianHypotheses
     ):
         _, sizes, means, variances, _, _, angles = hypothetical.arguments
-        if not any(angles):
-            worse = dominated(
-                sizes, means, variances, np.zeros(count) if prices is None else prices
-            )
+        own = np.zeros(count) if prices is None else prices
+        if not any(angles) and (worse := dominated(sizes, means, variances, own)).any():
             scores = np.where(np.append(worse, [False] * (choices - count)), np.inf, scores)
     index = _least(scores, optional=selector.sensing_is_optional)
     if entropies[index] != entropies[index]:
@@ -310,9 +308,10 @@ def _estimator(
     kind = estimator_of(selector, points.shape[0])
     if kind in NEIGHBOR_ESTIMATORS:
         neighbors = settings.active_sensing.num_nearest_neighbors
+        found = kernel_estimator(NearestNeighbor(neighbors, resolution), dimension)
         if kind == "nearest_neighbor":
-            return kernel_estimator(NearestNeighbor(neighbors, resolution), dimension)
-        return kernel_estimator(PriorNeighbors(belief.weights, neighbors, resolution), dimension)
+            return found
+        return found._replace(kind=EstimatorKind.PRIOR_NEIGHBORS, prior=belief.weights)
     upper = kind == "gaussian_mixture_upper"
     own = np.full(dimension, resolution * resolution)
     states_have_their_own = of_states and getattr(problem, "state_resolution", None) is not None

@@ -34,6 +34,8 @@ from holdfast.problems.attributes import has_own, name_of
 
 MAX_OBSERVATION_SIZE = 1024
 
+_POSITIVE = (np.nextafter(0.0, 1.0), np.finfo(np.float64).max)
+
 
 def prediction(
     problem: Any, states: FloatArray, sensing_action: int
@@ -55,7 +57,7 @@ def predictions(
     They are the sizes of the observations, D in all; their means, shape ``(D, n)``; and their
     variances, shape ``(D, n)``, or ``(D, 1)`` if none depends on the state.
     """
-    shown, spread = [np.empty((0, states.shape[0]))], [np.empty((0, 1))]
+    shown, spread = [], []
     for action in sensing_actions:
         # What comes is copied before the next call, which may return the same buffer.
         mean = _mean(problem, states, action)
@@ -65,18 +67,16 @@ def predictions(
         spread.append(rows.astype(np.float64, order="C"))
     if any(each.shape[1] > 1 for each in spread):
         spread = [np.repeat(each, len(states) // each.shape[1], axis=1) for each in spread]
-    sizes = [len(each) for each in shown[1:]]
+    sizes = [len(each) for each in shown]
     means, variances = np.concatenate(shown), np.concatenate(spread)
-    # A comparison with NaN is false.
-    usable = ((variances > 0.0) & (variances < np.inf)).all()
-    if not usable or not _kernel.all_finite(means):
+    if not _kernel.all_within(variances, *_POSITIVE) or not _kernel.all_finite(means):
         for action in sensing_actions:
             require_usable(problem, action, *prediction(problem, states, action))
     return sizes, means, variances
 
 
 def _mean(problem: Any, states: FloatArray, sensing_action: int) -> FloatArray:
-    mean: FloatArray = _ask(problem, "observation_mean", states, sensing_action)
+    mean: FloatArray = as_caller(problem.observation_mean, states, sensing_action)
     leading = states.shape[:-1]
     if not _is_float_array(mean) or mean.ndim != states.ndim or mean.shape[:-1] != leading:
         what = f"observation_mean of sensing action {sensing_action}"
@@ -92,7 +92,7 @@ def _mean(problem: Any, states: FloatArray, sensing_action: int) -> FloatArray:
 def _variance(
     problem: Any, states: FloatArray, sensing_action: int, shape: tuple[int, ...]
 ) -> FloatArray:
-    variance: FloatArray = _ask(problem, "observation_variance", states, sensing_action)
+    variance: FloatArray = as_caller(problem.observation_variance, states, sensing_action)
     one = shape[-1:]
     fits = isinstance(variance, np.ndarray) and variance.shape in (one, shape)
     if not fits or is_masked(variance):
@@ -106,8 +106,7 @@ def require_usable(
     problem: Any, sensing_action: int, mean: FloatArray, variance: FloatArray
 ) -> None:
     """Raise the error about the first entry of a prediction that no observation can have."""
-    # Comparisons with NaN are false.
-    if (variance > 0.0).all() and _kernel.all_finite(variance) and _kernel.all_finite(mean):
+    if _kernel.all_within(variance, *_POSITIVE) and _kernel.all_finite(mean):
         return
     function, values, need = "observation_mean", mean, "finite"
     unusable = ~np.isfinite(mean)

@@ -100,13 +100,11 @@ class PegInHole2D(PegProblem):
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
         """Go to x = 0; near it also turn upright; once upright also go down to y = 0."""
         del stage
-        x, y, angle = states[..., 0], states[..., 1], states[..., 2]
-        near = np.abs(x) < self._half_width
-        upright = near & (np.abs(angle) < self._upright_limit)
-        actions = np.empty(states.shape)
-        actions[..., 0] = -x
-        actions[..., 1] = np.where(upright, -y, 0.0)
-        actions[..., 2] = np.where(near, -angle, 0.0)
+        near = np.abs(states[..., 0]) < self._half_width
+        upright = near & (np.abs(states[..., 2]) < self._upright_limit)
+        actions = -states
+        actions[..., 1][~upright] = 0.0
+        actions[..., 2][~near] = 0.0
         return actions
 
     expected_path = PegProblem.follow_policy
