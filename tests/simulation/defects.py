@@ -87,7 +87,7 @@ class _DrawingJob(Job):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.position = 0
-        named = self._request or self.state
+        named = self.request or self.state
         assert named is not None
         if self.kind == "sensing":
             _, positions = self.drawn.setdefault(id(self._configuration), (self._configuration, {}))

@@ -434,7 +434,9 @@ class Script(Service):
         self.begun_at = now
         self.times.append(now)
 
-    def finished(self, job: Job, outcome: JobResult, now: float) -> list[ServiceEffect]:
+    def finished(
+        self, job: Job, outcome: JobResult, now: float, processor_s: float | None = None
+    ) -> list[ServiceEffect]:
         self.trace.append(f"finished {job.kind}")
         self.outcome = outcome
         self.times.append(now)
@@ -523,7 +525,7 @@ async def test_what_has_arrived_is_heard_before_the_next_brief_job() -> None:
 
 async def test_long_jobs_run_beside_each_other_and_beside_the_loop() -> None:
     meeting = threading.Barrier(3, timeout=PATIENCE_S)
-    machine, both = scripted(("one", 0.002, meeting.wait), ("two", math.inf, meeting.wait))
+    machine, both = scripted(("one", math.inf, meeting.wait), ("two", math.inf, meeting.wait))
     await both.start()
     both.deliver(Call(machine.trace))
     while meeting.n_waiting < 2:

@@ -240,9 +240,8 @@ def update(
             )
         checked.require_usable(problem, sensing_action, mean, variance)
         angles = circular_observation(problem, sensing_action, mean.shape[-1])
-        log_likelihood, squared_distance = _gaussian_log_likelihood(
-            observed, mean, variance, belief.weights, angles
-        )
+        log_likelihood, distances = gaussian_log_likelihood(observed, mean, variance, angles)
+        squared_distance = float(np.where(belief.weights > 0.0, distances, np.inf).min())
         explained = squared_distance <= VALIDATION_GATE_SQUARED
         distance = float(np.sqrt(squared_distance))
         # Most observations are near a particle, and cost no more than this comparison.
@@ -322,17 +321,12 @@ def _reweighted(
     return after, ObservationInfo(*found, distance, within_gate, distinct)
 
 
-def _gaussian_log_likelihood(
-    observed: FloatArray,
-    mean: FloatArray,
-    variance: FloatArray,
-    weights: FloatArray,
-    angles: Sequence[int],
-) -> tuple[FloatArray, float]:
-    """Return log p(observed | state) up to a constant, and the least squared distance.
+def gaussian_log_likelihood(
+    observed: FloatArray, mean: FloatArray, variance: FloatArray, angles: Sequence[int]
+) -> tuple[FloatArray, FloatArray]:
+    """Return log p(observed | state) up to a constant, and the squared distances, shape (..., n).
 
-    The distance is the Mahalanobis distance from a particle's prediction; particles of weight 0 do
-    not count.
+    The distance is the Mahalanobis distance from a particle's prediction.
     """
     # An overflow to infinity is correct: the observation is outside every validation gate.
     with np.errstate(over="ignore"):
@@ -342,12 +336,11 @@ def _gaussian_log_likelihood(
         distance = squares[..., 0].copy()
         for coordinate in range(1, squares.shape[-1]):
             distance += squares[..., coordinate]
-    nearest = float(np.where(weights > 0.0, distance, np.inf).min())
     log_likelihood = -0.5 * distance
     if variance.ndim > 1:
         for coordinate in range(variance.shape[-1]):
             log_likelihood -= 0.5 * numerics.log(variance[..., coordinate])
-    return log_likelihood, nearest
+    return log_likelihood, distance
 
 
 def resample(belief: Belief, stream: Stream) -> Belief:

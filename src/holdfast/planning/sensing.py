@@ -103,6 +103,47 @@ class SensingInfo(NamedTuple):
     prices: FloatArray | None = None
 
 
+class Predictions(NamedTuple):
+    """What the problem's functions say of n particles, each by itself.
+
+    Attributes
+    ----------
+    sets : array of shape (K, n, d)
+        The points whose entropies count, each set by its one of ``factors``.
+    factors : tuple of float
+    shown : tuple or None
+        Of :func:`holdfast.problems.checked.predictions`; None for a general likelihood.
+    """
+
+    sets: FloatArray
+    factors: tuple[float, ...]
+    shown: tuple[list[int], FloatArray, FloatArray] | None
+
+    def of(self, some: slice) -> Predictions:
+        """Return those of some of the particles."""
+        if self.shown is None:
+            return self._replace(sets=self.sets[:, some])
+        sizes, means, variances = self.shown
+        if variances.shape[1] > 1:
+            variances = np.ascontiguousarray(variances[:, some])
+        shown = sizes, np.ascontiguousarray(means[:, some]), variances
+        return Predictions(np.ascontiguousarray(self.sets[:, some]), self.factors, shown)
+
+
+def predict(
+    problem: Problem, settings: PlanningSettings, states: FloatArray, stage: int
+) -> Predictions:
+    """Return what an entropy method needs of particles in one stage, shape (n, state_size)."""
+    if settings.selector.method == "path_entropy":
+        sets, factors = path_points(problem, settings, states, stage)
+    else:
+        sets, factors = _points_of(problem, settings)(states, stage)[np.newaxis], (1.0,)
+    if has_general_observations(problem):
+        return Predictions(sets, factors, None)
+    every = range(len(problem.sensing_actions))
+    return Predictions(sets, factors, checked.predictions(problem, states, every))
+
+
 def choose_sensing_action(
     problem: Problem,
     settings: PlanningSettings,
@@ -110,6 +151,8 @@ def choose_sensing_action(
     stage: int,
     hypotheses: Stream,
     selection: Stream,
+    *,
+    predictions: Predictions | None = None,
 ) -> tuple[int, SensingInfo]:
     """Choose a sensing action for a belief: an index, the lowest of equally good ones.
 
@@ -121,7 +164,8 @@ def choose_sensing_action(
     one without effort.
 
     The stream ``hypotheses`` has the random numbers of the hypothetical observations, ``selection``
-    the one of the method ``random`` and of equal expected returns.
+    the one of the method ``random`` and of equal expected returns. Who has the ``predictions``
+    already, those of :func:`predict` for this belief and stage, may give them to an entropy method.
 
     Raises
     ------
@@ -152,16 +196,13 @@ def choose_sensing_action(
         return _greatest_return(problem, settings, belief, stage, hypotheses, selection)
 
     points_of = _points_of(problem, settings)
-    if selector.method == "path_entropy":
-        sets, factors = path_points(problem, settings, belief.states, stage)
-    else:
-        sets, factors = points_of(belief.states, stage)[np.newaxis], (1.0,)
+    sets, factors, shown = predictions or predict(problem, settings, belief.states, stage)
     estimator = _estimator(problem, settings, belief, sets[0])
     sets = _on_a_line(problem, settings, sets)
     points = sets.reshape(-1, sets.shape[-1])
     threads = settings.active_sensing.num_cores
     size = settings.active_sensing.num_observation_samples
-    hypothetical = _hypotheses_of(problem, belief)(range(count), size, hypotheses)
+    hypothetical = _hypotheses_of(problem, belief, shown)(range(count), size, hypotheses)
     entropies, samples, likelihoods, visits = hypothetical.entropies(
         scaled(points, estimator), estimator, threads, factors, selector.sensing_is_optional
     )
@@ -423,13 +464,15 @@ class _GeneralHypotheses(NamedTuple):
 
 
 def _hypotheses_of(
-    problem: Problem, belief: Belief
+    problem: Problem,
+    belief: Belief,
+    shown: tuple[list[int], FloatArray, FloatArray] | None = None,
 ) -> Callable[[Sequence[int], int, Stream], _GaussianHypotheses | _GeneralHypotheses]:
     """Return what draws hypothetical observations of some sensing actions, so many of each."""
     if has_general_observations(problem):
         return functools.partial(_general_hypotheses, problem, belief)
     every = range(len(problem.sensing_actions))
-    sizes, predicted, variances = checked.predictions(problem, belief.states, every)
+    sizes, predicted, variances = shown or checked.predictions(problem, belief.states, every)
     angles: list[int] = []
     if has_circular_observations(problem):
         for action, size in zip(every, sizes, strict=True):

@@ -29,6 +29,12 @@ from holdfast.protocol.service_sessions import (
     Session,
 )
 
+_TOGETHER_S = 0.003
+"""Expected time of the short tasks that a worker has at a time: nothing else runs meanwhile."""
+
+_MOST_TOGETHER = 32
+"""Bound on their number."""
+
 
 class _RoundRobin:
     """Tasks that wait, their owners by turns."""
@@ -173,14 +179,23 @@ class RequestQueue:
 
         None, too, if it takes more than ``room_bytes`` of memory; it keeps its turn.
         """
-        task = self._next() if len(self._running) < self._workers else None
-        if task is None or task.num_bytes > room_bytes:
+        task = self._next() if self._waiting.num else None
+        if task is None or task.num_bytes > room_bytes or not self._is_free_for(task):
             return None
         order = self._order_of(task)
         order.remove(task)
         order.end_turn(task.session.owner, now)
         self._count(task, -1)
         return task
+
+    def _is_free_for(self, task: PendingTask) -> bool:
+        """Return whether a worker is free, or takes a short task together with other short ones."""
+        if len(self._running) < self._workers:
+            return True
+        if len(self._running) >= _MOST_TOGETHER:
+            return False
+        running_s = sum(each.short_s for each in self._running.values())
+        return running_s + task.predicted_s() <= _TOGETHER_S
 
     def _next(self) -> PendingTask | None:
         urgent, later = self._urgent.first(), self._later.first()

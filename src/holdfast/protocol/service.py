@@ -14,8 +14,8 @@ go first, within limits.
 The machine computes nothing itself and has no clock, thread or socket. Methods take an event and
 the time and return effects, to be carried out in order. Then the caller asks for
 :meth:`Service.next_jobs`, so that no reply waits until they are chosen. It runs each :class:`Job`
-that it is handed (at most ``max_running`` at a time) anywhere, and returns its :class:`JobResult`
-with :meth:`Service.finished`.
+that it is handed (at most ``max_running`` at a time, and some short ones) anywhere, and returns its
+:class:`JobResult` with :meth:`Service.finished`.
 
 This module decides what requests and results mean. Memory is in
 :mod:`~holdfast.protocol.service_sessions`, the order of work in
@@ -120,7 +120,7 @@ class Service:
 
     @property
     def max_running(self) -> int:
-        """Jobs that may be handed out at a time; more than ``workers``, see :class:`Lanes`."""
+        """Jobs that may run at a time, besides short ones; :class:`Lanes` says why so many."""
         return self._queue.max_running
 
     @property
@@ -158,8 +158,10 @@ class Service:
         if (lane := self._queue.with_job(job)) is not None:
             lane.started(job, now)
 
-    def finished(self, job: Job, outcome: JobResult, now: float) -> list[ServiceEffect]:
-        """Handle the result of a job that was handed out."""
+    def finished(
+        self, job: Job, outcome: JobResult, now: float, processor_s: float | None = None
+    ) -> list[ServiceEffect]:
+        """Handle the result of a job that was handed out, and the processor time that it took."""
         lane = self._queue.with_job(job)
         if lane is None:
             return []  # handed out before everything was forgotten
@@ -168,7 +170,8 @@ class Service:
         is_awaited = session.pending.get(task.digest) is task
         session.remove_task(task)
         price = outcome.price
-        self._problems.release(session.problem_key, outcome.problem)
+        if task.short_s == math.inf:
+            self._problems.release(session.problem_key, outcome.problem)
         cost = None if price is None else price.problem
         self._problems.note_cost(session.owner, session.problem_key, cost)
         if not session.closed:
@@ -187,11 +190,14 @@ class Service:
             else:
                 computed_s = now - task.started_at
                 session.overran = session.overran and computed_s > self._queue.limits_s[MEDIUM]
+                if outcome.restored:
+                    # A particle in an obstacle, say, takes a thousand times as long.
+                    session.task_time.typical_s = session.sensing_time.typical_s = math.inf
                 if typical:
                     if task.lane <= BRIEF:
                         # What new robots are expected to take.
                         (self._sensing_time if task.sensing else self._task_time).learn(computed_s)
-                    task.expected_time.learn(computed_s)
+                    task.expected_time.learn(computed_s, processor_s)
                 self._succeeded(task, outcome, now)
             self._queue.release_held(session)
         return self._effects.take()
@@ -436,10 +442,12 @@ class Service:
                 return
         alone = self._queue.is_alone(task)
         estimated_s = self._queue.limits_s[task.lane]
-        problem = self._problems.acquire(session.problem_key)
-        expected_s = math.inf
-        if problem is not None and task.is_typical(state):
-            expected_s = task.expected_time.typical_s
+        task.short_s = task.predicted_s()
+        is_short = task.short_s < math.inf
+        problems = self._problems
+        problem = (problems.shared if is_short else problems.acquire)(session.problem_key)
+        if problem is None:
+            task.short_s = math.inf
         job = Job(
             task.kind,
             problem,
@@ -458,9 +466,10 @@ class Service:
             self._queue.most_s(task),
             # A long one would have to build it again.
             building_counts=task.lane != LONG,
+            company=session.company,
         )
         self._queue[task.lane].handed_out(task, job, now)
-        self._effects.append(StartJob(job, expected_s, task.lane <= BRIEF))
+        self._effects.append(StartJob(job, task.short_s, task.lane <= BRIEF))
 
     # -- outcomes --------------------------------------------------------------------------------
 
@@ -508,7 +517,6 @@ class Service:
         if outcome.restored:
             statistics.restores += 1
             assert outcome.state is not None
-            session.restored_trial = outcome.state.trial
             self._note("restored", session, trial=outcome.state.trial, step=outcome.state.step)
         state = task.state if outcome.state is None else outcome.state
         assert state is not None

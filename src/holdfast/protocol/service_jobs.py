@@ -118,28 +118,31 @@ class Job:
         *,
         # Whether building the problem and measuring it are part of that time.
         building_counts: bool = False,
+        # The same for jobs of the same problem and settings; None: like no other.
+        company: bytes | None = None,
     ) -> None:
         self.kind = kind
+        self.company = company
         self._pricing = pricing
-        self._price = price
+        self.price = price
         self._known = known
         self._most = most
         self._building_counts = building_counts
         self.interruption = Interruption(most_s)  # ends it
-        self._problem = problem
+        self.problem = problem
         self._make_problem = make_problem
         self._describe_error = describe_error
         self._configuration = configuration
-        self._planning = planning
+        self.planning = planning
         self._seed = seed
         self._limits = limits
-        self._request = request
+        self.request = request
         self.state = state
 
     @property
     def identity(self) -> tuple[object, ...]:
         """What the result depends on, besides that state, the problem and the settings."""
-        request = self._request
+        request = self.request
         named = None
         if request is not None:
             named = (
@@ -167,7 +170,7 @@ class Job:
         That includes ``KeyboardInterrupt``: on a worker's thread it can only come from them.
         """
         # Kept as it becomes known, for it is worth keeping if the rest fails.
-        problem = self._problem
+        problem = self.problem
         try:
             # All of it: a model may take long to build, and to measure.
             with interruptible(self.interruption):
@@ -175,21 +178,17 @@ class Job:
                     self.interruption.start_clock()
                 if problem is None:
                     problem = self._make_problem(unpack_configuration(self._configuration))
-                if self._price is None:
-                    self._price = self._pricing.price_of(problem, self._planning, self._known)
+                if self.price is None:
+                    self.price = self._pricing.price_of(problem, self.planning, self._known)
                 if not self._building_counts:
                     self.interruption.start_clock()
                 check()
-                cost = self._checked_cost(problem, self._price)
-                most = self._most
-                if most is not None and (
-                    cost.seconds > most.seconds or cost.num_bytes > most.num_bytes
-                ):
-                    return JobResult(problem=problem, price=self._price, postponed=cost)
-                return self._computed(problem)._replace(price=self._price)
+                if (cost := self.too_dear(problem, self.price)) is not None:
+                    return JobResult(problem=problem, price=self.price, postponed=cost)
+                return self._computed(problem)._replace(price=self.price)
         except InterruptedComputationError:
             # The problem was left in the middle of something. What it costs may be known.
-            return JobResult(cancelled=True, price=self._price)
+            return JobResult(cancelled=True, price=self.price)
         except _LacksStateError as lack:
             differs = lack.differs or self.state is not None
             return JobResult(
@@ -197,7 +196,7 @@ class Job:
             )
         except MemoryError as error:
             text = _account(error, self._describe_error)
-            asked = describe_cost(problem, self._planning)
+            asked = describe_cost(problem, self.planning)
             text = f"out of memory for a decision of {asked}: {text}"
             return JobResult(failure=("out_of_memory", text), problem=problem)
         except MessageError as error:
@@ -207,6 +206,13 @@ class Job:
         except BaseException as error:  # noqa: BLE001 - the problem is anybody's code
             text = _account(error, self._describe_error)
             return JobResult(failure=("failed", text), problem=problem)
+
+    def too_dear(self, problem: Problem, price: Price) -> Cost | None:
+        """Return what this job takes if that is more than it may."""
+        cost, most = self._checked_cost(problem, price), self._most
+        if most is None or (cost.seconds <= most.seconds and cost.num_bytes <= most.num_bytes):
+            return None
+        return cost
 
     def _checked_cost(self, problem: Problem, price: Price) -> Cost:
         """Return what this job takes; if that, or any decision of the session, is too much, raise.
@@ -218,7 +224,7 @@ class Job:
                 f"action_size of {problem.name} is {problem.action_size}: a service takes at most "
                 f"{MAX_ACTION_SIZE}"
             )
-        request, planning = self._request, self._planning
+        request, planning = self.request, self.planning
         reached = Cost(0.0, 0.0)
         if request is not None:
             steps, state = 0, self.state
@@ -267,7 +273,7 @@ class Job:
         return Cost(reached.seconds + price.sensing.seconds, longest.num_bytes)
 
     def _computed(self, problem: Problem) -> JobResult:
-        planning, request = self._planning, self._request
+        planning, request = self.planning, self.request
         planner = Planner(problem, planning)
         if request is None:
             assert self.state is not None
@@ -373,13 +379,15 @@ def _code_of(error: HoldfastError) -> str:
 class ProblemPool:
     """Problem instances that no job is using, and what problems cost.
 
-    Each instance is used by one job at a time, since it may keep buffers. Instances are kept of so
-    many distinct problems, the least recently released going first; costs of many times as many.
+    Each instance is used by one job at a time, since it may keep buffers; all short jobs, of which
+    one runs at a time, have one. Instances are kept of so many distinct problems, the least
+    recently released going first; costs of many times as many.
     """
 
     def __init__(self, max_problems: int) -> None:
         self._max_problems = max_problems
         self._idle: OrderedDict[bytes, list[Problem]] = OrderedDict()
+        self._shared: OrderedDict[bytes, Problem] = OrderedDict()
         self._costs: OrderedDict[tuple[str | None, bytes], ProblemCost] = OrderedDict()
 
     def cost_of(self, owner: str | None, key: bytes) -> ProblemCost | None:
@@ -388,6 +396,15 @@ class ProblemPool:
         None if that is not known any more. (Nobody's lane depends on what another has brought.)
         """
         return self._costs.get((owner, key))
+
+    def shared(self, key: bytes) -> Problem | None:
+        """Return the instance of all short jobs; None if one must be built, by another job."""
+        problem = self._shared.pop(key, None) or self.acquire(key)
+        if problem is not None:
+            self._shared[key] = problem
+            if len(self._shared) > self._max_problems:
+                self._shared.popitem(last=False)
+        return problem
 
     def acquire(self, key: bytes) -> Problem | None:
         """Take an unused instance; None if one must be built."""
@@ -426,11 +443,15 @@ class EndCall(NamedTuple):
 
 
 class StartJob(NamedTuple):
-    """Run a job anywhere, and hand its result to the machine's ``finished``."""
+    """Run a job anywhere, and hand its result to the machine's ``finished``.
+
+    Short jobs are run one after another, or together
+    (:func:`~holdfast.protocol.service_batches.run_together`): they share their problem.
+    """
 
     job: Job
-    # Typical time of the robot's earlier jobs; infinite if that predicts nothing: the first job, a
-    # problem that is not built in, or an unusual request.
+    # Time of a short job; infinite for one that takes long or that nothing predicts: the first job,
+    # a problem that is not built in, or an unusual request.
     expected_s: float
     # Whether its lane ends it after a moment. All others may take any time, so their threads have
     # less weight (:class:`~holdfast.protocol.service_lanes.Lanes`).

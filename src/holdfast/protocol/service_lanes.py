@@ -37,12 +37,16 @@ from holdfast.protocol.service_sessions import (
     MEDIUM,
     NEW,
     REQUESTED,
+    SHORT_S,
     PendingTask,
     Session,
 )
 
 _OVERRUN = 5.0
 """So many times its lane's limit a job may compute; hardly any takes 3 times its estimate."""
+
+_OVERRUN_SHORT = 10.0
+"""So many times :data:`SHORT_S` a short job may: everything else waits for it."""
 
 _OVERDUE = 4.0
 """The same of a long one, which is refused then."""
@@ -85,6 +89,8 @@ class Lanes:
 
     def most_s(self, task: PendingTask) -> float:
         """Return how long a job of a task may compute."""
+        if task.short_s < math.inf:
+            return _OVERRUN_SHORT * SHORT_S
         return (_OVERDUE if task.lane == LONG else _OVERRUN) * self.limits_s[task.lane]
 
     def release_held(self, session: Session) -> None:
@@ -124,6 +130,13 @@ class Lanes:
                 f"and takes at most {limits.max_decision_s:g} s (--max-decision-s). It has "
                 f"{describe_cost(None, session.planning)}",
             )
+        if cost is None and task.short_s < math.inf:
+            # It blocks nobody on a thread, and its next ones go there until one is short again.
+            task.expected_time.typical_s = math.inf
+            if task.calls:
+                session.pending[task.digest] = task
+                self[task.lane].enqueue(task)
+            return True
         session.is_brief = False
         if cost is None:
             session.overran = True

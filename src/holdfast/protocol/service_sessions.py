@@ -15,6 +15,7 @@ calls. A part is identified by the digest of its state, so equal questions share
 from __future__ import annotations
 
 import hashlib
+import math
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple, TypeAlias
@@ -43,6 +44,9 @@ Owner: TypeAlias = str | None
 
 SessionKey: TypeAlias = tuple[Owner, bytes]
 """Owner and session id."""
+
+SHORT_S = 0.001
+"""Jobs that take no longer than that are *short*: handing them to a thread takes as long."""
 
 _ESTIMATING_S = 1e-4
 """Time of a job that does no more than that."""
@@ -115,6 +119,7 @@ class PendingTask:
         self.num_bytes = 0.0  # estimated memory, unless it is brief
         self.cost_s = self._expected_s()
         self.running = False
+        self.short_s = math.inf  # how long a short one is expected to run
         self.started_at = since
 
     @property
@@ -141,17 +146,22 @@ class PendingTask:
         self.num_bytes = cost.num_bytes
         self.cost_s = self._expected_s()
 
-    def is_typical(self, state: PlanningState | None) -> bool:
+    def predicted_s(self) -> float:
+        """Return how long it takes on a free core; infinite if that is unknown, or not short."""
+        request, state = self.request, self.state
+        if request is not None and request.checkpoint is None:
+            state = self.session.state_before(request)
+        typical_s = self.expected_time.typical_s
+        return typical_s if typical_s <= SHORT_S and self._is_typical(state) else math.inf
+
+    def _is_typical(self, state: PlanningState | None) -> bool:
         """Return whether earlier times predict this task's, if it starts at ``state``.
 
         It must follow the previous observation, or start a trial, and span few steps, since a robot
-        may choose their number. Its problem must be built in: other code may take any time. So may
-        states that came from outside: a particle in an obstacle takes a thousand times as long.
+        may choose their number. Its problem must be built in: other code may take any time.
         """
         request = self.request
         if not (self.session.built_in and self.session.is_brief):
-            return False
-        if state is not None and state.trial == self.session.restored_trial:
             return False
         if request is None:
             return True
@@ -209,14 +219,14 @@ class Session:
         # Whether no decision was estimated to be too long for the lane of brief ones.
         self.is_brief = True
         self.overran = False  # whether its last decision took much longer than was estimated
-        # The last trial of which a state came from a checkpoint.
-        self.restored_trial: int | None = None
         self.price: Price | None = None  # what its decisions cost; None before the first
         self.built_in = configuration.problem in BUILT_IN
         # The number of threads changes no result, so the service may choose it.
         most = min(configuration.planning.active_sensing.num_cores, _MAX_THREADS)
         # With the threads that a decision has when it is computed alone.
         self.planning = with_cores(configuration.planning, most)
+        # What the sessions have in common that decide alike.
+        self.company = _digest_of((self.problem_key, configuration.planning))
         self.seed = configuration.seed
         self.served = False  # whether the robot got an answer
         # acknowledged, ahead: the state last asked about, and that at the next sensing step.

@@ -24,7 +24,9 @@ from __future__ import annotations
 import asyncio
 import functools
 import itertools
+import math
 import os
+import time
 from collections import Counter, deque
 from collections.abc import Callable
 from typing import Literal, TypeAlias
@@ -35,6 +37,7 @@ from holdfast.errors import DEFECT, MessageError, defect_fields
 from holdfast.protocol.events import LogEvent
 from holdfast.protocol.messages import Busy, Refused, Request, decode_request, encode
 from holdfast.protocol.service import Service
+from holdfast.protocol.service_batches import run_together
 from holdfast.protocol.service_jobs import (
     EndCall,
     Job,
@@ -49,9 +52,6 @@ from holdfast.runtime.pool import ThreadPool
 from holdfast.transport.contract import IncomingCall, ServiceTransport
 
 DecisionHook: TypeAlias = Callable[[Literal["task", "sensing"], float, float], None]
-
-_BRIEF_S = 0.001
-"""Longer jobs run on threads, because a job blocks the loop."""
 
 _NICENESS = 5
 """Niceness of the threads for jobs that may take any time: a third of the others' processor time.
@@ -250,29 +250,40 @@ class ServiceShell:
             now = self._loop.time()
             self._carry_out(self._service.gone(number, now), now)
 
-    def _run_brief_job(self) -> None:
+    def _run_brief_jobs(self) -> None:
         if not self._brief_jobs:
             return  # forgotten meanwhile
-        job = self._brief_jobs.popleft()
+        jobs = [self._brief_jobs.popleft()]
+        while self._brief_jobs and self._brief_jobs[0].kind == jobs[0].kind:
+            jobs.append(self._brief_jobs.popleft())
         if self._brief_jobs:
-            self._run_brief_job_soon()
+            self._run_brief_jobs_soon()
         elif self._has_replied:
             # A robot on this machine may wait for this very core: it acts on its reply first.
             os.sched_yield()
         self._has_replied = False
-        self._finished(job, *self._computed(job))
+        began, used_s = self._loop.time(), time.thread_time()
+        together = run_together(jobs)
+        share = 1.0 / len(jobs)
+        shares = share * (self._loop.time() - began), share * (time.thread_time() - used_s)
+        computed = [
+            self._computed(job) if outcome is None else (outcome, *shares)
+            for job, outcome in zip(jobs, together, strict=True)
+        ]
+        for job, (outcome, *times) in zip(jobs, computed, strict=True):
+            self._finished(job, outcome, *times)
 
-    def _run_brief_job_soon(self) -> None:
+    def _run_brief_jobs_soon(self) -> None:
         """Schedule the next brief job after all input that has arrived by then.
 
         In one turn the loop runs ``call_soon`` callbacks of before, then reads sockets, then runs
         due timers.
         """
-        self._loop.call_at(self._loop.time(), self._guarded, self._run_brief_job)
+        self._loop.call_at(self._loop.time(), self._guarded, self._run_brief_jobs)
 
-    def _computed(self, job: Job) -> tuple[JobResult, float]:
-        """Run a job on any thread; return its outcome and its duration."""
-        began = self._loop.time()
+    def _computed(self, job: Job) -> tuple[JobResult, float, float]:
+        """Run a job on any thread; return its outcome, its duration and its processor time."""
+        began, used_s = self._loop.time(), time.thread_time()
         try:
             outcome = job.run()
         except BaseException as error:  # noqa: BLE001 - a job touches nothing that is shared
@@ -280,14 +291,16 @@ class ServiceShell:
                 functools.partial(self.note, DEFECT, **defect_fields(error))
             )
             outcome = JobResult(failure=("failed", _in_words(error)))
-        return outcome, self._loop.time() - began
+        return outcome, self._loop.time() - began, time.thread_time() - used_s
 
-    def _finished(self, job: Job, outcome: JobResult, computed_s: float) -> None:
+    def _finished(
+        self, job: Job, outcome: JobResult, computed_s: float, processor_s: float
+    ) -> None:
         now = self._loop.time()
         # Without the time to a thread and back: with it a brief job that once ran there would
         # never count as brief again.
         self._service.started(job, now - computed_s)
-        self._carry_out(self._service.finished(job, outcome, now), now)
+        self._carry_out(self._service.finished(job, outcome, now, processor_s), now)
 
     def _tick(self) -> None:
         """Advance the machine's clock, and log dropped events that are due."""
@@ -327,7 +340,7 @@ class ServiceShell:
 
     def _run(self, run: StartJob) -> None:
         job = run.job
-        if run.expected_s > _BRIEF_S:
+        if run.expected_s == math.inf:
             pool = self._brief if run.is_brief else self._others
             pool.submit(
                 functools.partial(self._computed, job),
@@ -336,7 +349,7 @@ class ServiceShell:
             return
         self._brief_jobs.append(job)
         if len(self._brief_jobs) == 1:
-            self._run_brief_job_soon()
+            self._run_brief_jobs_soon()
 
     def _set_timer(self) -> None:
         """Set the timer for the machine's or the log's next wake-up."""

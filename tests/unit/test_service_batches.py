@@ -1,0 +1,83 @@
+"""Brief jobs that are computed at once: results, and what is left to each job alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+import pytest
+from tests.unit.test_protocol_service import Bench, Robot, content, planning_of
+
+from holdfast.planning.planner import digest
+from holdfast.protocol.decision_cost import Cost
+from holdfast.protocol.service_batches import run_together
+from holdfast.protocol.service_jobs import Job, JobResult
+
+
+def jobs_of(number: int, *, interval: int = 3) -> tuple[Bench, list[Robot]]:
+    """Return robots that were served before, whose next requests are handed out together."""
+    bench = Bench()
+    robots = [Robot(planning=planning_of(interval), key=key, seed=key) for key in range(number)]
+    for _ in range(3):  # the first job of each kind predicts nothing
+        for robot in robots:
+            bench.ask(robot.request(since=max(0, len(robot.observed) - 1)))
+            robot.act_until_sensing()
+            robot.sense()
+    for robot in robots:
+        bench.send(robot.request(since=len(robot.observed) - 1))
+    assert len(bench.jobs) == number, "short ones go out together"
+    return bench, robots
+
+
+def comparable(result: JobResult) -> tuple[object, ...]:
+    states = [None if each is None else digest(each) for each in (result.state, result.ahead)]
+    return (*states, *result._replace(state=None, ahead=None))
+
+
+@pytest.mark.parametrize("interval", [0, 3])
+def test_results_are_those_of_each_alone(interval: int) -> None:
+    bench, robots = jobs_of(3, interval=interval)
+    for kind in ("task", "sensing"):
+        jobs = list(bench.jobs)
+        assert {job.kind for job in jobs} == {kind}
+        bench.jobs.clear()
+        results = run_together(jobs)
+        for job, result in zip(jobs, results, strict=True):
+            assert result is not None
+            assert comparable(result) == comparable(job.run())
+            bench.apply(bench.service.finished(job, result, bench.now))
+    for call, robot in zip(list(bench.replies)[-3:], robots, strict=True):
+        assert content(bench.replies[call]) == robot.right_answer()
+
+
+def has_other_digest(job: Job) -> None:
+    assert job.request is not None
+    job.request = msgspec.structs.replace(job.request, digest=bytes(16))
+
+
+def costs_too_much(job: Job) -> None:
+    job._most = Cost(1e-9, 1e-9)
+
+
+def is_of_other_settings(job: Job) -> None:
+    job.company = b"another"
+
+
+@pytest.mark.parametrize("change", [has_other_digest, costs_too_much, is_of_other_settings])
+def test_what_is_unlike_is_left_to_itself(change: Callable[[Job], None]) -> None:
+    bench, _ = jobs_of(3)
+    jobs = list(bench.jobs)
+    change(jobs[1])
+    assert [result is None for result in run_together(jobs)] == [False, True, False]
+
+
+def test_what_goes_wrong_is_left_to_each() -> None:
+    bench, _ = jobs_of(3)
+    jobs = list(bench.jobs)
+    jobs[1].request = msgspec.structs.replace(jobs[1].request, inputs=(jobs[0].request,))  # type: ignore[type-var]
+    assert run_together(jobs) == [None] * 3
+
+
+def test_one_alone_is_left_to_itself() -> None:
+    bench, _ = jobs_of(1)
+    assert run_together(list(bench.jobs)) == [None]
