@@ -26,7 +26,6 @@ def main(application: Callable[[Sequence[str]], int] | None = None) -> None:
     ``application`` is run with the arguments instead of the commands of ``holdfast``; it returns
     the exit code.
     """
-    gc.disable()  # importing modules leaves no garbage
     if os.getpid() == 1:
         # The first process of a container does not get what it has no handler for.
         signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
@@ -50,9 +49,12 @@ def main(application: Callable[[Sequence[str]], int] | None = None) -> None:
         if application is None:
             from holdfast.cli.application import find_command
 
-            application, is_service = find_command(arguments)
+            gc.disable()  # importing modules leaves no garbage
+            try:
+                application, is_service = find_command(arguments)
+            finally:
+                gc.enable()
             arguments = arguments[1:]
-        gc.enable()
         # A service, and what guards one, go on when nobody reads their output.
         if is_service:
             sys.exit(application(arguments))

@@ -18,10 +18,9 @@ import numpy.typing as npt
 from holdfast.errors import InvalidValueError
 from holdfast.printable import one_line
 
-# npt.NDArray, without its module: a service that starts does not load it.
-FloatArray = np.ndarray[tuple[Any, ...], np.dtype[np.float64]]
-IntArray = np.ndarray[tuple[Any, ...], np.dtype[np.int64]]
-BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 
 NOTHING_ELSE = "(no text, truth value, date or masked entry)"
 """What a message says after numbers, which the readers alone take for such."""
@@ -82,10 +81,9 @@ def _hides_something(value: object) -> bool:
 
 def is_masked(value: object) -> bool:
     """Tell whether a mask hides an entry of an array: NumPy's functions drop it in silence."""
-    # No array is masked before NumPy's module of them is imported, which takes 10 ms.
-    if "numpy.ma" not in sys.modules:
-        return False
-    return isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(value))
+    # No array is masked before NumPy's module of them is imported, which is slow.
+    could_be = "numpy.ma" in sys.modules and isinstance(value, np.ma.MaskedArray)
+    return could_be and bool(np.ma.is_masked(value))
 
 
 def real_number(value: object) -> float | None:

@@ -18,13 +18,7 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
-from holdfast.errors import (
-    DEFECT,
-    HoldfastError,
-    InvalidValueError,
-    TransportError,
-    defect_fields,
-)
+from holdfast.errors import DEFECT, HoldfastError, InvalidValueError, defect_fields
 from holdfast.printable import printable
 from holdfast.service.garbage import collect_in_loop
 from holdfast.service.options import ServeOptions, checked_endpoints, parse_options
@@ -37,7 +31,7 @@ if TYPE_CHECKING:
     from holdfast.service.metrics import ServiceReport
     from holdfast.service.shell import ServiceShell
     from holdfast.service.supervisor import Supervised
-    from holdfast.transport.endpoints import Endpoint, TlsFiles
+    from holdfast.transport.endpoints import Endpoint
 
 IS_SERVICE = True
 
@@ -182,12 +176,10 @@ def _serve(
     if credentials is None:
         _import_without_openssl()
     with contextlib.ExitStack() as stack:
-        files = None if credentials is None else credentials.files
-        sockets: list[socket.socket | None]
+        sockets: Sequence[socket.socket | None]
         sockets = [socket.socket(fileno=each) for each in options.sockets]
-        sockets = sockets or [_listen_early(each, files, stack) for each in endpoints]
-        # From here and not from a module that a module needs: CPython keeps the frames of calls
-        # in pieces of 16 KB, and imports this deep would take and return one thousands of times.
+        sockets = sockets or [_listen_early(each, credentials, stack) for each in endpoints]
+        # Not from a module that others import: docs/decisions/start.md.
         import numpy as np  # noqa: F401
 
         extension = None if make_extension is None else make_extension()
@@ -468,20 +460,18 @@ async def _watched(
 
 
 def _listen_early(
-    endpoint: Endpoint, files: TlsFiles | None, stack: contextlib.ExitStack
+    endpoint: Endpoint, credentials: ServiceCredentials | None, stack: contextlib.ExitStack
 ) -> socket.socket | None:
     """Listen before anything slow is loaded; None if the transport is to do it, or to refuse.
 
-    The system answers who connects meanwhile. So a robot far away, which tries all the time, has
-    its connection when this service can decide: it uses a relaunched service a round trip sooner.
+    The system answers who connects meanwhile, so a robot far away saves a round trip.
     """
     from holdfast.transport.endpoints import check_credentials
     from holdfast.transport.listener import listen
 
-    if not endpoint.is_local_socket:
-        with contextlib.suppress(OSError, TransportError):
-            check_credentials(endpoint, files)
-            return stack.enter_context(listen(endpoint))
+    with contextlib.suppress(OSError, HoldfastError):
+        check_credentials(endpoint, None if credentials is None else credentials.files)
+        return None if endpoint.is_local_socket else stack.enter_context(listen(endpoint))
     return None
 
 

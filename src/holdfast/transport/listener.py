@@ -72,8 +72,7 @@ class Listener:
         *,
         # Whether another connection can be taken now.
         may_deliver: Callable[[], bool] = lambda: True,
-        # A socket that listens there already, or is bound there for several processes, of which
-        # this one listens, too.
+        # One that listens there already, or is bound there for several processes.
         shared: socket.socket | None = None,
     ) -> None:
         self._accepted = accepted
@@ -239,10 +238,8 @@ def listen(endpoint: Endpoint) -> socket.socket:
 def _listen_beside(shared: socket.socket) -> socket.socket:
     """Return a socket of this process that listens where one is bound, and close that one.
 
-    One that listens already is returned as it is.
-
-    The system spreads a port's connections over its sockets; a local socket is one file, so all
-    processes accept from one.
+    One that listens already is returned. The system spreads a port's connections over its sockets;
+    a local socket is one file, so all processes accept from one.
     """
     if shared.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
         return shared

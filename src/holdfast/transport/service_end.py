@@ -128,8 +128,7 @@ class StreamServiceTransport(LinkOwner):
         listen: Sequence[str] = (),  # endpoints at which robots connect
         # The connection to the robot that has launched this service.
         robot: socket.socket | None = None,
-        # If given, a socket for each of ``listen`` that listens there, or is bound there for
-        # several processes; None has this process make it.
+        # A socket for each of ``listen``, which listens or is bound there; None: make it.
         shared: Sequence[socket.socket | None] = (),
         # After this much silence robots consider this service lost. A robot's own lease is in its
         # hello.
