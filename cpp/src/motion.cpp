@@ -195,8 +195,10 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
         const std::size_t end = std::min(first + way_block_size, count);
         // Step by step through the block: a step of one particle waits for its last one, but not
         // for the other particles'.
-        std::array<std::array<double, d>, way_block_size> state;
-        std::array<std::size_t, way_block_size> own_stage, moving;
+        std::array<std::array<double, d>, way_block_size> state, next, action;
+        std::array<std::array<double, d>, way_block_size> tested;
+        std::array<std::uint8_t, way_block_size> collides;
+        std::array<std::size_t, way_block_size> own_stage, moving, near;
         std::size_t num_moving = end - first;
         Contact<World> contact(tolerance);
         for (std::size_t i = 0; i < end - first; ++i) {
@@ -207,22 +209,30 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
         std::uint32_t step = 0;
         for (std::size_t k = 0; k < offsets.size(); ++k) {
             for (; step < offsets[k] && num_moving > 0; ++step) {
-                std::size_t still_moving = 0;
+                std::size_t still_moving = 0, num_near = 0;
                 for (std::size_t m = 0; m < num_moving; ++m) {
                     const std::size_t i = moving[m];
-                    std::array<double, d> next, action;
-                    policy.executed(state[i].data(), own_stage[i], action.data());
-                    if (contact.stops(world, i, state[i].data(), action.data())) {
-                        stop_at_contact(world, state[i].data(), action.data(), tolerance,
-                                        next.data());
-                    } else {
-                        for (std::size_t c = 0; c < d; ++c) next[c] = state[i][c] + action[c];
+                    policy.executed(state[i].data(), own_stage[i], action[i].data());
+                    for (std::size_t c = 0; c < d; ++c) next[i][c] = state[i][c] + action[i][c];
+                    if (contact.stops(world, i, state[i].data(), action[i].data())) {
+                        tested[num_near] = next[i];
+                        near[num_near++] = i;
                     }
-                    const std::size_t next_stage = policy.next_stage(next.data(), own_stage[i]);
+                }
+                if (num_near > 0) world.collide_each(tested[0].data(), num_near, collides.data());
+                for (std::size_t n = 0; n < num_near; ++n) {
+                    if (collides[n] == 0) continue;
+                    const std::size_t i = near[n];
+                    stop_before(world, state[i].data(), action[i].data(), tolerance,
+                                next[i].data());
+                }
+                for (std::size_t m = 0; m < num_moving; ++m) {
+                    const std::size_t i = moving[m];
+                    const std::size_t next_stage = policy.next_stage(next[i].data(), own_stage[i]);
                     // Without noise, what stands still once does so for ever.
                     moving[still_moving] = i;
-                    still_moving += next != state[i] || next_stage != own_stage[i] ? 1 : 0;
-                    state[i] = next;
+                    still_moving += next[i] != state[i] || next_stage != own_stage[i] ? 1 : 0;
+                    state[i] = next[i];
                     own_stage[i] = next_stage;
                 }
                 num_moving = still_moving;
