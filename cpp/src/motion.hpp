@@ -39,14 +39,8 @@ void stop_at_contact(const World& world, const double* state, const double* acti
                      double tolerance, double* next) {
     constexpr std::size_t d = World::dimension;
     for (std::size_t c = 0; c < d; ++c) next[c] = state[c] + action[c];
-    if (world.collides(next)) stop_before(world, state, action, tolerance, next);
-}
+    if (!world.collides(next)) return;
 
-// The same for an action of which it is known that it ends in collision.
-template <class World>
-void stop_before(const World& world, const double* state, const double* action, double tolerance,
-                 double* next) {
-    constexpr std::size_t d = World::dimension;
     double reached = 0.0, blocked = 1.0;
     while (blocked - reached > tolerance) {
         const double fraction = 0.5 * (reached + blocked);

@@ -99,12 +99,11 @@ def predictions(
         spread.append(rows.astype(np.float64, order="C"))
     if any(each.shape[1] > 1 for each in spread):
         spread = [np.repeat(each, len(states) // each.shape[1], axis=1) for each in spread]
-    sizes = [len(each) for each in shown]
     means, variances = np.concatenate(shown), np.concatenate(spread)
     if not _kernel.all_within(variances, *_POSITIVE) or not _kernel.all_finite(means):
         for action in sensing_actions:
             require_usable(problem, action, *prediction(problem, states, action))
-    return sizes, means, variances
+    return [len(each) for each in shown], means, variances
 
 
 def _mean(problem: Any, states: FloatArray, sensing_action: int) -> FloatArray:
