@@ -25,7 +25,10 @@ HOLDFAST_INLINE T mass_around(T others, T own) {
 static Lanes distances_from(const PriorGroup& group, std::size_t n, const double* first,
                             std::size_t begin, std::size_t end, double* distances) {
     constexpr std::size_t together = 4;
-    Lanes least[together];
+    // Several, so that none waits for the one before; where a value takes more than one register,
+    // these are few.
+    constexpr std::size_t chains = registers == 1 ? together : 1;
+    Lanes least[chains];
     for (Lanes& each : least) each = splat(largest_finite);
     const auto rows = [&]<std::size_t number>(std::size_t block,
                                               Lanes(&sums)[number]) HOLDFAST_LAMBDA {
@@ -44,7 +47,7 @@ static Lanes distances_from(const PriorGroup& group, std::size_t n, const double
         }
         for (std::size_t i = 0; i < number; ++i) {
             store(distances + (block + i) * lane_count, sums[i]);
-            order(least[i], sums[i]);
+            order(least[i % chains], sums[i]);
         }
     };
     std::size_t block = begin;
@@ -56,7 +59,7 @@ static Lanes distances_from(const PriorGroup& group, std::size_t n, const double
         Lanes sums[1];
         rows(block, sums);
     }
-    for (std::size_t i = 1; i < together; ++i) order(least[0], least[i]);
+    for (std::size_t i = 1; i < chains; ++i) order(least[0], least[i]);
     return least[0];
 }
 
