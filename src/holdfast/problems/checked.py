@@ -518,15 +518,15 @@ def _stages(problem: Any, function: str, stages: Any, states: FloatArray) -> Int
     shape = states.shape[:-1]
     if not isinstance(stages, np.ndarray) or stages.dtype.kind not in "iu" or stages.shape != shape:
         raise _misfit(problem, function, stages, shape, "an array of integers")
-    stages = stages.astype(np.int64)
-    if not _kernel.all_integers_within(stages, 0, problem.num_stages - 1):
+    found: IntArray = stages.astype(np.int64)
+    if not _kernel.all_integers_within(found, 0, problem.num_stages - 1):
         outside = (stages < 0) | (stages >= problem.num_stages)
         bad = np.unravel_index(int(np.argmax(outside)), shape)
         raise ProblemError(
             f"{function} of {name_of(problem)} has the stage {stages[bad]} for state "
             f"{in_brief(states[bad])}: allowed are 0 to {problem.num_stages - 1}"
         )
-    return stages
+    return found
 
 
 def _single(problem: Any, function: str, value: object) -> Any:
