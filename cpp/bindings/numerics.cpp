@@ -24,17 +24,19 @@ Output<double> elementwise(const Input<1>& in) {
 }
 
 // Of any rank: it is asked of whatever somebody's code returned.
-using AnyArray = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
+template <class Value>
+using AnyArray = nb::ndarray<const Value, nb::c_contig, nb::device::cpu>;
 
 /// False for a NaN.
-bool all_within(const AnyArray& in, double least, double most) {
-    const double* values = in.data();
+template <class Value>
+bool all_within(const AnyArray<Value>& in, Value least, Value most) {
+    const Value* values = in.data();
     bool within = true;
     for (std::size_t i = 0; i < in.size(); ++i) within &= least <= values[i] && values[i] <= most;
     return within;
 }
 
-bool all_finite(const AnyArray& in) {
+bool all_finite(const AnyArray<double>& in) {
     constexpr double largest = std::numeric_limits<double>::max();
     return all_within(in, -largest, largest);
 }
@@ -57,7 +59,8 @@ void holdfast::bind_numerics(nb::module_& module) {
     define(module, "sum",
            [](const Input<1>& in) { return vector_kernels().sum(in.data(), in.shape(0)); });
     define(module, "all_finite", &all_finite);
-    define(module, "all_within", &all_within);
+    define(module, "all_within", &all_within<double>);
+    define(module, "all_integers_within", &all_within<std::int64_t>);
     define(module, "weighted_sums", [](const Input<1>& weights, const Input<2>& rows) {
         double* out;
         auto result = make_array<double>({rows.shape(1)}, out);

@@ -117,8 +117,8 @@ void prior_entropies(const PointSets& sets, const double* weights, std::size_t n
                 const std::size_t h = i / blocks, begin = i % blocks * block_size;
                 thread_local Lined scratch;
                 thread_local std::vector<std::uint32_t> numbers;
-                scratch.resize(2 * stride + k);
-                numbers.resize(stride + 2 * lane_count);
+                scratch.resize(10 * stride + 9 * k);
+                numbers.resize(lane_count * (stride + 2 * lane_count));
                 vector_kernels().prior_block(
                     {size, stride, sets.dimension, coordinates[h].varying,
                      coordinates[h].values.data(), vectors, rows.data(), k, constants},

@@ -29,22 +29,47 @@ HOLDFAST_INLINE double nearest_term(double weight, double mass, double log_radiu
                      log_of(mass / (1.0 - weight)) + constants.bias_correction[within]);
 }
 
-/// For each n the squared distances of eight points, from the `query`-th on, to point n; a point's
-/// own is infinite. Returns those to the k-th neighbours, and in `within` how many are within the
-/// resolution. A k that is known beforehand, not 0, keeps the least distances in registers.
+/// The k of the settings, unless it is changed: its least values stay in registers.
+inline constexpr std::uint32_t usual_neighbors = 5;
+
+/// Of rows of eight values, `count` at least k, the k-th least in each column, and in `within` how
+/// many are up to a limit. `kept` has room for k rows.
 template <std::uint32_t known>
-static Lanes compact_distances(const CompactPosterior& posterior, std::size_t query,
-                               std::uint32_t neighbors, double resolution_squared, Lanes& within) {
-    double* const squared = posterior.scratch;
-    double* const kept = squared + posterior.stride * lane_count;
-    const Lanes far = splat(__builtin_inf());
+static Lanes kth_least(const double* rows, std::size_t count, std::uint32_t k, double* kept,
+                       double limit, Lanes& within) {
     Lanes smallest[known == 0 ? 1 : known];
-    for (Lanes& each : smallest) each = far;
-    for (std::uint32_t i = 0; known == 0 && i < neighbors; ++i) store(kept + i * lane_count, far);
-    for (std::size_t n = posterior.count; n % lane_count != 0; ++n) {
-        store(squared + n * lane_count, far);
-    }
+    for (Lanes& each : smallest) each = splat(__builtin_inf());
+    for (std::uint32_t i = 0; known == 0 && i < k; ++i) store(kept + i * lane_count, smallest[0]);
     within = Lanes{};
+    for (std::size_t n = 0; n < count; ++n) {
+        Lanes value = load(rows + n * lane_count);
+        within += select(value <= limit, splat(1.0), Lanes{});
+        if constexpr (known != 0) {
+            for (Lanes& each : smallest) order(each, value);
+        } else {
+            for (std::uint32_t i = 0; i < k; ++i) {
+                Lanes each = load(kept + i * lane_count);
+                order(each, value);
+                store(kept + i * lane_count, each);
+            }
+        }
+    }
+    if constexpr (known != 0) return smallest[known - 1];
+    return load(kept + (k - 1) * lane_count);
+}
+
+HOLDFAST_INLINE Lanes kth_least(const double* rows, std::size_t count, std::uint32_t k,
+                                double* kept, double limit, Lanes& within) {
+    if (k == usual_neighbors)
+        return kth_least<usual_neighbors>(rows, count, k, kept, limit, within);
+    return kth_least<0>(rows, count, k, kept, limit, within);
+}
+
+/// Row n: the squared distances of eight points, from the `query`-th on, to point n. A point's own
+/// is infinite, as are those beyond the last point.
+static void compact_distances(const CompactPosterior& posterior, std::size_t query,
+                              double* squared) {
+    const Lanes far = splat(__builtin_inf());
     for (std::size_t n = 0; n < posterior.count; ++n) {
         Lanes distance{};
         for (std::size_t c = 0; c < posterior.dimension; ++c) {
@@ -52,25 +77,15 @@ static Lanes compact_distances(const CompactPosterior& posterior, std::size_t qu
             const Lanes difference = load(x + query) - x[n];
             distance += difference * difference;
         }
-        if (n - query < lane_count) distance[n - query] = __builtin_inf();
         store(squared + n * lane_count, distance);
-        within += select(distance <= resolution_squared, splat(1.0), Lanes{});
-        if constexpr (known != 0) {
-            for (Lanes& each : smallest) order(each, distance);
-        } else {
-            for (std::uint32_t i = 0; i < neighbors; ++i) {
-                Lanes each = load(kept + i * lane_count);
-                order(each, distance);
-                store(kept + i * lane_count, each);
-            }
-        }
     }
-    return known != 0 ? smallest[known == 0 ? 0 : known - 1]
-                      : load(kept + (neighbors - 1) * lane_count);
+    for (std::size_t n = posterior.count; n < posterior.stride; ++n) {
+        store(squared + n * lane_count, far);
+    }
+    for (std::size_t lane = 0; lane < lane_count; ++lane) {
+        squared[(query + lane) * lane_count + lane] = __builtin_inf();
+    }
 }
-
-/// The k of the settings, unless it is changed.
-inline constexpr std::uint32_t usual_neighbors = 5;
 
 /// Eight points beside each other, each with its distances to all points.
 static double compact_nearest(const CompactPosterior& posterior, std::uint32_t neighbors,
@@ -78,15 +93,14 @@ static double compact_nearest(const CompactPosterior& posterior, std::uint32_t n
     const std::size_t count = posterior.count;
     const double resolution_squared = constants.resolution * constants.resolution * tie_tolerance;
     const double log_resolution = log_of(constants.resolution);
-    const double* const squared = posterior.scratch;
+    double* const squared = posterior.scratch;
+    double* const kept = squared + posterior.stride * lane_count;
     double entropy = 0.0;
     for (std::size_t query = 0; query < count; query += lane_count) {
+        compact_distances(posterior, query, squared);
         Lanes within;
         const Lanes furthest =
-            neighbors == usual_neighbors
-                ? compact_distances<usual_neighbors>(posterior, query, neighbors,
-                                                     resolution_squared, within)
-                : compact_distances<0>(posterior, query, neighbors, resolution_squared, within);
+            kth_least(squared, count, neighbors, kept, resolution_squared, within);
         const IntLanes resolved = within >= static_cast<double>(neighbors);
         const Lanes reached = furthest * tie_tolerance;
         const Lanes radius_squared = select(resolved, splat(resolution_squared), reached);

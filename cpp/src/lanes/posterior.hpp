@@ -14,6 +14,18 @@
 
 namespace holdfast::inline HOLDFAST_ISA {
 
+/// The sums of the weights below a threshold, as those of all are added.
+static Lanes sum_below(const double* weights, std::size_t count, double threshold) {
+    Lanes below{};
+    for (std::size_t i = 0; i < count; i += lane_count) {
+        const std::size_t left = count - i < lane_count ? count - i : lane_count;
+        const Lanes weight =
+            left == lane_count ? load(weights + i) : load_partial(weights + i, left, 0.0);
+        below += select(weight < threshold, weight, Lanes{});
+    }
+    return below;
+}
+
 /// In place: log weights (in `weights`) to normalised weights; returns the number of non-zero ones.
 static std::size_t normalize_in_place(double* weights, std::size_t count, double largest,
                                       bool drop_negligible) {
@@ -27,7 +39,7 @@ static std::size_t normalize_in_place(double* weights, std::size_t count, double
     constexpr double thresholds[steps] = {1e-2 * hair, 1e-3 * hair, 1e-4 * hair, 1e-5 * hair,
                                           1e-6 * hair};
     constexpr double may_be_lost = 0.005;
-    Lanes total{}, below[steps] = {};
+    Lanes total{}, below{};
     for (std::size_t i = 0; i < count; i += lane_count) {
         const std::size_t left = count - i < lane_count ? count - i : lane_count;
         const Lanes weight =
@@ -35,11 +47,7 @@ static std::size_t normalize_in_place(double* weights, std::size_t count, double
                                        : load_partial(weights + i, left, -__builtin_inf())) -
                    largest);
         total += weight;
-        if (drop_negligible) {
-            for (std::size_t step = 0; step < steps; ++step) {
-                below[step] += select(weight < thresholds[step], weight, Lanes{});
-            }
-        }
+        below += select(weight < thresholds[0], weight, Lanes{});
         if (left == lane_count) {
             store(weights + i, weight);
         } else {
@@ -50,7 +58,9 @@ static std::size_t normalize_in_place(double* weights, std::size_t count, double
     if (drop_negligible) {
         const double limit = may_be_lost * sum_of(total);
         std::size_t step = 0;
-        while (step + 1 < steps && sum_of(below[step]) > limit) ++step;
+        while (step + 1 < steps && sum_of(below) > limit) {
+            below = sum_below(weights, count, thresholds[++step]);
+        }
         threshold = thresholds[step];
     }
     std::size_t survivors = 0;

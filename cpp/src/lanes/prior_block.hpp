@@ -25,7 +25,10 @@ HOLDFAST_INLINE T mass_around(T others, T own) {
 static Lanes distances_from(const PriorGroup& group, std::size_t n, const double* first,
                             std::size_t begin, std::size_t end, double* distances) {
     constexpr std::size_t together = 4;
-    Lanes least[together];
+    // Several, so that none waits for the one before; where a value takes more than one register,
+    // these are few.
+    constexpr std::size_t chains = registers == 1 ? together : 1;
+    Lanes least[chains];
     for (Lanes& each : least) each = splat(largest_finite);
     const auto rows = [&]<std::size_t number>(std::size_t block,
                                               Lanes(&sums)[number]) HOLDFAST_LAMBDA {
@@ -44,7 +47,7 @@ static Lanes distances_from(const PriorGroup& group, std::size_t n, const double
         }
         for (std::size_t i = 0; i < number; ++i) {
             store(distances + (block + i) * lane_count, sums[i]);
-            order(least[i], sums[i]);
+            order(least[i % chains], sums[i]);
         }
     };
     std::size_t block = begin;
@@ -56,7 +59,7 @@ static Lanes distances_from(const PriorGroup& group, std::size_t n, const double
         Lanes sums[1];
         rows(block, sums);
     }
-    for (std::size_t i = 1; i < together; ++i) order(least[0], least[i]);
+    for (std::size_t i = 1; i < chains; ++i) order(least[0], least[i]);
     return least[0];
 }
 
@@ -93,51 +96,94 @@ struct Neighborhood {
     double radius_squared;  // with the tolerance for ties
 };
 
-/// Writes the numbers of the neighbours of point n.
-static Neighborhood neighborhood_of(const PriorGroup& group, std::size_t n, const double* first,
-                                    double* distances, double* smallest, std::uint32_t* numbers) {
+/// The k-th least of eight values: the least that no fewer than k of them do not exceed.
+HOLDFAST_INLINE double kth_of(const Lanes& x, std::uint32_t k) {
+    Lanes not_greater{};
+    for (std::size_t lane = 0; lane < lane_count; ++lane) {
+        not_greater += select(splat(x[lane]) <= x, splat(1.0), Lanes{});
+    }
+    return -maximum_of(-select(not_greater >= static_cast<double>(k), x, splat(__builtin_inf())));
+}
+
+/// What `neighborhoods_of` works with; numbers for each of eight points.
+struct PriorScratch {
+    double* first;           // [stride] the first coordinates
+    double* distances;       // [stride]
+    double* smallest;        // [k]
+    double* rows;            // [stride][8]
+    double* kept;            // [k][8]
+    std::uint32_t* numbers;  // [8][numbers_each]
+    std::size_t numbers_each;
+};
+
+/// Writes the numbers of the neighbours of eight points or fewer, from point `base` on.
+static void neighborhoods_of(const PriorGroup& group, std::size_t base, std::size_t used,
+                             const PriorScratch& scratch, Neighborhood* around) {
     const double resolution_squared = group.constants.resolution * group.constants.resolution;
     const double resolved_above = resolution_squared * tie_tolerance;
     const std::uint32_t k = group.neighbors;
     // The k-th of the least distances of k or more lanes is an upper bound on the k-th distance.
     const std::size_t blocks = group.stride / lane_count;
     const std::size_t parts = (k + lane_count - 1) / lane_count;
-    std::uint32_t kept = 0, within = 0;
-    for (std::size_t part = 0; part < parts; ++part) {
-        const Lanes least = distances_from(group, n, first, part * blocks / parts,
-                                           (part + 1) * blocks / parts, distances);
-        within += static_cast<std::uint32_t>(
-            __builtin_popcount(bits_at_most(least, splat(resolved_above))));
-        if (within >= k) continue;
-        for (std::size_t lane = 0; lane < lane_count; ++lane) {
-            if (kept < k || least[lane] < smallest[k - 1]) {
-                insert_smallest(smallest, kept, k, least[lane]);
+    std::size_t candidates[lane_count] = {}, most = 0;
+    for (std::size_t i = 0; i < used; ++i) {
+        const std::size_t n = base + i;
+        std::uint32_t* const numbers = scratch.numbers + i * scratch.numbers_each;
+        scratch.first[n] = __builtin_inf();  // a point is no neighbour of its own
+        std::uint32_t kept = 0, within = 0;
+        double reach = 0.0;
+        for (std::size_t part = 0; part < parts; ++part) {
+            const Lanes least = distances_from(group, n, scratch.first, part * blocks / parts,
+                                               (part + 1) * blocks / parts, scratch.distances);
+            within += static_cast<std::uint32_t>(
+                __builtin_popcount(bits_at_most(least, splat(resolved_above))));
+            if (within >= k) continue;
+            if (parts == 1) {
+                reach = kth_of(least, k);
+                continue;
             }
+            for (std::size_t lane = 0; lane < lane_count; ++lane) {
+                if (kept < k || least[lane] < scratch.smallest[k - 1]) {
+                    insert_smallest(scratch.smallest, kept, k, least[lane]);
+                }
+            }
+            reach = scratch.smallest[k - 1];
+        }
+        scratch.first[n] = group.coordinates[n];
+        if (within >= k) {
+            const std::size_t members =
+                numbers_within(scratch.distances, group.stride, resolved_above, numbers);
+            around[i] = {members, static_cast<std::uint32_t>(members), resolved_above};
+            continue;
+        }
+        reach *= tie_tolerance;
+        candidates[i] = numbers_within(scratch.distances, group.stride,
+                                       reach < largest_finite ? reach : largest_finite, numbers);
+        for (std::size_t c = 0; c < candidates[i]; ++c) {
+            scratch.rows[c * lane_count + i] = scratch.distances[numbers[c]];
+        }
+        if (candidates[i] > most) most = candidates[i];
+    }
+    if (most == 0) return;
+    for (std::size_t i = 0; i < lane_count; ++i) {
+        for (std::size_t c = candidates[i]; c < most; ++c) {
+            scratch.rows[c * lane_count + i] = __builtin_inf();
         }
     }
-    if (within >= k) {
-        const std::size_t members =
-            numbers_within(distances, group.stride, resolved_above, numbers);
-        return {members, static_cast<std::uint32_t>(members), resolved_above};
+    Lanes within;
+    const Lanes furthest = kth_least(scratch.rows, most, k, scratch.kept, resolved_above, within);
+    for (std::size_t i = 0; i < used; ++i) {
+        if (candidates[i] == 0) continue;
+        const bool resolved = within[i] < static_cast<double>(k);
+        const double radius = resolved ? furthest[i] * tie_tolerance : resolved_above;
+        std::uint32_t* const numbers = scratch.numbers + i * scratch.numbers_each;
+        std::size_t members = 0;
+        for (std::size_t c = 0; c < candidates[i]; ++c) {
+            numbers[members] = numbers[c];
+            members += scratch.rows[c * lane_count + i] <= radius ? 1 : 0;
+        }
+        around[i] = {members, resolved ? k : static_cast<std::uint32_t>(members), radius};
     }
-    const double reach = smallest[k - 1] * tie_tolerance;
-    const std::size_t candidates = numbers_within(
-        distances, group.stride, reach < largest_finite ? reach : largest_finite, numbers);
-    kept = within = 0;
-    for (std::size_t i = 0; i < candidates; ++i) {
-        const double distance = distances[numbers[i]];
-        within += distance <= resolved_above ? 1 : 0;
-        if (kept < k || distance < smallest[k - 1]) insert_smallest(smallest, kept, k, distance);
-    }
-    const bool resolved = within < k;
-    const double radius = resolved ? smallest[k - 1] * tie_tolerance : resolved_above;
-    std::size_t members = 0;
-    for (std::size_t i = 0; i < candidates; ++i) {
-        const std::uint32_t number = numbers[i];
-        numbers[members] = number;
-        members += distances[number] <= radius ? 1 : 0;
-    }
-    return {members, resolved ? k : static_cast<std::uint32_t>(members), radius};
 }
 
 /// sums[i] = the sum over the numbers, in their order, of the row's vector that begins at from[i].
@@ -153,26 +199,52 @@ HOLDFAST_INLINE void sum_rows(const PriorGroup& group, const std::uint32_t* numb
     for (std::size_t v = 0; v < vectors; ++v) sums[v] = totals[v];
 }
 
+/// The terms of eight points or fewer of the prior's entropy.
+static void prior_terms(const PriorGroup& group, const Lanes& prior, const Lanes& mass,
+                        const Neighborhood* around, std::size_t used, double* terms) {
+    const NearestNeighborConstants& constants = group.constants;
+    Lanes radius_squared = splat(1.0), correction{};
+    for (std::size_t i = 0; i < used; ++i) {
+        radius_squared[i] = around[i].radius_squared;
+        correction[i] = constants.bias_correction[around[i].within];
+    }
+    // Rounding may leave nothing for the others, or less than their own sum.
+    const Lanes rest = 1.0 - prior;
+    const Lanes share = select(mass < rest, mass / rest, splat(1.0));
+    const double half = 0.5 * static_cast<double>(group.dimension);
+    store_partial(terms,
+                  prior * (-log_of(share) + constants.log_ball_volume +
+                           half * log_of(radius_squared) + correction),
+                  used);
+}
+
 /// For the points [begin, end): terms[n] of the prior's entropy, gains[n][vectors * 8] of the
-/// posteriors' information. `scratch` has 2 stride + k doubles, `numbers` stride + 16.
+/// posteriors' information. `doubles` has 10 stride + 9 k places, `numbers` 8 (stride + 16).
 static void prior_block(const PriorGroup& group, std::size_t begin, std::size_t end,
-                        double* scratch, std::uint32_t* numbers, double* terms, double* gains) {
+                        double* doubles, std::uint32_t* all_numbers, double* terms, double* gains) {
     const NearestNeighborConstants& constants = group.constants;
     const std::size_t columns = group.vectors * lane_count;
-    const double d = static_cast<double>(group.dimension);
-    double* first = scratch;
-    double* distances = first + group.stride;
-    double* smallest = distances + group.stride;
-    for (std::size_t j = 0; j < group.stride; j += lane_count) {
-        store(first + j, load(group.coordinates + j));
+    const std::size_t stride = group.stride, k = group.neighbors;
+    double* const rows = doubles + 2 * stride;
+    double* const kept = rows + lane_count * stride;
+    const PriorScratch scratch{doubles, doubles + stride, kept + lane_count * k,  rows,
+                               kept,    all_numbers,      stride + 2 * lane_count};
+    for (std::size_t j = 0; j < stride; j += lane_count) {
+        store(scratch.first + j, load(group.coordinates + j));
     }
+    Neighborhood found[lane_count];
+    Lanes priors{}, masses{};
     for (std::size_t n = begin; n < end; ++n) {
-        Neighborhood around{0, 0, constants.resolution * constants.resolution};
-        if (group.neighbors > 0) {
-            first[n] = __builtin_inf();  // a point is no neighbour of its own
-            around = neighborhood_of(group, n, first, distances, smallest, numbers);
-            first[n] = group.coordinates[n];
+        const std::size_t place = (n - begin) % lane_count;
+        if (place == 0) {
+            for (Neighborhood& each : found) {
+                each = {0, 0, constants.resolution * constants.resolution};
+            }
+            const std::size_t used = end - n < lane_count ? end - n : lane_count;
+            if (k > 0) neighborhoods_of(group, n, used, scratch, found);
         }
+        const Neighborhood& around = found[place];
+        const std::uint32_t* const numbers = all_numbers + place * scratch.numbers_each;
         const double* own_row = group.weights + n * columns;
         double inverse_mass = 1.0;
         for (std::size_t v = 0; v < group.vectors;) {
@@ -196,21 +268,19 @@ static void prior_block(const PriorGroup& group, std::size_t begin, std::size_t 
                 sum_rows<1>(group, numbers, around.members, from, sums);
             }
             for (std::size_t i = 0; i < chosen; ++i) {
-                if (from[i] == 0 && group.neighbors > 0) {
-                    // Column 0 is the prior. Rounding may leave nothing for the others, or less
-                    // than their own sum.
-                    const double prior = own_row[0], mass = sums[i][0], rest = 1.0 - prior;
-                    const double share = mass < rest ? mass / rest : 1.0;
-                    terms[n] = prior * (-log_of(share) + constants.log_ball_volume +
-                                        0.5 * d * log_of(around.radius_squared) +
-                                        constants.bias_correction[around.within]);
-                    inverse_mass = 1.0 / mass_around(mass, prior);
+                if (from[i] == 0 && k > 0) {  // column 0 is the prior
+                    priors[place] = own_row[0];
+                    masses[place] = sums[i][0];
+                    inverse_mass = 1.0 / mass_around(masses[place], priors[place]);
                 }
                 const Lanes own = load(own_row + from[i]);
                 const Lanes ratio =
                     select(own > 0.0, mass_around(sums[i], own) * inverse_mass, splat(1.0));
                 store(gains + n * columns + from[i], own * log_of(ratio));
             }
+        }
+        if (k > 0 && (place + 1 == lane_count || n + 1 == end)) {
+            prior_terms(group, priors, masses, found, place + 1, terms + n - place);
         }
     }
 }

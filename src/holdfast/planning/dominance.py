@@ -36,7 +36,6 @@ def dominated(
     matches = np.abs(products - products.T) <= 1e-6 * (size + size.T)
     if np.count_nonzero(matches) == len(means):  # each only itself
         return np.zeros(len(sizes), dtype=bool)
-    alike = matches.tolist()
     rows = [range(end - size, end) for end, size in zip(np.cumsum(sizes), sizes, strict=True)]
 
     def makes(better: int, worse: int) -> bool:
@@ -44,7 +43,7 @@ def dominated(
         for row in rows[worse]:
             for own in left:
                 pair = [own, row]
-                added = _added_variance(means[pair], variances[pair]) if alike[own][row] else -1.0
+                added = _added_variance(means[pair], variances[pair]) if matches[own, row] else -1.0
                 if added >= 0.0:
                     left.remove(own)
                     noisier |= added > 0.0

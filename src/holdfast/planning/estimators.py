@@ -199,7 +199,6 @@ def first_unbounded(points: FloatArray) -> int | None:
     """Return the index of the first point with a coordinate that is NaN or too large, or None."""
     if _kernel.all_within(points, -LARGEST, LARGEST):
         return None
-    # A comparison with NaN is false.
     return int(np.argmin((np.abs(points) <= LARGEST).all(axis=1)))
 
 

@@ -174,7 +174,7 @@ def choose_sensing_action(
     ProblemError
         If a function of the problem returns something out of its contract.
     """
-    selector = settings.selector
+    selector, sensing = settings.selector, settings.active_sensing
     count = len(problem.sensing_actions)
     choices = count + 1 if selector.sensing_is_optional else count
     if selector.method == "fixed":
@@ -200,13 +200,12 @@ def choose_sensing_action(
     estimator = _estimator(problem, settings, belief, sets[0])
     sets = _on_a_line(problem, settings, sets)
     points = sets.reshape(-1, sets.shape[-1])
-    threads = settings.active_sensing.num_cores
-    size = settings.active_sensing.num_observation_samples
+    threads, size = sensing.num_cores, sensing.num_observation_samples
     hypothetical = _hypotheses_of(problem, belief, shown)(range(count), size, hypotheses)
     entropies, samples, likelihoods, visits = hypothetical.entropies(
         scaled(points, estimator), estimator, threads, factors, selector.sensing_is_optional
     )
-    if settings.active_sensing.horizon > 1 and not np.isnan(entropies).any():
+    if sensing.horizon > 1 and not np.isnan(entropies).any():
         weights = hypothetical.weights(estimator.drops_negligible)
         if selector.sensing_is_optional:
             same = _kernel.normalize(numerics.log(belief.weights), estimator.drops_negligible)[0]
@@ -349,7 +348,8 @@ def _estimator(
     kind = estimator_of(selector, points.shape[0])
     if kind in NEIGHBOR_ESTIMATORS:
         neighbors = settings.active_sensing.num_nearest_neighbors
-        found = kernel_estimator(NearestNeighbor(neighbors, resolution), dimension)
+        nearest = kernel_estimator if each_its_own else _kept_estimator
+        found = nearest(NearestNeighbor(neighbors, resolution), dimension)
         if kind == "nearest_neighbor":
             return found
         return found._replace(kind=EstimatorKind.PRIOR_NEIGHBORS, prior=belief.weights)
@@ -359,6 +359,9 @@ def _estimator(
     if selector.resolution is None and not states_have_their_own:
         own = _noise_variance(problem, own)
     return kernel_estimator(GaussianMixture(own, upper), dimension, split_volume=each_its_own)
+
+
+_kept_estimator = functools.lru_cache(maxsize=100)(kernel_estimator)
 
 
 def _noise_variance(problem: Problem, own: FloatArray) -> FloatArray:

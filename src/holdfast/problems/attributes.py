@@ -363,6 +363,8 @@ def resolution_of(
     if of_states and getattr(problem, "state_resolution", None) is not None:
         attribute = "state_resolution"
     own = getattr(problem, attribute)
+    if type(own) is float:
+        return own
     # A configuration asks before check_problem has.
     numbers = real_numbers(own)
     if numbers is None:

@@ -67,12 +67,11 @@ def predictions(
         spread.append(rows.astype(np.float64, order="C"))
     if any(each.shape[1] > 1 for each in spread):
         spread = [np.repeat(each, len(states) // each.shape[1], axis=1) for each in spread]
-    sizes = [len(each) for each in shown]
     means, variances = np.concatenate(shown), np.concatenate(spread)
     if not _kernel.all_within(variances, *_POSITIVE) or not _kernel.all_finite(means):
         for action in sensing_actions:
             require_usable(problem, action, *prediction(problem, states, action))
-    return sizes, means, variances
+    return [len(each) for each in shown], means, variances
 
 
 def _mean(problem: Any, states: FloatArray, sensing_action: int) -> FloatArray:
@@ -487,14 +486,15 @@ def _stages(problem: Any, function: str, stages: Any, states: FloatArray) -> Int
     shape = states.shape[:-1]
     if not isinstance(stages, np.ndarray) or stages.dtype.kind not in "iu" or stages.shape != shape:
         raise _misfit(problem, function, stages, shape, "an array of integers")
-    if stages.size and (stages.min() < 0 or stages.max() >= problem.num_stages):
+    found: IntArray = stages.astype(np.int64)
+    if not _kernel.all_integers_within(found, 0, problem.num_stages - 1):
         outside = (stages < 0) | (stages >= problem.num_stages)
         bad = np.unravel_index(int(np.argmax(outside)), shape)
         raise ProblemError(
             f"{function} of {name_of(problem)} has the stage {stages[bad]} for state "
             f"{in_brief(states[bad])}: allowed are 0 to {problem.num_stages - 1}"
         )
-    return stages.copy()
+    return found
 
 
 def _single(problem: Any, function: str, value: object) -> Any:
