@@ -79,7 +79,7 @@ def _served(keys: Path) -> ServiceProcess:
 
 def region(context: Context) -> Result:
     """Kill all services of many robots, and start them again."""
-    robots, down_s, after_s = (400, 5.0, 8.0) if context.quick else (2000, 20.0, 20.0)
+    robots, down_s, after_s = (400, 5.0, 8.0) if context.quick else (2000, 20.0, 14.0)
     watchers = 8
     act_s = 1.0
     clients: list[_Robots] = []
