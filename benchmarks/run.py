@@ -28,6 +28,7 @@ from benchmarks import (
     horizon,
     neighbours,
     path_entropy,
+    region,
     scale,
     service,
     simulator,
@@ -71,6 +72,8 @@ CASES = (
     Case("standstill", "A far robot that moves on", far.standstill, 180.0, 20.0),
     Case("neighbours", "Bad neighbours", neighbours.neighbours, 150.0, 30.0),
     Case("capacity", "Many robots", service.capacity, 290.0, 60.0),
+    Case("region", "A region dies", region.region, 75.0, 30.0),
+    Case("robot_costs", "What a robot costs", region.costs, 80.0, 45.0),
     Case("serve", "The service's process", service.serve, 50.0, 14.0),
     Case("simulated", "Simulated runs", simulator.simulated, 15.0, 5.0),
 )

@@ -155,8 +155,10 @@ class TestManyFromOneAddress:
 
     @pytest.mark.parametrize("begun", [0, 3], ids=["silent", "in_the_handshake"])
     async def test_a_robot_that_is_slow_is_let_in(
-        self, tls: StreamWire, robot_tls: TlsFiles, begun: int
+        self, tls: StreamWire, robot_tls: TlsFiles, begun: int, monkeypatch: pytest.MonkeyPatch
     ) -> None:
+        monkeypatch.setattr(listener, "OPENING_TIMEOUT_S", PATIENCE_S)  # this machine may be slow
+        monkeypatch.setattr(links, "OPENING_TIMEOUT_S", PATIENCE_S)
         await tls.service("cloud", "b1").start(echo)
         stream = TlsStream(client_context(robot_tls), "127.0.0.1")
         stream.begin()

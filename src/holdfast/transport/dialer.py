@@ -14,6 +14,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ipaddress
+import math
 import random
 import socket
 import threading
@@ -37,7 +38,7 @@ _CONNECT_TIMEOUT_S: Final = 2.0
 """For one attempt; later ones run in parallel."""
 
 _NEXT_LINK_S: Final = 0.25
-_LAST_NEXT_LINK_S: Final = 2.0
+_LAST_LINK_S: Final = 2.0
 """After a connection, no second one is made for so long: it may wait for its handshake."""
 
 _LOOKUP_INTERVAL_S = 1.0
@@ -54,31 +55,29 @@ class RetryPauses:
     """How long to wait before each attempt: the longer, the longer the peer is gone.
 
     Waiting for the next attempt adds two per cent to an outage, and ten seconds at most. Pauses are
-    up to a quarter longer by chance: many robots that have lost one service do not stay in step.
+    up to a quarter longer by chance: robots that have lost one service do not stay in step.
 
     A peer that soon ends its connections is tried less often: the pause doubles with each, up to
     0.2 s. (It may be a proxy that accepts while its service starts.) A link that brought an answer,
     or lasted, resets the pause, so that a service that dies and restarts is found as fast as ever.
 
-    A connection without a hello may wait behind a thousand others, and another one would only make
-    the queue longer, or the peer may hang. So a second one follows after 0.25 s, and further ones
-    after twice the time each, up to 2 s.
+    A connection without a hello may hang, or wait behind a thousand others. So a second one follows
+    after 0.25 s, and further ones after twice the time each, up to 2 s.
     """
 
     def __init__(self, chance: Callable[[], float] = random.random) -> None:
         self._chance = chance
-        self._absent_since: float | None = None
+        self._absent_since = math.inf
         self._next_link_s = _NEXT_LINK_S
         self.least_s = _FIRST_PAUSE_S
 
     def begin(self, now: float) -> None:
         """Note that the peer is gone."""
-        if self._absent_since is None:
-            self._absent_since = now
+        self._absent_since = min(self._absent_since, now)
 
     def succeeded(self) -> None:
         """Note that the right peer is there: the outage is over."""
-        self._absent_since = None
+        self._absent_since = math.inf
         self._next_link_s = _NEXT_LINK_S
 
     def ended(self, *, useful: bool) -> None:
@@ -89,22 +88,20 @@ class RetryPauses:
 
     def next_attempt_s(self, now: float) -> float:
         """Return the pause after an attempt."""
-        share_s = min(_SHARE_OF_OUTAGE * self._absent_s(now), _LAST_PAUSE_S)
-        return self._spread(max(self.least_s, share_s))
+        return self._pause_s(now, self.least_s, _SHARE_OF_OUTAGE)
 
     def refused_s(self, now: float) -> float:
         """Return the pause after a refusal."""
-        share_s = min(_REFUSED_SHARE * self._absent_s(now), _LAST_PAUSE_S)
-        return self._spread(max(_REFUSED_PAUSE_S, share_s))
+        return self._pause_s(now, _REFUSED_PAUSE_S, _REFUSED_SHARE)
 
     def next_link_s(self) -> float:
         """Return how long a new connection may take to its hello before there is another."""
-        pause_s = self._next_link_s
-        self._next_link_s = min(2.0 * pause_s, _LAST_NEXT_LINK_S)
+        pause_s, self._next_link_s = self._next_link_s, min(2.0 * self._next_link_s, _LAST_LINK_S)
         return self._spread(pause_s)
 
-    def _absent_s(self, now: float) -> float:
-        return 0.0 if self._absent_since is None else now - self._absent_since
+    def _pause_s(self, now: float, least_s: float, share: float) -> float:
+        share_s = share * max(0.0, now - self._absent_since)
+        return self._spread(max(least_s, min(share_s, _LAST_PAUSE_S)))
 
     def _spread(self, seconds: float) -> float:
         return seconds * (1.0 + _JITTER * self._chance())

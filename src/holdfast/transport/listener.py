@@ -4,9 +4,9 @@ Anybody can open a connection, and most connections to a public port send nothin
 connection costs very little before its first byte. Silent ones are closed after a while; if there
 are too many, one of the network with the most is closed.
 
-When a region's robots come back, a thousand handshakes wait at once. To begin them all would help
-nobody. So connections wait with their first byte unread, in turns by network, and are delivered as
-fast as handshakes are computed. One whose peer has given up meanwhile costs no handshake.
+When many robots come back at once, connections wait with their first byte unread, in turns by
+network, and are delivered as fast as handshakes are computed. One whose peer has given up meanwhile
+costs none.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import asyncio
 import contextlib
 import errno
 import fcntl
+import itertools
 import os
 import select
 import socket
@@ -34,7 +35,7 @@ _BACKLOG: Final = 4096
 """Connections that wait to be accepted."""
 
 _ACCEPTED_AT_ONCE: Final = 2
-"""Before the event loop serves existing links."""
+"""Accepted, and delivered, before the event loop serves existing links."""
 
 _PAUSE_S: Final = 0.1
 """After the system could not accept, because no descriptor was free."""
@@ -49,8 +50,8 @@ MAX_SILENT: Final = 256
 MAX_WAITING: Final = 1024
 """Connections with a first byte that are not delivered yet."""
 
-_DELIVERED_AT_ONCE: Final = 4
 _DELIVERY_PAUSE_S: Final = 0.001
+"""Between two deliveries, so that existing links are served."""
 
 _MAPPED = b"\0" * 10 + b"\xff\xff"
 """Prefix of an IPv4 address within IPv6."""
@@ -92,7 +93,6 @@ class Listener:
         self._silent: dict[socket.socket, bytes] = {}
         self._timers: dict[socket.socket, asyncio.TimerHandle] = {}
         self._waiting: OrderedDict[bytes, deque[socket.socket]] = OrderedDict()
-        self._num_waiting = 0
         self._delivery: asyncio.TimerHandle | None = None
         self._pause: asyncio.TimerHandle | None = None
         self._loop.add_reader(self._socket, self._accept)
@@ -112,10 +112,8 @@ class Listener:
             connection.close()
         if self._delivery is not None:
             self._delivery.cancel()
-        for waiting in self._waiting.values():
-            for connection in waiting:
-                connection.close()
-        self._waiting.clear()
+        for connection in itertools.chain(*self._waiting.values()):
+            connection.close()
 
     def _accept(self) -> None:
         for _ in range(_ACCEPTED_AT_ONCE):
@@ -153,36 +151,32 @@ class Listener:
         if not first:
             connection.close()
             return
-        if self._num_waiting >= MAX_WAITING:
-            # The newest of the network with the most: others have waited for longer.
-            most = max(self._waiting, key=lambda each: len(self._waiting[each]))
-            if len(self._waiting.get(network, ())) >= len(self._waiting[most]):
-                connection.close()
-                return
-            self._waiting[most].pop().close()
-            self._num_waiting -= 1
         self._waiting.setdefault(network, deque()).append(connection)
-        self._num_waiting += 1
+        if sum(map(len, self._waiting.values())) > MAX_WAITING:
+            # The newest of the network with the most: others have waited for longer.
+            max(self._waiting.values(), key=len).pop().close()
         if self._delivery is None:
             self._deliver(have_waited=False)
 
     def _deliver(self, *, have_waited: bool = True) -> None:
-        """Deliver connections that wait: a few at a time."""
+        """Deliver some of the connections that wait, and come again."""
         self._delivery = None
+        if not self._waiting:
+            return
+        self._delivery = self._loop.call_later(_DELIVERY_PAUSE_S, self._deliver)
         delivered = 0
-        while self._waiting and delivered < _DELIVERED_AT_ONCE and self._may_deliver():
+        while self._waiting and delivered < _ACCEPTED_AT_ONCE and self._may_deliver():
             network, waiting = self._waiting.popitem(last=False)
-            connection = waiting.popleft()
-            self._num_waiting -= 1
+            connection = waiting.popleft() if waiting else None
             if waiting:
                 self._waiting[network] = waiting
+            if connection is None:
+                continue
             if have_waited and _has_hung_up(connection):
                 connection.close()
             else:
                 delivered += 1
                 self._accepted(connection, network)
-        if self._waiting or delivered:
-            self._delivery = self._loop.call_later(_DELIVERY_PAUSE_S, self._deliver)
 
     def _forget(self, connection: socket.socket) -> bytes:
         self._timers.pop(connection).cancel()
