@@ -12,6 +12,7 @@ from holdfast.planning.planner import digest
 from holdfast.protocol.decision_cost import Cost
 from holdfast.protocol.service_batches import run_together
 from holdfast.protocol.service_jobs import Job, JobResult
+from holdfast.protocol.service_sessions import SHORT_S
 
 
 def jobs_of(number: int, *, interval: int = 3) -> tuple[Bench, list[Robot]]:
@@ -81,3 +82,32 @@ def test_what_goes_wrong_is_left_to_each() -> None:
 def test_one_alone_is_left_to_itself() -> None:
     bench, _ = jobs_of(1)
     assert run_together(list(bench.jobs)) == [None]
+
+
+def test_a_short_one_that_takes_long_is_computed_anew_on_a_thread() -> None:
+    bench, (robot,) = jobs_of(1)
+    call = list(bench.replies)[-1]
+    assert is_short(bench.jobs[0])
+    bench.jobs[0].interruption.use_up()
+    bench.run()
+    assert not is_short(bench.jobs[0])
+    bench.run_all()
+    assert content(bench.replies[call]) == robot.right_answer()
+
+
+def test_what_is_known_of_newcomers() -> None:
+    bench, _ = jobs_of(1)
+    bench.run_all()
+    bench.send(Robot(planning=planning_of(), key=8).request())
+    assert is_short(bench.jobs[0]), "others had the same problem and settings"
+    bench.run_all()
+    came = Robot(planning=planning_of(), key=9)
+    came.sense()
+    bench.send(came.restore())
+    assert not is_short(bench.jobs[0]), "nothing is known of a state from outside"
+    bench.run()
+    assert is_short(bench.jobs[0]), "that took no longer than others"
+
+
+def is_short(job: Job) -> bool:
+    return job.interruption.most_s <= 5.0 * SHORT_S

@@ -25,6 +25,7 @@ computation in :mod:`~holdfast.protocol.service_jobs`.
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from collections.abc import Callable
 
 import msgspec
@@ -116,6 +117,8 @@ class Service:
         # Of all robots; each session has its own, which begin here.
         self._task_time = ExpectedTime(1e-3)
         self._sensing_time = ExpectedTime(1e-3)
+        # By problem and settings; the last used last.
+        self._times: OrderedDict[bytes, tuple[ExpectedTime, ExpectedTime]] = OrderedDict()
 
     @property
     def max_running(self) -> int:
@@ -191,13 +194,14 @@ class Service:
                 computed_s = now - task.started_at
                 session.overran = session.overran and computed_s > self._queue.limits_s[MEDIUM]
                 if outcome.restored:
-                    # A particle in an obstacle, say, takes a thousand times as long.
-                    session.task_time.typical_s = session.sensing_time.typical_s = math.inf
-                if typical:
-                    if task.lane <= BRIEF:
-                        # What new robots are expected to take.
-                        (self._sensing_time if task.sensing else self._task_time).learn(computed_s)
+                    # A particle in an obstacle, say, takes a thousand times as long to move.
+                    session.task_time.typical_s = math.inf
+                if typical and task.lane <= BRIEF:
+                    # What new robots are expected to take.
+                    (self._sensing_time if task.sensing else self._task_time).learn(computed_s)
+                if typical or outcome.restored:
                     task.expected_time.learn(computed_s, processor_s)
+                    self._times_of(session)[task.sensing].learn(computed_s, processor_s)
                 self._succeeded(task, outcome, now)
             self._queue.release_held(session)
         self._dispatch(now)
@@ -296,6 +300,10 @@ class Service:
             ExpectedTime(self._sensing_time.mean_s, _INERTIA_OF_ONE),
         )
         session.known = self._problems.cost_of(session.owner, session.problem_key)
+        # Whoever's they were: with equal problems and settings no decision takes longer at will.
+        task_time, sensing_time = self._times_of(session)
+        session.task_time.typical_s = task_time.typical_s
+        session.sensing_time.typical_s = sensing_time.typical_s
         lane = session.lane_of(request)
         if self._queue[lane].is_overloaded(now, key[0]):
             self._sessions.note_epoch(key, request.epoch)
@@ -554,6 +562,14 @@ class Service:
     def _send_sensing(self, task: PendingTask, digest: bytes, answer: CachedAnswer) -> None:
         for record in self._calls.detach(task):
             self._calls.send_sensing(record.call, record.number, digest, answer)
+
+    def _times_of(self, session: Session) -> tuple[ExpectedTime, ExpectedTime]:
+        """Return the times of task and sensing parts with a session's problem and settings."""
+        times = self._times.pop(session.company, None) or (ExpectedTime(), ExpectedTime())
+        self._times[session.company] = times
+        if len(self._times) > 4 * self._limits.max_problems:
+            self._times.popitem(last=False)
+        return times
 
     def _reject_busy(
         self,

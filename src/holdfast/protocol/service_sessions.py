@@ -45,8 +45,9 @@ Owner: TypeAlias = str | None
 SessionKey: TypeAlias = tuple[Owner, bytes]
 """Owner and session id."""
 
-SHORT_S = 0.001
-"""Jobs that take no longer than that are *short*: handing them to a thread takes as long."""
+SHORT_S = 0.002
+"""Jobs that take no longer than that are *short*: handing them to a thread takes as long where
+others want the interpreter, too."""
 
 _ESTIMATING_S = 1e-4
 """Time of a job that does no more than that."""
@@ -161,7 +162,7 @@ class PendingTask:
         may choose their number. Its problem must be built in: other code may take any time.
         """
         request = self.request
-        if not (self.session.built_in and self.session.is_brief):
+        if not (self.session.built_in and self.session.is_brief) or self.lane == NEW:
             return False
         if request is None:
             return True
