@@ -25,7 +25,6 @@ computation in :mod:`~holdfast.protocol.service_jobs`.
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from collections.abc import Callable
 
 import msgspec
@@ -65,7 +64,6 @@ from holdfast.protocol.service_sessions import (
     Session,
     SessionKey,
     SessionTable,
-    with_cores,
 )
 
 _INERTIA_OF_ONE = 4.0
@@ -117,8 +115,6 @@ class Service:
         # Of all robots; each session has its own, which begin here.
         self._task_time = ExpectedTime(1e-3)
         self._sensing_time = ExpectedTime(1e-3)
-        # By problem and settings; the last used last.
-        self._times: OrderedDict[bytes, tuple[ExpectedTime, ExpectedTime]] = OrderedDict()
 
     @property
     def max_running(self) -> int:
@@ -201,7 +197,7 @@ class Service:
                     (self._sensing_time if task.sensing else self._task_time).learn(computed_s)
                 if typical or outcome.restored:
                     task.expected_time.learn(computed_s, processor_s)
-                    self._times_of(session)[task.sensing].learn(computed_s, processor_s)
+                    self._sessions.alike(session).learn(task.sensing, computed_s, processor_s)
                 self._succeeded(task, outcome, now)
             self._queue.release_held(session)
         self._dispatch(now)
@@ -300,10 +296,7 @@ class Service:
             ExpectedTime(self._sensing_time.mean_s, _INERTIA_OF_ONE),
         )
         session.known = self._problems.cost_of(session.owner, session.problem_key)
-        # Whoever's they were: with equal problems and settings no decision takes longer at will.
-        task_time, sensing_time = self._times_of(session)
-        session.task_time.typical_s = task_time.typical_s
-        session.sensing_time.typical_s = sensing_time.typical_s
+        self._sessions.alike(session).share_with(session)
         lane = session.lane_of(request)
         if self._queue[lane].is_overloaded(now, key[0]):
             self._sessions.note_epoch(key, request.epoch)
@@ -463,7 +456,7 @@ class Service:
             self._make_problem,
             self._describe_error,
             session.configuration,
-            session.planning if alone else with_cores(session.planning, 1),
+            session.planning if alone else session.single_core,
             session.seed,
             self._limits,
             request,
@@ -562,14 +555,6 @@ class Service:
     def _send_sensing(self, task: PendingTask, digest: bytes, answer: CachedAnswer) -> None:
         for record in self._calls.detach(task):
             self._calls.send_sensing(record.call, record.number, digest, answer)
-
-    def _times_of(self, session: Session) -> tuple[ExpectedTime, ExpectedTime]:
-        """Return the times of task and sensing parts with a session's problem and settings."""
-        times = self._times.pop(session.company, None) or (ExpectedTime(), ExpectedTime())
-        self._times[session.company] = times
-        if len(self._times) > 4 * self._limits.max_problems:
-            self._times.popitem(last=False)
-        return times
 
     def _reject_busy(
         self,

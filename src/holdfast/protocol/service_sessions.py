@@ -180,6 +180,26 @@ class PendingTask:
         self.cost_s = self._expected_s()
 
 
+class Alike:
+    """What is common to sessions with the same problem and settings."""
+
+    def __init__(self, session: Session) -> None:
+        self.planning = session.planning
+        self.single_core = session.single_core
+        # How long their decisions take, whoever's they are.
+        self._task_time, self._sensing_time = ExpectedTime(), ExpectedTime()
+
+    def learn(self, sensing: bool, computed_s: float, processor_s: float | None) -> None:
+        """Include the time of one decision."""
+        (self._sensing_time if sensing else self._task_time).learn(computed_s, processor_s)
+
+    def share_with(self, session: Session) -> None:
+        """Give a new session what is known: the same objects need no further check."""
+        session.planning, session.single_core = self.planning, self.single_core
+        session.task_time.typical_s = self._task_time.typical_s
+        session.sensing_time.typical_s = self._sensing_time.typical_s
+
+
 class Session:
     """What is remembered of one robot.
 
@@ -226,6 +246,7 @@ class Session:
         most = min(configuration.planning.active_sensing.num_cores, _MAX_THREADS)
         # With the threads that a decision has when it is computed alone.
         self.planning = with_cores(configuration.planning, most)
+        self.single_core = with_cores(self.planning, 1)  # when others are computed, too
         # What the sessions have in common that decide alike.
         self.company = _digest_of((self.problem_key, configuration.planning))
         self.seed = configuration.seed
@@ -346,6 +367,8 @@ class SessionTable:
         self.configuration_bytes = self.state_bytes = 0
         self._epochs = ForgottenEpochs(max(4 * limits.max_sessions, _LEAST_EPOCHS))
         self._num_unserved = 0
+        # By problem and settings; the last used last.
+        self._alike: OrderedDict[bytes, Alike] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._sessions)
@@ -353,6 +376,16 @@ class SessionTable:
     def get(self, key: SessionKey) -> Session | None:
         """Return a session; None if it is not held."""
         return self._sessions.get(key)
+
+    def alike(self, session: Session) -> Alike:
+        """Return what is common to the sessions with a session's problem and settings."""
+        alike = self._alike.get(session.company)
+        if alike is None:
+            alike = self._alike[session.company] = Alike(session)
+            if len(self._alike) > 4 * self._limits.max_problems:
+                self._alike.popitem(last=False)
+        self._alike.move_to_end(session.company)
+        return alike
 
     def epoch_of(self, key: SessionKey) -> int:
         """Return a session's epoch, held or not; 0 if unknown."""
