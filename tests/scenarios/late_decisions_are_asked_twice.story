@@ -31,11 +31,11 @@ slow service=cloud-1 at=0.05 for_s=0.25 factor=20
    0.1250  robot    performs task action 9
    0.1350  robot    hears of call 4: SensingAnswer
    0.1350  robot    hears of call 4: its end
-   0.1352  robot    performs task action 10
-   0.1408  robot    hears of call 3: TaskAnswer
-   0.1454  robot    performs task actions 11 to 15
-   0.1908  robot    hears of call 3: Progress
-   0.1964  robot    performs task actions 16 to 17
+   0.1352  robot    performs task actions 10 to 11
+   0.1508  robot    hears of call 3: TaskAnswer
+   0.1556  robot    performs task actions 12 to 16
+   0.2008  robot    hears of call 3: Progress
+   0.2066  robot    performs task action 17
    0.2168  robot    performs sensing action 0 of step 18
    0.2178  robot    asks cloud-1, call 5
    0.2228  robot    hedge step=18 waited_ms=5
@@ -52,10 +52,10 @@ slow service=cloud-1 at=0.05 for_s=0.25 factor=20
    0.3158  robot    performs sensing action 0 of step 27
    0.3168  robot    asks cloud-1, call 7
    0.3198  robot    hears of call 7: TaskAnswer
-   0.3198  robot    performs task actions 27 to 30
-   0.3508  robot    hears of call 7: SensingAnswer
-   0.3508  robot    hears of call 7: its end
-   0.3606  robot    performs task actions 31 to 35
+   0.3198  robot    performs task actions 27 to 31
+   0.3608  robot    hears of call 7: SensingAnswer
+   0.3608  robot    hears of call 7: its end
+   0.3708  robot    performs task actions 32 to 35
    0.4116  robot    performs sensing action 2 of step 36
    0.4126  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
    0.4126  robot    asks cloud-1, call 8

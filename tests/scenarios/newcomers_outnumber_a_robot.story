@@ -24,34 +24,34 @@ crowd service=cloud-1 at=0.2 robots=200
    0.1006  robot    performs task action 8
    0.1108  robot    performs sensing action 0 of step 9
    0.1118  robot    asks cloud-1, call 3
-   0.1438  robot    hears of call 3: TaskAnswer
-   0.1438  robot    performs task actions 9 to 13
-   0.1938  robot    hears of call 3: Progress
-   0.1948  robot    performs task action 14
+   0.1538  robot    hears of call 3: TaskAnswer
+   0.1538  robot    performs task actions 9 to 13
    0.2000  cloud-1  is asked by 200 other robots
-   0.2050  robot    performs task actions 15 to 17
-   0.2338  robot    hears of call 3: SensingAnswer
-   0.2338  robot    hears of call 3: its end
-   0.2356  robot    performs sensing action 0 of step 18
-   0.2366  robot    asks cloud-1, call 4
-   0.2686  robot    hears of call 4: TaskAnswer
-   0.2686  robot    performs task actions 18 to 23
-   0.3268  robot    hears of call 4: Progress
-   0.3298  robot    performs task actions 24 to 26
-   0.3586  robot    hears of call 4: SensingAnswer
-   0.3586  robot    hears of call 4: its end
-   0.3604  robot    performs sensing action 0 of step 27
-   0.3614  robot    asks cloud-1, call 5
-   0.3934  robot    hears of call 5: TaskAnswer
-   0.3934  robot    performs task actions 27 to 32
-   0.4502  robot    hears of call 5: Progress
-   0.4546  robot    performs task actions 33 to 35
-   0.4834  robot    hears of call 5: SensingAnswer
-   0.4834  robot    hears of call 5: its end
-   0.4852  robot    performs sensing action 0 of step 36
-   0.4862  robot    asks cloud-1, call 6
-   0.5182  robot    hears of call 6: TaskAnswer
-   0.5182  robot    performs task actions 36 to 39
-   0.5590  robot    ends trial 3 after 40 steps
+   0.2048  robot    performs task actions 14 to 15
+   0.2171  robot    hears of call 3: Progress
+   0.2252  robot    performs task actions 16 to 17
+   0.2438  robot    hears of call 3: SensingAnswer
+   0.2438  robot    hears of call 3: its end
+   0.2456  robot    performs sensing action 0 of step 18
+   0.2466  robot    asks cloud-1, call 4
+   0.2786  robot    hears of call 4: TaskAnswer
+   0.2786  robot    performs task actions 18 to 24
+   0.3411  robot    hears of call 4: Progress
+   0.3500  robot    performs task actions 25 to 26
+   0.3686  robot    hears of call 4: SensingAnswer
+   0.3686  robot    hears of call 4: its end
+   0.3704  robot    performs sensing action 0 of step 27
+   0.3714  robot    asks cloud-1, call 5
+   0.4034  robot    hears of call 5: TaskAnswer
+   0.4034  robot    performs task actions 27 to 33
+   0.4651  robot    hears of call 5: Progress
+   0.4748  robot    performs task actions 34 to 35
+   0.4934  robot    hears of call 5: SensingAnswer
+   0.4934  robot    hears of call 5: its end
+   0.4952  robot    performs sensing action 0 of step 36
+   0.4962  robot    asks cloud-1, call 6
+   0.5282  robot    hears of call 6: TaskAnswer
+   0.5282  robot    performs task actions 36 to 39
+   0.5690  robot    ends trial 3 after 40 steps
 
 decided as without faults

@@ -354,3 +354,14 @@ class TestBadInput:
         last = planner.advance(state._replace(step=2**32 - 1), np.zeros(3))
         with pytest.raises(InvalidValueError, match=rf"step {2**32}: allowed are 0 to {2**32 - 1}"):
             planner.advance(last, np.zeros(3))
+
+
+def test_settings_that_change_are_checked_again() -> None:
+    offsets = [0, 1]
+    selector = SelectorSettings(path_offsets=offsets)  # type: ignore[arg-type]
+    settings = PlanningSettings(selector=selector)
+    assert Planner(PegInHole2D(), settings).settings.selector.path_offsets == (0, 1)
+    offsets.append(2)
+    assert Planner(PegInHole2D(), settings).settings.selector.path_offsets == (0, 1, 2)
+    plain = PlanningSettings()
+    assert Planner(PegInHole2D(), plain).settings is Planner(PegInHole2D(), plain).settings

@@ -12,6 +12,7 @@ from holdfast.planning.planner import digest
 from holdfast.protocol.decision_cost import Cost
 from holdfast.protocol.service_batches import run_together
 from holdfast.protocol.service_jobs import Job, JobResult
+from holdfast.protocol.service_sessions import SHORT_S
 
 
 def jobs_of(number: int, *, interval: int = 3) -> tuple[Bench, list[Robot]]:
@@ -42,8 +43,8 @@ def test_results_are_those_of_each_alone(interval: int) -> None:
         assert {job.kind for job in jobs} == {kind}
         bench.jobs.clear()
         results = run_together(jobs)
-        for job, result in zip(jobs, results, strict=True):
-            assert result is not None
+        for job in jobs:
+            result = results[job]
             assert comparable(result) == comparable(job.run())
             bench.apply(bench.service.finished(job, result, bench.now))
     for call, robot in zip(list(bench.replies)[-3:], robots, strict=True):
@@ -59,25 +60,60 @@ def costs_too_much(job: Job) -> None:
     job._most = Cost(1e-9, 1e-9)
 
 
-def is_of_other_settings(job: Job) -> None:
-    job.company = b"another"
-
-
-@pytest.mark.parametrize("change", [has_other_digest, costs_too_much, is_of_other_settings])
+@pytest.mark.parametrize("change", [has_other_digest, costs_too_much])
 def test_what_is_unlike_is_left_to_itself(change: Callable[[Job], None]) -> None:
     bench, _ = jobs_of(3)
     jobs = list(bench.jobs)
     change(jobs[1])
-    assert [result is None for result in run_together(jobs)] == [False, True, False]
+    assert list(run_together(jobs)) == [jobs[0], jobs[2]]
 
 
 def test_what_goes_wrong_is_left_to_each() -> None:
     bench, _ = jobs_of(3)
     jobs = list(bench.jobs)
     jobs[1].request = msgspec.structs.replace(jobs[1].request, inputs=(jobs[0].request,))  # type: ignore[type-var]
-    assert run_together(jobs) == [None] * 3
+    assert not run_together(jobs)
 
 
-def test_one_alone_is_left_to_itself() -> None:
+def test_which_are_alike() -> None:
+    bench, _ = jobs_of(2)
+    one, other = bench.jobs
+    assert one.is_like(other)
+    assert list(run_together([one])) == []
+    bench.run()
+    sensing = bench.jobs[-1]
+    assert sensing.kind == "sensing"
+    assert not other.is_like(sensing)
+    other.company = b"another"
+    assert not one.is_like(other)
+    one.company = other.company = None
+    assert not one.is_like(other)
+
+
+def test_a_short_one_that_takes_long_is_computed_anew_on_a_thread() -> None:
+    bench, (robot,) = jobs_of(1)
+    call = list(bench.replies)[-1]
+    assert is_short(bench.jobs[0])
+    bench.jobs[0].interruption.use_up()
+    bench.run()
+    assert not is_short(bench.jobs[0])
+    bench.run_all()
+    assert content(bench.replies[call]) == robot.right_answer()
+
+
+def test_what_is_known_of_newcomers() -> None:
     bench, _ = jobs_of(1)
-    assert run_together(list(bench.jobs)) == [None]
+    bench.run_all()
+    bench.send(Robot(planning=planning_of(), key=8).request())
+    assert is_short(bench.jobs[0]), "others had the same problem and settings"
+    bench.run_all()
+    came = Robot(planning=planning_of(), key=9)
+    came.sense()
+    bench.send(came.restore())
+    assert not is_short(bench.jobs[0]), "nothing is known of a state from outside"
+    bench.run()
+    assert is_short(bench.jobs[0]), "that took no longer than others"
+
+
+def is_short(job: Job) -> bool:
+    return job.interruption.most_s <= 5.0 * SHORT_S

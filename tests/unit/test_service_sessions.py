@@ -416,7 +416,7 @@ def test_the_nearest_state_before_a_request() -> None:
 
 def test_which_tasks_earlier_times_predict() -> None:
     session = session_of(1)
-    session.built_in = True
+    session.built_in = session.served = True
     session.task_time.learn(0.001)
     session.sensing_time.learn(0.001)
     interval = session.planning.sensing_interval

@@ -450,6 +450,9 @@ class Script(Service):
 class Scripted:
     """A job of a script."""
 
+    is_like = Job.is_like
+    company = None
+
     def __init__(self, kind: str, run: Callable[[], object]) -> None:
         self.kind = kind
         self.run = run

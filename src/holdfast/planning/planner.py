@@ -22,6 +22,7 @@ An observation may also come with a move (:meth:`Planner.observe_move`), or late
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import struct
 from typing import Annotated, NamedTuple
@@ -140,7 +141,7 @@ class Planner:
         check_sizes(problem)
         self.problem = problem
         settings = PlanningSettings() if settings is None else settings
-        settings = check_settings(settings, PlanningSettings)
+        settings = _checked(settings)
         if particles is not None:
             settings = _replaced(settings, "particle_filter", "num_particles", particles)
         if method is not None:
@@ -454,6 +455,23 @@ class Planner:
         stage = checked.next_stage(self.problem, estimated, state.stage)
         self._staged = state, stage
         return estimated, stage
+
+
+_checked_before: dict[int, tuple[PlanningSettings | None, PlanningSettings]] = {}
+"""Settings that were checked, and as what, by their identity."""
+
+
+def _checked(settings: PlanningSettings) -> PlanningSettings:
+    """Check settings, but not again at each decision of a service."""
+    given, found = _checked_before.get(id(settings), (None, settings))
+    if given is not settings:
+        found = check_settings(settings, PlanningSettings)
+        if len(_checked_before) >= 512:
+            _checked_before.clear()
+        with contextlib.suppress(TypeError):
+            hash(settings)  # else it has a list, say, which may change
+            _checked_before[id(settings)] = settings, found
+    return found
 
 
 def _replaced(

@@ -29,7 +29,7 @@ from holdfast.protocol.service_sessions import (
     Session,
 )
 
-_TOGETHER_S = 0.003
+_TOGETHER_S = 0.004
 """Expected time of the short tasks that a worker has at a time: nothing else runs meanwhile."""
 
 _MOST_TOGETHER = 32

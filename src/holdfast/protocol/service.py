@@ -65,7 +65,6 @@ from holdfast.protocol.service_sessions import (
     Session,
     SessionKey,
     SessionTable,
-    with_cores,
 )
 
 _INERTIA_OF_ONE = 4.0
@@ -191,13 +190,14 @@ class Service:
                 computed_s = now - task.started_at
                 session.overran = session.overran and computed_s > self._queue.limits_s[MEDIUM]
                 if outcome.restored:
-                    # A particle in an obstacle, say, takes a thousand times as long.
-                    session.task_time.typical_s = session.sensing_time.typical_s = math.inf
-                if typical:
-                    if task.lane <= BRIEF:
-                        # What new robots are expected to take.
-                        (self._sensing_time if task.sensing else self._task_time).learn(computed_s)
+                    # A particle in an obstacle, say, takes a thousand times as long to move.
+                    session.task_time.typical_s = math.inf
+                if typical and task.lane <= BRIEF:
+                    # What new robots are expected to take.
+                    (self._sensing_time if task.sensing else self._task_time).learn(computed_s)
+                if typical or outcome.restored:
                     task.expected_time.learn(computed_s, processor_s)
+                    self._sessions.alike(session).learn(task.sensing, computed_s, processor_s)
                 self._succeeded(task, outcome, now)
             self._queue.release_held(session)
         return self._effects.take()
@@ -300,6 +300,7 @@ class Service:
             ExpectedTime(self._sensing_time.mean_s, _INERTIA_OF_ONE),
         )
         session.known = self._problems.cost_of(session.owner, session.problem_key)
+        self._sessions.alike(session).share_with(session)
         lane = session.lane_of(request)
         if self._queue[lane].is_overloaded(now, key[0]):
             self._sessions.note_epoch(key, request.epoch)
@@ -454,7 +455,7 @@ class Service:
             self._make_problem,
             self._describe_error,
             session.configuration,
-            session.planning if alone else with_cores(session.planning, 1),
+            session.planning if alone else session.single_core,
             session.seed,
             self._limits,
             request,

@@ -33,22 +33,17 @@ class _Begun(NamedTuple):
     given: Sensed | None
 
 
-def run_together(jobs: Sequence[Job]) -> list[JobResult | None]:
-    """Run jobs of one kind; None for each that is to be run by itself."""
-    found: dict[Job, JobResult] = {}
-    for company in {job.company for job in jobs} if len(jobs) > 1 else ():
-        alike = [job for job in jobs if company is not None and job.company == company]
-        try:
-            found |= _run_alike(alike)
-        except BaseException:  # noqa: BLE001 - whose it is shows when each is run by itself
-            continue
-    return [found.get(job) for job in jobs]
+def run_together(jobs: Sequence[Job]) -> dict[Job, JobResult]:
+    """Run jobs that are alike (:meth:`Job.is_like`); what has no result is to be run by itself."""
+    try:
+        return _run_alike(jobs) if len(jobs) > 1 else {}
+    except BaseException:  # noqa: BLE001 - whose it is shows when each is run by itself
+        return {}
 
 
 def _run_alike(jobs: Sequence[Job]) -> dict[Job, JobResult]:
-    """Run jobs with the same problem and settings, as far as they can be run together."""
-    problem = next((job.problem for job in jobs if job.problem is not None), None)
-    if problem is None or len(jobs) < 2:
+    problem = jobs[0].problem
+    if problem is None:
         return {}
     planner = Planner(problem, jobs[0].planning)
     if not can_decide_together(planner):

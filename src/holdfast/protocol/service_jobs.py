@@ -155,6 +155,10 @@ class Job:
             )
         return self.kind, self._seed, named
 
+    def is_like(self, other: Job) -> bool:
+        """Return whether another job asks the same of the same problem and settings."""
+        return self.company is not None and (self.kind, self.company) == (other.kind, other.company)
+
     @property
     def is_cancelled(self) -> bool:
         """Whether it is to end."""

@@ -43,10 +43,8 @@ from holdfast.protocol.service_sessions import (
 )
 
 _OVERRUN = 5.0
-"""So many times its lane's limit a job may compute; hardly any takes 3 times its estimate."""
-
-_OVERRUN_SHORT = 10.0
-"""So many times :data:`SHORT_S` a short job may: everything else waits for it."""
+"""So many times its lane's limit a job may compute; hardly any takes 3 times its estimate. A short
+one may so many times what is short: everything else waits for it."""
 
 _OVERDUE = 4.0
 """The same of a long one, which is refused then."""
@@ -90,7 +88,7 @@ class Lanes:
     def most_s(self, task: PendingTask) -> float:
         """Return how long a job of a task may compute."""
         if task.short_s < math.inf:
-            return _OVERRUN_SHORT * SHORT_S
+            return _OVERRUN * SHORT_S
         return (_OVERDUE if task.lane == LONG else _OVERRUN) * self.limits_s[task.lane]
 
     def release_held(self, session: Session) -> None:

@@ -45,8 +45,9 @@ Owner: TypeAlias = str | None
 SessionKey: TypeAlias = tuple[Owner, bytes]
 """Owner and session id."""
 
-SHORT_S = 0.001
-"""Jobs that take no longer than that are *short*: handing them to a thread takes as long."""
+SHORT_S = 0.002
+"""Jobs that take no longer than that are *short*: handing them to a thread takes as long where
+others want the interpreter, too."""
 
 _ESTIMATING_S = 1e-4
 """Time of a job that does no more than that."""
@@ -161,7 +162,7 @@ class PendingTask:
         may choose their number. Its problem must be built in: other code may take any time.
         """
         request = self.request
-        if not (self.session.built_in and self.session.is_brief):
+        if not (self.session.built_in and self.session.is_brief) or self.lane == NEW:
             return False
         if request is None:
             return True
@@ -177,6 +178,26 @@ class PendingTask:
         self.digest, self.request = request.digest, request
         self.sensing, self.size = sensing, size
         self.cost_s = self._expected_s()
+
+
+class Alike:
+    """What is common to sessions with the same problem and settings."""
+
+    def __init__(self, session: Session) -> None:
+        self.planning = session.planning
+        self.single_core = session.single_core
+        # How long their decisions take, whoever's they are.
+        self._task_time, self._sensing_time = ExpectedTime(), ExpectedTime()
+
+    def learn(self, sensing: bool, computed_s: float, processor_s: float | None) -> None:
+        """Include the time of one decision."""
+        (self._sensing_time if sensing else self._task_time).learn(computed_s, processor_s)
+
+    def share_with(self, session: Session) -> None:
+        """Give a new session what is known: the same objects need no further check."""
+        session.planning, session.single_core = self.planning, self.single_core
+        session.task_time.typical_s = self._task_time.typical_s
+        session.sensing_time.typical_s = self._sensing_time.typical_s
 
 
 class Session:
@@ -225,6 +246,7 @@ class Session:
         most = min(configuration.planning.active_sensing.num_cores, _MAX_THREADS)
         # With the threads that a decision has when it is computed alone.
         self.planning = with_cores(configuration.planning, most)
+        self.single_core = with_cores(self.planning, 1)  # when others are computed, too
         # What the sessions have in common that decide alike.
         self.company = _digest_of((self.problem_key, configuration.planning))
         self.seed = configuration.seed
@@ -345,6 +367,8 @@ class SessionTable:
         self.configuration_bytes = self.state_bytes = 0
         self._epochs = ForgottenEpochs(max(4 * limits.max_sessions, _LEAST_EPOCHS))
         self._num_unserved = 0
+        # By problem and settings; the last used last.
+        self._alike: OrderedDict[bytes, Alike] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._sessions)
@@ -352,6 +376,16 @@ class SessionTable:
     def get(self, key: SessionKey) -> Session | None:
         """Return a session; None if it is not held."""
         return self._sessions.get(key)
+
+    def alike(self, session: Session) -> Alike:
+        """Return what is common to the sessions with a session's problem and settings."""
+        alike = self._alike.get(session.company)
+        if alike is None:
+            alike = self._alike[session.company] = Alike(session)
+            if len(self._alike) > 4 * self._limits.max_problems:
+                self._alike.popitem(last=False)
+        self._alike.move_to_end(session.company)
+        return alike
 
     def epoch_of(self, key: SessionKey) -> int:
         """Return a session's epoch, held or not; 0 if unknown."""

@@ -253,9 +253,9 @@ class ServiceShell:
     def _run_brief_jobs(self) -> None:
         if not self._brief_jobs:
             return  # forgotten meanwhile
-        jobs = [self._brief_jobs.popleft()]
-        while self._brief_jobs and self._brief_jobs[0].kind == jobs[0].kind:
-            jobs.append(self._brief_jobs.popleft())
+        first = self._brief_jobs[0]
+        jobs = [job for job in self._brief_jobs if job is first or job.is_like(first)]
+        self._brief_jobs = deque(job for job in self._brief_jobs if job not in jobs)
         if self._brief_jobs:
             self._run_brief_jobs_soon()
         elif self._has_replied:
@@ -263,18 +263,16 @@ class ServiceShell:
             os.sched_yield()
         self._has_replied = False
         began, used_s = self._loop.time(), time.thread_time()
-        together = run_together(jobs)
-        share = 1.0 / len(jobs)
-        shares = share * (self._loop.time() - began), share * (time.thread_time() - used_s)
-        computed = [
-            self._computed(job) if outcome is None else (outcome, *shares)
-            for job, outcome in zip(jobs, together, strict=True)
-        ]
-        for job, (outcome, *times) in zip(jobs, computed, strict=True):
-            self._finished(job, outcome, *times)
+        found = run_together(jobs)
+        computed_s, processor_s = self._loop.time() - began, time.thread_time() - used_s
+        for job in jobs:
+            if (outcome := found.get(job)) is None:
+                self._finished(job, *self._computed(job))
+            else:
+                self._finished(job, outcome, computed_s / len(found), processor_s / len(found))
 
     def _run_brief_jobs_soon(self) -> None:
-        """Schedule the next brief job after all input that has arrived by then.
+        """Schedule the next brief jobs after all input that has arrived by then.
 
         In one turn the loop runs ``call_soon`` callbacks of before, then reads sockets, then runs
         due timers.

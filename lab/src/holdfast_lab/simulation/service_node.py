@@ -52,6 +52,7 @@ class ServiceNode:
         self._deferred: list[tuple[Callable[..., None], tuple[object, ...]]] = []
         self._wakes_at: float | None = None
         self._memory = 0
+        self._short_ones_end_at = 0.0
         self.machine: Service | None = None
         self.incarnation = 0
         self.up = False
@@ -77,6 +78,7 @@ class ServiceNode:
             )
             self._memory += 1
             self._wakes_at = None
+            self._short_ones_end_at = 0.0
             self.machine = Service(lambda _: problem, run.workers, limits)
         self.go_on()
 
@@ -134,25 +136,33 @@ class ServiceNode:
             elif isinstance(effect, EndCall):
                 network.end(self, effect.call)
             elif isinstance(effect, StartJob):
-                machine.started(effect.job, self._clock.now())
-                self._begin(effect.job)
+                self._begin(effect)
         due = machine.next_wakeup()
         if due is not None and (self._wakes_at is None or due < self._wakes_at):
             self._wakes_at = due
             queue.after(self._clock.until(due), self._tick, self._memory, due)
 
-    def _begin(self, job: Job) -> None:
-        """Compute for as long as the run says, and not as this machine does."""
+    def _begin(self, run: StartJob) -> None:
+        """Compute for as long as the run says, and not as this machine does.
+
+        A short job begins when those before it have ended.
+        """
+        job, queue = run.job, self._world.queue
         most_s, job.interruption.most_s = job.interruption.most_s, math.inf
         cost_s = max(self.slownesses, default=1.0) * self._cost_s[job.kind]
         if cost_s > most_s:
             job.interruption.use_up()
-        self._world.queue.after(min(cost_s, most_s), self._finish, self._memory, job)
+        took_s, waits_s = min(cost_s, most_s), 0.0
+        if run.expected_s < math.inf:
+            waits_s = max(0.0, self._short_ones_end_at - queue.now)
+            self._short_ones_end_at = queue.now + waits_s + took_s
+        queue.after(waits_s + took_s, self._finish, self._memory, job, took_s)
 
-    def _finish(self, memory: int, job: Job) -> None:
-        if memory != self._memory or self._is_later(self._finish, memory, job):
+    def _finish(self, memory: int, job: Job, took_s: float) -> None:
+        if memory != self._memory or self._is_later(self._finish, memory, job, took_s):
             return
         assert self.machine is not None
+        self.machine.started(job, self._clock.now() - took_s)
         if job.kind in self.lacks_memory_for:
             failure = ("out_of_memory", f"out of memory for a {job.kind} part")
             outcome = JobResult(failure=failure, problem=self._world.setup.planner.problem)
