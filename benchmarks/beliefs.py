@@ -87,8 +87,19 @@ def recorded_trial(
     return states, seconds
 
 
-def concentrated_state(num_particles: int, deviation: float) -> PlanningState:
-    """Return a Gaussian belief around (0, 1, 0): the peg above the hole, about to be lowered."""
+def concentrated_state(
+    num_particles: int, deviation: float, *, in_space: bool = False, heavy_tails: bool = False
+) -> PlanningState:
+    """Return a Gaussian belief around (0, 1, 0): the peg above the hole, about to be lowered.
+
+    In space around (0, 0, 1, 0, 0, 0). With heavy tails the particles follow Student's t
+    distribution with two degrees of freedom.
+    """
+    centre = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0] if in_space else [0.0, 1.0, 0.0])
     draws = stream(SEED, 0, 0, Purpose.INITIAL_BELIEF)
-    states = np.array([0.0, 1.0, 0.0]) + deviation * draws.normal((num_particles, 3))
-    return PlanningState(SEED, 0, 0, 0, False, Belief.uniform(states))
+    deviations = deviation * draws.normal((num_particles, len(centre)))
+    if heavy_tails:
+        # The root of a mean of two squares.
+        squares = draws.substream(1).normal((num_particles, 2)) ** 2
+        deviations = deviations / np.sqrt(0.5 * (squares[:, :1] + squares[:, 1:]))
+    return PlanningState(SEED, 0, 0, 0, False, Belief.uniform(centre + deviations))

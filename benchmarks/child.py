@@ -16,23 +16,40 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.beliefs import SEED, concentrated_state, recorded_trial, settings_for
+from benchmarks.beliefs import (
+    SEED,
+    concentrated_state,
+    default_settings,
+    recorded_trial,
+    settings_for,
+)
 from benchmarks.common import decide, evenly_spread
 from benchmarks.measure import alternate, peak_memory_bytes
 from holdfast import _kernel
 from holdfast.planning.planner import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.problems.peg_in_hole_3d import PegInHole3D
 
 
-def large(num_particles: int, deviation: float | None, threads: int, turns: int) -> dict[str, Any]:
+def large(
+    num_particles: int,
+    deviation: float | None,
+    threads: int,
+    turns: int,
+    in_space: bool = False,
+    heavy_tails: bool = False,
+    default: bool = False,
+) -> dict[str, Any]:
     """Time a decision over many particles; a deviation of None means the initial belief."""
-    problem = PegInHole2D()
-    settings = settings_for(num_particles, threads)
+    problem = PegInHole3D() if in_space else PegInHole2D()
+    settings = (default_settings if default else settings_for)(num_particles, threads)
     planner = Planner(problem, settings)
     if deviation is None:
         state = planner.init(SEED, 0)
     else:
-        state = concentrated_state(num_particles, deviation)
+        state = concentrated_state(
+            num_particles, deviation, in_space=in_space, heavy_tails=heavy_tails
+        )
     before = peak_memory_bytes()
     seconds = []
     for _ in range(turns):

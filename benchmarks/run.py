@@ -53,7 +53,7 @@ CASES = (
     Case("default", "A decision by the default", decisions.default_decision, 30.0, 2.0),
     Case("decision", "A decision by the published method", decisions.decision, 60.0, 6.0),
     Case("ratio", "Against the literal algorithm", decisions.ratio, 60.0, 4.0),
-    Case("large", "100,000 particles", scale.large, 40.0, 8.0),
+    Case("large", "100,000 particles", scale.large, 60.0, 12.0),
     Case("growth", "How the cost grows", scale.growth, 60.0, 4.0),
     Case("trials", "A thousand trials", command.trials, 40.0, 3.0),
     Case("floor", "Distance from the floor", decisions.floor, 10.0, 1.0),

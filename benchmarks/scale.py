@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -30,11 +31,16 @@ LARGE_BAR_GB = 1.0
 def large(context: Context) -> Result:
     """A hundred thousand particles, in processes of their own."""
     num_particles = 100_000
-    beliefs: dict[str, float | None] = {
-        "initial belief": None,
-        "deviation 0.3": 0.3,
-        "deviation 0.1": 0.1,
-        "deviation 0.05": 0.05,
+    beliefs: dict[str, dict[str, Any]] = {
+        "initial belief": {"deviation": None},
+        "deviation 0.3": {"deviation": 0.3},
+        "deviation 0.1": {"deviation": 0.1},
+        "deviation 0.05": {"deviation": 0.05},
+        "deviation 0.03": {"deviation": 0.03},
+        "heavy tails, 0.05": {"deviation": 0.05, "heavy_tails": True},
+        "in space, 0.3": {"deviation": 0.3, "in_space": True},
+        "in space, 0.02": {"deviation": 0.02, "in_space": True},
+        "path entropy, 0.03": {"deviation": 0.03, "default": True},
     }
     processes = 1 if context.quick else 3
     seconds: dict[str, list[float]] = {label: [] for label in beliefs}
@@ -42,12 +48,12 @@ def large(context: Context) -> Result:
     visits = dict.fromkeys(beliefs, 0)
     before = 0
     for process in range(processes):
-        for at, (label, deviation) in enumerate(beliefs.items()):
+        for at, (label, belief) in enumerate(beliefs.items()):
             found = child(
                 {
                     "kind": "large",
                     "num_particles": num_particles,
-                    "deviation": deviation,
+                    **belief,
                     "threads": THREADS[-1],
                     "turns": 1 if context.quick else 2,
                 }
@@ -82,6 +88,8 @@ def large(context: Context) -> Result:
                 Gaussian ones around (0, 1, 0), the peg above the hole, with one standard deviation
                 for all coordinates: the narrower, the more particles survive a hypothetical
                 observation, and the more of them lie within the resolution (0.1) of each other.
+                Heavy tails are those of Student's t distribution with two degrees of freedom, in
+                space J = 6, and path entropy, the default, takes two sets of actions.
                 Peak memory is that of the whole process, which before the decision has
                 {before / 1e6:.0f} MB."""
             ),

@@ -85,6 +85,7 @@ double seconds_since(std::chrono::steady_clock::time_point start) {
 void holdfast::bind_entropy(nb::module_& module) {
     define(module, "use_threads_from",
            [](double nanoseconds) { return use_threads_from(nanoseconds); });
+    define(module, "use_ball_work", [](double nanoseconds) { return use_ball_work(nanoseconds); });
     define(module, "threads_started", [] { return threads_started(); });
     // The caller keeps the flag alive until it watches another one, or none.
     define(

@@ -93,9 +93,10 @@ static void renumber(NearestLists<length>& lists) {
     }
 }
 
+/// Fills the lists, or returns false once all of them reach no further than to `enough`.
 template <std::size_t length>
-static void find_nearest(const TreeView& tree, const QueryLeaf& query, NearestLists<length>& lists,
-                         std::uint64_t* visits) {
+static bool find_nearest(const TreeView& tree, const QueryLeaf& query, NearestLists<length>& lists,
+                         std::uint64_t* visits, double enough = -1.0) {
     struct Pending {
         std::uint32_t node;
         double least;
@@ -181,9 +182,11 @@ static void find_nearest(const TreeView& tree, const QueryLeaf& query, NearestLi
         if (in_block == length) {
             merge();
             bound = furthest(lists);
+            if (bound <= enough) return false;
         }
     }
     if (in_block > 0) merge();
+    return true;
 }
 
 /// The terms of one point under every posterior, walking outwards through its list.
