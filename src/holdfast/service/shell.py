@@ -247,8 +247,7 @@ class ServiceShell:
     def _gone(self, number: int) -> None:
         """Handle the end of a link on which a call was open."""
         if self._calls.pop(number, None) is not None:
-            now = self._loop.time()
-            self._carry_out(self._service.gone(number, now), now)
+            self._carry_out(self._service.gone(number), self._loop.time())
 
     def _run_brief_job(self) -> None:
         if not self._brief_jobs:
