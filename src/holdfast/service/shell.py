@@ -255,8 +255,8 @@ class ServiceShell:
         job = self._brief_jobs.popleft()
         if self._brief_jobs:
             self._run_brief_job_soon()
-        elif self._has_replied:
-            # A robot on this machine may wait for this very core: it acts on its reply first.
+        elif self._has_replied and len(self._calls) == 1:
+            # The only robot, if on this machine, may wait for this very core to read its reply.
             os.sched_yield()
         self._has_replied = False
         self._finished(job, *self._computed(job))
