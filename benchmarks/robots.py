@@ -34,7 +34,7 @@ simulator:
   sensing_intervals: {sensing_interval}
   seed: 0
 recovery: {{launch: {launch}}}
-offload: {{services: {services}, what: all}}
+offload: {{services: {services}, what: {what}}}
 """
 
 _PATIENCE_S = 30.0
@@ -48,8 +48,12 @@ def configuration_for(
     launch: str = "never",
     num_particles: int = 100,
     sensing_interval: int = 8,
+    what: str = "all",
 ) -> Configuration:
-    """Return the published settings (M = 10, k = 5, H = 1, interval 8), with services for all."""
+    """Return the published settings (M = 10, k = 5, H = 1, interval 8), with services.
+
+    ``what`` they decide: ``all``, or ``sensing`` alone.
+    """
     path = directory / "robot.yaml"
     path.write_text(
         _CONFIGURATION.format(
@@ -58,6 +62,7 @@ def configuration_for(
             num_trials=num_trials,
             launch=launch,
             services=list(services),
+            what=what,
         )
     )
     return load(path)

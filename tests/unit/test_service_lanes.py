@@ -106,7 +106,7 @@ class TestNobodyAwaitsIt:
         bench = Bench(workers=1)
         first, second = ask_for_long_ones(bench, 2)
         assert (bench.service.statistics.running, bench.service.statistics.waiting) == (1, 1)
-        bench.apply(bench.service.gone(second, bench.now))
+        bench.apply(bench.service.gone(second))
         assert (bench.service.statistics.running, bench.service.statistics.waiting) == (1, 0)
         assert bench.service.statistics.calls == 1
         assert not bench.replies[first]
@@ -115,7 +115,7 @@ class TestNobodyAwaitsIt:
         bench = Bench(workers=1)
         first, _ = ask_for_long_ones(bench, 2)
         (job,) = bench.jobs
-        bench.apply(bench.service.gone(first, bench.now))
+        bench.apply(bench.service.gone(first))
         outcome = job.run()
         assert outcome.cancelled
         assert outcome.problem is None, "left in the middle of something"
@@ -130,7 +130,7 @@ class TestNobodyAwaitsIt:
         bench, robot = Bench(workers=1), robot_of(long_planning(), 100)
         (call,) = ask_for_long_ones(bench, 1)
         (job,) = bench.jobs
-        bench.apply(bench.service.gone(call, bench.now))
+        bench.apply(bench.service.gone(call))
         again = bench.send(robot.request())
         estimate_index = next(i for i, each in enumerate(bench.jobs) if each is not job)
         bench.run(estimate_index)
@@ -153,7 +153,7 @@ class TestNobodyAwaitsIt:
     def test_a_brief_one_goes_on_for_the_robots_next_link(self) -> None:
         bench, robot = Bench(), Robot()
         call = bench.send(robot.request())
-        bench.apply(bench.service.gone(call, bench.now))
+        bench.apply(bench.service.gone(call))
         bench.run_all()
         assert content(bench.ask(robot.request())) == robot.right_answer()
         assert bench.service.statistics.cache_hits == 1
@@ -161,7 +161,7 @@ class TestNobodyAwaitsIt:
     def test_a_call_that_has_ended_can_go(self) -> None:
         bench, robot = Bench(), Robot()
         bench.ask(robot.request())
-        bench.apply(bench.service.gone(0, bench.now))
+        bench.apply(bench.service.gone(0))
         assert content(bench.ask(robot.request())) == robot.right_answer()
 
 

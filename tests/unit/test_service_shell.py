@@ -442,7 +442,7 @@ class Script(Service):
         self.times.append(now)
         return []
 
-    def gone(self, call: int, now: float) -> list[ServiceEffect]:
+    def gone(self, call: int) -> list[ServiceEffect]:
         self.trace.append(f"gone {call}")
         return []
 

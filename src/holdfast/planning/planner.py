@@ -149,8 +149,7 @@ class Planner:
         if particles is not None or method is not None:
             settings = check_settings(settings, PlanningSettings)
         self.settings = settings
-        # A state whose stage was found last: its action is chosen, then it advances by that.
-        self._staged: tuple[PlanningState | None, int] = None, 0
+        self._staged: tuple[PlanningState | None, int] = None, 0  # the stage that was found last
 
     @in_own_mode
     def init(self, seed: int, trial: int = 0) -> PlanningState:

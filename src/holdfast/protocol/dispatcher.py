@@ -347,8 +347,6 @@ class Dispatcher(DecisionSource):
                     self._launches.failed(now)
 
     def _enforce_decision_timeout(self, now: float) -> None:
-        if not self._calls or now < self._calls.first_sent_at() + self._limit_s:
-            return
         for call in self._calls:
             if now >= call.sent_at + self._limit_s:
                 replica = call.replica
@@ -364,8 +362,8 @@ class Dispatcher(DecisionSource):
         calls = self._calls.about(question)
         if self.tracker.is_recovering and self._services.local_usable(now):
             # The cloud is only tried: it may say for long that it is at work.
-            return any([call.replica is self._services.local for call in calls])
-        return any([call.replica.detector.trusted for call in calls])
+            return any(call.replica is self._services.local for call in calls)
+        return any(call.replica.detector.trusted for call in calls)
 
     def _ask_or_hold(self, question: Question, now: float) -> None:
         """Send the question to the best usable service; without one, start the recovery or hold."""

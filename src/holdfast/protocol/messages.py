@@ -322,9 +322,9 @@ def decode_request(payload: bytes) -> Request:
         raise _other_version(sent.version)
     if sent.checkpoint is not None and sent.inputs:
         raise MessageError("malformed", "a request has a checkpoint and inputs as well")
-    inputs = tuple(map(_received, sent.inputs))
-    fields = msgspec.structs.astuple(sent)[:8]  # those before the inputs
-    return Request(*fields, inputs, session_configuration, sent.checkpoint)
+    fields: list[Any] = list(msgspec.structs.astuple(sent)[:11])  # all but the settings' digest
+    fields[8:10] = tuple(map(_received, sent.inputs)), session_configuration
+    return Request(*fields)
 
 
 def _sent(given: CatchUpInput) -> _SentSensed | _SentMoved:

@@ -164,11 +164,9 @@ class RequestQueue:
 
     def _count(self, task: PendingTask, sign: int) -> None:
         owner = task.session.owner
-        load = self._waiting_of.get(owner)
-        if load is None:
-            load = self._waiting_of[owner] = _Load()
-        self._waiting.count(task, sign)
-        load.count(task, sign)
+        load = self._waiting_of.setdefault(owner, _Load())
+        for each in (self._waiting, load):
+            each.count(task, sign)
         if not load.num:
             del self._waiting_of[owner]
 

@@ -149,7 +149,7 @@ class OpenRequests:
 
     def is_asked(self, replica: Replica, question: Question) -> bool:
         """Return whether a service has the question."""
-        return any([call.replica is replica for call in self.about(question)])
+        return any(call.replica is replica for call in self.about(question))
 
     def retry_at(self, replica: Replica, question: Question) -> float:
         """Return when a service that may not hear the robot is sent the question again."""

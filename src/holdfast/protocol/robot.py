@@ -538,11 +538,10 @@ class Robot:
     # -- effects ---------------------------------------------------------------------------------
 
     def _write(self, *records: Record) -> None:
-        history = self._history
-        if self._source.tracker.recoveries != self._recoveries_counted and history is not None:
+        history, is_new = self._history, self._source.tracker.recoveries > self._recoveries_counted
+        if is_new and history is not None and (records or self._unwritten or history.begun):
             # A recovery alone does not begin a trial.
-            if records or self._unwritten or history.begun:
-                self._count_recoveries()
+            self._count_recoveries()
         self._unwritten += records
         if self._unwritten:
             # The effects that follow may rest on these records.

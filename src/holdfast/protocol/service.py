@@ -12,9 +12,8 @@ performed. So the task part is sent before the sensing part is begun, and other 
 go first, within limits.
 
 The machine computes nothing itself and has no clock, thread or socket. Methods take an event and
-the time and return effects, to be carried out in order. Then the caller asks for
-:meth:`Service.next_jobs`, so that no reply waits until they are chosen. It runs each :class:`Job`
-that it is handed (at most ``max_running`` at a time, and some short ones) anywhere, and returns its
+the time and return effects, to be carried out in order; then the caller asks for jobs. It runs each
+:class:`Job` (at most ``max_running`` at a time, and some short ones) anywhere, and returns its
 :class:`JobResult` with :meth:`Service.finished`.
 
 This module decides what requests and results mean. Memory is in
@@ -202,7 +201,7 @@ class Service:
             self._queue.release_held(session)
         return self._effects.take()
 
-    def gone(self, call: int, now: float) -> list[ServiceEffect]:
+    def gone(self, call: int) -> list[ServiceEffect]:
         """Handle the end of a call by itself: its link has ended, and nobody awaits replies."""
         task = self._calls.drop(call)
         if task is not None and not task.calls:

@@ -83,7 +83,7 @@ class Lanes:
         """Return whether a task that is to be started may have all cores."""
         if task.lane == LONG and self._fewer == 1:
             return True  # no other long one runs beside it
-        return not any([lane.num_running or lane.num_waiting for lane in self._lanes])
+        return not any(lane.num_running or lane.num_waiting for lane in self._lanes)
 
     def most_s(self, task: PendingTask) -> float:
         """Return how long a job of a task may compute."""

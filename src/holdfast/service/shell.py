@@ -247,8 +247,7 @@ class ServiceShell:
     def _gone(self, number: int) -> None:
         """Handle the end of a link on which a call was open."""
         if self._calls.pop(number, None) is not None:
-            now = self._loop.time()
-            self._carry_out(self._service.gone(number, now), now)
+            self._carry_out(self._service.gone(number), self._loop.time())
 
     def _run_brief_jobs(self) -> None:
         if not self._brief_jobs:
@@ -258,8 +257,8 @@ class ServiceShell:
         self._brief_jobs = deque(job for job in self._brief_jobs if job not in jobs)
         if self._brief_jobs:
             self._run_brief_jobs_soon()
-        elif self._has_replied:
-            # A robot on this machine may wait for this very core: it acts on its reply first.
+        elif self._has_replied and len(self._calls) == 1:
+            # The only robot, if on this machine, may wait for this very core to read its reply.
             os.sched_yield()
         self._has_replied = False
         began, used_s = self._loop.time(), time.thread_time()

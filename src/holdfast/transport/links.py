@@ -18,11 +18,10 @@ import functools
 import math
 import os
 import socket
-import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
-from time import thread_time
+from time import thread_time, time
 from typing import TYPE_CHECKING, Concatenate, Final, ParamSpec, TypeVar
 
 from holdfast.errors import FrameError
@@ -561,7 +560,7 @@ class Link(asyncio.BufferedProtocol):
             # If this process has stalled, first read what came meanwhile.
             self._loop.call_soon(self._loop.call_soon, self._end_if_silent, now)
             return
-        valid_s = math.inf if self.peer is None else self.peer.expires_at - time.time()
+        valid_s = math.inf if self.peer is None else self.peer.expires_at - time()
         if valid_s <= 0.0:
             self.refuse(_EXPIRED)
             return

@@ -94,23 +94,21 @@ class _StreamCall(msgspec.Struct, eq=False):
 
     def reply(self, payload: bytes, *, last: bool = False) -> None:
         """Send a reply, and end the call with the last one. A robot that is gone is no error."""
-        if len(payload) > self.link.max_message_bytes:
-            if last:
-                self.end()
-        elif self.is_open:
-            if last:
-                self._close()
-            self.link.send_message(LAST if last else REPLY, self.number, payload)
+        if len(payload) <= self.link.max_message_bytes:
+            self._send(LAST if last else REPLY, payload)
+        elif last:
+            self._send(END)
 
     def end(self) -> None:
         """End the call. May be repeated."""
-        if self.is_open:
-            self._close()
-            self.link.send_message(END, self.number)
+        self._send(END)
 
-    def _close(self) -> None:
-        self.is_open = False
-        self.calls.discard(self)
+    def _send(self, kind: int, payload: bytes = b"") -> None:
+        if self.is_open:
+            if kind != REPLY:
+                self.is_open = False
+                self.calls.discard(self)
+            self.link.send_message(kind, self.number, payload)
 
 
 class StreamServiceTransport(LinkOwner):

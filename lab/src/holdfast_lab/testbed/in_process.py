@@ -64,8 +64,7 @@ class _InProcessCall(msgspec.Struct, eq=False):
 
     def reply(self, payload: bytes, *, last: bool = False) -> None:
         if len(payload) <= self.service_end.max_message_bytes:
-            calls = self.robot_end.calls
-            asyncio.get_running_loop().call_soon(calls.replied, self.number, payload)
+            asyncio.get_running_loop().call_soon(self.robot_end.calls.replied, self.number, payload)
         if last:
             self.end()
 
