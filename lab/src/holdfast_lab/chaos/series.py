@@ -26,22 +26,13 @@ TRIALS_NAME = "trials.jsonl"
 
 
 class SeriesPlan(NamedTuple):
-    """What each trial of a series is.
-
-    Attributes
-    ----------
-    wires : tuple of str
-        Trial n is over wire n modulo their number.
-    kinds : tuple of FaultKind
-        The trials over each wire are of one kind after another; each wire begins with another one.
-    possible : tuple of FaultKind
-        The kinds that this machine can inject, for combinations.
-    """
+    """What each trial of a series is."""
 
     seed: int
-    wires: tuple[Wire, ...]
+    wires: tuple[Wire, ...]  # trial n is over wire n modulo their number
+    # The trials over each wire are of one kind after another; each wire begins with another one.
     kinds: tuple[FaultKind, ...]
-    possible: tuple[FaultKind, ...]
+    possible: tuple[FaultKind, ...]  # the kinds that this machine can inject, for combinations
 
     def of(self, trial: int) -> tuple[Wire, FaultKind]:
         """Return the wire and the kind of a trial."""

@@ -40,18 +40,10 @@ class _Coming(NamedTuple):
 
 
 class Resumed(NamedTuple):
-    """What the world tells a robot's next process.
+    """What the world tells a robot's next process."""
 
-    Attributes
-    ----------
-    last : ReferenceStep or None
-        Its last task action, if it can still tell what that has shown.
-    late : tuple of Late
-        What has come meanwhile.
-    """
-
-    last: ReferenceStep | None
-    late: tuple[Late, ...]
+    last: ReferenceStep | None  # its last task action, if it can still tell what that has shown
+    late: tuple[Late, ...]  # what has come meanwhile
 
 
 class EnvironmentModel:

@@ -311,19 +311,15 @@ class Testbed:
     ) -> None:
         """Run the loop until something is so.
 
+        Raises NoProgressError if it does not happen in time; ProcessEndedError if a process ends
+        that was not killed.
+
         Parameters
         ----------
         what : str
             Names it in messages.
         limit_s : float
             How long to wait; begins anew whenever the progress changes.
-
-        Raises
-        ------
-        NoProgressError
-            If it does not happen in time.
-        ProcessEndedError
-            If a process ends that was not killed.
         """
         began = moved_at = time.monotonic()
         seen = progress()

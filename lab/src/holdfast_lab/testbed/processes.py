@@ -40,7 +40,8 @@ class Process:
     """A command as a process of its own, in its own process group.
 
     Its standard input stays open until :meth:`close`, so a service started with
-    ``--until-stdin-closes`` ends with this process.
+    ``--until-stdin-closes`` ends with this process. Raises CannotStartError if it cannot be
+    started.
 
     Parameters
     ----------
@@ -59,11 +60,6 @@ class Process:
         When :meth:`kill` was called.
     exit_code : int or None
         Negative after a signal; None until it has ended and all its events are here.
-
-    Raises
-    ------
-    CannotStartError
-        If it cannot be started.
     """
 
     def __init__(
@@ -155,12 +151,8 @@ class Process:
     ) -> LogEvent:
         """Wait for the n-th event with a name and these fields.
 
-        Raises
-        ------
-        ProcessEndedError
-            If the process ends before.
-        NoProgressError
-            If the event does not come in time.
+        Raises ProcessEndedError if the process ends before; NoProgressError if the event does not
+        come in time.
         """
         deadline = time.monotonic() + timeout_s
         with self._changed:
@@ -274,10 +266,7 @@ class Ports:
     def free(self, host: str = "127.0.0.1") -> int:
         """Return a port that is free for streams and datagrams.
 
-        Raises
-        ------
-        CannotStartError
-            If there is none.
+        Raises CannotStartError if there is none.
         """
         for number in itertools.islice(self._numbers, self._size):
             port = self._first + number % self._size

@@ -48,6 +48,8 @@ def endpoint_at(transport: str, place: Place) -> str:
 class Proxy(BadLine):
     """A line to a service on this machine; to be used in a ``with`` statement.
 
+    Raises CannotStartError if it cannot listen.
+
     Parameters
     ----------
     target : int or Path
@@ -56,11 +58,6 @@ class Proxy(BadLine):
         Whether it carries datagrams between the same ports, too.
     overhear : callable
         Gets what is carried, a piece of a stream or a datagram, and which way; in another thread.
-
-    Raises
-    ------
-    CannotStartError
-        If it cannot listen.
     """
 
     def __init__(

@@ -44,6 +44,8 @@ def make_reference_run(
 ) -> ReferenceRun:
     """Run trials until there are enough steps; write the configuration and the run's directory.
 
+    Raises OutputError if something cannot be written.
+
     Parameters
     ----------
     path : Path
@@ -51,11 +53,6 @@ def make_reference_run(
         comment.
     performed : Path or None
         Gets the performed task actions: see :mod:`~holdfast_lab.testbed.world`.
-
-    Raises
-    ------
-    OutputError
-        If something cannot be written.
     """
 
     def configure(num_trials: int) -> Configuration:
