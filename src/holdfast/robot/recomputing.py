@@ -58,10 +58,7 @@ _FINISHED_S = 30.0
 class RecordedTrials:
     """The trials of a journal, to be run again.
 
-    Parameters
-    ----------
-    world_is_simulated : bool
-        Else the trials happen in the recorded world, which shows what it has shown.
+    Unless the world is simulated, they happen in the recorded one, which shows what it has shown.
     """
 
     def __init__(

@@ -43,17 +43,9 @@ class SeriesPlan(NamedTuple):
 
 
 class Series:
-    """A series in a directory, which is empty.
+    """A series in a directory, which is empty; ``outcomes`` come in the order in which trials end.
 
-    Parameters
-    ----------
-    keep : bool
-        Whether the directories of good trials stay. Those of others always do.
-
-    Attributes
-    ----------
-    outcomes : list of TrialOutcome
-        In the order in which the trials ended.
+    With ``keep`` the directories of good trials stay. Those of others always do.
     """
 
     def __init__(self, directory: Path, plan: SeriesPlan, *, keep: bool = False) -> None:
@@ -80,12 +72,8 @@ class Series:
     ) -> None:
         """Run trials; what gets each outcome runs in this thread.
 
-        Raises
-        ------
-        HoldfastError
-            If a trial cannot be run at all.
-        KeyboardInterrupt
-            Once all processes have ended.
+        Raises HoldfastError if a trial cannot be run at all, and KeyboardInterrupt once all
+        processes have ended.
         """
         missing = deque(trials)
         cancelled = threading.Event()
