@@ -151,12 +151,8 @@ class EnvironmentModel:
     def resumed(self, records: Sequence[Record], *, may_lack: bool) -> Resumed:
         """Tell the robot's next process what has happened meanwhile.
 
-        Parameters
-        ----------
-        records : sequence of Record
-            What the journal holds of this trial.
-        may_lack : bool
-            Whether a power cut has taken some away.
+        Of this trial the journal holds the records; a power cut may have taken some away
+        (``may_lack``).
         """
         observed = [each for each in records if isinstance(each, Sensed)]
         written = [each.taken for each in records if isinstance(each, Late)]

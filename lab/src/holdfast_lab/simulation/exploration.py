@@ -64,18 +64,11 @@ def explore(
     on_batch: Callable[[range, ExplorationTally], bool],
     batch: int = _BATCH,
 ) -> None:
-    """Run the schedules of many seeds.
+    """Run the schedules of many seeds, in so many processes; 1 is this one. That changes time only.
 
-    Raises InvalidValueError if the number of processes is out of bounds; SimulationError if a
-    process was killed; what it had is not known.
-
-    Parameters
-    ----------
-    jobs : int
-        Processes; 1 runs all seeds in this one. Changes time only.
-    on_batch : callable
-        Gets the seeds of a batch that was run, in their order, and what was seen; returns whether
-        to go on.
+    ``on_batch`` gets the seeds of a batch that was run, in their order, and what was seen; it
+    returns whether to go on. Raises InvalidValueError if the number of processes is out of bounds,
+    and SimulationError if a process was killed; what it had is not known.
     """
     if not 1 <= jobs <= MAX_JOBS:
         raise InvalidValueError(f"jobs is {jobs}: must be from 1 to {MAX_JOBS}")

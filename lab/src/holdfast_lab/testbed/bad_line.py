@@ -50,12 +50,8 @@ class Impairment:
 class BadLine:
     """A line without ends; to be used in a ``with`` statement.
 
-    Parameters
-    ----------
-    overhear : callable
-        Gets what is carried, a piece of a stream or a datagram, and which way; in another thread.
-    selector : selector or None
-        Which waits; one that knows whole milliseconds only would falsify short delays.
+    ``overhear`` gets what is carried, a piece of a stream or a datagram, and which way; in another
+    thread. The selector waits; one that knows whole milliseconds only would falsify short delays.
     """
 
     def __init__(

@@ -30,12 +30,8 @@ _PROTOCOLS = ("tcp", "udp")
 class NetworkNamespace:
     """A new network with a loopback alone; to be used in a ``with`` statement.
 
-    Raises CannotStartError if it cannot be made.
-
-    Attributes
-    ----------
-    prefix : tuple of str
-        A command that runs another one in this namespace.
+    Its ``prefix`` is a command that runs another one in it. Raises CannotStartError if it cannot be
+    made.
     """
 
     def __init__(self) -> None:

@@ -40,26 +40,10 @@ class Process:
     """A command as a process of its own, in its own process group.
 
     Its standard input stays open until :meth:`close`, so a service started with
-    ``--until-stdin-closes`` ends with this process. Raises CannotStartError if it cannot be
-    started.
-
-    Parameters
-    ----------
-    log_path : Path or None
-        Its output is appended to this file.
-    changed : threading.Condition or None
-        Notified of each line and of the end; several processes may share it.
-    own_session : bool
-        Whether it leads a session, so that it may have a terminal of its own.
-
-    Attributes
-    ----------
-    spawned_at : float
-        In seconds since the epoch.
-    killed_at : float or None
-        When :meth:`kill` was called.
-    exit_code : int or None
-        Negative after a signal; None until it has ended and all its events are here.
+    ``--until-stdin-closes`` ends with this process. Its output is appended to the log. ``changed``
+    is notified of each line and of the end; several processes may share it. With ``own_session`` it
+    leads a session, so that it may have a terminal of its own. Raises CannotStartError if it cannot
+    be started.
     """
 
     def __init__(
@@ -77,6 +61,7 @@ class Process:
         self.lines: list[str] = []
         self.events: list[LogEvent] = []
         self.killed_at: float | None = None
+        # Negative after a signal; None until it has ended and all its events are here.
         self.exit_code: int | None = None
         self.spawned_at = time.time()
         try:
@@ -205,10 +190,7 @@ class Process:
 class ProcessGroup:
     """Processes, and all that they start: a variable, which children inherit, marks them.
 
-    Attributes
-    ----------
-    changed : threading.Condition
-        Notified when one of them writes a line, or has ended.
+    ``changed`` is notified when one of them writes a line, or has ended.
     """
 
     def __init__(self) -> None:
@@ -227,12 +209,8 @@ class ProcessGroup:
     def close(self, patience_s: float, orderly_end_s: float = 0.0) -> list[int]:
         """End all of them, and return those that had to be killed although nobody knew them.
 
-        Parameters
-        ----------
-        patience_s : float
-            How long what they have started has to end by itself, after them.
-        orderly_end_s : float
-            How long they have after SIGTERM; at 0, or by an exception, they are killed at once.
+        After SIGTERM they have ``orderly_end_s``; at 0, or by an exception, they are killed at
+        once. What they have started has ``patience_s`` to end by itself, after them.
         """
         try:
             if orderly_end_s > 0.0:
