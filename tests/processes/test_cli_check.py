@@ -39,7 +39,6 @@ class {name}(hf.ProblemBase):
         return np.array([0.01])
 """
 RIGHT = "return states + actions + 0.1 * stream.normal(states.shape)"
-SHARED = "return states + actions + 0.1 * stream.normal((1,))"
 RAISES = 'raise KeyError("wheel")'
 LOOPS = "while stream is not None: pass"
 ENDS = "__import__('os')._exit(0)"

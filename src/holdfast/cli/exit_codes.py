@@ -60,11 +60,8 @@ class EndedBySignal(KeyboardInterrupt):
 def ended_by_signals(*, once: bool = False) -> Iterator[None]:
     """Let SIGTERM and SIGHUP end the block as Ctrl-C does, and exit with their numbers.
 
-    Parameters
-    ----------
-    once : bool
-        Whether later signals, Ctrl-C included, are ignored up to the end of the process: for a
-        command that must end its child processes undisturbed.
+    With ``once`` later signals, Ctrl-C included, are ignored up to the end of the process: for a
+    command that must end its child processes undisturbed.
     """
     ended = False
 

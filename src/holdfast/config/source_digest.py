@@ -71,22 +71,13 @@ def problem_digest(problem_class: type, named_in: str | None = None) -> str:
 
 
 def problem_sources(problem_class: type, named_in: str | None = None) -> dict[str, str]:
-    """Return the digest of each source of a problem's code beyond holdfast's core.
+    """Return the digest of each source of a problem's code beyond holdfast's core, by module.
 
+    The digests are hexadecimal; that of a module that was loaded and has no source here is empty.
     The sources are read from the disk now: to identify loaded code, call this at once.
-
-    Parameters
-    ----------
-    named_in : str or None
-        Module that the problem's name in a configuration leads to
-        (:func:`holdfast.config.registry.problem_module`). It need not be the one in which the
-        class is defined, and may have made the class or changed it.
-
-    Returns
-    -------
-    dict of str
-        Digests in hexadecimal by the names of the modules; an empty one for a module that was
-        loaded and has no source here.
+    ``named_in`` is the module that the problem's name in a configuration leads to
+    (:func:`holdfast.config.registry.problem_module`). It need not be the one in which the class is
+    defined, and may have made the class or changed it.
     """
     found: dict[str, str] = {}
     defined_in = [derived.__module__ for derived in problem_class.__mro__]

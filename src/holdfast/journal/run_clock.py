@@ -76,15 +76,8 @@ def _uptime_ns() -> int:
 class RunClock:
     """Says when something was, from its stamp and the reading of the wall clock at the time.
 
-    Parameters
-    ----------
-    readings : iterable of (Stamp or None, int)
-        All that there are, with nanoseconds since 1970; of two boots the earlier one comes first.
-
-    Attributes
-    ----------
-    notes : tuple of str
-        How the wall clock was set.
+    ``readings`` are all that there are, with nanoseconds since 1970; of two boots the earlier one
+    comes first. ``notes`` say how the wall clock was set.
     """
 
     def __init__(self, readings: Iterable[tuple[Stamp | None, int]]) -> None:

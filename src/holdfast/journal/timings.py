@@ -28,15 +28,9 @@ class EventTable:
     """A table with a row for each event of a kind, open for more.
 
     Its columns are the event's fields, and the times as ``events.jsonl`` has them: the wall
-    clock's, which boot of the machine this is, and how long it lasts. Raises OutputError if it
-    cannot be written; so does :meth:`add`.
-
-    Parameters
-    ----------
-    kind : type
-        Timing for ``timings.csv``, VerificationNoted for ``verification.csv``.
-    clock : callable
-        Returns nanoseconds since 1970.
+    clock's, which boot of the machine this is, and how long it lasts. ``kind`` is Timing for
+    ``timings.csv``, VerificationNoted for ``verification.csv``; ``clock`` returns nanoseconds since
+    1970. Raises OutputError if it cannot be written; so does :meth:`add`.
     """
 
     def __init__(

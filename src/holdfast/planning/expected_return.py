@@ -76,21 +76,16 @@ _NEGLIGIBLE = 1e-9
 
 
 class Returns(NamedTuple):
-    """Expected returns of all sensing actions.
-
-    Attributes
-    ----------
-    means : array of shape (J,)
-        Expected discounted return after each sensing action, less its price, and up to a constant
-        that all of them share. For one that was given up early it is the best one's mean plus their
-        mean difference in the samples that they share.
-    samples : array of shape (J, M)
-        The returns after single hypothetical observations, less the price. NaN for those of later
-        rounds of a sensing action that had been given up.
-    """
+    """Expected returns of all sensing actions."""
 
     means: FloatArray
+    """Of shape (J,): expected discounted return after each sensing action, less its price, and up
+    to a constant that all of them share. For one that was given up early it is the best one's mean
+    plus their mean difference in the samples that they share."""
+
     samples: FloatArray
+    """Of shape (J, M): the returns after single hypothetical observations, less the price. NaN for
+    those of later rounds of a sensing action that had been given up."""
 
 
 def expected_returns(

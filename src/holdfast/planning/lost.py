@@ -41,22 +41,16 @@ MOVE = -1
 
 
 class Verdict(NamedTuple):
-    """An alarm.
-
-    Attributes
-    ----------
-    kind : {"lost", "sensor_suspect"}
-    sensing_action : int or None
-        The suspect one; of a lost robot, the only one of the run if there is but one (then that
-        sensor may be dead instead), else None. :data:`MOVE` is what moves show.
-    outside, observations : int
-        Observations outside the gate, and all, since the evidence began.
-    """
+    """An alarm."""
 
     kind: Literal["lost", "sensor_suspect"]
+
     sensing_action: int | None
-    outside: int
-    observations: int
+    """The suspect one; of a lost robot, the only one of the run if there is but one (then that
+    sensor may be dead instead), else None. :data:`MOVE` is what moves show."""
+
+    outside: int  # observations outside the gate, since the evidence began
+    observations: int  # all since then
 
 
 class _Evidence:
@@ -82,17 +76,9 @@ class _Evidence:
 
 
 class LostTest:
-    """The test, from the beginning of a belief on.
+    """The test, from the beginning of a belief on, with its alarms of each kind so far.
 
-    Parameters
-    ----------
-    false_alarm_rate : float
-        Above 0 and at most 1.
-
-    Attributes
-    ----------
-    num_lost, num_suspect : int
-        Alarms of each kind so far.
+    ``false_alarm_rate`` is above 0 and at most 1.
     """
 
     def __init__(self, false_alarm_rate: float) -> None:

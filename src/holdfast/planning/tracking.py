@@ -52,39 +52,6 @@ class Trial:
     """A trial so far.
 
     ``false_alarm_rate`` is the one of :class:`~holdfast.planning.lost.LostTest`.
-
-    Attributes
-    ----------
-    state : PlanningState
-        After everything that is known to be performed.
-    log : DecisionLog
-    num_sensed : int
-        Sensing actions that were performed.
-    num_inputs : int
-        What led to the state besides task actions: observations and choices not to sense, moves
-        that have shown something, late observations, reinitialisations.
-    num_missing : int
-        Sensing actions that were performed and have no observation (so far, if it comes late).
-    num_unexplained : int
-        Observations that no particle explains.
-    fewest_distinct : int or None
-        The least number of different particles that an observation weighed.
-    lost_test : LostTest
-    alarm : Verdict or None
-        That of the last input or move.
-    found : ObservationInfo or None
-        What its observation was found to be.
-    is_lost : bool
-        Whether the robot was found lost by the last observation or move, or by what came late since
-        then.
-    pending : array or None
-        A task action in the journal that is not known to be performed.
-    paused : bool
-        Whether the last record says that the robot's process ended in order.
-    sensing_ms : list of float
-        How long each choice of a sensing action took.
-    recoveries : int
-        Times that the cloud was lost.
     """
 
     def __init__(
@@ -95,24 +62,26 @@ class Trial:
         false_alarm_rate: float = LostSettings().false_alarm_rate,
     ) -> None:
         self.planner = planner
-        self.state = planner.init(seed, trial)
+        self.state = planner.init(seed, trial)  # after everything that is known to be performed
         self.log = DecisionLog(planner.problem.action_size)
         self.rewards = RewardAccount(planner.problem)
-        self.num_sensed = 0
+        self.num_sensed = 0  # sensing actions that were performed
+        # What led to the state besides task actions: observations and choices not to sense, moves
+        # that have shown something, late observations, reinitialisations.
         self.num_inputs = 0
-        self.num_missing = 0
-        self.num_unexplained = 0
-        self.fewest_distinct: int | None = None
+        self.num_missing = 0  # performed, and without an observation so far
+        self.num_unexplained = 0  # observations that no particle explains
+        self.fewest_distinct: int | None = None  # particles that an observation weighed
         self.lost_test = LostTest(false_alarm_rate)
-        self.alarm: Verdict | None = None
-        self.found: ObservationInfo | None = None
-        self.sensing_ms: list[float] = []
-        self.recoveries = 0
+        self.alarm: Verdict | None = None  # of the last input or move
+        self.found: ObservationInfo | None = None  # what its observation was found to be
+        self.sensing_ms: list[float] = []  # of each choice of a sensing action
+        self.recoveries = 0  # times that the cloud was lost
         # The latest inputs from which a service can fold the state, as many as fit into a request.
         self.inputs: tuple[CatchUpInput, ...] = ()
-        self.pending: FloatArray | None = None
-        self.paused = False
-        self.is_lost = False
+        self.pending: FloatArray | None = None  # in the journal, and not known to be performed
+        self.paused = False  # whether the last record says that the process ended in order
+        self.is_lost = False  # by the last observation or move, or by what came late since then
         # From the oldest awaited observation on: each input, the action of a move and, of an
         # awaited one, the state before it.
         self._inputs: list[tuple[Input, FloatArray | None]] = []
@@ -137,12 +106,8 @@ class Trial:
     def take(self, given: _GivenT) -> _GivenT:
         """Fold in a record; return it with the digest of the state that it leads to.
 
-        Raises
-        ------
-        RecordError
-            If it does not follow from those before it.
-        HoldfastError
-            If the problem cannot fold it in. Nothing is changed by a record that raises.
+        Raises RecordError if it does not follow from those before it, and HoldfastError if the
+        problem cannot fold it in. Nothing is changed by a record that raises.
         """
         digest = self._take(given)
         self.paused = isinstance(given, PausedRecord)

@@ -55,13 +55,7 @@ TRANSITIONS: Mapping[tuple[Status, Cause], Status] = MappingProxyType(
 
 
 def next_status(status: Status, cause: Cause) -> Status:
-    """Return the status that follows.
-
-    Raises
-    ------
-    IllegalTransitionError
-        If the table does not have that transition.
-    """
+    """Return the status that follows; IllegalTransitionError if the table has none."""
     try:
         return TRANSITIONS[status, cause]
     except KeyError:
@@ -69,13 +63,7 @@ def next_status(status: Status, cause: Cause) -> Status:
 
 
 class StatusTracker:
-    """The status of a robot's process, with how often and since when the cloud is lost.
-
-    Attributes
-    ----------
-    recoveries : int
-        Times that the cloud was lost.
-    """
+    """The status of a robot's process, with how often and since when the cloud is lost."""
 
     def __init__(self) -> None:
         self._lost_at: float | None = None

@@ -78,14 +78,9 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def compare_runs(first: Path, second: Path) -> Comparison:
-    """Compare the decisions of two runs; neither is changed.
+    """Compare the decisions of two runs, by their directories or journals; neither is changed.
 
-    Raises OutputError if one is no run, or is damaged.
-
-    Parameters
-    ----------
-    first, second : Path
-        The directory of a run, or its journal. A run may go on meanwhile.
+    A run may go on meanwhile. Raises OutputError if one is no run, or is damaged.
     """
     with ExitStack() as stack:
         one, other = (

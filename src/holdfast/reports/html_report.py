@@ -92,14 +92,8 @@ def run_page(
 
     Without ``problem_directory`` no code that the run names is run: the report of a problem of
     one's own then lacks the trials step by step, and says so. Raises OutputError if it is no run,
-    is damaged, or its report would be larger than 3 MB.
-
-    Parameters
-    ----------
-    worst : int
-        How many trials are shown step by step, at most 12.
-    on_trial : callable
-        Gets the number of trials that are computed.
+    is damaged, or its report would be larger than 3 MB. The ``worst`` trials, at most 12, are shown
+    step by step; ``on_trial`` gets the number of those that are computed.
     """
     with JournalReader.read_run(run, "report") as journal:
         outcomes = outcomes_of(journal, run.name)

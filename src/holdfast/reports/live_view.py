@@ -34,16 +34,10 @@ _Work: TypeAlias = Callable[..., None]
 
 
 class LiveView:
-    """Shows a run while it goes on.
+    """Shows a run while it goes on, from its ``directory``, where its journal is.
 
-    Parameters
-    ----------
-    directory : Path
-        That of the run; its journal is there.
-    on_note : callable
-        Gets what the user should know, from another thread.
-    work : callable
-        What the other process does.
+    ``on_note`` gets what the user should know, from another thread; ``work`` is what the other
+    process does.
     """
 
     def __init__(

@@ -262,14 +262,9 @@ class _Facts(ComparedTrial):
 
 
 class _Output:
-    """The sinks, which also get the events of the services, between the facts.
+    """The sinks, which also get the events of the services, in order, between the facts.
 
-    Parameters
-    ----------
-    events : sequence of EventFact
-        In order.
-    with_others : bool
-        Whether to write also the events outside of the replayed trials.
+    Events outside of the replayed trials are written only ``with_others``.
     """
 
     def __init__(

@@ -83,14 +83,9 @@ class RerunSink:
     """Logs the facts of a run; to be used in a ``with`` statement.
 
     Raises ViewError if the viewer cannot be started or reached, or the file not be written; later
-    if the viewer of a recorded run is lost.
-
-    Parameters
-    ----------
-    has_times : bool
-        Whether the times of the facts are those of a clock, in nanoseconds since 1970.
-    live : bool
-        Whether the viewer follows the last fact; then one that is lost is told by ``streams``.
+    if the viewer of a recorded run is lost. ``has_times``: the times of the facts are those of a
+    clock, in nanoseconds since 1970. ``live``: the viewer follows the last fact; then one that is
+    lost is told by ``streams``.
     """
 
     def __init__(

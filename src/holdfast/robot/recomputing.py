@@ -58,10 +58,7 @@ _FINISHED_S = 30.0
 class RecordedTrials:
     """The trials of a journal, to be run again.
 
-    Parameters
-    ----------
-    world_is_simulated : bool
-        Else the trials happen in the recorded world, which shows what it has shown.
+    Unless the world is simulated, they happen in the recorded one, which shows what it has shown.
     """
 
     def __init__(
@@ -75,12 +72,8 @@ class RecordedTrials:
     def run(self, recorded: TrialResult | UnfinishedTrial, observer: TrialObserver) -> bool:
         """Run a trial again, as far as it went; return whether its observations were kept.
 
-        A result has its decisions.
-
-        Raises
-        ------
-        DecidedOtherwiseError
-            If the recorded world has no answer to a decision.
+        A result has its decisions. Raises DecidedOtherwiseError if the recorded world has no answer
+        to a decision.
         """
         seed, trial, planner = self._simulator.seed, recorded.trial, self.planner
         if isinstance(recorded, UnfinishedTrial):
@@ -173,12 +166,8 @@ def run_recorded_trial(
 class ComparedTrial(TrialObserver):
     """Observes a trial that is run again; a decision that differs raises DecidedOtherwiseError.
 
-    ``observer`` gets the beginning, what is decided as recorded, and the end.
-
-    Attributes
-    ----------
-    expected : list of decisions
-        The recorded ones.
+    ``observer`` gets the beginning, what is decided as recorded, and the end; ``expected`` are the
+    recorded decisions.
     """
 
     def __init__(
@@ -275,21 +264,10 @@ def compute_again(
     first, the last and one between), of which none but the first is begun after 30 s. So it takes
     no longer than these trials were planned.
 
-    Parameters
-    ----------
-    made_by : str
-        The version that decided since the last of ``earlier``.
-    on_progress : callable
-        Gets how many decisions were computed, and of how many.
-
-    Raises
-    ------
-    DecidedOtherwiseError
-        If a decision is another one than the recorded.
-    OutputError
-        If the journal is damaged.
-    HoldfastError
-        If it holds decisions, and no observations from which they follow.
+    ``made_by`` is the version that decided since the last of ``earlier``; ``on_progress`` gets how
+    many decisions were computed, and of how many. Raises DecidedOtherwiseError if a decision is
+    another one than the recorded, OutputError if the journal is damaged, HoldfastError if it holds
+    decisions, and no observations from which they follow.
     """
     trials = RecordedTrials(
         journal, configuration, world_is_simulated=configuration.environment.object is None

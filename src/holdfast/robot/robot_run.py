@@ -37,21 +37,11 @@ if TYPE_CHECKING:
 
 
 class RobotObserver(NamedTuple):
-    """Callbacks on the robot's event loop, so each must return at once.
+    """Callbacks on the robot's event loop, so each must return at once."""
 
-    Attributes
-    ----------
-    process : callable
-        Gets the robot's process before it runs.
-    order : callable
-        Gets each order to the environment, and the state in which it was decided.
-    timing : callable
-        Gets the times of each decision, before the order that comes of it.
-    """
-
-    process: Callable[[RobotProcess], None]
-    order: Callable[[PlanningState, Act | Sense], None]
-    timing: Callable[[Timing], None]
+    process: Callable[[RobotProcess], None]  # before it runs
+    order: Callable[[PlanningState, Act | Sense], None]  # with the state in which it was decided
+    timing: Callable[[Timing], None]  # of each decision, before the order that comes of it
 
 
 class _StampedLog:
@@ -87,14 +77,8 @@ def perform_trials(
 
     The ``sinks`` get the events, besides the run's own log, and are closed at the end; so is the
     ``view``, which shows the run while it goes on. ``after_reboot`` says that a person lets the
-    run go on although the machine was rebooted.
-
-    Raises
-    ------
-    RebootedError
-        If nobody does.
-    HoldfastError
-        If the robot holds still and cannot go on.
+    run go on although the machine was rebooted; RebootedError if nobody does. HoldfastError if the
+    robot holds still and cannot go on.
     """
     if len(directory.journal.finished()) < configuration.simulator.num_trials:
         directory.allow_robot(after_reboot=after_reboot)

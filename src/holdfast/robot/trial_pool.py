@@ -67,13 +67,10 @@ _BUILD_S = 60.0  # for a worker to start and to build a problem, before a trial'
 class Arm:
     """What trials are run of, told apart by identity. Of one seed they meet the same worlds.
 
-    Attributes
-    ----------
-    problem_name, label : str
-        For messages; the label tells it from other arms, and is empty if there is only one.
-    plain : mapping or None
-        :meth:`Configuration.plain` of the configuration that built the problem, from which a worker
-        builds it again. None: the problem itself is sent, as a pickle in the pipe.
+    ``problem_name`` and ``label`` are for messages; the label tells it from other arms, and is
+    empty if there is only one. ``plain`` is :meth:`Configuration.plain` of the configuration that
+    built the problem, from which a worker builds it again; if it is None, the problem itself is
+    sent, as a pickle in the pipe.
     """
 
     problem: Problem
@@ -178,22 +175,12 @@ class TrialPool:
     def run(self, trials: Iterable[tuple[Arm, int]] = ()) -> Iterator[FinishedTrial]:
         """Yield trials as they are finished, in any order, until none is left.
 
-        Parameters
-        ----------
-        trials : iterable of (Arm, int)
-            Submitted one by one, when there is room.
-
-        Raises
-        ------
-        TrialError
-            If holdfast refuses something in a trial, for example what a problem's function
-            returned, or if such a function raises; the message then has the frames of that
-            function. Its ``arm`` is the trial's, as of the others. Another call can go on.
-        WorkerDiedError
-            If a worker process ended or was overdue; the message names the trial.
-        TrialCrashError
-            If anything else went wrong in a worker process. In this process that error is raised
-            as it is, with a note that names the trial.
+        ``trials`` are submitted one by one, when there is room. Raises TrialError if holdfast
+        refuses something in a trial, for example what a problem's function returned, or if such a
+        function raises; the message then has the frames of that function, and another call can go
+        on. WorkerDiedError if a worker process ended or was overdue; TrialCrashError if anything
+        else went wrong in a worker process. (In this process that error is raised as it is, with a
+        note that names the trial.) Each has the trial's ``arm``.
         """
         more = iter(trials)
         here = self._jobs == 1 and self._overdue is None

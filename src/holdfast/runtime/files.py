@@ -112,10 +112,7 @@ def _replacing(path: Path, mode: int = 0o666) -> Iterator[BinaryIO]:
 def write_atomically(path: Path, content: bytes | Iterable[str]) -> None:
     """Write a file atomically; a file that exists is replaced, or unchanged if that fails.
 
-    Parameters
-    ----------
-    content : bytes, str or iterable of str
-        Text is encoded as UTF-8, piece by piece.
+    Text is encoded as UTF-8, piece by piece.
     """
     pieces: Iterable[bytes]
     if isinstance(content, bytes):

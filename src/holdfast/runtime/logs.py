@@ -39,19 +39,10 @@ def log_option(
 class EventLog:
     """Writes events as lines; thread-safe, and safe in signal handlers.
 
-    Raises OutputError if the file cannot be opened.
-
-    Parameters
-    ----------
-    target : text stream or path
-        A stream stays open when the log is closed. A file is appended to, each line in one piece,
-        so several processes can write to the same file.
-    format : {"text", "json"}
-    component : str
-        Who reports: ``robot``, or a service's name. The text form writes ``service`` for all
-        services, because names are longer than the column.
-    clock : callable
-        Returns nanoseconds since 1970.
+    A stream stays open when the log is closed. A file is appended to, each line in one piece, so
+    several processes can write to the same file; OutputError if it cannot be opened. ``component``
+    is who reports: ``robot``, or a service's name. (The text form writes ``service`` for all
+    services, because names are longer than the column.) ``clock`` returns nanoseconds since 1970.
     """
 
     def __init__(
@@ -78,13 +69,9 @@ class EventLog:
                 self._writer = _BackgroundWriter(target)
 
     def event(self, name: str, /, **fields: object) -> None:
-        """Write an event.
+        """Write an event: numbers, texts, None, lists and mappings of them; bytes as hexadecimal.
 
-        Parameters
-        ----------
-        **fields : object
-            Numbers, texts, None, lists and mappings of them; bytes are written as hexadecimal.
-            Names end in their unit; those in ``_ms`` are rounded to three digits.
+        Names of fields end in their unit; those in ``_ms`` are rounded to three digits.
         """
         now_ns = self._clock()
         try:

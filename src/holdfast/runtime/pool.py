@@ -22,20 +22,10 @@ _Task: TypeAlias = tuple[Callable[[], Any], Callable[[Any], None]]
 class ThreadPool:
     """Runs functions on threads, and hands their results to an event loop.
 
-    Its methods are called on the loop's thread. Threads start when they are needed.
-
-    Parameters
-    ----------
-    failed : callable, optional
-        Called with an exception of a function; without it the loop's exception handler gets that.
-    niceness : int, optional
-        How much less of the processors the threads get while others want them; 5 is a third. Of
-        the process's threads, only Linux knows that of one.
-
-    Attributes
-    ----------
-    num_open : int
-        Functions whose results have not been delivered.
+    Its methods are called on the loop's thread. Threads start when they are needed. ``failed`` is
+    called with an exception of a function; without it the loop's exception handler gets that. By
+    ``niceness`` the threads get less of the processors while others want them; 5 is a third. (Only
+    Linux knows that of one thread of a process.)
     """
 
     def __init__(
@@ -52,7 +42,7 @@ class ThreadPool:
         self._queue: SimpleQueue[_Task | None] = SimpleQueue()
         self._threads: list[threading.Thread] = []
         self._closed = False
-        self.num_open = 0
+        self.num_open = 0  # functions whose results have not been delivered
 
     def submit(self, function: Callable[[], _Result], done: Callable[[_Result], None]) -> None:
         """Run a function on a thread, then ``done`` with its result on the running loop."""

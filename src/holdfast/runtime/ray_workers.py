@@ -28,14 +28,10 @@ _MAX_TEXT = 300
 class RayCluster:
     """A cluster that this process has joined, to be used in a ``with`` statement.
 
-    Raises InvalidValueError if Ray is not installed; HoldfastError if the cluster cannot be joined,
-    or has no core.
-
-    Parameters
-    ----------
-    address : str
-        ``auto`` (that of this machine), ``HOST:PORT`` (this machine is one of its nodes) or
-        ``ray://HOST:PORT`` (of its client server; Ray's usual port is 10001).
+    Its address is ``auto`` (that of this machine), ``HOST:PORT`` (this machine is one of its nodes)
+    or ``ray://HOST:PORT`` (of its client server; Ray's usual port is 10001). Raises
+    InvalidValueError if Ray is not installed; HoldfastError if the cluster cannot be joined, or has
+    no core.
     """
 
     def __init__(self, address: str) -> None:

@@ -51,18 +51,9 @@ class WorkerProcess:
     or a batch system sends to all processes: only the parent handles them. Store the object before
     you call :meth:`start`, so that an interrupt cannot lose a started worker.
 
-    Parameters
-    ----------
-    work : callable
-        A module's function, called with its end of the pipe and ``arguments``, which must be
-        picklable.
-    threads : int
-        Of NumPy's BLAS in the worker.
-
-    Attributes
-    ----------
-    connection : multiprocessing.connection.Connection
-        This end of the pipe, for :func:`multiprocessing.connection.wait`.
+    ``work`` is a module's function, called with its end of the pipe and ``arguments``, which must
+    be picklable; ``threads`` are those of NumPy's BLAS in the worker; ``connection`` is this end of
+    the pipe, for :func:`multiprocessing.connection.wait`.
     """
 
     def __init__(

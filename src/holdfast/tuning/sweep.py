@@ -66,13 +66,8 @@ def arms_of(
     Raises InvalidValueError if a key has a value twice, there are more than 200 combinations, or
     they would not have the same worlds: trials, seed or limit of steps differ.
 
-    Parameters
-    ----------
-    axes : mapping
-        The values of each ``section.key``. A key with one value is set in all of them, and is in no
-        name.
-    load : callable
-        Gets values by key, and returns the configuration with them.
+    ``axes`` have the values of each ``section.key``; one with a single value is set in all of them,
+    and is in no name. ``load`` gets values by key, and returns the configuration with them.
     """
     for key, values in axes.items():
         for index, value in enumerate(values):

@@ -93,17 +93,10 @@ def judge(
 ) -> Verdict:
     """Choose among the configuration as it was, the finalists and random sensing.
 
-    Parameters
-    ----------
-    rows : mapping
-        Of each candidate the same fresh trials, in the same order. That of the configuration comes
-        first; of equals, the first one is chosen.
-    limit : int
-        Steps of a trial that does not succeed.
-    barred : collection of str
-        Those that must not be chosen.
-    least : int
-        With fewer trials, nothing is said.
+    ``rows`` have the same fresh trials of each candidate, in the same order. Those of the
+    configuration come first; of equals, the first one is chosen. A trial that does not succeed
+    counts ``limit`` steps, those ``barred`` must not be chosen, and with fewer trials than
+    ``least``, nothing is said.
     """
     names = list(rows)
     configured = names[0]

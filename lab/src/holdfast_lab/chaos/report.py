@@ -38,55 +38,36 @@ _DASH_EXPLAINED = (
 
 
 class KindRow(msgspec.Struct, frozen=True, kw_only=True):
-    """The results of the trials of one kind.
-
-    Attributes
-    ----------
-    faults : int
-        Injected faults.
-    wrong : int
-        Trials that are not identical with their reference runs.
-    times : dict of str to Spread
-        ``detection``, ``recovery``, ``launch`` and ``failback``, where they were measured.
-    """
+    """The results of the trials of one kind."""
 
     kind: FaultKind
     trials: int
-    faults: int
-    wrong: int
+    faults: int  # injected faults
+    wrong: int  # trials that are not identical with their reference runs
+    # ``detection``, ``recovery``, ``launch`` and ``failback``, where they were measured.
     times: dict[str, Spread]
 
 
 class ChaosSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """The content of ``summary.json``.
-
-    Attributes
-    ----------
-    identical, diverged, failed, timed_out : int
-        Trials by their verdicts.
-    faults : int
-        In all of them.
-    steps, sensing_actions : int
-        Compared with those of the reference runs and found the same.
-    left_out : dict of str to str
-        Kinds that this machine cannot inject, and why.
-    """
+    """The content of ``summary.json``."""
 
     seed: int
     first: int
     trials: int
     finished: int
+    # Trials by their verdicts.
     identical: int
     diverged: int
     failed: int
     timed_out: int
-    faults: int
+    faults: int  # in all of them
+    # Compared with those of the reference runs and found the same.
     steps: int
     sensing_actions: int
     jobs: int
     kinds: tuple[KindRow, ...]
     wires: dict[str, int]
-    left_out: dict[str, str]
+    left_out: dict[str, str]  # kinds that this machine cannot inject, and why
     machine: dict[str, str]
 
 
@@ -148,10 +129,7 @@ def summarise(
 def write_report(directory: Path, summary: ChaosSummary) -> None:
     """Write ``summary.json`` and ``table.txt``.
 
-    Raises
-    ------
-    OutputError
-        If they cannot be written.
+    Raises OutputError if they cannot be written.
     """
     text = msgspec.json.format(msgspec.json.encode(summary), indent=2)
     write_atomically(directory / _SUMMARY_NAME, text + b"\n")

@@ -27,29 +27,19 @@ Launch: TypeAlias = Literal["on_failure", "at_start", "never"]
 
 
 class Schedule(msgspec.Struct, frozen=True, kw_only=True):
-    """One trial: a robot, its services, and their faults.
-
-    Attributes
-    ----------
-    world_seed : int
-        Of the robot's run.
-    decision_deadline_ms : float or None
-        After which the robot asks its local service as well.
-    faults : tuple of Fault
-        In order of time.
-    """
+    """One trial: a robot, its services, and their faults."""
 
     seed: int
     trial: int
     kind: FaultKind
     wire: Wire
-    world_seed: int
+    world_seed: int  # of the robot's run
     num_particles: int
     num_clouds: int
     launch: Launch
-    decision_deadline_ms: float | None
+    decision_deadline_ms: float | None  # after which the robot asks its local service as well
     what: Literal["sensing", "all"]
-    faults: tuple[Fault, ...]
+    faults: tuple[Fault, ...]  # in order of time
 
     @property
     def needs_namespace(self) -> bool:

@@ -26,22 +26,13 @@ TRIALS_NAME = "trials.jsonl"
 
 
 class SeriesPlan(NamedTuple):
-    """What each trial of a series is.
-
-    Attributes
-    ----------
-    wires : tuple of str
-        Trial n is over wire n modulo their number.
-    kinds : tuple of FaultKind
-        The trials over each wire are of one kind after another; each wire begins with another one.
-    possible : tuple of FaultKind
-        The kinds that this machine can inject, for combinations.
-    """
+    """What each trial of a series is."""
 
     seed: int
-    wires: tuple[Wire, ...]
+    wires: tuple[Wire, ...]  # trial n is over wire n modulo their number
+    # The trials over each wire are of one kind after another; each wire begins with another one.
     kinds: tuple[FaultKind, ...]
-    possible: tuple[FaultKind, ...]
+    possible: tuple[FaultKind, ...]  # the kinds that this machine can inject, for combinations
 
     def of(self, trial: int) -> tuple[Wire, FaultKind]:
         """Return the wire and the kind of a trial."""
@@ -52,17 +43,9 @@ class SeriesPlan(NamedTuple):
 
 
 class Series:
-    """A series in a directory, which is empty.
+    """A series in a directory, which is empty; ``outcomes`` come in the order in which trials end.
 
-    Parameters
-    ----------
-    keep : bool
-        Whether the directories of good trials stay. Those of others always do.
-
-    Attributes
-    ----------
-    outcomes : list of TrialOutcome
-        In the order in which the trials ended.
+    With ``keep`` the directories of good trials stay. Those of others always do.
     """
 
     def __init__(self, directory: Path, plan: SeriesPlan, *, keep: bool = False) -> None:
@@ -89,12 +72,8 @@ class Series:
     ) -> None:
         """Run trials; what gets each outcome runs in this thread.
 
-        Raises
-        ------
-        HoldfastError
-            If a trial cannot be run at all.
-        KeyboardInterrupt
-            Once all processes have ended.
+        Raises HoldfastError if a trial cannot be run at all, and KeyboardInterrupt once all
+        processes have ended.
         """
         missing = deque(trials)
         cancelled = threading.Event()

@@ -50,49 +50,29 @@ _STALL_S = 60.0
 
 
 class Pace(NamedTuple):
-    """The length and the speed of the robot's run.
+    """The length and the speed of the robot's run."""
 
-    Attributes
-    ----------
-    min_steps : int
-        Trials are added to the run until it has as many task actions.
-    rate_hz : float
-        Task actions per second.
-    """
-
-    min_steps: int = 150
-    rate_hz: float = 60.0
+    min_steps: int = 150  # trials are added to the run until it has as many task actions
+    rate_hz: float = 60.0  # task actions per second
 
 
 class TrialOutcome(msgspec.Struct, frozen=True, kw_only=True):
-    """The outcome of a trial.
-
-    Attributes
-    ----------
-    verdict : {"identical", "diverged", "failed", "timed_out"}
-        ``identical``: every decision and every performed action is that of the reference run.
-        ``diverged``: one is not. ``failed``: a process ended that should not, or one was left.
-        ``timed_out``: the robot decided nothing for a minute, or its run took over ten.
-    reason : str
-        Why it is not ``identical``; otherwise empty.
-    faults : tuple of FaultTimes
-        Those that were injected before the robot's run was over.
-    steps, sensing_actions : int
-        Of the robot's run, all of them compared.
-    robots : int
-        Processes that the robot had.
-    """
+    """The outcome of a trial."""
 
     trial: int
     kind: FaultKind
     wire: Wire
+    # ``identical``: every decision and every performed action is that of the reference run.
+    # ``diverged``: one is not. ``failed``: a process ended that should not, or one was left.
+    # ``timed_out``: the robot decided nothing for a minute, or its run took over ten.
     verdict: Verdict
-    reason: str
+    reason: str  # why it is not ``identical``; otherwise empty
     launch: str
-    faults: tuple[FaultTimes, ...]
+    faults: tuple[FaultTimes, ...]  # those that were injected before the robot's run was over
+    # Of the robot's run, all of them compared.
     steps: int
     sensing_actions: int
-    robots: int
+    robots: int  # processes that the robot had
     took_s: float
 
 
@@ -101,12 +81,7 @@ def run_chaos_trial(
 ) -> TrialOutcome:
     """Run a trial in an empty directory, which gets both runs and all logs.
 
-    Raises
-    ------
-    CancelledTrialError
-        If it was cancelled.
-    HoldfastError
-        If it cannot be run at all.
+    Raises CancelledTrialError if it was cancelled; HoldfastError if it cannot be run at all.
     """
     began = time.monotonic()
     verdict: Verdict = "identical"

@@ -62,21 +62,12 @@ class Line(NamedTuple):
 
 @dataclass
 class DemoState:
-    """All that has happened so far; times count from the beginning of the demo.
-
-    Attributes
-    ----------
-    began_at : float
-        In seconds since the epoch.
-    expected_s : float
-        How long the demo will take, as far as can be known.
-    changes : dict of str to list of Change
-        Of each row, in order of time.
-    """
+    """All that has happened so far; times count from the beginning of the demo."""
 
     title: str = ""
-    began_at: float = field(default_factory=time.time)
-    expected_s: float = 1.0
+    began_at: float = field(default_factory=time.time)  # in seconds since the epoch
+    expected_s: float = 1.0  # how long the demo will take, as far as can be known
+    # Of each row, in order of time.
     changes: dict[Row, list[Change]] = field(
         default_factory=lambda: {"cloud": [], "local": [], "robot": []}
     )

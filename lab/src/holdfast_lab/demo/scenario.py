@@ -51,42 +51,21 @@ _AROUND_S = 3.0
 
 
 class Findings(NamedTuple):
-    """What the demo comes to.
+    """What the demo comes to."""
 
-    Attributes
-    ----------
-    outages : tuple of FaultTimes
-        Of the two kills of the cloud service.
-    listening_ms : tuple of float
-        From the start of each cloud service that followed until it listened.
-    robot_kill : FaultTimes
-        Of the kill of the robot's own process.
-    statuses : tuple of list of str
-        Of each process that the robot had.
-    comparison : Comparison
-        Of the reference run and the run with the kills.
-    """
-
-    outages: tuple[FaultTimes, ...]
+    outages: tuple[FaultTimes, ...]  # of the two kills of the cloud service
+    # From the start of each cloud service that followed until it listened.
     listening_ms: tuple[float, ...]
-    robot_kill: FaultTimes
-    statuses: tuple[list[str], ...]
-    comparison: Comparison
+    robot_kill: FaultTimes  # of the kill of the robot's own process
+    statuses: tuple[list[str], ...]  # of each process that the robot had
+    comparison: Comparison  # of the reference run and the run with the kills
 
 
 class Plan(NamedTuple):
-    """How long the demo is.
+    """How long the demo is."""
 
-    Attributes
-    ----------
-    min_steps : int
-        Trials are added until the run has as many task actions.
-    duration_s : float
-        How long the robot takes for them.
-    """
-
-    min_steps: int = 400
-    duration_s: float = 16.0
+    min_steps: int = 400  # trials are added until the run has as many task actions
+    duration_s: float = 16.0  # how long the robot takes for them
 
 
 class Demo:
@@ -111,12 +90,8 @@ class Demo:
     def run(self) -> Findings:
         """Run it.
 
-        Raises
-        ------
-        NoProgressError
-            If something does not happen in time.
-        ProcessEndedError
-            If a process ends that should not.
+        Raises NoProgressError if something does not happen in time; ProcessEndedError if a process
+        ends that should not.
         """
         testbed = self._testbed
         directory = testbed.directory

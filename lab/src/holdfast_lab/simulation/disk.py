@@ -24,13 +24,7 @@ class Unfinished(NamedTuple):
 
 
 class Disk:
-    """The journal of one run.
-
-    Parameters
-    ----------
-    forces_out : bool
-        Whether each append is on the disk when it returns.
-    """
+    """The journal of one run; ``forces_out``: each append is on the disk when it returns."""
 
     def __init__(self, *, forces_out: bool) -> None:
         self._forces_out = forces_out

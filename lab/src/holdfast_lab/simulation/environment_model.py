@@ -40,18 +40,10 @@ class _Coming(NamedTuple):
 
 
 class Resumed(NamedTuple):
-    """What the world tells a robot's next process.
+    """What the world tells a robot's next process."""
 
-    Attributes
-    ----------
-    last : ReferenceStep or None
-        Its last task action, if it can still tell what that has shown.
-    late : tuple of Late
-        What has come meanwhile.
-    """
-
-    last: ReferenceStep | None
-    late: tuple[Late, ...]
+    last: ReferenceStep | None  # its last task action, if it can still tell what that has shown
+    late: tuple[Late, ...]  # what has come meanwhile
 
 
 class EnvironmentModel:
@@ -159,12 +151,8 @@ class EnvironmentModel:
     def resumed(self, records: Sequence[Record], *, may_lack: bool) -> Resumed:
         """Tell the robot's next process what has happened meanwhile.
 
-        Parameters
-        ----------
-        records : sequence of Record
-            What the journal holds of this trial.
-        may_lack : bool
-            Whether a power cut has taken some away.
+        Of this trial the journal holds the records; a power cut may have taken some away
+        (``may_lack``).
         """
         observed = [each for each in records if isinstance(each, Sensed)]
         written = [each.taken for each in records if isinstance(each, Late)]

@@ -12,20 +12,12 @@ from typing import Any
 
 
 class EventQueue:
-    """Events in the order of their time.
-
-    Attributes
-    ----------
-    now : float
-        Seconds since the beginning.
-    count : int
-        Of all events that were added.
-    """
+    """Events in the order of their time."""
 
     def __init__(self) -> None:
-        self.now = 0.0
+        self.now = 0.0  # seconds since the beginning
         self._heap: list[tuple[float, int, Callable[..., None], tuple[Any, ...]]] = []
-        self.count = 0
+        self.count = 0  # of all events that were added
 
     def after(self, seconds: float, do: Callable[..., None], *arguments: Any) -> None:
         """Let something happen after some seconds."""
@@ -49,12 +41,7 @@ class EventQueue:
 class Clock:
     """What a process reads as the time: it never goes back, but it may be off, and fast or slow.
 
-    Parameters
-    ----------
-    offset_s : float
-        What it shows at the beginning.
-    rate : float
-        Seconds that it shows for each second.
+    It shows ``offset_s`` at the beginning, and ``rate`` seconds for each second.
     """
 
     def __init__(self, queue: EventQueue, offset_s: float, rate: float) -> None:

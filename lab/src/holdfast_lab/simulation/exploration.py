@@ -38,22 +38,13 @@ class ViolationFound(msgspec.Struct, frozen=True):
 
 
 class ExplorationTally(msgspec.Struct, kw_only=True):
-    """What was seen under some seeds.
-
-    Attributes
-    ----------
-    held : int
-        Of these, how many ended with a robot that rightly holds still for good.
-    faults : dict of str to int
-        By kind, how many have happened.
-    longest_recovery_s : float
-        Virtual time from the end of the last fault to the end of a run.
-    """
+    """What was seen under some seeds."""
 
     runs: int = 0
-    held: int = 0
-    faults: dict[str, int] = msgspec.field(default_factory=dict)
+    held: int = 0  # of these, how many ended with a robot that rightly holds still for good
+    faults: dict[str, int] = msgspec.field(default_factory=dict)  # by kind, how many have happened
     messages: int = 0
+    # Virtual time from the end of the last fault to the end of a run.
     longest_recovery_s: float = 0.0
     findings: list[ViolationFound] = msgspec.field(default_factory=list)
 
@@ -73,22 +64,11 @@ def explore(
     on_batch: Callable[[range, ExplorationTally], bool],
     batch: int = _BATCH,
 ) -> None:
-    """Run the schedules of many seeds.
+    """Run the schedules of many seeds, in so many processes; 1 is this one. That changes time only.
 
-    Parameters
-    ----------
-    jobs : int
-        Processes; 1 runs all seeds in this one. Changes time only.
-    on_batch : callable
-        Gets the seeds of a batch that was run, in their order, and what was seen; returns whether
-        to go on.
-
-    Raises
-    ------
-    InvalidValueError
-        If the number of processes is out of bounds.
-    SimulationError
-        If a process was killed; what it had is not known.
+    ``on_batch`` gets the seeds of a batch that was run, in their order, and what was seen; it
+    returns whether to go on. Raises InvalidValueError if the number of processes is out of bounds,
+    and SimulationError if a process was killed; what it had is not known.
     """
     if not 1 <= jobs <= MAX_JOBS:
         raise InvalidValueError(f"jobs is {jobs}: must be from 1 to {MAX_JOBS}")

@@ -41,28 +41,17 @@ Way = Literal["to", "from"]
 
 
 class _Line:
-    """What lies between the robot and one service.
-
-    Attributes
-    ----------
-    connection : _Connection or None
-        The last that was made, until it breaks.
-    cuts, counts : dict of str to int
-        By direction, how many cuts there are, and how many messages there were.
-    arrived : dict of str to float
-        When the last message arrives, which none overtakes.
-    held : dict of str to list
-        Messages that wait for the end of a cut.
-    """
+    """What lies between the robot and one service."""
 
     __slots__ = ("arrived", "connection", "counts", "cuts", "held", "latency_s", "service")
 
     def __init__(self, service: ServiceNode, latency_s: float) -> None:
         self.service = service
         self.latency_s = latency_s
-        self.connection: _Connection | None = None
+        self.connection: _Connection | None = None  # the last that was made, until it breaks
         self.cuts: dict[Way, int] = {"to": 0, "from": 0}
-        self.counts: dict[Way, int] = {"to": 0, "from": 0}
+        self.counts: dict[Way, int] = {"to": 0, "from": 0}  # of messages
+        # When the last message arrives, which none overtakes, and those that wait for a cut's end.
         self.arrived: dict[Way, float] = {"to": 0.0, "from": 0.0}
         self.held: dict[Way, list[tuple[Callable[..., None], tuple[Any, ...]]]]
         self.held = {"to": [], "from": []}

@@ -44,28 +44,17 @@ Repeats: TypeAlias = tuple[tuple[int, int], ...]
 
 
 class Circumstances(NamedTuple):
-    """What makes a trial another one, without any fault of the robot's.
+    """What makes a trial another one, without any fault of the robot's."""
 
-    Attributes
-    ----------
-    repeats : tuple of (int, int)
-        Steps in which something had been sensed before, and how often, without anybody knowing it
-        now. What is sensed there then shows something else: the trial as it goes from there.
-    late : tuple of int
-        Steps whose observation does not come at once.
-    deliveries : tuple of Delivery
-        In the order in which they come. Those that nobody awaits change nothing.
-    unseen : tuple of int
-        Steps of which nobody knows what the move has shown.
-    reinitialises : bool
-        Whether the robot is carried away, and its belief is begun anew after each observation
-        outside the validation gate.
-    """
-
+    # Steps in which something had been sensed before, and how often, without anybody knowing it
+    # now. What is sensed there then shows something else: the trial as it goes from there.
     repeats: Repeats = ()
-    late: tuple[int, ...] = ()
+    late: tuple[int, ...] = ()  # steps whose observation does not come at once
+    # In the order in which they come. Those that nobody awaits change nothing.
     deliveries: tuple[Delivery, ...] = ()
-    unseen: tuple[int, ...] = ()
+    unseen: tuple[int, ...] = ()  # steps of which nobody knows what the move has shown
+    # Whether the robot is carried away, and its belief is begun anew after each observation outside
+    # the validation gate.
     reinitialises: bool = False
 
 
@@ -73,27 +62,14 @@ UNDISTURBED = Circumstances()
 
 
 class ReferenceStep(NamedTuple):
-    """One step of the undisturbed run.
+    """One step of the undisturbed run."""
 
-    Attributes
-    ----------
-    sensing_action : int or None
-        What was sensed before the task action, if anything.
-    observation : array or None
-        What it showed, at once or later.
-    action : bytes
-        The task action, little-endian float64.
-    done : bool or "failed"
-        How the task stands after it.
-    motion, shown : array or None
-        What the move has shown.
-    """
-
-    sensing_action: int | None
-    observation: FloatArray | None
-    action: bytes
+    sensing_action: int | None  # what was sensed before the task action, if anything
+    observation: FloatArray | None  # what it showed, at once or later
+    action: bytes  # the task action, little-endian float64
     reward: float | None
-    done: Done
+    done: Done  # how the task stands after it
+    # What the move has shown.
     motion: FloatArray | None = None
     shown: FloatArray | None = None
 

@@ -81,23 +81,7 @@ _WITHOUT_CONSEQUENCES = (LogEvent, Timing, ComputeOwnAnswer, VerificationNoted)
 
 
 class RobotNode:
-    """The robot, over all lives of its process.
-
-    Attributes
-    ----------
-    machine : Robot or None
-        Of the process that lives.
-    incarnation : int
-        Of the process; 0 before the first.
-    stopped : bool
-        Whether the process is stopped.
-    stopped_until : float
-        Until when it is to be.
-    finished : bool
-        Whether all trials are.
-    stopped_by : HoldfastError or None
-        Why the process holds still for good.
-    """
+    """The robot, over all lives of its process."""
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -155,12 +139,12 @@ class RobotNode:
             Paused: lambda _: self._end_in_order(),
             Halt: self._hold_still,
         }
-        self.machine: Robot | None = None
-        self.incarnation = 0
+        self.machine: Robot | None = None  # of the process that lives
+        self.incarnation = 0  # of the process; 0 before the first
         self.stopped = False
         self.stopped_until = 0.0
-        self.finished = False
-        self.stopped_by: HoldfastError | None = None
+        self.finished = False  # whether all trials are
+        self.stopped_by: HoldfastError | None = None  # why the process holds still for good
 
     @property
     def up(self) -> bool:

@@ -271,10 +271,7 @@ _NAMES = frozenset(str(kind.__struct_config__.tag) for kind in get_args(_ITEM))
 def parse_item(line: str) -> RunSettings | SimulatedFault:
     """Read one line of a schedule.
 
-    Raises
-    ------
-    ScheduleError
-        If it is none; the message repeats it.
+    Raises ScheduleError if it is none; the message repeats it.
     """
     name, *words = line.split()
     if name not in _NAMES:
@@ -295,10 +292,7 @@ def parse_item(line: str) -> RunSettings | SimulatedFault:
 def parse_schedule(text: str) -> SimulationSchedule:
     """Read a schedule; empty lines and those that begin with ``#`` are left out.
 
-    Raises
-    ------
-    ScheduleError
-        If a line is no item of a schedule, or there is more than one ``run``.
+    Raises ScheduleError if a line is no item of a schedule, or there is more than one ``run``.
     """
     lines = [line.strip() for line in text.splitlines()]
     items = [parse_item(line) for line in lines if line and not line.startswith("#")]

@@ -20,34 +20,17 @@ class StoryLine(NamedTuple):
 
 
 class RunOutcome(NamedTuple):
-    """What became of a run.
+    """What became of a run."""
 
-    Attributes
-    ----------
-    violation : str or None
-        What must never happen and did.
-    held : str or None
-        Why the robot holds still for good, although that is right.
-    duration_s : float
-        Of the run, in virtual time.
-    recovery_s : float
-        From the end of the last fault until the end of the run.
-    faults : dict of str to int
-        By kind, how many have happened.
-    story : list of StoryLine
-        What happened, if it was to be told.
-    never_happened : tuple of SimulatedFault
-        Those of the schedule's faults, if the story was to be told: the run had ended before, or
-        what they would have struck was not there.
-    """
-
-    violation: str | None
-    held: str | None
-    duration_s: float
-    recovery_s: float
+    violation: str | None  # what must never happen and did
+    held: str | None  # why the robot holds still for good, although that is right
+    duration_s: float  # of the run, in virtual time
+    recovery_s: float  # from the end of the last fault until the end of the run
     messages: int
-    faults: dict[str, int]
-    story: list[StoryLine]
+    faults: dict[str, int]  # by kind, how many have happened
+    story: list[StoryLine]  # what happened, if it was to be told
+    # Those of the schedule's faults, if the story was to be told: the run had ended before, or what
+    # they would have struck was not there.
     never_happened: tuple[SimulatedFault, ...]
 
 

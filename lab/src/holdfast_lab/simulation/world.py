@@ -166,10 +166,7 @@ class Setup:
 class World:
     """One run; see :class:`Simulator`.
 
-    Attributes
-    ----------
-    faults_end_at : float
-        Until when the faults so far are felt; nothing is expected of anybody before.
+    Nothing is expected of anybody before ``faults_end_at``, until when the faults so far are felt.
     """
 
     def __init__(self, simulator: Simulator, schedule: SimulationSchedule, *, tell: bool) -> None:

@@ -32,42 +32,26 @@ _CAPACITY = 4096
 
 @dataclass(frozen=True, kw_only=True)
 class Impairment:
-    """An impairment of the line.
+    """An impairment of the line."""
 
-    Attributes
-    ----------
-    direction : {"both", "to_service", "to_robot"}
-        What it affects. A cut has no direction.
-    latency_s, jitter_s : float
-        Everything is late by the latency and up to the jitter.
-    loss : float
-        Share of datagrams that are dropped, and of a stream's pieces that are late by TCP's
-        retransmission timeout.
-    doubled : bool
-        Whether datagrams come twice.
-    carriers : tuple of {"streams", "datagrams"}
-        What it affects.
-    """
-
-    direction: Direction = "both"
+    direction: Direction = "both"  # what it affects. A cut has no direction.
+    # Everything is late by the latency and up to the jitter.
     latency_s: float = 0.0
     jitter_s: float = 0.0
+    # Share of datagrams that are dropped, and of a stream's pieces that are late by TCP's
+    # retransmission timeout.
     loss: float = 0.0
     silent: bool = False
     cut: bool = False
-    doubled: bool = False
-    carriers: tuple[Carrier, ...] = CARRIERS
+    doubled: bool = False  # whether datagrams come twice
+    carriers: tuple[Carrier, ...] = CARRIERS  # what it affects
 
 
 class BadLine:
     """A line without ends; to be used in a ``with`` statement.
 
-    Parameters
-    ----------
-    overhear : callable
-        Gets what is carried, a piece of a stream or a datagram, and which way; in another thread.
-    selector : selector or None
-        Which waits; one that knows whole milliseconds only would falsify short delays.
+    ``overhear`` gets what is carried, a piece of a stream or a datagram, and which way; in another
+    thread. The selector waits; one that knows whole milliseconds only would falsify short delays.
     """
 
     def __init__(

@@ -309,21 +309,10 @@ class Testbed:
         limit_s: float,
         progress: Callable[[], object] = lambda: None,
     ) -> None:
-        """Run the loop until something is so.
+        """Run the loop until something is so; ``what`` names it in messages.
 
-        Parameters
-        ----------
-        what : str
-            Names it in messages.
-        limit_s : float
-            How long to wait; begins anew whenever the progress changes.
-
-        Raises
-        ------
-        NoProgressError
-            If it does not happen in time.
-        ProcessEndedError
-            If a process ends that was not killed.
+        The limit begins anew whenever the progress changes. Raises NoProgressError if it does not
+        happen in time; ProcessEndedError if a process ends that was not killed.
         """
         began = moved_at = time.monotonic()
         seen = progress()

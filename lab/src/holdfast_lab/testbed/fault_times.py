@@ -29,45 +29,28 @@ _LOST = ("service_vanished", "service_suspected")
 
 
 class InjectedFault(msgspec.Struct, kw_only=True):
-    """A fault as it happened; times in seconds since the epoch.
-
-    Attributes
-    ----------
-    target : str
-        Its process or line, as the robot names it.
-    usable_at : float or None
-        Since when the target could be used again; None if that was not seen.
-    """
+    """A fault as it happened; times in seconds since the epoch."""
 
     kind: str
-    target: str
+    target: str  # its process or line, as the robot names it
     injected_at: float
+    # Since when the target could be used again; None if that was not seen.
     usable_at: float | None = None
 
 
 class FaultTimes(msgspec.Struct, frozen=True, kw_only=True):
-    """The times of a fault, in milliseconds; None where there is nothing to measure.
-
-    Attributes
-    ----------
-    away_ms : float or None
-        From the fault until the target could be used again.
-    in_use : bool
-        Whether the target made the robot's last decision before the fault.
-    detection_ms, recovery_ms, launch_ms, failback_ms : float or None
-        See the module.
-    longest_wait_ms : float or None
-        Longest time that the robot stood still for a decision, until it used the target again.
-    """
+    """The times of a fault, in milliseconds; None where there is nothing to measure."""
 
     kind: str
     target: str
-    away_ms: float | None
-    in_use: bool
+    away_ms: float | None  # from the fault until the target could be used again
+    in_use: bool  # whether the target made the robot's last decision before the fault
+    # See the module.
     detection_ms: float | None
     recovery_ms: float | None
     launch_ms: float | None
     failback_ms: float | None
+    # Longest time that the robot stood still for a decision, until it used the target again.
     longest_wait_ms: float | None
 
 

@@ -65,30 +65,18 @@ DESCRIPTIONS = {
 
 
 class Fault(msgspec.Struct, frozen=True, kw_only=True):
-    """One fault.
-
-    Attributes
-    ----------
-    at : float
-        When, as a fraction of the run's steps.
-    duration_s : float
-        How long until the killed process is started again, the stopped one resumed, or the line
-        healed.
-    cloud : int
-        Which cloud service, or the line to which one.
-    direction : {"both", "to_service", "to_robot"}
-    loss : float
-        Share of packets, or of the pieces that a proxy carries.
-    """
+    """One fault."""
 
     kind: FaultKind
-    at: float
+    at: float  # when, as a fraction of the run's steps
+    # How long until the killed process is started again, the stopped one resumed, or the line
+    # healed.
     duration_s: float
-    cloud: int = 0
+    cloud: int = 0  # which cloud service, or the line to which one
     direction: Direction = "both"
     latency_ms: float = 0.0
     jitter_ms: float = 0.0
-    loss: float = 0.0
+    loss: float = 0.0  # share of packets, or of the pieces that a proxy carries
 
 
 def _kill_cloud(testbed: Testbed, fault: Fault) -> Script:

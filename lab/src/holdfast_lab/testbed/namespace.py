@@ -30,15 +30,8 @@ _PROTOCOLS = ("tcp", "udp")
 class NetworkNamespace:
     """A new network with a loopback alone; to be used in a ``with`` statement.
 
-    Attributes
-    ----------
-    prefix : tuple of str
-        A command that runs another one in this namespace.
-
-    Raises
-    ------
-    CannotStartError
-        If it cannot be made.
+    Its ``prefix`` is a command that runs another one in it. Raises CannotStartError if it cannot be
+    made.
     """
 
     def __init__(self) -> None:
@@ -119,10 +112,7 @@ class NetworkNamespace:
     ) -> None:
         """Run a command in it to its end, with a text as input and some open descriptors.
 
-        Raises
-        ------
-        CannotStartError
-            If it cannot be run or fails: the refusal, and what it says.
+        Raises CannotStartError if it cannot be run or fails: the refusal, and what it says.
         """
         try:
             done = subprocess.run(

@@ -40,30 +40,10 @@ class Process:
     """A command as a process of its own, in its own process group.
 
     Its standard input stays open until :meth:`close`, so a service started with
-    ``--until-stdin-closes`` ends with this process.
-
-    Parameters
-    ----------
-    log_path : Path or None
-        Its output is appended to this file.
-    changed : threading.Condition or None
-        Notified of each line and of the end; several processes may share it.
-    own_session : bool
-        Whether it leads a session, so that it may have a terminal of its own.
-
-    Attributes
-    ----------
-    spawned_at : float
-        In seconds since the epoch.
-    killed_at : float or None
-        When :meth:`kill` was called.
-    exit_code : int or None
-        Negative after a signal; None until it has ended and all its events are here.
-
-    Raises
-    ------
-    CannotStartError
-        If it cannot be started.
+    ``--until-stdin-closes`` ends with this process. Its output is appended to the log. ``changed``
+    is notified of each line and of the end; several processes may share it. With ``own_session`` it
+    leads a session, so that it may have a terminal of its own. Raises CannotStartError if it cannot
+    be started.
     """
 
     def __init__(
@@ -81,6 +61,7 @@ class Process:
         self.lines: list[str] = []
         self.events: list[LogEvent] = []
         self.killed_at: float | None = None
+        # Negative after a signal; None until it has ended and all its events are here.
         self.exit_code: int | None = None
         self.spawned_at = time.time()
         try:
@@ -155,12 +136,8 @@ class Process:
     ) -> LogEvent:
         """Wait for the n-th event with a name and these fields.
 
-        Raises
-        ------
-        ProcessEndedError
-            If the process ends before.
-        NoProgressError
-            If the event does not come in time.
+        Raises ProcessEndedError if the process ends before; NoProgressError if the event does not
+        come in time.
         """
         deadline = time.monotonic() + timeout_s
         with self._changed:
@@ -213,10 +190,7 @@ class Process:
 class ProcessGroup:
     """Processes, and all that they start: a variable, which children inherit, marks them.
 
-    Attributes
-    ----------
-    changed : threading.Condition
-        Notified when one of them writes a line, or has ended.
+    ``changed`` is notified when one of them writes a line, or has ended.
     """
 
     def __init__(self) -> None:
@@ -235,12 +209,8 @@ class ProcessGroup:
     def close(self, patience_s: float, orderly_end_s: float = 0.0) -> list[int]:
         """End all of them, and return those that had to be killed although nobody knew them.
 
-        Parameters
-        ----------
-        patience_s : float
-            How long what they have started has to end by itself, after them.
-        orderly_end_s : float
-            How long they have after SIGTERM; at 0, or by an exception, they are killed at once.
+        After SIGTERM they have ``orderly_end_s``; at 0, or by an exception, they are killed at
+        once. What they have started has ``patience_s`` to end by itself, after them.
         """
         try:
             if orderly_end_s > 0.0:
@@ -274,10 +244,7 @@ class Ports:
     def free(self, host: str = "127.0.0.1") -> int:
         """Return a port that is free for streams and datagrams.
 
-        Raises
-        ------
-        CannotStartError
-            If there is none.
+        Raises CannotStartError if there is none.
         """
         for number in itertools.islice(self._numbers, self._size):
             port = self._first + number % self._size

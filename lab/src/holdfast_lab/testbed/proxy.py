@@ -48,19 +48,9 @@ def endpoint_at(transport: str, place: Place) -> str:
 class Proxy(BadLine):
     """A line to a service on this machine; to be used in a ``with`` statement.
 
-    Parameters
-    ----------
-    target : int or Path
-        Where the service listens. If nothing does, connections are closed at once.
-    datagrams : bool
-        Whether it carries datagrams between the same ports, too.
-    overhear : callable
-        Gets what is carried, a piece of a stream or a datagram, and which way; in another thread.
-
-    Raises
-    ------
-    CannotStartError
-        If it cannot listen.
+    The service listens at ``target``; if nothing does, connections are closed at once. With
+    ``datagrams`` it carries datagrams between the same ports, too. ``overhear`` is that of a bad
+    line. Raises CannotStartError if it cannot listen.
     """
 
     def __init__(

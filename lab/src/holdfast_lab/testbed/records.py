@@ -19,15 +19,9 @@ from holdfast.protocol.question import OWN_PLANNER
 
 @dataclass(frozen=True)
 class LogEvent:
-    """An event that a process has logged.
+    """An event that a process has logged."""
 
-    Attributes
-    ----------
-    at : float
-        In seconds since the epoch.
-    """
-
-    at: float
+    at: float  # in seconds since the epoch
     name: str
     fields: Mapping[str, Any]
 
@@ -52,31 +46,17 @@ def log_event_of(line: str) -> LogEvent | None:
 
 
 class Decision(NamedTuple):
-    """A row of a robot's ``timings.csv``.
+    """A row of a robot's ``timings.csv``."""
 
-    Attributes
-    ----------
-    at : float
-        When it was carried out, in seconds since the epoch.
-    kind : str
-        ``sensing`` or ``task``.
-    waited_ms : float
-        How long the robot stood still for it.
-    round_trip_ms : float
-        From the request until the answer.
-    computed_ms : float
-        The service's own part of that.
-    """
-
-    at: float
+    at: float  # when it was carried out, in seconds since the epoch
     trial: int
     step: int
-    kind: str
+    kind: str  # ``sensing`` or ``task``
     service: str
     status: str
-    waited_ms: float
-    round_trip_ms: float = 0.0
-    computed_ms: float = 0.0
+    waited_ms: float  # how long the robot stood still for it
+    round_trip_ms: float = 0.0  # from the request until the answer
+    computed_ms: float = 0.0  # the service's own part of that
 
 
 def of_services(decisions: Iterable[Decision]) -> list[Decision]:

@@ -44,18 +44,9 @@ def make_reference_run(
 ) -> ReferenceRun:
     """Run trials until there are enough steps; write the configuration and the run's directory.
 
-    Parameters
-    ----------
-    path : Path
-        Gets the document, with the number of trials, as a configuration that begins with the
-        comment.
-    performed : Path or None
-        Gets the performed task actions: see :mod:`~holdfast_lab.testbed.world`.
-
-    Raises
-    ------
-    OutputError
-        If something cannot be written.
+    ``path`` gets the document, with the number of trials, as a configuration that begins with the
+    comment; ``performed`` the performed task actions: see :mod:`~holdfast_lab.testbed.world`.
+    Raises OutputError if something cannot be written.
     """
 
     def configure(num_trials: int) -> Configuration:

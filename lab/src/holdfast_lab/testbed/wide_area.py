@@ -53,25 +53,17 @@ socket.send_fds(socket.socket(fileno=int(sys.argv[1])), [b"."], [device])
 
 
 class Route(NamedTuple):
-    """A route from a robot to a service.
+    """A route from a robot to a service."""
 
-    Attributes
-    ----------
-    robot_prefix, service_prefix : tuple of str
-        Commands that run another one in the namespace of either end.
-    host : str
-        By which the robot calls the service.
-    carried_bytes : callable or None
-        Returns the bytes of all packets sent so far, both ways, with headers and lost packets;
-        None where no packets are seen.
-    """
-
+    # Commands that run another one in the namespace of either end.
     robot_prefix: tuple[str, ...]
     service_prefix: tuple[str, ...]
     listen: str
     connect: str
-    host: str
+    host: str  # by which the robot calls the service
     emulated_by: Emulation
+    # Returns the bytes of all packets sent so far, both ways, with headers and lost packets; None
+    # where no packets are seen.
     carried_bytes: Callable[[], int] | None = None
 
 
@@ -81,6 +73,9 @@ def lay_route(
 ) -> Iterator[Route]:
     """Set up a route for as long as the ``with`` statement lasts.
 
+    Raises InvalidValueError if there is no such transport, or a number is out of bounds;
+    CannotStartError if it cannot be set up.
+
     Parameters
     ----------
     round_trip_ms : float
@@ -89,13 +84,6 @@ def lay_route(
         Share of packets that are lost, each way.
     packets : bool
         False uses a proxy even where namespaces are permitted.
-
-    Raises
-    ------
-    InvalidValueError
-        If there is no such transport, or a number is out of bounds.
-    CannotStartError
-        If it cannot be set up.
     """
     if transport not in get_args(Transport):
         raise InvalidValueError(

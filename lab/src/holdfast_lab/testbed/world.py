@@ -29,32 +29,20 @@ _FIELDS = 5
 
 
 class Performance(NamedTuple):
-    """A task action that was performed.
-
-    Attributes
-    ----------
-    action : str
-        The bytes of its numbers, as hexadecimal.
-    at : float
-        In seconds since the epoch.
-    """
+    """A task action that was performed."""
 
     trial: int
     step: int
-    action: str
+    action: str  # the bytes of its numbers, as hexadecimal
     process: int
-    at: float
+    at: float  # in seconds since the epoch
 
 
 class WitnessedWorld:
     """The world of one trial: see :class:`~holdfast.robot.environment.Environment`.
 
-    A resumed trial goes on after the lines of another robot's process.
-
-    Raises
-    ------
-    EnvironmentFailedError
-        If the file is not one of performances.
+    A resumed trial goes on after the lines of another robot's process. Raises
+    EnvironmentFailedError if the file is not one of performances.
     """
 
     def __init__(
@@ -110,10 +98,7 @@ def witnessed_by(path: Path) -> dict[str, Any]:
 def performances(path: Path) -> Iterator[Performance]:
     """Yield the performed task actions, in order.
 
-    Raises
-    ------
-    EnvironmentFailedError
-        If a line cannot be read.
+    Raises EnvironmentFailedError if a line cannot be read.
     """
     for number, line in enumerate(path.read_text().splitlines(), start=1):
         fields = line.split(" ")
