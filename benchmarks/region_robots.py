@@ -128,10 +128,10 @@ class MachineShell:
     def gone(self, call: int) -> None:
         """Take note that whoever has called is gone."""
         if self.up:
-            self._carry_out(self.machine.gone(call, self._scheduler.now))
+            self._carry_out(self.machine.gone(call))
 
     def _carry_out(self, effects: list[ServiceEffect]) -> None:
-        for effect in effects:
+        for effect in (*effects, *self.machine.next_jobs(self._scheduler.now)):
             if isinstance(effect, SendReply):
                 self._reply(effect.call, effect.payload)
             elif isinstance(effect, EndCall):
