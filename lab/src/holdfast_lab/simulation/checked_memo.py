@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 from holdfast.planning.planner import PlanningState, digest
 from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
+from holdfast.protocol.service_batches import run_together
 from holdfast.protocol.service_jobs import Job, JobResult
 from holdfast.robot.memo_cache import MemoCache, MemoizingPlanner, key_of
 from holdfast_lab.errors import Violation
@@ -61,6 +62,7 @@ class JobCache:
         self._outcomes: Memo[tuple[object, ...], tuple[str, JobResult]]
         self._outcomes = Memo(check=_check_outcomes)
         self._digests: Memo[int, tuple[PlanningState, bytes]] = Memo()
+        self._runs = 0
 
     def outcome(self, job: Job) -> JobResult:
         """Return the outcome of a job; another one than the last time is a Violation."""
@@ -70,7 +72,13 @@ class JobCache:
         known = None
         if state is not None:
             known = self._digests.get(id(state), lambda: (state, digest(state)))[1]
-        return self._outcomes.get((job.identity, known), lambda: (job.kind, job.run()))[1]
+        return self._outcomes.get((job.identity, known), lambda: (job.kind, self._run(job)))[1]
+
+    def _run(self, job: Job) -> JobResult:
+        """Compute a job alone and, in turns, together with others, as far as it can be."""
+        self._runs += 1
+        together = run_together([job, job]) if self._runs % 2 else {}
+        return together.get(job) or job.run()
 
 
 def _check_outcomes(known: tuple[str, JobResult], now: tuple[str, JobResult]) -> None:
