@@ -145,7 +145,7 @@ def test_a_configuration(text: str, workplace: Path, said: Run) -> None:
         ["compare", HOSTILE, HOSTILE],
         ["simulate", "--seeds", HOSTILE],
         ["serve", "--listen", HOSTILE],
-        ["serve", "--problem", HOSTILE],
+        ["serve", "--listen", "unix/nix", "--problem", HOSTILE],
         [HOSTILE],
     ],
     ids=lambda arguments: arguments[0] if len(arguments[0]) < 10 else "command",

@@ -200,7 +200,7 @@ class TestWhateverItRaises:
         [
             ["run", "peg.yaml", "--problem", "exits_at_import:X"],
             ["run", "peg.yaml", "--environment", "exits_at_import:X"],
-            ["serve", "--listen", "tcp/127.0.0.1:0", "--problem", "exits_at_import:X"],
+            ["serve", "--listen", "unix/nix", "--problem", "exits_at_import:X"],
         ],
         ids=lambda command: command[0] + command[-2],
     )
