@@ -256,8 +256,9 @@ class TestEpoch:
         assert "another process has resumed this run, so this one stops" in older.output
         assert cloud.process.matching("session_taken_over")
         assert cloud.process.matching("refused", code="stale_epoch")
-        # It still performed what it had been told before, and nothing after that.
-        assert world.step <= steps[3] + 1
+        # The service may have chosen what to sense next before it was overtaken, and refuses what is
+        # asked then, while the robot moves: at the latest it stops where it should sense again.
+        assert world.step <= steps[4]
         world.check()
         other.assert_each_once(reference)
 
