@@ -26,13 +26,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.processes import usage_of
 from benchmarks.robots import configuration_for
 from benchmarks.turns import Turn, recorded_turns
-from holdfast.protocol.events import (
-    CallEnded,
-    ReplyReceived,
-    ServiceAppeared,
-    ServiceVanished,
-    TransportEvent,
-)
 from holdfast.protocol.messages import (
     PROTOCOL_VERSION,
     Busy,
@@ -44,6 +37,13 @@ from holdfast.protocol.messages import (
     TaskAnswer,
     decode_reply,
     encode,
+)
+from holdfast.protocol.robot_events import (
+    CallEnded,
+    ReplyReceived,
+    ServiceAppeared,
+    ServiceVanished,
+    TransportEvent,
 )
 from holdfast.robot.session_configuration import session_configuration_of
 from holdfast.transport.robot_end import StreamRobotTransport

@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.region_robots import CLOUD, RegionRobot, Setup
 from benchmarks.robots import configuration_for
-from holdfast.protocol.events import ServiceAppeared, ServiceVanished, TransportEvent
+from holdfast.protocol.robot_events import ServiceAppeared, ServiceVanished, TransportEvent
 from holdfast.robot.session_configuration import session_configuration_of
 from holdfast.runtime.descriptors import allow_descriptors
 from holdfast.transport.endpoints import TlsFiles

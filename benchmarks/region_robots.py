@@ -26,7 +26,9 @@ from holdfast.planning.settings import (
 from holdfast.planning.tracking import replay
 from holdfast.problems.problem import Problem
 from holdfast.protocol.dispatcher import Dispatcher
-from holdfast.protocol.events import (
+from holdfast.protocol.messages import SessionConfiguration, decode_request
+from holdfast.protocol.robot import Robot
+from holdfast.protocol.robot_events import (
     Abandon,
     Act,
     Acted,
@@ -43,8 +45,6 @@ from holdfast.protocol.events import (
     ServiceAppeared,
     Timing,
 )
-from holdfast.protocol.messages import SessionConfiguration, decode_request
-from holdfast.protocol.robot import Robot
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect, StartJob
 from holdfast.protocol.service_limits import ServiceLimits

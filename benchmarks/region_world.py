@@ -21,8 +21,13 @@ import msgspec
 from benchmarks.region_robots import CLOUD, MachineShell, RegionRobot, Setup
 from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared, ServiceVanished
 from holdfast.protocol.messages import Busy, SessionConfiguration, encode
+from holdfast.protocol.robot_events import (
+    CallEnded,
+    ReplyReceived,
+    ServiceAppeared,
+    ServiceVanished,
+)
 from holdfast.protocol.service_limits import ServiceLimits
 from holdfast.transport.dialer import _SHARE_OF_OUTAGE, RetryPauses
 from holdfast.transport.links import OPENING_TIMEOUT_S

@@ -17,7 +17,7 @@ from typing import NamedTuple
 from holdfast.config.loader import Configuration, load
 from holdfast.journal.run_directory import RunDirectory
 from holdfast.planning.outcome import TrialResult
-from holdfast.protocol.events import Timing, TransportEvent
+from holdfast.protocol.robot_events import Timing, TransportEvent
 from holdfast.robot.environment_maker import load_environment
 from holdfast.robot.links import make_links
 from holdfast.robot.process import RobotProcess

@@ -16,7 +16,6 @@ from holdfast.planning.inputs import Sensed, decode_floats, encode_floats
 from holdfast.planning.planner import Planner, PlanningState, digest, encode_checkpoint
 from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
-from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared, TransportEvent
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
     PROTOCOL_VERSION,
@@ -28,6 +27,7 @@ from holdfast.protocol.messages import (
     decode_reply,
     encode,
 )
+from holdfast.protocol.robot_events import CallEnded, ReplyReceived, ServiceAppeared, TransportEvent
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.robot_end import StreamRobotTransport

@@ -24,7 +24,21 @@ from holdfast.planning.settings import (
 from holdfast.planning.tracking import replay
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.dispatcher import Dispatcher
-from holdfast.protocol.events import (
+from holdfast.protocol.messages import (
+    DIGEST_SIZE,
+    MAX_TASK_ACTIONS,
+    NeedState,
+    Progress,
+    Reply,
+    Request,
+    SensingAnswer,
+    SessionConfiguration,
+    TaskAnswer,
+    decode_request,
+    encode,
+)
+from holdfast.protocol.robot import Robot
+from holdfast.protocol.robot_events import (
     Abandon,
     Act,
     Acted,
@@ -48,20 +62,6 @@ from holdfast.protocol.events import (
     VerificationNoted,
     WriteRecords,
 )
-from holdfast.protocol.messages import (
-    DIGEST_SIZE,
-    MAX_TASK_ACTIONS,
-    NeedState,
-    Progress,
-    Reply,
-    Request,
-    SensingAnswer,
-    SessionConfiguration,
-    TaskAnswer,
-    decode_request,
-    encode,
-)
-from holdfast.protocol.robot import Robot
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import run_trial
 

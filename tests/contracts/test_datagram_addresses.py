@@ -24,7 +24,7 @@ from tests.contracts.test_datagram_links import (
 from tests.contracts.wires import Inbox, StreamWire, echo, until
 from tests.ports import free_port
 
-from holdfast.protocol.events import ServiceAppeared, ServiceVanished
+from holdfast.protocol.robot_events import ServiceAppeared, ServiceVanished
 from holdfast.transport.datagram_links import RobotDatagramLink
 from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.exchanges import ECHO

@@ -18,7 +18,12 @@ from tests.contracts.wires import LEASE_MS, Inbox, Received, StreamWire, echo, u
 from tests.ports import free_port
 
 from holdfast.errors import TransportError
-from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared, ServiceVanished
+from holdfast.protocol.robot_events import (
+    CallEnded,
+    ReplyReceived,
+    ServiceAppeared,
+    ServiceVanished,
+)
 from holdfast.transport import datagram_cipher
 from holdfast.transport import datagram_links as datagram_links
 from holdfast.transport.contract import IncomingCall

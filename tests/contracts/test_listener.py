@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from tests.contracts.wires import HELLO, PATIENCE_S, Inbox, StreamWire, Visitor, echo, until
 
-from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared
+from holdfast.protocol.robot_events import CallEnded, ReplyReceived, ServiceAppeared
 from holdfast.transport import frames, links, listener, service_end
 from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.tls import TlsStream, client_context

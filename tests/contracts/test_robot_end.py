@@ -28,7 +28,7 @@ from tests.contracts.wires import (
 )
 from tests.process_states import stop
 
-from holdfast.protocol.events import (
+from holdfast.protocol.robot_events import (
     CallEnded,
     ReplyReceived,
     ServiceAppeared,
@@ -285,7 +285,7 @@ async def test_what_came_while_a_robot_stood_still_is_read_before_anybody_is_giv
 
 ROBOT_THAT_ENDS = """
 import asyncio, sys
-from holdfast.protocol.events import ServiceAppeared
+from holdfast.protocol.robot_events import ServiceAppeared
 from holdfast.transport.robot_end import StreamRobotTransport
 
 async def main():

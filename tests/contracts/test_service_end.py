@@ -22,7 +22,7 @@ from tests.contracts.wires import (
     until,
 )
 
-from holdfast.protocol.events import (
+from holdfast.protocol.robot_events import (
     CallEnded,
     ReplyReceived,
     ServiceAppeared,

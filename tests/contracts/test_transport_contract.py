@@ -31,7 +31,7 @@ from tests.contracts.wires import (
 from tests.process_states import stop
 
 from holdfast.errors import InvalidValueError
-from holdfast.protocol.events import (
+from holdfast.protocol.robot_events import (
     CallEnded,
     ReplyReceived,
     ServiceAppeared,

@@ -28,7 +28,7 @@ from tests.contracts.wires import (
 )
 
 from holdfast.errors import TransportError
-from holdfast.protocol.events import (
+from holdfast.protocol.robot_events import (
     CallEnded,
     ReplyReceived,
     ServiceAppeared,

@@ -28,13 +28,13 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from tests.ports import free_port
 from tests.processes.faults import PATIENT
 
-from holdfast.protocol.events import (
+from holdfast.protocol.messages import Refused, decode_reply
+from holdfast.protocol.robot_events import (
     CallEnded,
     ReplyReceived,
     ServiceAppeared,
     TransportEvent,
 )
-from holdfast.protocol.messages import Refused, decode_reply
 from holdfast.transport import frames
 from holdfast.transport.contract import IncomingCall, RobotTransport, ServiceTransport
 from holdfast.transport.endpoints import TlsFiles

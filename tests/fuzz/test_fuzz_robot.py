@@ -21,15 +21,6 @@ from tests.robot_world import LOCAL, World
 from holdfast.planning.inputs import encode_floats
 from holdfast.planning.settings import SimulatorSettings
 from holdfast.protocol.dispatcher import Dispatcher
-from holdfast.protocol.events import (
-    CallEnded,
-    Halt,
-    ReplyReceived,
-    RobotEffect,
-    Send,
-    ServiceAppeared,
-    ServiceVanished,
-)
 from holdfast.protocol.messages import (
     Busy,
     NeedState,
@@ -40,6 +31,15 @@ from holdfast.protocol.messages import (
     TaskAnswer,
     encode,
     with_checksum,
+)
+from holdfast.protocol.robot_events import (
+    CallEnded,
+    Halt,
+    ReplyReceived,
+    RobotEffect,
+    Send,
+    ServiceAppeared,
+    ServiceVanished,
 )
 
 ONE_TRIAL = SimulatorSettings(num_trials=1, max_steps=14, seed=11)

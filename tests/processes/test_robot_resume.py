@@ -256,8 +256,8 @@ class TestEpoch:
         assert "another process has resumed this run, so this one stops" in older.output
         assert cloud.process.matching("session_taken_over")
         assert cloud.process.matching("refused", code="stale_epoch")
-        # The service may have chosen what to sense next before it was overtaken, and refuses what is
-        # asked then, while the robot moves: at the latest it stops where it should sense again.
+        # The service may have chosen what to sense next before it was overtaken. It refuses what is
+        # asked then, while the robot moves: this one stops where it should sense again, or before.
         assert world.step <= steps[4]
         world.check()
         other.assert_each_once(reference)

@@ -26,13 +26,6 @@ from tests.processes.faults import PATIENT
 from tests.programs import completed
 from tests.unit.test_protocol_service import Robot, content
 
-from holdfast.protocol.events import (
-    CallEnded,
-    ReplyReceived,
-    ServiceAppeared,
-    ServiceVanished,
-    TransportEvent,
-)
 from holdfast.protocol.messages import (
     PROTOCOL_VERSION,
     Progress,
@@ -42,6 +35,13 @@ from holdfast.protocol.messages import (
     decode_reply,
     encode,
     with_checksum,
+)
+from holdfast.protocol.robot_events import (
+    CallEnded,
+    ReplyReceived,
+    ServiceAppeared,
+    ServiceVanished,
+    TransportEvent,
 )
 from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.robot_end import StreamRobotTransport

@@ -6,7 +6,8 @@ import pytest
 from tests.robot_world import LOCAL, SmallService, World, answer_third_slowly, nth
 
 from holdfast.errors import ServiceRefusedError
-from holdfast.protocol.events import (
+from holdfast.protocol.messages import Busy, Refused, Reply, Request, TaskAnswer, encode
+from holdfast.protocol.robot_events import (
     Launch,
     LogEvent,
     RecoveryExited,
@@ -14,7 +15,6 @@ from holdfast.protocol.events import (
     ServiceAppeared,
     ServiceVanished,
 )
-from holdfast.protocol.messages import Busy, Refused, Reply, Request, TaskAnswer, encode
 
 
 def fails_in_its_sensing_part(service: SmallService, code: str, calls: int = 10**9) -> None:

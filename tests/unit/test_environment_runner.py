@@ -19,7 +19,7 @@ from holdfast.planning.inputs import Late, Moved, Sensed, encode_floats
 from holdfast.planning.outcome import Ending, MoveResult, ending_of
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.protocol.events import (
+from holdfast.protocol.robot_events import (
     Acted,
     EnvironmentEvent,
     EnvironmentFailed,

@@ -19,7 +19,7 @@ from holdfast.planning.inputs import ActingRecord, Moved, Record, encode_floats
 from holdfast.planning.outcome import Ending
 from holdfast.planning.planner import Planner, digest
 from holdfast.planning.tracking import Trial
-from holdfast.protocol.events import Timing
+from holdfast.protocol.robot_events import Timing
 from holdfast.reports.facts import (
     EventFact,
     LateFact,

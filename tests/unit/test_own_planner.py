@@ -14,8 +14,8 @@ from holdfast.errors import ProblemError
 from holdfast.planning.planner import Decision, Planner, PlanningState
 from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.protocol.events import ComputeOwnAnswer, Halt, OwnAnswer
 from holdfast.protocol.question import OWN_PLANNER, InProcessSource, Question
+from holdfast.protocol.robot_events import ComputeOwnAnswer, Halt, OwnAnswer
 from holdfast.robot import own_planner
 from holdfast.robot.own_planner import OwnPlanner
 

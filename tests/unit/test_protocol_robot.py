@@ -18,7 +18,10 @@ from holdfast.planning.outcome import ending_of
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings, OnLost, SimulatorSettings
 from holdfast.planning.tracking import Trial, replay
-from holdfast.protocol.events import (
+from holdfast.protocol.messages import Reply, SensingAnswer, TaskAnswer
+from holdfast.protocol.question import OWN_PLANNER, InProcessSource
+from holdfast.protocol.robot import Robot
+from holdfast.protocol.robot_events import (
     Act,
     Acted,
     EnvironmentFailed,
@@ -30,9 +33,6 @@ from holdfast.protocol.events import (
     Timing,
     WriteRecords,
 )
-from holdfast.protocol.messages import Reply, SensingAnswer, TaskAnswer
-from holdfast.protocol.question import OWN_PLANNER, InProcessSource
-from holdfast.protocol.robot import Robot
 from holdfast.reports.recorder import Recorder
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import run_trial

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from holdfast.protocol.events import RecoveryExited
+from holdfast.protocol.robot_events import RecoveryExited
 from holdfast.robot.recovery_launcher import RecoveryLauncher
 
 PATIENCE_S = 60.0

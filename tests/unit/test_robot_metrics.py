@@ -12,7 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from tests.robot_world import Misleading, World
 
 from holdfast.planning.settings import SimulatorSettings
-from holdfast.protocol.events import Timing
+from holdfast.protocol.robot_events import Timing
 from holdfast.robot.metrics import RobotMetrics
 
 RULES = Path(__file__).parents[2] / "deploy" / "prometheus" / "rules.yaml"

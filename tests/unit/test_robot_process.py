@@ -21,7 +21,8 @@ from holdfast.journal.run_directory import RunDirectory
 from holdfast.planning.inputs import Moved, PausedRecord
 from holdfast.planning.outcome import SensingDecision, TrialResult
 from holdfast.planning.planner import Planner, PlanningState
-from holdfast.protocol.events import (
+from holdfast.protocol.question import InProcessSource
+from holdfast.protocol.robot_events import (
     Act,
     Acted,
     ComputeOwnAnswer,
@@ -34,7 +35,6 @@ from holdfast.protocol.events import (
     Timing,
     TransportEvent,
 )
-from holdfast.protocol.question import InProcessSource
 from holdfast.protocol.status import Status
 from holdfast.robot import own_planner
 from holdfast.robot import process as robot_process

@@ -10,7 +10,7 @@ import pytest
 
 from holdfast.config.loader import Configuration, load
 from holdfast.planning.planner import Planner, PlanningState
-from holdfast.protocol.events import Act, Sense, Timing
+from holdfast.protocol.robot_events import Act, Sense, Timing
 from holdfast.robot.links import RECOVERY_SERVICE
 from holdfast_ros.ros2 import telemetry as module
 from holdfast_ros.ros2.telemetry import PublishedDecision, Telemetry

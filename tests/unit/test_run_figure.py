@@ -18,8 +18,8 @@ from holdfast.journal.run_directory import RunDirectory
 from holdfast.journal.timings import EventTable
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
-from holdfast.protocol.events import Timing
 from holdfast.protocol.question import OWN_PLANNER
+from holdfast.protocol.robot_events import Timing
 from holdfast.reports.recorder import Recorder
 
 PEG = """

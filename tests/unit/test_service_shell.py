@@ -17,13 +17,6 @@ from tests.unit.test_protocol_service import Robot, content, planning_of
 from holdfast.errors import MessageError
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.problem import Problem
-from holdfast.protocol.events import (
-    CallEnded,
-    ReplyReceived,
-    ServiceAppeared,
-    ServiceVanished,
-    TransportEvent,
-)
 from holdfast.protocol.messages import (
     Busy,
     NeedState,
@@ -37,6 +30,13 @@ from holdfast.protocol.messages import (
     decode_request,
     encode,
     with_checksum,
+)
+from holdfast.protocol.robot_events import (
+    CallEnded,
+    ReplyReceived,
+    ServiceAppeared,
+    ServiceVanished,
+    TransportEvent,
 )
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import Job, JobResult, SendReply, ServiceEffect, StartJob

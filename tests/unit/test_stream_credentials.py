@@ -14,7 +14,7 @@ import pytest
 from tests.processes.faults import PATIENT
 
 from holdfast.errors import TransportError
-from holdfast.protocol.events import (
+from holdfast.protocol.robot_events import (
     CallEnded,
     ReplyReceived,
     ServiceAppeared,

@@ -15,7 +15,7 @@ from holdfast.journal.timings import (
     count_answers,
     count_verified,
 )
-from holdfast.protocol.events import Timing, VerificationNoted
+from holdfast.protocol.robot_events import Timing, VerificationNoted
 from holdfast_lab.testbed.records import DecisionTable, time_of
 
 MOMENT_NS = 1_700_000_000_123_456_789

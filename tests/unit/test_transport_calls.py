@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from holdfast.protocol.events import (
+from holdfast.protocol.messages import Refused, decode_reply
+from holdfast.protocol.robot_events import (
     CallEnded,
     ServiceAppeared,
     ServiceVanished,
     TransportEvent,
 )
-from holdfast.protocol.messages import Refused, decode_reply
 from holdfast.transport.calls import CallTable, too_large
 
 

@@ -19,7 +19,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from holdfast.errors import CredentialsError
-from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared
+from holdfast.protocol.robot_events import CallEnded, ReplyReceived, ServiceAppeared
 from holdfast.transport.contract import IncomingCall
 from holdfast.transport.credentials import load_credentials
 from holdfast.transport.endpoints import Role, TlsFiles

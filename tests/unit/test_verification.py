@@ -14,7 +14,9 @@ from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.inputs import decode_floats, encode_floats
 from holdfast.planning.planner import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.protocol.events import (
+from holdfast.protocol.messages import Reply, SensingAnswer, TaskAnswer
+from holdfast.protocol.question import Provenance, Question, same_actions
+from holdfast.protocol.robot_events import (
     Act,
     ComputeOwnAnswer,
     Effects,
@@ -24,8 +26,6 @@ from holdfast.protocol.events import (
     RobotEffect,
     VerificationNoted,
 )
-from holdfast.protocol.messages import Reply, SensingAnswer, TaskAnswer
-from holdfast.protocol.question import Provenance, Question, same_actions
 from holdfast.protocol.verification import MAX_OPEN_CHECKS, Verification
 
 PLANNER = Planner(PROBLEM, PLANNING)

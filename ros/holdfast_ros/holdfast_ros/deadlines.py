@@ -6,8 +6,6 @@ import threading
 import time
 from collections.abc import Callable
 
-__all__ = ["Absence", "Deadline"]
-
 _SUSPENDED_S = 1.0
 """A wait that wakes this much too late was in a stopped process; it gets the time back."""
 

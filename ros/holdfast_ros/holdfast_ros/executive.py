@@ -25,15 +25,6 @@ from holdfast.planning.outcome import Done
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import ObservationSizes, is_no_reading
 
-__all__ = [
-    "DecideCode",
-    "DecideRequest",
-    "DecisionHandover",
-    "DueDecision",
-    "ExecutiveEnvironment",
-]
-
-
 _NO_NUMBERS: FloatArray = np.empty(0)
 
 

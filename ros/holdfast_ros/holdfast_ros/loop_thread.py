@@ -11,8 +11,6 @@ from typing import Any, TypeVar
 
 from holdfast.errors import TransportError
 
-__all__ = ["LoopThread"]
-
 _T = TypeVar("_T")
 
 

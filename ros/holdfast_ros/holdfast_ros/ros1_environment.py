@@ -11,11 +11,6 @@ from typing import NamedTuple, Self
 from holdfast.errors import TransportError
 from ros1_master_guard.headers import host_and_port_of
 
-__all__ = [
-    "RosEnvironment",
-    "ServiceType",
-]
-
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 _MAX_NAME = 200
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-__all__ = ["IS_SERVICE", "SUMMARY", "main"]
-
 SUMMARY = "Keep a ROS 1 master alive."
 IS_SERVICE = True
 

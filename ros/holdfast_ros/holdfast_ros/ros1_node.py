@@ -36,8 +36,6 @@ from ros1_master_guard.ros1_calls import (
     message,
 )
 
-__all__ = ["RosNode", "ServiceHandler", "Topic", "TopicType"]
-
 ServiceHandler = Callable[[bytes], Awaitable[bytes]]
 """Takes a request's bytes and returns the response's."""
 

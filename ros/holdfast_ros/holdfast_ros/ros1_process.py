@@ -13,8 +13,6 @@ from holdfast.service.options import DEFAULT_NAME, ServeOptions
 if TYPE_CHECKING:
     from holdfast_ros.ros1_service import Ros1Server
 
-__all__ = ["Ros1ServeOptions", "main"]
-
 
 class Ros1ServeOptions(ServeOptions):
     """Offer a service in ROS 1, at the address of ROS_MASTER_URI and the like.

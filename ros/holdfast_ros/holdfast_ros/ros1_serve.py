@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-__all__ = ["IS_SERVICE", "SUMMARY", "main"]
-
 SUMMARY = "Decide for robots in ROS 1, as a service."
 IS_SERVICE = True
 

@@ -19,8 +19,6 @@ from holdfast_ros.ros1_client import service_type
 from holdfast_ros.ros1_environment import RosEnvironment
 from holdfast_ros.ros1_node import RosNode
 
-__all__ = ["MAX_WAITING", "Ros1Server"]
-
 _START_S = 5.0
 
 MAX_WAITING = 64

@@ -9,8 +9,6 @@ from typing import Any, NamedTuple
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 
-__all__ = ["CallClients", "Connections", "RobotCall"]
-
 
 class RobotCall(NamedTuple):
     """A service or an action of the robot's, by its resolved name."""

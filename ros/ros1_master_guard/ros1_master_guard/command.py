@@ -16,8 +16,6 @@ from ros1_master_guard.events import EventLog, json_line
 from ros1_master_guard.guard import MasterGuard
 from ros1_master_guard.settings import GuardSettings, MasterAddress
 
-__all__ = ["main"]
-
 _ABOUT = """\
 Guard the ROS 1 master: when it dies, the next one knows all that it knew.
 

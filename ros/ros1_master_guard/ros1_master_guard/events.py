@@ -10,8 +10,6 @@ import threading
 from collections.abc import Mapping
 from typing import TextIO
 
-__all__ = ["EventLog", "json_line"]
-
 _MAX_QUEUED_LINES = 1000
 _MAX_LINE = 4000
 _FLUSH_TIMEOUT_S = 0.5

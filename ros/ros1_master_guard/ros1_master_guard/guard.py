@@ -37,8 +37,6 @@ from ros1_master_guard.saved_state import read_journal, write_journal
 from ros1_master_guard.settings import GuardSettings, directory_for, guard_lock, listens_at
 from ros1_master_guard.standby import MasterLink, MasterProcess
 
-__all__ = ["MasterGuard"]
-
 _PROBE_EVERY_S = 0.2
 _PROBE_S = 1.0
 _POLL_EVERY_S = 0.25

@@ -12,15 +12,6 @@ from urllib.parse import urlsplit
 
 from ros1_master_guard.errors import ProtocolError
 
-__all__ = [
-    "ANY_TYPE",
-    "MAX_HEADER_BYTES",
-    "decode_header",
-    "encode_header",
-    "encode_message",
-    "host_and_port_of",
-]
-
 MAX_HEADER_BYTES = 64 * 1024
 """Bound on a connection header; a topic's contains the whole definition of its type."""
 

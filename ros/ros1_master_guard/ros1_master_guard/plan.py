@@ -14,8 +14,6 @@ from ros1_master_guard.errors import CallError, GoneError, SilentError
 from ros1_master_guard.process import MasterState
 from ros1_master_guard.ros1_calls import CALLER, Connection, call
 
-__all__ = ["gone_and_silent", "process_of", "snapshot", "without"]
-
 _ANSWER_S = 0.3
 """Longest wait for a node while there is no master."""
 

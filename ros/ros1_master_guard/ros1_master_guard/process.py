@@ -30,8 +30,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Dict, List, NoReturn, Tuple  # noqa: UP035 (older Python)
 
-__all__ = ["HEAD", "MasterState", "decoded", "encoded"]
-
 Registrations = Dict[str, List[Tuple[str, str]]]  # noqa: UP006
 """Nodes of each topic or parameter: name and URI of the node's XML-RPC server."""
 

@@ -22,17 +22,6 @@ from ros1_master_guard.headers import (
     host_and_port_of,
 )
 
-__all__ = [
-    "CALLER",
-    "MAX_SHORT_BYTES",
-    "Connection",
-    "HttpHead",
-    "call",
-    "connect",
-    "decoded",
-    "message",
-]
-
 CALLER: Final = "/ros1_master_guard"
 """Name of the caller where no node calls."""
 

@@ -14,8 +14,6 @@ from ros1_master_guard.errors import CallError, GoneError
 from ros1_master_guard.events import EventLog
 from ros1_master_guard.ros1_calls import call
 
-__all__ = ["ROSOUT", "Rosout", "how_it_ended", "set_versions"]
-
 ROSOUT = "/rosout"
 
 _CHECK_EVERY_S = 1.0

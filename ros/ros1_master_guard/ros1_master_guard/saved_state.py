@@ -11,8 +11,6 @@ from pathlib import Path
 
 from ros1_master_guard.process import HEAD, MasterState, decoded, encoded
 
-__all__ = ["read_journal", "write_journal"]
-
 _MAGIC = b"ros1_master_guard 2\n"
 
 

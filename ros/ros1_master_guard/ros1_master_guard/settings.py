@@ -14,15 +14,6 @@ from urllib.parse import urlsplit
 
 from ros1_master_guard.errors import GuardError
 
-__all__ = [
-    "DEFAULT_PORT",
-    "GuardSettings",
-    "MasterAddress",
-    "directory_for",
-    "guard_lock",
-    "listens_at",
-]
-
 DEFAULT_PORT = 11311
 
 

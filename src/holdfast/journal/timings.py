@@ -20,7 +20,7 @@ from typing import NamedTuple
 from holdfast.errors import OutputError
 from holdfast.journal.run_clock import Stamp, read_clocks
 from holdfast.printable import cell
-from holdfast.protocol.events import Timing, VerificationNoted
+from holdfast.protocol.robot_events import Timing, VerificationNoted
 from holdfast.runtime.files import bounded_lines
 
 

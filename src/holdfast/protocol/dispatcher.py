@@ -19,16 +19,6 @@ from holdfast.errors import HoldfastError, ServiceRefusedError
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import OffloadSettings, RecoverySettings
 from holdfast.problems.problem import Problem
-from holdfast.protocol.events import (
-    CallEnded,
-    Launch,
-    OwnAnswer,
-    RecoveryExited,
-    ReplyReceived,
-    ServiceAppeared,
-    ServiceVanished,
-    TransportEvent,
-)
 from holdfast.protocol.local_service import HedgingBudget, RestartPolicy
 from holdfast.protocol.messages import (
     NeedState,
@@ -40,6 +30,16 @@ from holdfast.protocol.messages import (
 from holdfast.protocol.question import DecisionSource, Question
 from holdfast.protocol.replica_set import Replica, ReplicaSet
 from holdfast.protocol.requests import OpenRequest, OpenRequests
+from holdfast.protocol.robot_events import (
+    CallEnded,
+    Launch,
+    OwnAnswer,
+    RecoveryExited,
+    ReplyReceived,
+    ServiceAppeared,
+    ServiceVanished,
+    TransportEvent,
+)
 from holdfast.protocol.status import Cause
 from holdfast.protocol.verification import Verification
 

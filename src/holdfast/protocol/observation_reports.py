@@ -14,7 +14,7 @@ from holdfast.planning.lost import MOVE, Verdict
 from holdfast.planning.settings import LostSettings, OnLost
 from holdfast.planning.tracking import Trial
 from holdfast.problems.attributes import sensing_labels
-from holdfast.protocol.events import Effects, RobotEffect
+from holdfast.protocol.robot_events import Effects, RobotEffect
 
 _MAX_REPORTS = 10
 """Bound on reports of each kind per trial; all are counted."""

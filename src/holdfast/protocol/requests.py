@@ -16,7 +16,6 @@ from collections.abc import Iterator
 
 from holdfast.errors import MessageError, StaleEpochError
 from holdfast.planning.planner import Planner
-from holdfast.protocol.events import Abandon, Effects, RobotEffect, Send
 from holdfast.protocol.messages import (
     PROTOCOL_VERSION,
     Busy,
@@ -33,6 +32,7 @@ from holdfast.protocol.messages import (
 )
 from holdfast.protocol.question import Provenance, Question
 from holdfast.protocol.replica_set import Replica
+from holdfast.protocol.robot_events import Abandon, Effects, RobotEffect, Send
 from holdfast.protocol.verification import Verification
 
 _MAX_CALLS = 4

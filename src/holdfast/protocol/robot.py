@@ -10,7 +10,7 @@ computed. It is used only if the state in which it was chosen is, bit for bit, t
 robot arrives.
 
 The machine touches nothing. Methods take an event and the time and return effects
-(:mod:`holdfast.protocol.events`), to be carried out in order. If nothing happens before
+(:mod:`holdfast.protocol.robot_events`), to be carried out in order. If nothing happens before
 :meth:`Robot.next_wakeup`, the shell calls :meth:`Robot.wake`.
 """
 
@@ -34,7 +34,10 @@ from holdfast.planning.outcome import Ending
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.settings import LostSettings, SimulatorSettings
 from holdfast.planning.tracking import Trial
-from holdfast.protocol.events import (
+from holdfast.protocol.messages import DIGEST_SIZE
+from holdfast.protocol.observation_reports import ObservationReports, held_error
+from holdfast.protocol.question import DecisionSource, Provenance, Question
+from holdfast.protocol.robot_events import (
     Act,
     Acted,
     EndTrial,
@@ -52,9 +55,6 @@ from holdfast.protocol.events import (
     TransportEvent,
     WriteRecords,
 )
-from holdfast.protocol.messages import DIGEST_SIZE
-from holdfast.protocol.observation_reports import ObservationReports, held_error
-from holdfast.protocol.question import DecisionSource, Provenance, Question
 from holdfast.protocol.status import Status
 
 _TICKS_INTERVAL_S = 1.0

@@ -40,7 +40,6 @@ from holdfast.protocol.decision_cost import (
     cost_of_answer,
     describe_cost,
 )
-from holdfast.protocol.events import LogEvent
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_ACTION_SIZE,
@@ -49,6 +48,7 @@ from holdfast.protocol.messages import (
     SessionConfiguration,
     unpack_configuration,
 )
+from holdfast.protocol.robot_events import LogEvent
 from holdfast.protocol.service_limits import ServiceLimits
 
 _COSTS_PER_PROBLEM = 128

@@ -11,7 +11,6 @@ import hashlib
 import math
 from collections import OrderedDict
 
-from holdfast.protocol.events import Effects
 from holdfast.protocol.messages import (
     MAX_TEXT,
     MAX_WORD,
@@ -24,6 +23,7 @@ from holdfast.protocol.messages import (
     TaskAnswer,
     encode,
 )
+from holdfast.protocol.robot_events import Effects
 from holdfast.protocol.service_jobs import EndCall, SendReply, ServiceEffect
 from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
 from holdfast.protocol.service_sessions import CachedAnswer, PendingTask, WaitingCall

@@ -27,13 +27,6 @@ import numpy as np
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.planner import Planner
 from holdfast.problems import checked
-from holdfast.protocol.events import (
-    ComputeOwnAnswer,
-    Effects,
-    OwnAnswer,
-    RobotEffect,
-    VerificationNoted,
-)
 from holdfast.protocol.messages import DIGEST_SIZE, SensingAnswer
 from holdfast.protocol.question import (
     OWN_PLANNER,
@@ -41,6 +34,13 @@ from holdfast.protocol.question import (
     Question,
     WrongAnswer,
     same_actions,
+)
+from holdfast.protocol.robot_events import (
+    ComputeOwnAnswer,
+    Effects,
+    OwnAnswer,
+    RobotEffect,
+    VerificationNoted,
 )
 
 MAX_OPEN_CHECKS = 64

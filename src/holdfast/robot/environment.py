@@ -31,8 +31,8 @@ from holdfast.planning.settings import EnvironmentSettings
 from holdfast.problems import checked
 from holdfast.problems.attributes import check_sizes, has_general_observations, sensing_action_of
 from holdfast.problems.problem import Problem, ProblemBase
-from holdfast.protocol.events import Acted, EnvironmentReady, NoReading
 from holdfast.protocol.messages import MAX_ACTION_SIZE
+from holdfast.protocol.robot_events import Acted, EnvironmentReady, NoReading
 
 _NUMBERS = f"numbers {NOTHING_ELSE}"
 

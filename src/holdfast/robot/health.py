@@ -11,8 +11,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 from holdfast.planning.outcome import TrialResult
-from holdfast.protocol.events import Timing
 from holdfast.protocol.robot import Robot
+from holdfast.protocol.robot_events import Timing
 from holdfast.runtime.events import EventSink
 from holdfast.runtime.service_manager import ServiceManager
 

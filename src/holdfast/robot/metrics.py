@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 from holdfast import __version__
 from holdfast.planning.outcome import TrialResult
-from holdfast.protocol.events import Timing
 from holdfast.protocol.messages import PROTOCOL_VERSION
 from holdfast.protocol.robot import Robot
+from holdfast.protocol.robot_events import Timing
 from holdfast.protocol.status import Status
 from holdfast.runtime.exposition import Durations, exposition, require_prometheus
 

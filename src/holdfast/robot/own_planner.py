@@ -19,8 +19,8 @@ from time import perf_counter
 from holdfast.errors import HoldfastError
 from holdfast.planning.planner import Planner
 from holdfast.protocol.computing_time import ExpectedTime
-from holdfast.protocol.events import ComputeOwnAnswer, OwnAnswer
 from holdfast.protocol.messages import MAX_TASK_ACTIONS
+from holdfast.protocol.robot_events import ComputeOwnAnswer, OwnAnswer
 from holdfast.runtime.pool import ThreadPool
 
 _BRIEF_S = 0.001

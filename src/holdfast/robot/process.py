@@ -28,7 +28,9 @@ from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import PlanningState
 from holdfast.planning.tracking import Trial, replay
 from holdfast.protocol.dispatcher import Dispatcher
-from holdfast.protocol.events import (
+from holdfast.protocol.question import DecisionSource, InProcessSource
+from holdfast.protocol.robot import Robot
+from holdfast.protocol.robot_events import (
     Abandon,
     Act,
     ComputeOwnAnswer,
@@ -50,8 +52,6 @@ from holdfast.protocol.events import (
     VerificationNoted,
     WriteRecords,
 )
-from holdfast.protocol.question import DecisionSource, InProcessSource
-from holdfast.protocol.robot import Robot
 from holdfast.robot.ending_signals import ending_signals
 from holdfast.robot.environment_maker import EnvironmentMaker
 from holdfast.robot.environment_runner import EnvironmentRunner, make_runner

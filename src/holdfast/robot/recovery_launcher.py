@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO
 
-from holdfast.protocol.events import RecoveryExited
+from holdfast.protocol.robot_events import RecoveryExited
 from holdfast.runtime.files import started_in
 from holdfast.runtime.pool import ThreadPool
 from holdfast.runtime.process_ends import how_it_ended

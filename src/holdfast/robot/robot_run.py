@@ -19,7 +19,7 @@ from holdfast.journal.run_directory import (
     VERIFICATION_NAME,
 )
 from holdfast.journal.timings import EventTable, count_verified
-from holdfast.protocol.events import Timing, VerificationNoted
+from holdfast.protocol.robot_events import Timing, VerificationNoted
 from holdfast.robot.links import make_links
 from holdfast.robot.process import RobotProcess
 from holdfast.runtime.events import BoundedEventLog
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from holdfast.journal.run_directory import RunDirectory
     from holdfast.planning.outcome import TrialResult
     from holdfast.planning.planner import PlanningState
-    from holdfast.protocol.events import Act, Sense
+    from holdfast.protocol.robot_events import Act, Sense
     from holdfast.robot.environment_maker import EnvironmentMaker
     from holdfast.robot.health import RobotWatch
     from holdfast.runtime.events import EventSink

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from holdfast.errors import InvalidValueError
-from holdfast.protocol.events import (
+from holdfast.protocol.robot_events import (
     CallEnded,
     ReplyReceived,
     ServiceAppeared,

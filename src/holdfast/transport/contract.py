@@ -13,7 +13,7 @@ import asyncio
 from collections.abc import Callable
 from typing import Protocol
 
-from holdfast.protocol.events import TransportEvent
+from holdfast.protocol.robot_events import TransportEvent
 
 DEFAULT_MAX_MESSAGE_BYTES = 64 * 1024 * 1024
 """Default bound on a message: a state of a million particles fills 56 MB."""
@@ -25,19 +25,17 @@ class RobotTransport(Protocol):
     def start(self, deliver: Callable[[TransportEvent], None]) -> None:
         """Begin to connect, in the running loop, and to deliver events.
 
-        Events of one call come in the order in which they happened, and after its
-        :class:`~holdfast.protocol.events.CallEnded` nothing more comes of it. A service that is
-        already there is delivered as :class:`~holdfast.protocol.events.ServiceAppeared` as well.
-        One that is gone is delivered as :class:`~holdfast.protocol.events.ServiceVanished`, then
-        the ends of its calls.
+        They are the transport events of :mod:`holdfast.protocol.robot_events`. Those of one call
+        come in the order in which they happened, and after its ``CallEnded`` nothing more comes of
+        it. A service that is already there is delivered as ``ServiceAppeared`` as well. One that is
+        gone is delivered as ``ServiceVanished``, then the ends of its calls.
         """
 
     def call(self, service: str, call: int, payload: bytes) -> None:
         """Send a request to a known service; never raises for a lost one.
 
         The results are events with the number ``call``, which is unique while the transport is
-        open. The last event is always :class:`~holdfast.protocol.events.CallEnded`, soon if the
-        service is absent or lost.
+        open. The last event is always ``CallEnded``, soon if the service is absent or lost.
         """
 
     def abandon(self, call: int) -> None:

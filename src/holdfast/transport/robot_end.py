@@ -21,7 +21,7 @@ from holdfast.errors import (
     TransportError,
     defect_fields,
 )
-from holdfast.protocol.events import TransportEvent
+from holdfast.protocol.robot_events import TransportEvent
 from holdfast.transport.calls import CallTable, too_large
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
 from holdfast.transport.dialer import Dialer

@@ -24,7 +24,9 @@ from holdfast.planning.settings import (
 )
 from holdfast.planning.tracking import Trial, replay
 from holdfast.protocol.dispatcher import Dispatcher
-from holdfast.protocol.events import (
+from holdfast.protocol.messages import MAX_TASK_ACTIONS
+from holdfast.protocol.robot import Robot
+from holdfast.protocol.robot_events import (
     Abandon,
     Act,
     Acted,
@@ -48,8 +50,6 @@ from holdfast.protocol.events import (
     VerificationNoted,
     WriteRecords,
 )
-from holdfast.protocol.messages import MAX_TASK_ACTIONS
-from holdfast.protocol.robot import Robot
 from holdfast_lab.errors import Violation
 from holdfast_lab.simulation.checkers import StatusChecker
 from holdfast_lab.simulation.disk import Disk

@@ -14,7 +14,15 @@ from typing import Any
 from holdfast.errors import HoldfastError, IllegalTransitionError, MessageError
 from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.protocol.events import (
+from holdfast.protocol.messages import (
+    DIGEST_SIZE,
+    PROTOCOL_VERSION,
+    Request,
+    SessionConfiguration,
+    decode_reply,
+    encode,
+)
+from holdfast.protocol.robot_events import (
     Act,
     CallEnded,
     ReplyReceived,
@@ -24,14 +32,6 @@ from holdfast.protocol.events import (
     Timing,
     TransportEvent,
     WriteRecords,
-)
-from holdfast.protocol.messages import (
-    DIGEST_SIZE,
-    PROTOCOL_VERSION,
-    Request,
-    SessionConfiguration,
-    decode_reply,
-    encode,
 )
 from holdfast_lab.errors import Violation
 from holdfast_lab.simulation.checked_memo import CheckedPlanner, JobCache, Memo

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 import msgspec
 
 from holdfast.errors import InvalidValueError, TransportError
-from holdfast.protocol.events import TransportEvent
+from holdfast.protocol.robot_events import TransportEvent
 from holdfast.transport.calls import CallTable, too_large
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, IncomingCall
 

@@ -13,8 +13,6 @@ from typing import Any
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 
-__all__ = ["Bond"]
-
 _TIMEOUT_S = 4.0
 """After which an end without heartbeats is dead, as Nav2 has it."""
 

@@ -17,8 +17,6 @@ from holdfast.protocol.status import Status
 from holdfast_ros.ros2.run_segment import Ending, RunSegment, SegmentResult
 from holdfast_ros.ros2.telemetry import Telemetry
 
-__all__ = ["Diagnostics", "Level", "RobotDiagnosis"]
-
 _HOLDING = "holding still"
 
 

@@ -13,8 +13,6 @@ import textwrap
 import threading
 from collections.abc import Sequence
 
-__all__ = ["main"]
-
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 

@@ -22,15 +22,6 @@ from holdfast.problems.problem import Problem
 from holdfast.reports.csv_export import state_labels
 from holdfast_ros.ros2.telemetry import PublishedDecision
 
-__all__ = [
-    "belief_message",
-    "decision_message",
-    "floats",
-    "frame_message",
-    "outcome_message",
-    "pose_array",
-]
-
 
 def floats(values: npt.ArrayLike) -> array.array[float]:
     """Return numbers as rclpy takes them fastest."""

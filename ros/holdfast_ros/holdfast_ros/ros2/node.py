@@ -38,7 +38,7 @@ from std_msgs.msg import Float64MultiArray, String
 from holdfast.errors import HoldfastError
 from holdfast.planning.planner import PlanningState
 from holdfast.problems.attributes import sensing_labels
-from holdfast.protocol.events import Act, Sense
+from holdfast.protocol.robot_events import Act, Sense
 from holdfast.reports.poses import PoseLayout, pose_layout
 from holdfast.robot.links import check_services
 from holdfast.robot.recomputing import resume_run_if_begun
@@ -59,8 +59,6 @@ from holdfast_ros.ros2.parameters import (
 from holdfast_ros.ros2.run_segment import Ending, RunSegment, SegmentResult, make_world
 from holdfast_ros.ros2.telemetry import PublishedDecision, Telemetry
 from holdfast_ros.ros2_connections import Connections
-
-__all__ = ["NUM_THREADS", "HoldfastNode"]
 
 _Run = holdfast_interfaces.action.Run
 _Decide = holdfast_interfaces.srv.Decide

@@ -25,17 +25,6 @@ from holdfast.config.yaml_document import read
 from holdfast.errors import ConfigurationError
 from holdfast.validation import close_match, described, dotted, find_mismatch
 
-__all__ = [
-    "OWN",
-    "OWN_DEFAULTS",
-    "NodeParameters",
-    "in_force",
-    "in_parameters",
-    "known_parameters",
-    "read_parameters",
-    "refusal_of_name",
-]
-
 _SECTIONS_OF_PROBLEMS = ("model.", "state_space_planner.")
 _ARGUMENTS = "environment.arguments."
 _OF_ROS = ("use_sim_time", "start_type_description_service")

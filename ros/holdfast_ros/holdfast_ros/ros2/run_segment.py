@@ -29,7 +29,7 @@ from holdfast.errors import (
 from holdfast.journal.run_directory import RunDirectory
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import PlanningState
-from holdfast.protocol.events import Act, Sense, Timing
+from holdfast.protocol.robot_events import Act, Sense, Timing
 from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
 from holdfast.robot.health import Condition
 from holdfast.robot.process import RobotProcess
@@ -38,8 +38,6 @@ from holdfast.robot.robot_run import RobotObserver, perform_trials
 from holdfast.runtime.events import EventSink
 from holdfast_ros.executive import DecideCode, DecisionHandover, ExecutiveEnvironment
 from holdfast_ros.ros2.parameters import NodeParameters, in_parameters
-
-__all__ = ["MAX_TRIALS_TOLD", "Ending", "RunSegment", "SegmentResult", "World", "make_world"]
 
 MAX_TRIALS_TOLD = 10_000
 """Most trials in a result; ``trials.csv`` has all."""

@@ -23,13 +23,10 @@ import numpy as np
 from holdfast.config.loader import Configuration
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.planner import Planner, PlanningState
-from holdfast.protocol.events import Act, Sense, Timing
 from holdfast.protocol.question import OWN_PLANNER
+from holdfast.protocol.robot_events import Act, Sense, Timing
 from holdfast.protocol.status import Status
 from holdfast.robot.links import RECOVERY_SERVICE
-
-__all__ = ["PublishedDecision", "Telemetry"]
-
 
 _MAX_STATE_BYTES = 32 << 20
 _MIN_STATES = 4
